@@ -1,0 +1,370 @@
+"""The values: cameras, observations, known positions, dataset. They check themselves and never change.
+
+Axis order is (points, cameras, 2). Pixels are (u, v) = (column, row) with (0, 0) the centre of the top-left pixel;
+positions are in the dataset's own world frame and length unit. Missing is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from implicam.errors import DatasetError, did_you_mean
+
+Floats = NDArray[np.float64]
+Names = NDArray[np.str_]
+
+TRUTH_COLUMNS = (
+    "true_x", "true_y", "true_z", "limit_sd_x", "limit_sd_y", "limit_sd_z",
+    "limit_cov_xy", "limit_cov_xz", "limit_cov_yz",
+)  # fmt: skip
+"""Extra columns of points.csv that `implicam simulate` writes: where the point really was, and its Cramer-Rao limit."""
+
+_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera's name and image size in pixels; None where the size is not known."""
+
+    name: str
+    width: int | None = None
+    height: int | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_name(self.name, "camera name")
+        if set("/\\") & set(self.name) or self.name.startswith("."):
+            raise DatasetError(
+                f"camera name {self.name!r} cannot name a folder.",
+                fix="leave out slashes, backslashes and a leading dot",
+            )
+        for what, size in (("width", self.width), ("height", self.height)):
+            if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 1):
+                raise DatasetError(
+                    f"camera {self.name!r} has {what} = {size!r}; it must be a whole number of pixels.",
+                    fix=f"give the {what} of its images, for example {what} = 1280",
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Which point was seen by which camera, at which pixel.
+
+    points: (n,) names, each once. uv: (n, cameras, 2) pixels, NaN where the camera did not see the point.
+    sd: standard uncertainty of each pixel coordinate, same shape, NaN where not stated.
+    extra: further columns of observations.csv as text, (n, cameras) each.
+    """
+
+    points: Names
+    cameras: tuple[Camera, ...]
+    uv: Floats
+    sd: Floats
+    extra: Mapping[str, Names] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        points = _text(self.points)
+        n, c = len(points), len(self.cameras)
+        _check_unique(points, "point")
+        _check_unique([camera.name for camera in self.cameras], "camera")
+        uv = _array(self.uv, (n, c, 2), "uv")
+        if np.isinf(uv).any() or (np.isnan(uv[..., 0]) != np.isnan(uv[..., 1])).any():
+            raise DatasetError("a view must have both u and v, finite, or neither (NaN).")
+        sd = _array(self.sd, (n, c, 2), "sd")
+        if (sd <= 0).any() or np.isinf(sd).any():
+            raise DatasetError("sd_u and sd_v must be positive and finite, or not stated (NaN).")
+        extra = {key: _text(value, (n, c)) for key, value in self.extra.items()}
+        _freeze(self, points=points, cameras=tuple(self.cameras), uv=uv, sd=sd, extra=extra)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(n, cameras) where a camera saw the point."""
+        return ~np.isnan(self.uv[..., 0])
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The cameras' names, in the order of the second axis."""
+        return tuple(camera.name for camera in self.cameras)
+
+    def select(self, index: ArrayLike) -> Observations:
+        """The observations of some points: a boolean mask, or positions in the order wanted."""
+        i = np.asarray(index)
+        extra = {key: value[i] for key, value in self.extra.items()}
+        return Observations(self.points[i], self.cameras, self.uv[i], self.sd[i], extra)
+
+    def with_cameras(self, names: Sequence[str]) -> Observations:
+        """The observations of some cameras, in the order wanted; every point stays, seen or not."""
+        known = self.camera_names
+        for name in names:
+            if name not in known:
+                raise DatasetError(
+                    f"there is no camera {name!r}{did_you_mean(name, known)}.",
+                    fix=f"the cameras are {', '.join(known)}",
+                )
+        i = [known.index(name) for name in names]
+        extra = {key: value[:, i] for key, value in self.extra.items()}
+        cameras = tuple(self.cameras[j] for j in i)
+        return Observations(self.points, cameras, self.uv[:, i], self.sd[:, i], extra)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPositions:
+    """Where the points were, and which shot each belongs to.
+
+    shots: (n,) names; the points of one exposure (a board) share one. xyz: (n, 3), world frame, the dataset's unit.
+    sd: standard uncertainties, (n, 3), NaN where not stated. extra: further columns of points.csv as text, (n,) each.
+    """
+
+    shots: Names
+    xyz: Floats
+    sd: Floats
+    extra: Mapping[str, Names] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shots = _text(self.shots)
+        n = len(shots)
+        for shot in np.unique(shots):
+            _check_name(str(shot), "shot")
+        xyz = _array(self.xyz, (n, 3), "xyz")
+        if not np.isfinite(xyz).all():
+            raise DatasetError("a known position must be finite.")
+        sd = _array(self.sd, (n, 3), "sd")
+        if (sd < 0).any() or np.isinf(sd).any():
+            raise DatasetError("sd_x, sd_y and sd_z must be finite and not negative, or not stated (NaN).")
+        extra = {key: _text(value, (n,)) for key, value in self.extra.items()}
+        _freeze(self, shots=shots, xyz=xyz, sd=sd, extra=extra)
+
+    def select(self, index: ArrayLike) -> KnownPositions:
+        """The positions of some points."""
+        i = np.asarray(index)
+        extra = {key: value[i] for key, value in self.extra.items()}
+        return KnownPositions(self.shots[i], self.xyz[i], self.sd[i], extra)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What only a simulation knows: the true positions (n, 3), and the Cramer-Rao limit of each, (n, 3, 3)."""
+
+    xyz: Floats
+    limit: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Observations, the known positions that go with them (None where they are to be measured), and the unit."""
+
+    name: str
+    length_unit: str
+    observations: Observations
+    known: KnownPositions | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_name(self.name, "dataset name")
+        _check_name(self.length_unit, "length unit")
+        if self.known is not None and len(self.known.shots) != len(self.observations):
+            raise DatasetError(
+                f"{len(self.observations)} observed points, but {len(self.known.shots)} known positions.",
+                fix="give both for the same points, in the same order",
+            )
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """The rig's cameras."""
+        return self.observations.cameras
+
+    @property
+    def points(self) -> Names:
+        """(n,) names of the points."""
+        return self.observations.points
+
+    @property
+    def positions(self) -> KnownPositions:
+        """The known positions, or a clear error where there are none."""
+        if self.known is None:
+            raise DatasetError(
+                f"dataset {self.name!r} has no known positions.",
+                why="there is no points.csv (or no x, y, z columns)",
+                fix="add points.csv with point,shot,x,y,z; without it a dataset can only be measured",
+            )
+        return self.known
+
+    @property
+    def xyz(self) -> Floats:
+        """(n, 3) known positions."""
+        return self.positions.xyz
+
+    @property
+    def shots(self) -> Names:
+        """(n,) the shot of each point."""
+        return self.positions.shots
+
+    @property
+    def truth(self) -> Truth | None:
+        """The simulated truth, where the dataset carries it."""
+        columns = self.known.extra if self.known else {}
+        if not set(TRUTH_COLUMNS) <= set(columns):
+            return None
+        try:
+            table = np.stack([columns[key].astype(np.float64) for key in TRUTH_COLUMNS], axis=1)
+        except ValueError as error:
+            raise DatasetError(
+                "a column of the simulated truth (true_x ... limit_cov_yz) holds text.",
+                why=str(error),
+                fix="simulate the dataset again, or delete these columns from points.csv",
+            ) from error
+        return Truth(table[:, :3], covariance_from_columns(table[:, 3:6], table[:, 6:9]))
+
+    @property
+    def metres_per_unit(self) -> float:
+        """How long one length unit is in metres."""
+        try:
+            return _METRES[self.length_unit]
+        except KeyError:
+            raise DatasetError(
+                f"the length unit {self.length_unit!r} is not known in metres{did_you_mean(self.length_unit, _METRES)}.",
+                fix=f"use one of {', '.join(_METRES)}",
+            ) from None
+
+    def select(self, index: ArrayLike) -> Dataset:
+        """The dataset of some points: a boolean mask, or positions in the order wanted."""
+        known = self.known.select(index) if self.known else None
+        return replace(self, observations=self.observations.select(index), known=known)
+
+    def with_cameras(self, names: Sequence[str]) -> Dataset:
+        """The dataset of some cameras; every point stays, seen or not."""
+        return replace(self, observations=self.observations.with_cameras(names))
+
+    def without(self, names: Sequence[str]) -> Dataset:
+        """The dataset without some cameras."""
+        self.observations.with_cameras(names)  # says which name is unknown
+        return self.with_cameras([name for name in self.observations.camera_names if name not in names])
+
+    def split(self, n: int, *, seed: int) -> tuple[Dataset, Dataset]:
+        """`n` points at random, and the rest."""
+        if not 0 < n < len(self):
+            raise DatasetError(
+                f"cannot split {len(self)} points into {n} and the rest.",
+                fix=f"choose a number from 1 to {len(self) - 1}",
+            )
+        order = np.random.default_rng(seed).permutation(len(self))
+        return self.select(np.sort(order[:n])), self.select(np.sort(order[n:]))
+
+    def folds(self, k: int, *, seed: int) -> Iterator[tuple[str, Dataset, Dataset]]:
+        """`k` random folds: name, the others, the fold; each point is held out once."""
+        if not 2 <= k <= len(self):
+            raise DatasetError(
+                f"cannot make {k} folds of {len(self)} points.", fix=f"choose a number from 2 to {len(self)}"
+            )
+        fold = np.random.default_rng(seed).permutation(np.arange(len(self)) % k)
+        for i in range(k):
+            yield f"fold {i + 1}", self.select(fold != i), self.select(fold == i)
+
+    def leave_out_shots(self) -> Iterator[tuple[str, Dataset, Dataset]]:
+        """Each shot in turn: its name, the others, the shot."""
+        shots = np.unique(self.shots)
+        if len(shots) < 2:
+            raise DatasetError(
+                f"dataset {self.name!r} has one shot only, so no shot can be left out.",
+                fix="use --cv 10, or give the points of each exposure their own shot in points.csv",
+            )
+        for shot in shots:
+            yield str(shot), self.select(self.shots != shot), self.select(self.shots == shot)
+
+
+def join(first: Dataset, second: Dataset) -> Dataset:
+    """One dataset of the points of both; they must share cameras, unit and kind."""
+    if first.cameras != second.cameras or first.length_unit != second.length_unit:
+        raise DatasetError(
+            f"datasets {first.name!r} and {second.name!r} do not belong to one rig.",
+            why="their cameras or length units differ",
+            fix="join only datasets with the same [[cameras]] and length_unit",
+        )
+    if (first.known is None) != (second.known is None):
+        raise DatasetError("one dataset has known positions and the other has none.", fix="join datasets of one kind")
+    a, b = first.observations, second.observations
+    observations = Observations(
+        np.concatenate([a.points, b.points]),
+        a.cameras,
+        np.concatenate([a.uv, b.uv]),
+        np.concatenate([a.sd, b.sd]),
+        _joined_columns(a.extra, b.extra, a.uv.shape[:2], b.uv.shape[:2]),
+    )
+    known = None
+    if first.known and second.known:
+        p, q = first.known, second.known
+        known = KnownPositions(
+            np.concatenate([p.shots, q.shots]),
+            np.concatenate([p.xyz, q.xyz]),
+            np.concatenate([p.sd, q.sd]),
+            _joined_columns(p.extra, q.extra, (len(first),), (len(second),)),
+        )
+    return replace(first, observations=observations, known=known)
+
+
+def covariance_from_columns(sd: Floats, off_diagonal: Floats) -> Floats:
+    """(n, 3, 3) covariance from standard uncertainties (n, 3) and cov_xy, cov_xz, cov_yz (n, 3)."""
+    cov = np.zeros((len(sd), 3, 3))
+    cov[:, [0, 1, 2], [0, 1, 2]] = sd**2
+    cov[:, [0, 0, 1], [1, 2, 2]] = cov[:, [1, 2, 2], [0, 0, 1]] = off_diagonal
+    return cov
+
+
+def _joined_columns(
+    a: Mapping[str, Names], b: Mapping[str, Names], shape_a: tuple[int, ...], shape_b: tuple[int, ...]
+) -> dict[str, Names]:
+    keys = [*a, *(key for key in b if key not in a)]
+    empty_a, empty_b = np.full(shape_a, ""), np.full(shape_b, "")
+    return {key: np.concatenate([a.get(key, empty_a), b.get(key, empty_b)]) for key in keys}
+
+
+def _array(value: ArrayLike, shape: tuple[int, ...], name: str) -> Floats:
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise DatasetError(f"{name} has the shape {array.shape}; expected {shape}.")
+    return array
+
+
+def _text(value: ArrayLike, shape: tuple[int, ...] | None = None) -> Names:
+    array = np.array(value, dtype=np.str_)
+    if shape is not None and array.shape != shape:
+        raise DatasetError(f"a text column has the shape {array.shape}; expected {shape}.")
+    return array
+
+
+def _check_name(name: object, what: str) -> None:
+    ok = isinstance(name, str) and name != "" and name == name.strip() and name.isprintable()
+    if not ok:
+        raise DatasetError(
+            f"{what} {name!r} is not usable.",
+            why="names are printable text without spaces at either end",
+            fix="rename it",
+        )
+
+
+def _check_unique(names: Sequence[str] | Names, what: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        _check_name(str(name), what)
+        if name in seen:
+            raise DatasetError(f"{what} {str(name)!r} is there twice.", fix=f"give each {what} a name of its own")
+        seen.add(str(name))
+
+
+def _freeze(value: object, **fields: Any) -> None:
+    """Set the checked fields of a frozen value, arrays read-only."""
+    for name, content in fields.items():
+        for array in content.values() if isinstance(content, dict) else [content]:
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+        object.__setattr__(value, name, content)

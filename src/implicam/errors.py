@@ -1,0 +1,77 @@
+"""One error tree. Every message says what happened, why, and how to fix it.
+
+    ImplicamError
+    ├── DatasetError          a file or a value in a dataset is wrong
+    ├── FitError              a calibration cannot be computed from these data
+    ├── CalibrationFileError  a .implicam file is damaged, hostile or too new
+    ├── NumericalError        a matrix that must be positive definite is not
+    ├── MissingExtraError     an optional library is not installed
+    └── UsageError            options that do not go together
+
+The command line prints the three lines and no traceback; `--debug` shows it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from types import ModuleType
+
+
+class ImplicamError(Exception):
+    """What happened; `why`, the cause where we know it; `fix`, what the reader can do about it."""
+
+    def __init__(self, what: str, *, why: str = "", fix: str = "") -> None:
+        super().__init__(what, why, fix)
+        self.what, self.why, self.fix = what, why, fix
+
+    def __str__(self) -> str:
+        lines = [self.what]
+        if self.why:
+            lines.append(f"  why: {self.why}")
+        if self.fix:
+            lines.append(f"  fix: {self.fix}")
+        return "\n".join(lines)
+
+
+class DatasetError(ImplicamError):
+    """A file or a value in a dataset is wrong; names the file, the line and the value."""
+
+
+class FitError(ImplicamError):
+    """A calibration cannot be computed from these data."""
+
+
+class CalibrationFileError(ImplicamError):
+    """A calibration file is damaged, hostile or from a newer version; nothing in it was run."""
+
+
+class NumericalError(ImplicamError):
+    """A matrix that must be positive definite is not, or a number that must be finite is not."""
+
+
+class MissingExtraError(ImplicamError):
+    """An optional library is not installed."""
+
+
+class UsageError(ImplicamError):
+    """Options or arguments that do not go together."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'cam1'?"` where a known word is close, else nothing."""
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def import_extra(module: str, extra: str, purpose: str) -> ModuleType:
+    """Import an optional library late, or say which extra brings it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{purpose} needs the library {module.partition('.')[0]!r}, which is not installed.",
+            why=str(error),
+            fix=f'pip install "implicam[{extra}]"',
+        ) from error

@@ -1,0 +1,64 @@
+"""Measured positions with their covariance, and measured.csv."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Floats, Names
+from implicam.files import write_text
+
+MEASURED_COLUMNS = (
+    "point", "x", "y", "z", "sd_x", "sd_y", "sd_z", "cov_xy", "cov_xz", "cov_yz", "views", "consistency", "reason",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Positions of n points, in the world frame and length unit of the calibration.
+
+    xyz: (n, 3), NaN where the point could not be measured; reason then says why, else it is empty.
+    cov: (n, 3, 3) covariance of the *position*, everything included: pixel noise of this measurement, lack of
+    calibration data, parameters. views: (n,) number of views used. consistency: (n,) p-value of the chi-squared test
+    that the views agree, NaN where it cannot be tested.
+    """
+
+    points: Names
+    xyz: Floats
+    cov: Floats
+    views: NDArray[np.int64]
+    consistency: Floats
+    reason: Names
+    length_unit: str
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(n,) where there is a position."""
+        return ~np.isnan(self.xyz[:, 0])
+
+    @property
+    def sd(self) -> Floats:
+        """(n, 3) standard uncertainties."""
+        return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
+
+    def write_csv(self, path: str | Path) -> None:
+        """Write measured.csv: every point keeps its row; one that was not measured has empty numbers and a reason."""
+        buffer = io.StringIO(newline="")
+        writer = csv.writer(buffer, lineterminator="\n")
+        writer.writerow(MEASURED_COLUMNS)
+        off_diagonal = self.cov[:, [0, 0, 1], [1, 2, 2]]
+        numbers = np.concatenate([self.xyz, self.sd, off_diagonal], axis=1)
+        for i, name in enumerate(self.points):
+            row = ["" if np.isnan(x) else repr(float(x)) for x in numbers[i]]
+            p = self.consistency[i]
+            tail = [str(int(self.views[i])), "" if np.isnan(p) else repr(float(p)), str(self.reason[i])]
+            writer.writerow([str(name), *row, *tail])
+        write_text(Path(path), buffer.getvalue())
