@@ -108,6 +108,13 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="")
 
 
+def toml_text(table: Mapping[str, Any]) -> str:
+    """A dict as TOML."""
+    import tomli_w  # late, so that `import implicam` needs NumPy and SciPy only
+
+    return tomli_w.dumps(table)
+
+
 def write_zip(file: Path | io.BytesIO, members: Mapping[str, bytes]) -> None:
     """Write an uncompressed zip whose bytes depend on the members only (no dates)."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -120,7 +127,7 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     members = {}
     for name, array in arrays.items():
         buffer = io.BytesIO()
-        np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+        np.lib.format.write_array(buffer, np.asarray(array, order="C"), allow_pickle=False)
         members[f"{name}.npy"] = buffer.getvalue()
     archive = io.BytesIO()
     write_zip(archive, members)

@@ -1,5 +1,11 @@
 """Correspondences: read, check, split, join, write."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from implicam.dataset.folder import read_folder, write_folder
 from implicam.dataset.model import (
     TRUTH_COLUMNS,
     Camera,
@@ -12,6 +18,17 @@ from implicam.dataset.model import (
     covariance_from_columns,
     join,
 )
+from implicam.dataset.wide import (
+    arrays_from_dataset,
+    dataset_from_arrays,
+    read_npz_dataset,
+    read_parquet,
+    read_wide_csv,
+    write_npz_dataset,
+    write_parquet,
+    write_wide_csv,
+)
+from implicam.errors import DatasetError
 
 __all__ = [
     "TRUTH_COLUMNS",
@@ -22,6 +39,52 @@ __all__ = [
     "Names",
     "Observations",
     "Truth",
+    "arrays_from_dataset",
     "covariance_from_columns",
+    "dataset_from_arrays",
     "join",
+    "read_dataset",
+    "write_dataset",
 ]
+
+
+def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
+    """Read a dataset: a folder, a wide .csv, a .parquet or an .npz.
+
+    `unit` names the length unit of a wide CSV that has no description beside it. Raises DatasetError, which names
+    the file, the line, the value and the cure.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return read_folder(path)
+    if suffix == ".csv":
+        return read_wide_csv(path, unit)
+    if suffix == ".parquet":
+        return read_parquet(path)
+    if suffix == ".npz":
+        return read_npz_dataset(path)
+    raise DatasetError(
+        f"{path} is not a dataset." if path.exists() else f"{path} does not exist.",
+        why="" if path.exists() else f"the working folder is {Path.cwd()}",
+        fix="give a folder with dataset.toml, or a .csv, .parquet or .npz file; see docs/formats.md",
+    )
+
+
+def write_dataset(
+    data: Dataset, path: str | Path, *, overwrite: bool = False, also: Mapping[str, str] | None = None
+) -> None:
+    """Write a dataset, whole or not at all; the ending chooses the form, none means a folder.
+
+    An existing folder is refused unless `overwrite`; `also` adds text files to a folder.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        write_wide_csv(data, path)
+    elif suffix == ".parquet":
+        write_parquet(data, path)
+    elif suffix == ".npz":
+        write_npz_dataset(data, path)
+    else:
+        write_folder(data, path, overwrite=overwrite, also=also)

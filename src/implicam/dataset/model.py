@@ -232,7 +232,7 @@ class Dataset:
             return _METRES[self.length_unit]
         except KeyError:
             raise DatasetError(
-                f"the length unit {self.length_unit!r} is not known in metres{did_you_mean(self.length_unit, _METRES)}.",
+                f"the length unit {self.length_unit!r} has no known size{did_you_mean(self.length_unit, _METRES)}.",
                 fix=f"use one of {', '.join(_METRES)}",
             ) from None
 
