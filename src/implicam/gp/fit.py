@@ -1,0 +1,219 @@
+"""Maximum marginal likelihood for an exact GP with an ARD kernel.
+
+The signal variance is profiled out: with `A = R + rho I` (R the correlation matrix, rho the noise-to-signal ratio) its
+best value is `y^T A^-1 y / n`, so only the log lengthscales and log rho are searched (Rasmussen & Williams eq. 5.8-5.9
+with that substitution). One evaluation costs one Cholesky, one inverse and four cheap matrix products, whatever the
+number of lengthscales.
+
+Finding the optimum: the likelihood has several local optima, most of them with a lengthscale stuck at its bound. We
+search a small subset from several starts, pull every lengthscale back to where its gradient is alive, and search all
+data from there in coordinates whitened by the Fisher information, which makes most directions equally steep.
+See docs/decisions/0003-gp-fit.md for what was tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import blas, lapack
+from scipy.optimize import minimize
+
+from implicam.errors import NumericalError
+from implicam.gp.kernels import SHAPES, Floats, Kernel, squared_distances
+
+LONGEST, SHORTEST = 1e6, 0.05  # lengthscale bounds, in standard deviations of an input
+ALIVE = 30.0  # beyond this a lengthscale has next to no gradient: a search must not start there
+NOISIEST = 10.0  # largest noise-to-signal ratio
+SUBSET = 80
+CHEAP = 300  # up to this many points, several searches on all data cost nothing
+_FAILED = 1e12
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Hyperparameters at the optimum, in the units of the data, and how it was reached."""
+
+    kernel: Kernel
+    noise_variance: float
+    log_marginal_likelihood: float
+    evaluations: dict[int, int] = field(default_factory=dict)
+    """Number of points -> how often the likelihood was evaluated on so many."""
+    converged: bool = True
+
+
+class ProfiledLikelihood:
+    """Negative log marginal likelihood of standardised data, and its gradient, over [log lengthscales, log rho]."""
+
+    def __init__(self, X: Floats, y: Floats, shape: str) -> None:
+        self.X, self.y, self.shape = X, y, SHAPES[shape]
+        n, d = X.shape
+        self.evaluations = 0
+        # Fresh n x n arrays would cost more in page faults than the arithmetic on them.
+        self._d2: Floats = np.empty((n, n))
+        self._A: Floats = np.empty((n, n))
+        self._left, self._right = np.ones((n, d + 2)), np.ones((n, d + 2))
+
+    def __call__(self, theta: Floats) -> tuple[float, Floats]:
+        """The value and its gradient (d + 1,)."""
+        self.evaluations += 1
+        n, d = self.X.shape
+        rho = float(np.exp(theta[d]))
+        scaled = self.X * np.exp(-theta[:d])
+        correlation, slope = self.shape(self._squared_distances(scaled))
+        np.copyto(self._A, correlation)
+        self._A.flat[:: n + 1] = 1.0 + rho
+        L, info = lapack.dpotrf(self._A.T, lower=1, clean=1, overwrite_a=1)
+        if info != 0:
+            return _FAILED, np.zeros(d + 1)
+        a, _ = lapack.dpotrs(L, self.y, lower=1)
+        signal = float(self.y @ a) / n
+        value = 0.5 * n * (np.log(2 * np.pi * signal) + 1) + np.log(np.diagonal(L)).sum()
+
+        # gradient = ½ tr((A^-1 - a a^T / signal) dA); only the lower triangle is ever formed
+        inverse, _ = lapack.dpotri(L, lower=1, overwrite_c=1)
+        gradient = np.empty(d + 1)
+        gradient[d] = 0.5 * rho * (np.trace(inverse) - a @ a / signal)
+        blas.dsyr(-1.0 / signal, a, lower=1, a=inverse, overwrite_a=1)
+        M = np.multiply(inverse.T, slope, out=self._A)
+        ones = np.ones(n)
+        gradient[:d] = (M @ ones + ones @ M) @ scaled**2 - 2 * np.einsum("ij,ij->j", scaled, M @ scaled)
+        return float(value), gradient
+
+    def _squared_distances(self, scaled: Floats) -> Floats:
+        """r², in one matrix product: [-2x, |x|², 1] [x', 1, |x'|²]^T, written into the buffer."""
+        d = scaled.shape[1]
+        squares = np.einsum("ij,ij->i", scaled, scaled)
+        self._left[:, :d], self._left[:, d] = -2.0 * scaled, squares
+        self._right[:, :d], self._right[:, d + 1] = scaled, squares
+        np.dot(self._left, self._right.T, out=self._d2)
+        return self._d2
+
+    def signal_variance(self, theta: Floats) -> float:
+        """The profiled signal variance at theta."""
+        d = self.X.shape[1]
+        scaled = self.X * np.exp(-theta[:d])
+        A = self.shape(squared_distances(scaled, scaled))[0]
+        A.flat[:: len(A) + 1] = 1.0 + np.exp(theta[d])
+        L, _ = lapack.dpotrf(A, lower=1)
+        a, _ = lapack.dpotrs(L, self.y, lower=1)
+        return float(self.y @ a) / len(A)
+
+    def fisher_information(self, theta: Floats) -> Floats:
+        """(d + 1, d + 1) expected second derivatives, ½ tr(A^-1 dA A^-1 dA') less what the profiled signal absorbs."""
+        n, d = self.X.shape
+        scaled = self.X * np.exp(-theta[:d])
+        correlation, slope = self.shape(squared_distances(scaled, scaled))
+        inverse = np.linalg.inv(correlation + np.exp(theta[d]) * np.eye(n))
+        products = [inverse @ (slope * (x[:, None] - x) ** 2) for x in scaled.T]
+        G = np.stack([*products, np.exp(theta[d]) * inverse])
+        traces = np.trace(G, axis1=1, axis2=2)
+        fisher = 0.5 * np.einsum("aij,bji->ab", G, G, optimize=True) - np.outer(traces, traces) / (2 * n)
+        return np.asarray(0.5 * (fisher + fisher.T))
+
+
+def maximise(
+    X: Floats, y: Floats, shape: str = "squared-exponential", *, start: Fit | None = None, seed: int = 0
+) -> Fit:
+    """Hyperparameters of a zero-mean GP that maximise the marginal likelihood of y (n,) at X (n, d).
+
+    `start` continues from an earlier fit (a point was added), which is cheaper than a search from nothing.
+    `seed` draws the subset. Raises NumericalError where there is nothing to learn from.
+    """
+    X, y = np.asarray(X, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    _check(X, y)
+    spread = X.std(axis=0)
+    spread[spread == 0] = 1.0
+    size = float(np.sqrt(np.mean(y**2)))
+    search = _Search((X - X.mean(axis=0)) / spread, y / size, shape, seed)
+    theta, value = search.from_nothing() if start is None else search.continued(start, spread)
+    n, d = X.shape
+    signal = search.all_data.signal_variance(theta) * size**2
+    return Fit(
+        Kernel(shape, signal, np.exp(theta[:d]) * spread),
+        float(np.exp(theta[d])) * signal,
+        -value - n * np.log(size),
+        search.evaluations,
+        search.converged,
+    )
+
+
+class _Search:
+    """One search for the optimum, on standardised data."""
+
+    def __init__(self, X: Floats, y: Floats, shape: str, seed: int) -> None:
+        n, d = X.shape
+        self.X, self.y, self.shape, self.d = X, y, shape, d
+        self.all_data = ProfiledLikelihood(X, y, shape)
+        self.subset = np.random.default_rng(seed).permutation(n)[:SUBSET]
+        # Below this ratio rounding, about n times 1e-16, would make the Cholesky fail.
+        quietest = max(1e-12, 20 * n * np.finfo(float).eps)
+        self.low = np.append(np.full(d, np.log(SHORTEST)), np.log(quietest))
+        self.high = np.append(np.full(d, np.log(LONGEST)), np.log(NOISIEST))
+        self.evaluations: dict[int, int] = {}
+        self.converged = True
+
+    def from_nothing(self) -> tuple[Floats, float]:
+        few = ProfiledLikelihood(self.X[self.subset], self.y[self.subset], self.shape)
+        starts = [self._isotropic(3.0, 1e-6), self._isotropic(10.0, 1e-8)]
+        theta, _ = min((self._descend(few, start, coarse=True) for start in starts), key=lambda found: found[1])
+        found = [self._descend(self.all_data, theta)]
+        if len(self.y) <= CHEAP:
+            # Steepest descent from short lengthscales drops the inputs one by one, and often ends better.
+            found.append(self._descend(self.all_data, self._isotropic(1.0, 1e-4), whiten=False))
+        return min(found, key=lambda result: result[1])
+
+    def continued(self, start: Fit, spread: Floats) -> tuple[Floats, float]:
+        ratio = start.noise_variance / start.kernel.signal_variance
+        theta = np.append(np.log(start.kernel.lengthscale / spread), np.log(ratio))
+        return self._descend(self.all_data, np.clip(theta, self.low, self.high))
+
+    def _isotropic(self, lengthscale: float, rho: float) -> Floats:
+        # Distances grow with the square root of the dimension, and so must the lengthscale.
+        return np.append(np.full(self.d, np.log(lengthscale * np.sqrt(self.d / 4))), np.log(rho))
+
+    def _descend(
+        self, likelihood: ProfiledLikelihood, theta: Floats, *, coarse: bool = False, whiten: bool = True
+    ) -> tuple[Floats, float]:
+        start = theta.copy()
+        start[: self.d] = np.minimum(start[: self.d], np.log(ALIVE))
+        start = np.clip(start, self.low, self.high)
+        unwhiten = self._whitening(start, len(likelihood.y)) if whiten else np.eye(self.d + 1)
+
+        def whitened(z: Floats) -> tuple[float, Floats]:
+            wanted = start + unwhiten @ z
+            theta = np.clip(wanted, self.low, self.high)
+            value, gradient = likelihood(theta)
+            # A clipped direction is flat; without this the line search would run along it for ever.
+            return value, unwhiten.T @ np.where(theta == wanted, gradient, 0.0)
+
+        before = likelihood.evaluations
+        # In whitened coordinates half the squared gradient is about the distance to the optimum in nats.
+        options = {"gtol": 0.05 if coarse else 0.005, "ftol": 1e-9, "maxcor": 20, "maxiter": 200, "maxls": 12}
+        found = minimize(whitened, np.zeros(self.d + 1), jac=True, method="L-BFGS-B", options=options)
+        n = len(likelihood.y)
+        self.evaluations[n] = self.evaluations.get(n, 0) + likelihood.evaluations - before
+        if likelihood is self.all_data:
+            self.converged = bool(found.fun < _FAILED and found.nit < options["maxiter"])
+        return np.clip(start + unwhiten @ found.x, self.low, self.high), float(found.fun)
+
+    def _whitening(self, theta: Floats, n: int) -> Floats:
+        """Columns that turn unit steps into equally steep ones; the added 1 keeps unseen directions modest."""
+        few = ProfiledLikelihood(self.X[self.subset], self.y[self.subset], self.shape)
+        fisher = few.fisher_information(theta) * (n / len(self.subset))
+        eigenvalues, vectors = np.linalg.eigh(fisher + np.eye(self.d + 1))
+        return np.asarray(vectors / np.sqrt(np.maximum(eigenvalues, 1.0)))
+
+
+def _check(X: Floats, y: Floats) -> None:
+    if X.ndim != 2 or y.shape != (len(X),) or len(X) < 2:
+        raise NumericalError(
+            f"cannot learn from inputs of shape {X.shape} and outputs of shape {y.shape}.",
+            fix="give X (n, d) and y (n,) with n of at least 2",
+        )
+    if not (np.isfinite(X).all() and np.isfinite(y).all()):
+        raise NumericalError("an input or an output is not finite.", fix="leave out points with NaN or infinity")
+    if np.mean(y**2) == 0:
+        raise NumericalError(
+            "all outputs are zero, so no variance can be learned.", fix="give outputs that vary between the points"
+        )
