@@ -1,0 +1,266 @@
+"""inverse-gp, the paper's method: three independent GPs from the pixels of all cameras to x, y and z.
+
+De Boi et al., "Implicit Multi-Camera System Calibration Using Gaussian Processes", section "Implicit Camera
+Calibration": inputs u1, v1, u2, v2, ...; exact GPs with an ARD squared-exponential kernel; maximum marginal likelihood.
+Inputs and outputs are standardised here. `preset="paper"` trains with the paper's software and its defaults instead
+(paper_preset.py).
+
+The stated covariance is that of a new noisy output: the function's variance plus the noise variance, since a pixel
+error of the measurement moves the position as much as one in the training data did. It is diagonal, because the three
+GPs know nothing of each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.protocol import Arrays, Unused, require_points, same_cameras, why_not_all_seen
+from implicam.dataset import Dataset, Floats, Names, Observations
+from implicam.errors import FitError, UsageError, did_you_mean
+from implicam.gp import SHAPES, GaussianProcess, Kernel, maximise
+from implicam.measurement import Measurement
+from implicam.progress import Progress, silent
+from implicam.threads import side_by_side
+
+PRESETS = ("standardised", "paper")
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Standardised = (value - offset) / scale, column by column."""
+
+    offset: Floats
+    scale: Floats
+
+    @classmethod
+    def of(cls, values: Floats) -> Scaling:
+        """The scaling that gives each column of (n, d) mean 0 and standard deviation 1."""
+        scale = values.std(axis=0)
+        return cls(values.mean(axis=0), np.where(scale > 0, scale, 1.0))
+
+    def apply(self, values: Floats) -> Floats:
+        """Standardise (n, d)."""
+        return (values - self.offset) / self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class Hyperparameters:
+    """Of one output: kernel, noise variance and constant mean, all in standardised units."""
+
+    kernel: Kernel
+    noise_variance: float
+    mean: float = 0.0
+
+
+@dataclass(frozen=True)
+class InverseGP:
+    """The paper's method. kernel: `squared-exponential` or `matern-5/2`; preset: `standardised` or `paper`."""
+
+    kernel: str = "squared-exponential"
+    preset: str = "standardised"
+    seed: int = 0
+
+    method: ClassVar[str] = "inverse-gp"
+
+    def __post_init__(self) -> None:
+        for what, value, known in (("kernel", self.kernel, SHAPES), ("preset", self.preset, PRESETS)):
+            if value not in known:
+                raise UsageError(
+                    f"inverse-gp has no {what} {value!r}{did_you_mean(value, known)}.",
+                    fix=f"choose one of {', '.join(known)}",
+                )
+        if self.preset == "paper" and self.kernel != "squared-exponential":
+            raise UsageError("the paper preset has the squared-exponential kernel only.", fix="leave out --kernel")
+
+    def fit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
+        """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
+        usable, unused = _usable(data)
+        if self.preset == "paper":
+            from implicam.calibrators.paper_preset import train
+        else:
+            train = _train
+        inputs, outputs = _pixels(usable), usable.xyz
+        pixels, positions = Scaling.of(inputs), Scaling.of(outputs)
+        if self.preset == "paper":  # it never standardised its positions: they are in metres, from the robot's origin
+            positions = Scaling(np.zeros(3), np.full(3, 1.0 / data.metres_per_unit))
+        hyper = train(self, pixels.apply(inputs), positions.apply(outputs), progress)
+        return InverseGPCalibration(self, data, unused, pixels, positions, hyper)
+
+
+def _usable(data: Dataset) -> tuple[Dataset, tuple[Unused, ...]]:
+    """The points with every view, and why the others are not used."""
+    seen = data.observations.seen
+    complete = seen.all(axis=1)
+    names = data.observations.camera_names
+    unused = tuple(
+        Unused(str(data.points[i]), why_not_all_seen(seen[i], names, InverseGP.method))
+        for i in np.flatnonzero(~complete)
+    )
+    _ = data.positions  # a clear error where there are none
+    per_camera = ", ".join(f"{name} sees {count}" for name, count in zip(names, seen.sum(axis=0), strict=True))
+    least = 5  # fewer than a line and a noise can be learned from
+    require_points(
+        int(complete.sum()),
+        least,
+        InverseGP.method,
+        f"only points seen by every camera can be used; of {len(data)} points, {per_camera}",
+    )
+    usable = data.select(complete)
+    for axis, values in zip(AXES, usable.xyz.T, strict=True):
+        if np.ptp(values) == 0:
+            raise FitError(
+                f"all {len(usable)} usable points have the same {axis} = {values[0]:g}.",
+                why=f"inverse-gp learns {axis} from examples, and has seen one value only",
+                fix=f"add points with other {axis}, for example a second position of the board",
+            )
+    return usable, unused
+
+
+def _pixels(data: Dataset) -> Floats:
+    """(n, 2 cameras) the concatenated pixels u1, v1, u2, v2, ..."""
+    return data.observations.uv.reshape(len(data), -1)
+
+
+def _train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperparameters, ...]:
+    """Our own fit, the three outputs side by side."""
+    done: list[int] = []
+    progress("fitting", 0, 3)
+
+    def one(y: Floats) -> Hyperparameters:
+        fit = maximise(X, y, method.kernel, seed=method.seed)
+        done.append(1)
+        progress("fitting", len(done), 3)
+        return Hyperparameters(fit.kernel, fit.noise_variance)
+
+    return tuple(side_by_side(one, Y.T))
+
+
+@dataclass(frozen=True, eq=False)
+class InverseGPCalibration:
+    """Three GPs conditioned on the known points that every camera saw."""
+
+    calibrator: InverseGP
+    data: Dataset
+    unused: tuple[Unused, ...]
+    pixels: Scaling
+    positions: Scaling
+    hyperparameters: tuple[Hyperparameters, ...] = field(repr=False)
+
+    method: ClassVar[str] = "inverse-gp"
+
+    @cached_property
+    def processes(self) -> tuple[GaussianProcess, ...]:
+        """The three conditioned GPs, in standardised units."""
+        usable = self.data.select(self.data.observations.seen.all(axis=1))
+        X, Y = self.pixels.apply(_pixels(usable)), self.positions.apply(usable.xyz)
+
+        def one(pair: tuple[Hyperparameters, Floats]) -> GaussianProcess:
+            h, y = pair
+            return GaussianProcess.condition(h.kernel, h.noise_variance, X, y, h.mean)
+
+        return tuple(side_by_side(one, list(zip(self.hyperparameters, Y.T, strict=True))))
+
+    def measure(self, observations: Observations) -> Measurement:
+        """Measure the points that every camera saw; the others keep their row, with a reason."""
+        observations = same_cameras(self.data.observations, observations)
+        seen = observations.seen
+        complete = seen.all(axis=1)
+        n = len(observations)
+        xyz, cov = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+        X = self.pixels.apply(observations.uv[complete].reshape(-1, 2 * len(observations.cameras)))
+
+        def one(pair: tuple[GaussianProcess, Hyperparameters]) -> tuple[Floats, Floats]:
+            mean, variance = pair[0].predict(X)
+            return mean, variance + pair[1].noise_variance
+
+        answers = side_by_side(one, list(zip(self.processes, self.hyperparameters, strict=True)))
+        scale, offset = self.positions.scale, self.positions.offset
+        xyz[complete] = np.stack([mean for mean, _ in answers], axis=1) * scale + offset
+        variances = np.stack([variance for _, variance in answers], axis=1) * scale**2
+        cov[complete] = variances[:, :, None] * np.eye(3)
+        return Measurement(
+            observations.points,
+            xyz,
+            cov,
+            seen.sum(axis=1),
+            np.full(n, np.nan),  # a map from all pixels to a position cannot ask whether the views agree
+            _reasons(seen, observations.camera_names),
+            self.data.length_unit,
+        )
+
+    def refit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
+        """The same method with the same options on other data."""
+        return self.calibrator.fit(data, progress)
+
+    def residuals(self) -> dict[str, Any]:
+        """Leave-one-out errors per axis, in the dataset's unit (closed form, hyperparameters kept)."""
+        errors, sds = [], []
+        for gp, scale in zip(self.processes, self.positions.scale, strict=True):
+            mean, variance = gp.leave_one_out()
+            errors.append((gp.y - mean) * scale)
+            sds.append(np.sqrt(variance) * scale)
+        rms = np.sqrt(np.mean(np.square(errors), axis=1))
+        return {
+            "points_used": len(self.processes[0]),
+            "points_unused": len(self.unused),
+            "leave_one_out_rms": dict(zip(AXES, map(float, rms), strict=True)),
+            "leave_one_out_mean_sd": dict(zip(AXES, map(float, np.mean(sds, axis=1)), strict=True)),
+        }
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Options, and the hyperparameters in standardised units with the scaling."""
+        h = self.hyperparameters
+        table = {"kernel": self.calibrator.kernel, "preset": self.calibrator.preset, "seed": self.calibrator.seed}
+        arrays = {
+            "pixel_offset": self.pixels.offset,
+            "pixel_scale": self.pixels.scale,
+            "position_offset": self.positions.offset,
+            "position_scale": self.positions.scale,
+            "lengthscale": np.stack([x.kernel.lengthscale for x in h]),
+            "signal_variance": np.array([x.kernel.signal_variance for x in h]),
+            "noise_variance": np.array([x.noise_variance for x in h]),
+            "mean": np.array([x.mean for x in h]),
+        }
+        return table, arrays
+
+    @classmethod
+    def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> InverseGPCalibration:
+        """Restore a calibration; the factors are computed again, which takes less time than reading them would."""
+        calibrator = InverseGP(str(table["kernel"]), str(table["preset"]), int(table["seed"]))
+        _, unused = _usable(data)
+        d = 2 * len(data.cameras)
+        pixels = Scaling(_column(arrays, "pixel_offset", (d,)), _column(arrays, "pixel_scale", (d,), positive=True))
+        positions = Scaling(
+            _column(arrays, "position_offset", (3,)), _column(arrays, "position_scale", (3,), positive=True)
+        )
+        lengthscale = _column(arrays, "lengthscale", (3, d), positive=True)
+        signal = _column(arrays, "signal_variance", (3,), positive=True)
+        noise, mean = _column(arrays, "noise_variance", (3,), positive=True), _column(arrays, "mean", (3,))
+        hyper = tuple(
+            Hyperparameters(
+                Kernel(calibrator.kernel, float(signal[i]), lengthscale[i]), float(noise[i]), float(mean[i])
+            )
+            for i in range(3)
+        )
+        return cls(calibrator, data, unused, pixels, positions, hyper)
+
+
+def _reasons(seen: NDArray[np.bool_], names: tuple[str, ...]) -> Names:
+    reasons = ["" if row.all() else why_not_all_seen(row, names, InverseGP.method) for row in seen]
+    return np.array(reasons, dtype=np.str_)
+
+
+def _column(arrays: Arrays, name: str, shape: tuple[int, ...], *, positive: bool = False) -> Floats:
+    array = arrays[name]
+    if array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite float64 of shape {shape}, and is {array.dtype} {array.shape}")
+    if positive and not (array > 0).all():
+        raise ValueError(f"{name} must be positive")
+    return array

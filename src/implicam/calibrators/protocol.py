@@ -1,0 +1,102 @@
+"""What every method offers, so that everything above works with each of them.
+
+A *calibrator* is a method with its options, a frozen value; `fit` returns a *calibration*, the fitted map of the rig.
+To add a method: 1. write `calibrators/<method>.py` with the two classes; 2. add it to `METHODS` in
+`calibrators/__init__.py`; 3. run the tests: one contract test runs over every entry of METHODS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Dataset, Observations
+from implicam.errors import DatasetError, FitError
+from implicam.measurement import Measurement
+from implicam.progress import Progress, silent
+
+Arrays = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Unused:
+    """A known point that the fit could not use, and why."""
+
+    point: str
+    reason: str
+
+
+class Calibration(Protocol):
+    """A fitted map of a rig, and the data it was fitted from."""
+
+    method: ClassVar[str]
+    data: Dataset
+    unused: tuple[Unused, ...]
+
+    def measure(self, observations: Observations) -> Measurement:
+        """Measure each point; one that cannot be measured keeps its row, with a reason."""
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """What a calibration file must carry beside the data: a readable table, and arrays."""
+
+    @classmethod
+    def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> Self:
+        """The inverse of `state`; KeyError, ValueError or TypeError for anything that does not fit."""
+
+    def refit(self, data: Dataset, progress: Progress = silent) -> Self:
+        """The same method with the same options on other data: cross-validation, or one point more."""
+
+    def residuals(self) -> dict[str, Any]:
+        """A few readable numbers on how well the calibration fits its own data."""
+
+
+class Calibrator(Protocol):
+    """A method and its options, not fitted yet."""
+
+    method: ClassVar[str]
+
+    def fit(self, data: Dataset, progress: Progress = silent) -> Calibration:
+        """Fit to known points; FitError says why it cannot be done."""
+
+
+def same_cameras(trained: Observations, observations: Observations) -> Observations:
+    """The observations with the calibration's cameras in its order; an error where one of them is missing."""
+    wanted, given = trained.camera_names, observations.camera_names
+    missing = [name for name in wanted if name not in given]
+    if missing:
+        raise DatasetError(
+            f"the observations have no camera {', '.join(map(repr, missing))}.",
+            why=f"the calibration was made with {', '.join(wanted)}; these data have {', '.join(given)}",
+            fix="measure with data of the same rig, with the same camera names in dataset.toml",
+        )
+    ordered = observations.with_cameras(wanted)
+    for camera, other in zip(trained.cameras, ordered.cameras, strict=True):
+        if None not in (camera.width, other.width) and (camera.width, camera.height) != (other.width, other.height):
+            raise DatasetError(
+                f"camera {camera.name!r} has images of {other.width} x {other.height} pixels; it was calibrated with "
+                f"{camera.width} x {camera.height}.",
+                why="a calibration holds for one image size",
+                fix="record with the size of the calibration, or calibrate again",
+            )
+    return ordered
+
+
+def why_not_all_seen(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> str:
+    """The reason for a point that not every camera saw."""
+    blind = [name for name, ok in zip(names, seen, strict=True) if not ok]
+    return f"{method} needs all {len(names)} cameras; not seen by {', '.join(blind)}"
+
+
+def require_points(n: int, least: int, method: str, why: str) -> None:
+    """FitError for fewer usable points than a method needs."""
+    if n < least:
+        raise FitError(
+            f"{n} usable known point{'s' * (n != 1)}; {method} needs at least {least}.",
+            why=why,
+            fix="add known points, leave out the camera that misses most of them (--without NAME), or choose a method "
+            "that copes with missing views",
+        )

@@ -1,0 +1,7 @@
+"""Does the covariance tell the truth? Errors against the stated covariance: rmse, coverage, NEES, NLL, CRPS."""
+
+from implicam.coverage.assess import assess, tercile_labels
+from implicam.coverage.intervals import Estimate
+from implicam.coverage.model import LEVELS, Coverage, Level, Summary
+
+__all__ = ["LEVELS", "Coverage", "Estimate", "Level", "Summary", "assess", "tercile_labels"]

@@ -1,0 +1,70 @@
+"""What a report is about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from implicam.coverage import Coverage
+from implicam.dataset import Floats
+from implicam.errors import UsageError
+from implicam.measurement import Measurement
+
+
+@dataclass(frozen=True, eq=False)
+class ReportData:
+    """A measurement and all that is known about it; everything but title and measurement may be left out.
+
+    measurement: brings names, positions, covariances, views, unit, and the reasons of points not measured.
+    true_xyz: (n, 3) where its points really were, NaN where unknown. coverage: `implicam.coverage.assess` of the same
+    points, the base of the headline and of the verdict. known_xyz: (m, 3) points the rig was calibrated from.
+    cameras: name -> (3,) centre. facts: label and value pairs for the head (rig, method, date, ...). notes: sentences
+    for "how it was computed".
+    """
+
+    title: str
+    measurement: Measurement
+    subtitle: str = ""
+    facts: tuple[tuple[str, str], ...] = ()
+    coverage: Coverage | None = None
+    true_xyz: Floats | None = None
+    known_xyz: Floats | None = None
+    cameras: Mapping[str, ArrayLike] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(self.measurement)
+        if self.true_xyz is not None and self.true_xyz.shape != (n, 3):
+            raise UsageError(f"true_xyz has the shape {self.true_xyz.shape}; expected {(n, 3)}, as measured.")
+        if self.coverage is not None and self.coverage.overall.n + self.coverage.overall.unmeasured != n:
+            raise UsageError(
+                "the coverage belongs to other points than the measurement.",
+                why=f"it counts {self.coverage.overall.n + self.coverage.overall.unmeasured}, the measurement has {n}",
+                fix="call assess(measurement.xyz - true_xyz, measurement.cov) on the same measurement",
+            )
+
+    @property
+    def unit(self) -> str:
+        """The length unit."""
+        return self.measurement.length_unit
+
+    @property
+    def error(self) -> Floats | None:
+        """(n,) distance of each measured point from its truth, NaN where either is missing."""
+        if self.true_xyz is None:
+            return None
+        return np.asarray(np.linalg.norm(self.measurement.xyz - self.true_xyz, axis=1), dtype=np.float64)
+
+    @property
+    def spread(self) -> Floats:
+        """(n,) stated uncertainty in 3D, sqrt of the trace of the covariance."""
+        return np.asarray(np.linalg.norm(self.measurement.sd, axis=1), dtype=np.float64)
+
+    @property
+    def unmeasured(self) -> list[tuple[str, str]]:
+        """Name and reason of each point without a position."""
+        m = self.measurement
+        return [(str(m.points[i]), str(m.reason[i]) or "no reason given") for i in np.flatnonzero(~m.measured)]

@@ -1,0 +1,122 @@
+"""The report in sentences: headline, verdict, key numbers. Plain text; the page escapes it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from implicam.coverage import Estimate, Summary
+from implicam.figures.style import number
+from implicam.report.data import ReportData
+
+VERDICTS = {
+    "right": ("The error bars tell the truth.", "good"),
+    "too small": ("The error bars are too small.", "bad"),
+    "too large": ("The error bars are too large.", "careful"),
+    "cannot tell": ("Too few points to judge the error bars.", "unknown"),
+}
+"""Verdict in words, and the tone that colours it."""
+
+
+def per_cent(share: Estimate) -> str:
+    """`94.1 % (91.2–96.3)`, the interval in brackets."""
+    if not math.isfinite(share.value):
+        return "–"
+    return f"{100 * share.value:.1f} % ({100 * share.low:.1f}–{100 * share.high:.1f})"
+
+
+def interval(value: Estimate) -> str:
+    """`2.94 (2.71–3.19)`, without brackets where there is no interval."""
+    if not math.isfinite(value.low):
+        return number(value.value)
+    return f"{number(value.value)} ({number(value.low)}–{number(value.high)})"
+
+
+def headline(data: ReportData) -> str:
+    """The result in one sentence."""
+    unit, n = data.unit, int(data.measurement.measured.sum())
+    if n == 0:
+        return "No point could be measured."
+    if data.coverage is None or data.coverage.overall.n == 0:
+        typical = number(float(np.nanmedian(data.spread)))
+        return f"{_points(n)} measured, with a typical stated uncertainty of {typical} {unit} in 3D."
+    row = data.coverage.overall
+    inside = row.level(0.95).ellipsoid
+    off = f"A measured position is off by {number(row.rmse)} {unit} rms"
+    if not math.isfinite(inside.value):
+        return f"{off}, over {_points(row.n)}."
+    return f"{off}; its 95 % ellipsoid contained the truth for {per_cent(inside)} of {_points(row.n - row.unusable)}."
+
+
+def verdict(data: ReportData) -> tuple[str, str, str]:
+    """Title, explanation and tone of what the error bars are worth."""
+    if data.coverage is None:
+        return (
+            "Nobody checked the error bars here.",
+            "The true positions are not known, so this page shows what the instrument states about itself, not "
+            "whether that is so. Measure a few points whose positions you know, and evaluate.",
+            "unknown",
+        )
+    row = data.coverage.overall
+    title, tone = VERDICTS[row.verdict]
+    return title, f"{_judgement(row)} {_independence(row)}".strip(), tone
+
+
+def tiles(data: ReportData) -> list[tuple[str, str, str]]:
+    """Label, value and explanation of the key numbers."""
+    unit, m = data.unit, data.measurement
+    measured = int(m.measured.sum())
+    count = ("points measured", f"{measured:,} of {len(m):,}", "the others are listed below, with the reason")
+    if measured == len(m):
+        count = ("points measured", f"{measured:,}", "none was left out")
+    if data.coverage is None or data.coverage.overall.n == 0:
+        x, y, z = (number(float(s)) for s in np.median(m.sd[m.measured], axis=0)) if measured else ("–",) * 3
+        return [count, (f"stated sd, median ({unit})", f"{x} / {y} / {z}", "in x, y and z")]
+    row = data.coverage.overall
+    found = [
+        ("rms error, 3D", f"{number(row.rmse)} {unit}", f"the error bars predict {number(row.stated_rms)} {unit}"),
+        (
+            "half / 95 % of points within",
+            f"{number(row.median_error)} / {number(row.p95_error)} {unit}",
+            "of the truth",
+        ),
+        ("rms error in x / y / z", " / ".join(number(r, 2) for r in row.rmse_axes) + f" {unit}", _stated(row, unit)),
+        ("NEES", interval(row.nees), "squared error over stated variance, 3 is right"),
+    ]
+    if math.isfinite(row.rmse_over_limit):
+        times = f"{number(row.rmse_over_limit)}×"
+        found.append(("rms error over the Cramér–Rao limit", times, "1× is the best these pixels allow"))
+    return [*found, count]
+
+
+def _judgement(row: Summary) -> str:
+    inside = row.level(0.95).ellipsoid
+    seen = f"95 % of points should lie in their 95 % ellipsoid; {per_cent(inside)} did."
+    factor = number(row.sd_factor, 2)
+    return {
+        "right": f"{seen} The interval includes 95 %.",
+        "too small": f"{seen} The instrument claims to know more than it does: its standard uncertainties "
+        f"would have to be {factor} times as large.",
+        "too large": f"{seen} The instrument is better than it says: its standard uncertainties could be "
+        f"{factor} times as large.",
+        "cannot tell": f"{seen} So wide an interval proves nothing: evaluate more points."
+        if math.isfinite(inside.value)
+        else "No point has both a known truth and a usable covariance.",
+    }[row.verdict]
+
+
+def _independence(row: Summary) -> str:
+    if row.cluster_kind == "shots":
+        return f"The interval counts {row.clusters} shots, because points of one shot share errors."
+    if row.cluster_kind == "points of one shot":
+        return "All points come from one shot and may share errors, so the interval may be too narrow."
+    return ""
+
+
+def _stated(row: Summary, unit: str) -> str:
+    return "mean stated sd " + " / ".join(number(sd, 2) for sd in row.mean_sd) + f" {unit}"
+
+
+def _points(n: int) -> str:
+    return f"{n:,} point" + ("" if n == 1 else "s")

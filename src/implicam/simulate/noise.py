@@ -1,0 +1,111 @@
+"""What the cameras report: a dataset with noise, missing views, wrong detections, and the truth beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import TRUTH_COLUMNS, Camera, Dataset, Floats, KnownPositions, Names, Observations
+from implicam.errors import UsageError
+from implicam.simulate.camera import SimulatedCamera
+from implicam.simulate.rigs import Rig
+from implicam.simulate.targets import Target
+
+Bools = NDArray[np.bool_]
+
+GRAZING = np.cos(np.radians(80.0))
+"""A board seen more obliquely than 80° is not detected."""
+
+
+def simulate(
+    rig: Rig, target: Target, *, seed: int, robot_noise: float = 0.0, missing: float = 0.0, outliers: float = 0.0
+) -> Dataset:
+    """The dataset that the rig records of a target; `seed` rules everything that the rig's own seed does not.
+
+    robot_noise: sd per axis of the known positions, in the rig's unit; a shot is off as a whole, as a robot or a
+    slide is. missing: probability that a view is lost. outliers: probability that a view left is a wrong detection,
+    anywhere in the image. The known positions carry the truth and the Cramer-Rao limit (`TRUTH_COLUMNS`), the
+    observations true_u, true_v and outlier, as extra columns.
+    """
+    _check_options(seed, robot_noise, missing, outliers)
+    to_robot, to_missing, to_outliers, to_pixels = (np.random.default_rng([seed, i]) for i in range(4))
+    true_uv, visible = views(rig, target)
+    seen = visible & (to_missing.random(visible.shape) >= missing)
+    wrong = seen & (to_outliers.random(visible.shape) < outliers)
+    sizes = np.array([(camera.width, camera.height) for camera in rig.cameras])
+    anywhere = to_outliers.uniform(-0.5, sizes - 0.5, size=true_uv.shape)
+    noise_sd = np.array([camera.noise_sd for camera in rig.cameras])
+    uv = true_uv + noise_sd[:, None] * to_pixels.normal(size=true_uv.shape)
+    uv = np.where(seen[..., None], np.where(wrong[..., None], anywhere, uv), np.nan)
+    extra = {
+        "true_u": _text(true_uv[..., 0], seen),
+        "true_v": _text(true_uv[..., 1], seen),
+        "outlier": np.where(seen, np.where(wrong, "1", "0"), ""),
+    }
+    stated = np.where(seen & (noise_sd > 0), noise_sd, np.nan)[..., None].repeat(2, axis=2)
+    cameras = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
+    known = _known(target, robot_noise, to_robot, cramer_rao_limit(rig, target.xyz, seen & ~wrong))
+    return Dataset(
+        f"{rig.name}-{target.name}", rig.length_unit, Observations(target.points, cameras, uv, stated, extra), known
+    )
+
+
+def views(rig: Rig, target: Target) -> tuple[Floats, Bools]:
+    """The true pixels (n, cameras, 2), and (n, cameras) where the camera sees the point."""
+    pairs = [camera.pixel_from_world(target.xyz) for camera in rig.cameras]
+    uv = np.stack([uv for uv, _ in pairs], axis=1)
+    visible = np.stack(
+        [on & _faces(camera, target) for camera, (_, on) in zip(rig.cameras, pairs, strict=True)], axis=1
+    )
+    return uv, visible
+
+
+def cramer_rao_limit(rig: Rig, xyz: Floats, used: Bools) -> Floats:
+    """(n, 3, 3) the covariance nobody can beat, with perfectly known cameras; NaN for fewer than two views.
+
+    The inverse of the Fisher information: the sum of J^T J / noise_sd^2 over the cameras used (n, cameras).
+    """
+    information = np.zeros((len(xyz), 3, 3))
+    for c, camera in enumerate(rig.cameras):
+        jacobian = camera.jacobian(xyz)[used[:, c]] / max(camera.noise_sd, 1e-12)
+        information[used[:, c]] += jacobian.transpose(0, 2, 1) @ jacobian
+    limit = np.full_like(information, np.nan)
+    enough = used.sum(axis=1) >= 2
+    limit[enough] = np.linalg.inv(information[enough])
+    return limit
+
+
+def _faces(camera: SimulatedCamera, target: Target) -> Bools:
+    if target.facing is None:
+        return np.ones(len(target.xyz), dtype=np.bool_)
+    to_camera = camera.camera_from_world.centre - target.xyz
+    cos = to_camera @ target.facing / np.linalg.norm(to_camera, axis=1)
+    return np.asarray(cos > GRAZING, dtype=np.bool_)
+
+
+def _known(target: Target, robot_noise: float, rng: np.random.Generator, limit: Floats) -> KnownPositions:
+    """Known positions and their stated uncertainty, with the truth as extra columns."""
+    shots, shot_of_point = np.unique(target.shots, return_inverse=True)
+    shift = robot_noise * rng.normal(size=(len(shots), 3))
+    sd = np.full_like(target.xyz, robot_noise if robot_noise > 0 else np.nan)
+    off_diagonal = limit[:, [0, 0, 1], [1, 2, 2]]
+    table = np.hstack([target.xyz, np.sqrt(np.diagonal(limit, axis1=1, axis2=2)), off_diagonal])
+    everywhere = np.ones(len(table), dtype=np.bool_)
+    extra = {key: _text(table[:, i], everywhere) for i, key in enumerate(TRUTH_COLUMNS)}
+    return KnownPositions(target.shots, target.xyz + shift[shot_of_point], sd, extra)
+
+
+def _text(numbers: Floats, where: Bools) -> Names:
+    """Numbers as text that reads back to the same bits; empty elsewhere."""
+    flat = [repr(float(x)) if here else "" for x, here in zip(numbers.ravel(), where.ravel(), strict=True)]
+    return np.array(flat, dtype=np.str_).reshape(numbers.shape)
+
+
+def _check_options(seed: int, robot_noise: float, missing: float, outliers: float) -> None:
+    if seed < 0:
+        raise UsageError(f"seed = {seed}; it must not be negative.", fix="use 0, 1, 2, ...")
+    if not (np.isfinite(robot_noise) and robot_noise >= 0):
+        raise UsageError(f"robot_noise = {robot_noise}; it must be zero or more.", fix="for example robot_noise = 0.1")
+    for what, part in (("missing", missing), ("outliers", outliers)):
+        if not 0 <= part <= 1:
+            raise UsageError(f"{what} = {part}; it is a probability.", fix=f"for example {what} = 0.1")

@@ -1,0 +1,247 @@
+"""Simulated rigs: the paper's six cameras on a bar, a stereo pair, a dome.
+
+A rig is built on a bench, in millimetres: the working volume's centre is the origin, x runs along the bar to the
+right, y down, z away from the cameras. Then it is moved into a world frame nobody chose for our convenience.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from implicam.cameras import BrownConrady, KannalaBrandt, Lens
+from implicam.dataset import Floats
+from implicam.errors import UsageError, did_you_mean
+from implicam.geometry import Pose, look_at, rotation_from_vector
+from implicam.simulate.camera import SimulatedCamera, random_error
+
+BAR_FOCAL_MM = (1.55, 2.8, 2.8, 1.85, 2.2, 1.3)
+"""The paper's effective focal lengths of cam1 ... cam6."""
+BAR_X_MM = (-300.0, -75.0, 75.0, -180.0, 180.0, 300.0)
+"""Where cam1 ... cam6 sit on the bar: the two regular lenses in the middle. Our assumption; the paper does not say."""
+PIXEL_MM = 0.003
+"""Pixel pitch of the bar's cameras. Our assumption; the paper does not say."""
+PERSPECTIVE_FROM_PX = 850.0
+"""Shorter lenses are wide: Kannala-Brandt, not Brown-Conrady."""
+
+CAMERA_SETS = {
+    "2R": ("cam2", "cam3"),
+    "2R2W": ("cam2", "cam3", "cam4", "cam5"),
+    "2R4W": ("cam1", "cam2", "cam3", "cam4", "cam5", "cam6"),
+}
+"""The paper's sets of cameras of bar6: two regular, and two or four wide lenses."""
+
+SPECS = ("bar6", "stereo", "dome8")
+UNITS_PER_MM = {"mm": 1.0, "m": 1e-3}
+
+# Rows: what forward, left and up of a robot's base are on the bench (x right, y down, z away).
+_ROBOT_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box with its centre at the origin of its own frame and edges `size` (3,) along its axes; z is depth."""
+
+    world_from_box: Pose
+    size: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras and the volume they watch, in a world frame with `length_unit`; built with `frame` and `seed`."""
+
+    name: str
+    cameras: tuple[SimulatedCamera, ...]
+    volume: Box
+    length_unit: str
+    frame: str
+    seed: int
+
+    @property
+    def units_per_mm(self) -> float:
+        """How many length units of the rig a millimetre is."""
+        return UNITS_PER_MM[self.length_unit]
+
+
+@dataclass(frozen=True)
+class _Mount:
+    """One camera as designed: image size, focal length in pixels, and its place on the bench in mm."""
+
+    width: int
+    height: int
+    focal: float
+    place: tuple[float, float, float]
+
+
+def build_rig(
+    spec: str,
+    *,
+    seed: int,
+    lens_error: float = 0.5,
+    noise: float = 0.2,
+    frame: Literal["robot", "random"] = "robot",
+    unit: Literal["mm", "m"] = "mm",
+    cameras: str | None = None,
+) -> Rig:
+    """A rig like `spec`: "bar6", "stereo", "dome8", or any "bar<N>" or "dome<N>"; every seed differs a little.
+
+    lens_error: rms in pixels of the smooth error no lens model contains. noise: sd in pixels of a view. frame: a
+    world like a robot's base (z up, axes parallel to the bench, origin elsewhere) or any rotation and offset.
+    unit: of the world. cameras: names joined by commas, or a set of the paper ("2R", "2R2W", "2R4W"); the
+    rig itself stays the same.
+    """
+    _check_options(seed=seed, lens_error=lens_error, noise=noise, frame=frame, unit=unit)
+    mounts, size = _design(spec)
+    world_from_bench = _world_from_bench(np.random.default_rng([seed, 0]), frame)
+    built = tuple(
+        _camera(f"cam{i + 1}", mount, np.random.default_rng([seed, 1, i]), world_from_bench, lens_error, noise)
+        for i, mount in enumerate(mounts)
+    )
+    rig = Rig(spec, built, Box(world_from_bench, np.array(size)), "mm", frame, seed)
+    return _in_unit(_with_cameras(rig, cameras), unit)
+
+
+def write_rig(rig: Rig) -> dict[str, Any]:
+    """The truth about a rig as plain tables, for `truth.toml`: lenses, poses, noise, seed.
+
+    Of the smooth error only its size: `build_rig` makes the same one again from name, seed, frame and the numbers here.
+    """
+    volume = rig.volume
+    return {
+        "name": rig.name,
+        "seed": rig.seed,
+        "frame": rig.frame,
+        "length_unit": rig.length_unit,
+        "volume": {"size": volume.size.tolist(), "world_from_box": _pose_table(volume.world_from_box)},
+        "cameras": [_camera_table(camera) for camera in rig.cameras],
+    }
+
+
+def _camera_table(camera: SimulatedCamera) -> dict[str, Any]:
+    return {
+        "name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "noise_sd_px": camera.noise_sd,
+        "lens": {"model": type(camera.lens).__name__, **asdict(camera.lens)},
+        "camera_from_world": _pose_table(camera.camera_from_world),
+        "lens_error_rms_px": camera.error.rms,
+    }
+
+
+def _pose_table(pose: Pose) -> dict[str, Any]:
+    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
+
+
+def _design(spec: str) -> tuple[list[_Mount], tuple[float, float, float]]:
+    """The mounts of a rig, and its working volume (x, y, z) in mm."""
+    if spec == "stereo":
+        return [_Mount(1280, 1024, 1200.0, (x, 0.0, -700.0)) for x in (-120.0, 120.0)], (300.0, 240.0, 240.0)
+    found = re.fullmatch(r"(bar|dome)([1-9][0-9]{0,2})", spec)
+    if not found or int(found[2]) < 2:
+        raise UsageError(
+            f"there is no rig {spec!r}{did_you_mean(spec, SPECS)}.",
+            why="a rig is stereo, bar<N> or dome<N>, with N from 2 to 999 cameras",
+            fix=f"use one of {', '.join(SPECS)}, or for example dome12",
+        )
+    n = int(found[2])
+    if found[1] == "dome":
+        return list(_dome(n)), (400.0, 400.0, 400.0)
+    return list(_bar(n)), (240.0, 160.0, 240.0)
+
+
+def _bar(n: int) -> Iterator[_Mount]:
+    places = BAR_X_MM if n == len(BAR_X_MM) else np.linspace(-300, 300, n)
+    for i in range(n):
+        yield _Mount(1280, 800, BAR_FOCAL_MM[i % len(BAR_FOCAL_MM)] / PIXEL_MM, (float(places[i]), 0.0, -380.0))
+
+
+def _dome(n: int) -> Iterator[_Mount]:
+    """Cameras all round at one metre, in turn low and high above the bench."""
+    for i in range(n):
+        around, up = 2 * np.pi * i / n, np.radians((25.0, 55.0)[i % 2])
+        place = 1000 * np.array([np.sin(around) * np.cos(up), -np.sin(up), -np.cos(around) * np.cos(up)])
+        yield _Mount(1280, 1024, 1200.0, (float(place[0]), float(place[1]), float(place[2])))
+
+
+def _camera(
+    name: str, mount: _Mount, rng: np.random.Generator, world_from_bench: Pose, lens_error: float, noise: float
+) -> SimulatedCamera:
+    """A camera as built: nothing is quite where the drawing says."""
+    aimed = look_at(mount.place, (0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0))
+    turned = Pose(rotation_from_vector(rng.normal(scale=np.radians(1.2), size=3)), np.zeros(3))  # about 2° in all
+    moved = Pose(np.eye(3), rng.normal(scale=3.0, size=3))
+    camera_from_world = turned @ aimed @ moved @ world_from_bench.inverse()
+    lens = _random_lens(mount, rng)
+    error = random_error(rng, mount.width, mount.height, lens_error)
+    return SimulatedCamera(name, mount.width, mount.height, lens, camera_from_world, error, noise)
+
+
+def _random_lens(mount: _Mount, rng: np.random.Generator) -> Lens:
+    """A lens near its design: focal length 2 %, centre 10 px, distortion within bounds, for it must not fold."""
+    fx = mount.focal * (1 + rng.normal(scale=0.02))
+    fy = fx * (1 + rng.normal(scale=0.001))
+    cx, cy = np.array([mount.width - 1, mount.height - 1]) / 2 + rng.normal(scale=10.0, size=2)
+    k = rng.uniform(-1, 1, size=4)
+    if mount.focal < PERSPECTIVE_FROM_PX:
+        return KannalaBrandt(
+            fx, fy, float(cx), float(cy), *(k * [0.02, 0.005, 0.001, 0.0002] - [0.01, 0, 0, 0]).tolist()
+        )
+    k1, k2, p1, p2 = (k * [0.04, 0.01, 5e-4, 5e-4] + [-0.08, 0.02, 0, 0]).tolist()
+    return BrownConrady(fx, fy, float(cx), float(cy), k1, k2, p1, p2)
+
+
+def _world_from_bench(rng: np.random.Generator, frame: str) -> Pose:
+    offset = rng.uniform(200, 600, size=3) * rng.choice([-1, 1], size=3)
+    turn = rotation_from_vector(_random_rotation_vector(rng))
+    return Pose(_ROBOT_AXES if frame == "robot" else turn, offset)
+
+
+def _random_rotation_vector(rng: np.random.Generator) -> Floats:
+    axis = rng.normal(size=3)
+    return axis / np.linalg.norm(axis) * rng.uniform(0.5, np.pi)
+
+
+def _with_cameras(rig: Rig, wanted: str | None) -> Rig:
+    if wanted is None:
+        return rig
+    if wanted in CAMERA_SETS and rig.name != "bar6":
+        raise UsageError(f"the set {wanted!r} belongs to bar6, not to {rig.name}.", fix="name the cameras: cam1,cam2")
+    known = {camera.name: camera for camera in rig.cameras}
+    names: Sequence[str] = CAMERA_SETS.get(wanted) or [name.strip() for name in wanted.split(",")]
+    for name in names:
+        if name not in known:
+            raise UsageError(
+                f"rig {rig.name} has no camera {name!r}{did_you_mean(name, [*known, *CAMERA_SETS])}.",
+                fix=f"its cameras are {', '.join(known)}",
+            )
+    return replace(rig, cameras=tuple(known[name] for name in names))
+
+
+def _in_unit(rig: Rig, unit: str) -> Rig:
+    """The same rig with another length unit."""
+    scale = UNITS_PER_MM[unit]
+
+    def scaled(pose: Pose) -> Pose:
+        return Pose(pose.rotation, pose.translation * scale)
+
+    cameras = tuple(replace(camera, camera_from_world=scaled(camera.camera_from_world)) for camera in rig.cameras)
+    volume = Box(scaled(rig.volume.world_from_box), rig.volume.size * scale)
+    return replace(rig, cameras=cameras, volume=volume, length_unit=unit)
+
+
+def _check_options(*, seed: int, lens_error: float, noise: float, frame: str, unit: str) -> None:
+    if seed < 0:
+        raise UsageError(f"seed = {seed}; it must not be negative.", fix="use 0, 1, 2, ...")
+    for what, value in (("lens_error", lens_error), ("noise", noise)):
+        if not (np.isfinite(value) and value >= 0):
+            raise UsageError(f"{what} = {value} px; it must be zero or more.", fix=f"for example {what} = 0.2")
+    for what, word, known in (("frame", frame, ("robot", "random")), ("unit", unit, tuple(UNITS_PER_MM))):
+        if word not in known:
+            raise UsageError(
+                f"there is no {what} {word!r}{did_you_mean(word, known)}.", fix=f"use {' or '.join(known)}"
+            )
