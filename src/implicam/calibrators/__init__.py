@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+from implicam import calibration_file
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
 from implicam.calibrators.protocol import Calibration, Calibrator, Unused
-from implicam.errors import UsageError, did_you_mean
+from implicam.errors import CalibrationFileError, UsageError, did_you_mean
 
 METHODS: dict[str, tuple[type[Any], type[Any]]] = {
     InverseGP.method: (InverseGP, InverseGPCalibration),
@@ -30,6 +32,20 @@ def calibrator(method: str, **options: Any) -> Calibrator:
     return made
 
 
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a `.implicam` file; CalibrationFileError says what is wrong with one that cannot be used."""
+    contents = calibration_file.read(path)
+    if contents.method not in METHODS:
+        raise CalibrationFileError(
+            f"{path} was made by the method {contents.method!r}, which this version does not have.",
+            why=f"the methods here are {', '.join(METHODS)}",
+            fix="pip install --upgrade implicam",
+        )
+    with calibration_file.refusing(contents.path):
+        restored: Calibration = METHODS[contents.method][1].from_state(contents.data, contents.options, contents.arrays)
+    return restored
+
+
 __all__ = [
     "COMING",
     "DEFAULT_METHOD",
@@ -40,4 +56,5 @@ __all__ = [
     "InverseGPCalibration",
     "Unused",
     "calibrator",
+    "load_calibration",
 ]

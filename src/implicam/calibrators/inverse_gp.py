@@ -15,11 +15,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam import calibration_file
 from implicam.calibrators.protocol import Arrays, Unused, require_points, same_cameras, why_not_all_seen
 from implicam.dataset import Dataset, Floats, Names, Observations
 from implicam.errors import FitError, UsageError, did_you_mean
@@ -30,6 +32,7 @@ from implicam.threads import side_by_side
 
 PRESETS = ("standardised", "paper")
 AXES = "xyz"
+LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
 
 @dataclass(frozen=True)
@@ -199,6 +202,21 @@ class InverseGPCalibration:
         """The same method with the same options on other data."""
         return self.calibrator.fit(data, progress)
 
+    def notes(self) -> list[str]:
+        """What the user should know before trusting this calibration; empty where all is well."""
+        lattice = [
+            f"{axis} has {len(np.unique(values))} values"
+            for axis, values in zip(AXES, self.data.xyz.T, strict=True)
+            if len(np.unique(values)) <= len(values) / LATTICE_REPEATS
+        ]
+        if not lattice:
+            return []
+        return [
+            f"The known positions lie on a lattice ({', '.join(lattice)} at {len(self.data)} points). inverse-gp may "
+            "learn its planes instead of the space between them: judge it by --leave-out shot or by points off the "
+            "lattice, not by a random split."
+        ]
+
     def residuals(self) -> dict[str, Any]:
         """Leave-one-out errors per axis, in the dataset's unit (closed form, hyperparameters kept)."""
         errors, sds = [], []
@@ -213,6 +231,10 @@ class InverseGPCalibration:
             "leave_one_out_rms": dict(zip(AXES, map(float, rms), strict=True)),
             "leave_one_out_mean_sd": dict(zip(AXES, map(float, np.mean(sds, axis=1)), strict=True)),
         }
+
+    def save(self, path: str | Path) -> None:
+        """Write a `.implicam` file that carries everything, the known points included."""
+        calibration_file.save(self, path)
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Options, and the hyperparameters in standardised units with the scaling."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
@@ -34,8 +35,14 @@ class Calibration(Protocol):
     """A fitted map of a rig, and the data it was fitted from."""
 
     method: ClassVar[str]
-    data: Dataset
-    unused: tuple[Unused, ...]
+
+    @property
+    def data(self) -> Dataset:
+        """The data it was fitted from."""
+
+    @property
+    def unused(self) -> tuple[Unused, ...]:
+        """The known points that the fit could not use."""
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure each point; one that cannot be measured keeps its row, with a reason."""
@@ -49,6 +56,12 @@ class Calibration(Protocol):
 
     def refit(self, data: Dataset, progress: Progress = silent) -> Self:
         """The same method with the same options on other data: cross-validation, or one point more."""
+
+    def save(self, path: str | Path) -> None:
+        """Write a `.implicam` file."""
+
+    def notes(self) -> list[str]:
+        """What the user should know before trusting this calibration; empty where all is well."""
 
     def residuals(self) -> dict[str, Any]:
         """A few readable numbers on how well the calibration fits its own data."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from implicam.dataset.folder import read_folder, write_folder
+from implicam.dataset.folder import folder_files, read_folder, write_folder
 from implicam.dataset.model import (
     TRUTH_COLUMNS,
     Camera,
@@ -42,6 +42,7 @@ __all__ = [
     "arrays_from_dataset",
     "covariance_from_columns",
     "dataset_from_arrays",
+    "folder_files",
     "join",
     "read_dataset",
     "write_dataset",

@@ -214,17 +214,19 @@ def _spread(values: list[str], i: NDArray[Any], j: NDArray[Any], shape: tuple[in
 
 def write_folder(data: Dataset, path: Path, *, overwrite: bool = False, also: Mapping[str, str] | None = None) -> None:
     """Write a dataset folder, whole or not at all; `also` maps further relative file names to their text."""
-    files = {
-        "dataset.toml": description_text(data),
-        "observations.csv": _observations_text(data.observations),
-    }
-    if data.known is not None:
-        files["points.csv"] = _points_text(data.points, data.known)
     with replacing_folder(path, overwrite=overwrite) as temporary:
-        for name, text in {**files, **(also or {})}.items():
+        for name, text in {**folder_files(data), **(also or {})}.items():
             target = temporary / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(text, encoding="utf-8", newline="")
+
+
+def folder_files(data: Dataset) -> dict[str, str]:
+    """The files of a dataset folder: name -> text."""
+    files = {"dataset.toml": description_text(data), "observations.csv": _observations_text(data.observations)}
+    if data.known is not None:
+        files["points.csv"] = _points_text(data.points, data.known)
+    return files
 
 
 def description_text(data: Dataset) -> str:

@@ -242,8 +242,15 @@ class Dataset:
         return replace(self, observations=self.observations.select(index), known=known)
 
     def with_cameras(self, names: Sequence[str]) -> Dataset:
-        """The dataset of some cameras; every point stays, seen or not."""
-        return replace(self, observations=self.observations.with_cameras(names))
+        """The dataset of some cameras; every point stays, seen or not.
+
+        The Cramer-Rao limit of a simulated dataset holds for all its cameras: with fewer it becomes unknown.
+        """
+        known = self.known
+        if known and set(names) != set(self.observations.camera_names):
+            forgotten = {c: np.full(len(self), "nan") for c in known.extra if c.startswith("limit_")}
+            known = replace(known, extra={**known.extra, **forgotten})
+        return replace(self, observations=self.observations.with_cameras(names), known=known)
 
     def without(self, names: Sequence[str]) -> Dataset:
         """The dataset without some cameras."""

@@ -71,8 +71,8 @@ def _measured(go: Any, xyz: Floats, spread: Floats, error: Floats | None, texts:
     # The top of the scale is a high quantile, so that one blunder does not paint all others alike.
     top = float(np.nanquantile(value, 0.98)) if np.isfinite(value).any() else 1.0
     bar = {
-        "title": {"text": plain(f"{what} ({unit})"), "side": "right"},
-        "thickness": 14, "len": 0.75, "outlinewidth": 0, "ticks": "outside", "tickformat": ".3~g", "x": 1.0,
+        "title": {"text": f"{what}<br>({plain(unit)})", "side": "top"},
+        "thickness": 14, "len": 0.75, "outlinewidth": 0, "ticks": "outside", "tickformat": ".3~g", "x": 0.9,
     }  # fmt: skip
     marker = {
         "size": _sizes(spread), "color": value, "colorscale": "Cividis", "cmin": 0.0, "cmax": top or 1.0,

@@ -59,9 +59,15 @@ class ReportData:
         return np.asarray(np.linalg.norm(self.measurement.xyz - self.true_xyz, axis=1), dtype=np.float64)
 
     @property
+    def sd(self) -> Floats:
+        """(n, 3) standard uncertainties, NaN where a variance is negative (the coverage says so in words)."""
+        with np.errstate(invalid="ignore"):
+            return self.measurement.sd
+
+    @property
     def spread(self) -> Floats:
         """(n,) stated uncertainty in 3D, sqrt of the trace of the covariance."""
-        return np.asarray(np.linalg.norm(self.measurement.sd, axis=1), dtype=np.float64)
+        return np.asarray(np.linalg.norm(self.sd, axis=1), dtype=np.float64)
 
     @property
     def unmeasured(self) -> list[tuple[str, str]]:

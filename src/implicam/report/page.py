@@ -74,7 +74,7 @@ def _result(data: ReportData) -> str:
 def _scene(data: ReportData) -> str:
     m = data.measurement
     figure = figures.scene(
-        m.xyz, m.sd, names=m.points, views=m.views, unit=data.unit, known_xyz=data.known_xyz, true_xyz=data.true_xyz,
+        m.xyz, data.sd, names=m.points, views=m.views, unit=data.unit, known_xyz=data.known_xyz, true_xyz=data.true_xyz,
         error=data.error, cameras=data.cameras,
     )  # fmt: skip
     colour = "stated uncertainty" if data.error is None else "error"

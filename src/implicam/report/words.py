@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from implicam.coverage import Estimate, Summary
+from implicam.dataset import Floats
 from implicam.figures.style import number
 from implicam.report.data import ReportData
 
@@ -39,7 +40,7 @@ def headline(data: ReportData) -> str:
     if n == 0:
         return "No point could be measured."
     if data.coverage is None or data.coverage.overall.n == 0:
-        typical = number(float(np.nanmedian(data.spread)))
+        typical = number(_median(data.spread))
         return f"{_points(n)} measured, with a typical stated uncertainty of {typical} {unit} in 3D."
     row = data.coverage.overall
     inside = row.level(0.95).ellipsoid
@@ -71,7 +72,7 @@ def tiles(data: ReportData) -> list[tuple[str, str, str]]:
     if measured == len(m):
         count = ("points measured", f"{measured:,}", "none was left out")
     if data.coverage is None or data.coverage.overall.n == 0:
-        x, y, z = (number(float(s)) for s in np.median(m.sd[m.measured], axis=0)) if measured else ("–",) * 3
+        x, y, z = (number(_median(sd)) for sd in data.sd.T)
         return [count, (f"stated sd, median ({unit})", f"{x} / {y} / {z}", "in x, y and z")]
     row = data.coverage.overall
     found = [
@@ -116,6 +117,11 @@ def _independence(row: Summary) -> str:
 
 def _stated(row: Summary, unit: str) -> str:
     return "mean stated sd " + " / ".join(number(sd, 2) for sd in row.mean_sd) + f" {unit}"
+
+
+def _median(values: Floats) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else float("nan")
 
 
 def _points(n: int) -> str:

@@ -4,6 +4,11 @@ rig = build_rig("bar6", seed=1)
 data = simulate(rig, ball_grid(rig), seed=2, missing=0.1)
 """
 
+from __future__ import annotations
+
+import numpy as np
+
+from implicam.dataset import Dataset
 from implicam.simulate.camera import SimulatedCamera, SmoothError
 from implicam.simulate.noise import cramer_rao_limit, simulate, views
 from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, build_rig, write_rig
@@ -23,6 +28,15 @@ __all__ = [
     "moving_board",
     "random_positions",
     "simulate",
+    "simulated",
     "views",
     "write_rig",
 ]
+
+
+def simulated(rig: str = "bar6", *, points: int | None = None, seed: int = 0, cameras: str | None = None) -> Dataset:
+    """A simulated dataset in one call: the ball on the paper's grid, or at `points` random positions."""
+    built = build_rig(rig, seed=seed, cameras=cameras)
+    rng = np.random.default_rng([seed, 17])
+    target = ball_grid(built) if points is None else random_positions(built, points, rng)
+    return simulate(built, target, seed=seed)

@@ -1,0 +1,64 @@
+"""implicam turns a set of fixed cameras into a 3D measuring instrument with honest error bars.
+
+>>> import implicam as ic
+>>> rig = ic.simulated("stereo", points=60, seed=1)         # or ic.read_dataset("my-rig")
+>>> calibration = ic.InverseGP().fit(rig)
+>>> measured = calibration.measure(rig.observations)
+>>> measured.xyz.shape, measured.cov.shape, str(measured.reason[0])
+((60, 3), (60, 3, 3), '')
+
+`import implicam` needs NumPy and SciPy only; everything heavier is imported where it is used.
+"""
+
+from implicam.calibration_file import package_version
+from implicam.calibrators import METHODS, Calibration, InverseGP, InverseGPCalibration, calibrator, load_calibration
+from implicam.coverage import Coverage, assess
+from implicam.dataset import (
+    Camera,
+    Dataset,
+    KnownPositions,
+    Observations,
+    join,
+    read_dataset,
+    write_dataset,
+)
+from implicam.errors import (
+    CalibrationFileError,
+    DatasetError,
+    FitError,
+    ImplicamError,
+    MissingExtraError,
+    NumericalError,
+    UsageError,
+)
+from implicam.measurement import Measurement
+from implicam.simulate import simulated
+
+__version__ = package_version()
+
+__all__ = [
+    "METHODS",
+    "Calibration",
+    "CalibrationFileError",
+    "Camera",
+    "Coverage",
+    "Dataset",
+    "DatasetError",
+    "FitError",
+    "ImplicamError",
+    "InverseGP",
+    "InverseGPCalibration",
+    "KnownPositions",
+    "Measurement",
+    "MissingExtraError",
+    "NumericalError",
+    "Observations",
+    "UsageError",
+    "assess",
+    "calibrator",
+    "join",
+    "load_calibration",
+    "read_dataset",
+    "simulated",
+    "write_dataset",
+]

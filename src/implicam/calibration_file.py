@@ -1,0 +1,197 @@
+"""A calibration is one file, `*.implicam`: a zip of calibration.toml (readable) and arrays.npz (never pickled).
+
+It carries the observations it was fitted from, so it can be checked, continued and fitted again years later. Its bytes
+depend on the calibration only: no dates, so the same fit gives the same file. Reading trusts nothing: sizes are
+checked before memory is spent, the arrays against a SHA-256, every shape and sign against the data, and whatever does
+not fit is a CalibrationFileError.
+
+Format versions: 1 (this one). A newer version is refused with the cure; an older one will be converted in `_UPGRADES`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
+from implicam.dataset.tables import parse_toml
+from implicam.errors import CalibrationFileError, ImplicamError
+from implicam.files import npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
+
+FORMAT_VERSION = 1
+MAX_BYTES = 1 << 31
+TOML, ARRAYS = "calibration.toml", "arrays.npz"
+PIXEL_CONVENTION = "(u, v) = (column, row); (0, 0) is the centre of the top-left pixel"
+_DATA, _METHOD = "data/", "method/"  # where an array belongs
+
+_UPGRADES: dict[int, Callable[[dict[str, Any], dict[str, NDArray[Any]]], None]] = {}
+"""Format version -> a function that turns its table and arrays into those of the next."""
+
+
+class Savable(Protocol):
+    """What a calibration must tell of itself to be saved."""
+
+    @property
+    def method(self) -> str:
+        """The method's name."""
+
+    @property
+    def data(self) -> Dataset:
+        """The data it was fitted from."""
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Its options as a readable table, and its arrays."""
+
+    def residuals(self) -> dict[str, Any]:
+        """A few readable numbers on how well it fits its own data."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What a calibration file holds: everything that the method needs to restore itself."""
+
+    path: Path
+    method: str
+    data: Dataset
+    options: Mapping[str, Any]
+    arrays: Mapping[str, NDArray[Any]]
+
+
+def save(calibration: Savable, path: str | Path) -> None:
+    """Write the calibration, whole or not at all."""
+    path = Path(path)
+    method_table, method_arrays = calibration.state()
+    arrays = {_DATA + name: array for name, array in arrays_from_dataset(calibration.data).items()}
+    arrays |= {_METHOD + name: array for name, array in method_arrays.items()}
+    content = npz_bytes(arrays)
+    table = {**_description(calibration), "arrays_sha256": hashlib.sha256(content).hexdigest(), "options": method_table}
+    with replacing(path) as temporary:
+        write_zip(temporary, {TOML: toml_text(table).encode(), ARRAYS: content})
+
+
+def _description(calibration: Savable) -> dict[str, Any]:
+    data = calibration.data
+    known = data.xyz
+    cameras = [
+        {key: value for key, value in (("name", c.name), ("width", c.width), ("height", c.height)) if value is not None}
+        for c in data.cameras
+    ]
+    return {
+        "format_version": FORMAT_VERSION,
+        "method": calibration.method,
+        "dataset": data.name,
+        "length_unit": data.length_unit,
+        "pixel_convention": PIXEL_CONVENTION,
+        "known_points": len(data),
+        "workspace": {"lowest": known.min(axis=0).tolist(), "highest": known.max(axis=0).tolist()},
+        "residuals": calibration.residuals(),
+        "versions": {
+            "implicam": package_version(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "scipy": scipy.__version__,
+        },
+        "cameras": cameras,
+    }
+
+
+def package_version() -> str:
+    """The installed version of implicam."""
+    try:
+        return version("implicam")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def read(path: str | Path) -> Contents:
+    """Read a calibration file; CalibrationFileError for anything that is not one, whole and unchanged."""
+    path = Path(path)
+    members = _members(path)
+    table = _table(path, members[TOML])
+    if table.get("arrays_sha256") != hashlib.sha256(members[ARRAYS]).hexdigest():
+        raise refusal(path, "its arrays are not those it was written with (their SHA-256 differs)")
+    arrays = read_npz(members[ARRAYS], lambda reason: refusal(path, reason))
+    for older in range(table["format_version"], FORMAT_VERSION):
+        _UPGRADES[older](table, arrays)
+    method, options = table.get("method"), table.get("options")
+    if not isinstance(method, str) or not isinstance(options, dict):
+        raise refusal(path, f"{TOML} states no method, or no options")
+    with refusing(path):
+        data = dataset_from_arrays(_part(arrays, _DATA), path)
+        _ = data.positions
+    return Contents(path, method, data, options, _part(arrays, _METHOD))
+
+
+@contextmanager
+def refusing(path: Path) -> Iterator[None]:
+    """Turn whatever a wrong value causes while a calibration is restored into a CalibrationFileError."""
+    try:
+        yield
+    except ImplicamError as error:
+        raise refusal(path, error.what) from error
+    except KeyError as error:
+        raise refusal(path, f"{error} is missing") from error
+    except (ValueError, TypeError, IndexError, OverflowError) as error:
+        raise refusal(path, str(error)) from error
+
+
+def describe(path: str | Path) -> dict[str, Any]:
+    """What calibration.toml says, without loading the arrays."""
+    path = Path(path)
+    return _table(path, _members(path)[TOML])
+
+
+def _members(path: Path) -> dict[str, bytes]:
+    if not path.is_file():
+        what = "is a folder, not a calibration" if path.is_dir() else "does not exist"
+        raise CalibrationFileError(
+            f"{path} {what}.", fix="give a file made by `implicam calibrate DATASET -o rig.implicam`"
+        )
+    if path.stat().st_size > MAX_BYTES or not zipfile.is_zipfile(path):
+        raise refusal(path, "it is not a zip, or it is cut off")
+    members = read_zip(path.read_bytes(), lambda reason: refusal(path, reason))
+    if set(members) != {TOML, ARRAYS}:
+        raise refusal(
+            path, f"it must hold {TOML} and {ARRAYS}, and holds {', '.join(sorted(members))[:200] or 'nothing'}"
+        )
+    return members
+
+
+def _table(path: Path, content: bytes) -> dict[str, Any]:
+    try:
+        table = parse_toml(content.decode("utf-8"))
+    except ValueError as error:
+        raise refusal(path, f"{TOML} is not readable: {error}") from None
+    number = table.get("format_version")
+    if not isinstance(number, int) or isinstance(number, bool) or number < 1:
+        raise refusal(path, f"{TOML} states no format_version")
+    if number > FORMAT_VERSION:
+        raise CalibrationFileError(
+            f"{path} is from a newer version of implicam (format {number}; this one reads up to {FORMAT_VERSION}).",
+            fix="pip install --upgrade implicam",
+        )
+    return table
+
+
+def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+
+
+def refusal(path: Path, reason: str) -> CalibrationFileError:
+    """The error for a file that cannot be used, with the reason."""
+    return CalibrationFileError(
+        f"{path} is not a usable calibration file.",
+        why=reason,
+        fix="take it from your backup, or calibrate again; nothing in it was executed",
+    )

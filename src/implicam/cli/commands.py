@@ -1,0 +1,504 @@
+"""The commands and their options. Every help text ends with an example that a test runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import typer
+
+from implicam import calibration_file
+from implicam.calibrators import DEFAULT_METHOD, Calibration, calibrator, load_calibration
+from implicam.cli import show
+from implicam.compare import as_json, compare, summarise
+from implicam.dataset import Dataset, folder_files, read_dataset, write_dataset
+from implicam.errors import UsageError
+from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
+from implicam.files import replacing, toml_text
+from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate, write_rig
+
+app = typer.Typer(
+    name="implicam",
+    help="Turn a set of fixed cameras into a 3D measuring instrument with honest error bars.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Start with: implicam demo      Any command: --debug shows the traceback of an error.",
+)
+
+EXAMPLES = {
+    "demo": "implicam demo",
+    "simulate": "implicam simulate my-rig --rig bar6 --positions random --points 157 --check 300",
+    "calibrate": "implicam calibrate my-rig -o my-rig.implicam",
+    "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
+    "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
+    "compare": "implicam compare my-rig --train 17,35,87 --seeds 3 -o compare.png",
+    "report": "implicam report my-rig.implicam -o report.html",
+    "convert": "implicam convert my-rig my-rig.csv",
+    "info": "implicam info my-rig.implicam",
+}
+"""Command -> an example, in an order in which they can be run."""
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def _command(name: str) -> Callable[[Function], Function]:
+    return app.command(name, epilog=f"Example:  [bold]{EXAMPLES[name]}[/bold]")
+
+
+class Target(StrEnum):
+    """What the simulated rig is shown."""
+
+    ball = "ball"
+    board = "board"
+
+
+class Positions(StrEnum):
+    """Where the ball goes."""
+
+    grid = "grid"
+    random = "random"
+
+
+class Frame(StrEnum):
+    """The world frame of a simulated rig."""
+
+    robot = "robot"
+    random = "random"
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="The same seed gives the same numbers.")]
+Unit = Annotated[str | None, typer.Option("--unit", help="Length unit of a wide CSV that does not state it.")]
+Method = Annotated[str | None, typer.Option("--method", help=f"Calibration method (default {DEFAULT_METHOD}).")]
+Kernel = Annotated[str | None, typer.Option("--kernel", help="inverse-gp: squared-exponential or matern-5/2.")]
+Preset = Annotated[
+    str | None, typer.Option("--preset", help='inverse-gp: standardised, or "paper" for the paper\'s own software.')
+]
+Cameras = Annotated[str | None, typer.Option("--cameras", help="Use only these cameras, separated by commas.")]
+Without = Annotated[str | None, typer.Option("--without", help="Leave these cameras out, separated by commas.")]
+Report = Annotated[Path | None, typer.Option("--report", help="Also write a one-page HTML report with a 3D view.")]
+
+
+def _read(path: Path, unit: str | None, cameras: str | None = None, without: str | None = None) -> Dataset:
+    data = read_dataset(path, unit=unit)
+    if cameras:
+        data = data.with_cameras([name.strip() for name in cameras.split(",")])
+    if without:
+        data = data.without([name.strip() for name in without.split(",")])
+    return data
+
+
+def _calibrator(method: str | None, kernel: str | None, preset: str | None, seed: int) -> Any:
+    return calibrator(method or DEFAULT_METHOD, kernel=kernel, preset=preset, seed=seed)
+
+
+@_command("demo")
+def demo_command(
+    folder: Annotated[Path, typer.Argument(help="Where to put its files.")] = Path("implicam-demo"),
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Simulate a rig, calibrate, measure, judge, report: everything once, in about a minute."""
+    from implicam.demo import run
+
+    if folder.exists() and any(folder.iterdir()) and not (folder / "truth.toml").exists():
+        raise UsageError(
+            f"{folder} exists and was not made by the demo.", fix="give another folder: implicam demo OTHER-NAME"
+        )
+    with show.progress(json) as progress:
+        made = run(folder, seed=seed, progress=progress)
+    files = {key: str(getattr(made, key)) for key in ("dataset", "calibration", "measured", "report")}
+    if json:
+        show.emit_json({"rows": [{"cameras": r.cameras, **asdict(r.trial)} for r in made.rows], **files})
+        return
+    console = show.out()
+    console.print(show.demo_table(made))
+    console.print("limit: the Cramer-Rao bound, what nobody can beat with this pixel noise and perfectly known cameras")
+    for key, path in files.items():
+        console.print(f"  {key:<12}{path}", soft_wrap=True)
+
+
+@_command("simulate")
+def simulate_command(
+    out: Annotated[Path, typer.Argument(help="Folder to write the dataset to.")],
+    rig: Annotated[str, typer.Option(help="bar6 (the paper's), stereo, dome8, or any barN, domeN.")] = "bar6",
+    target: Annotated[Target, typer.Option(help="A ball on a robot, or a board on a slide.")] = Target.ball,
+    positions: Annotated[Positions, typer.Option(help="Where the ball goes.")] = Positions.grid,
+    points: Annotated[int, typer.Option(min=1, help="How many random positions.")] = 157,
+    grid: Annotated[str, typer.Option(help="Positions of the grid along, down and away.")] = "5x5x7",
+    boards: Annotated[int, typer.Option(min=1, help="How many positions of the board.")] = 20,
+    check: Annotated[int, typer.Option(min=0, help="Also write so many random positions to OUT/check.")] = 0,
+    cameras: Annotated[str | None, typer.Option(help="2R, 2R2W, 2R4W, or names separated by commas.")] = None,
+    noise: Annotated[float, typer.Option(min=0, help="Pixel noise, standard deviation.")] = 0.2,
+    lens_error: Annotated[float, typer.Option(min=0, help="Error no lens model contains, rms pixels.")] = 0.5,
+    robot_noise: Annotated[float, typer.Option(min=0, help="Error of the known positions, sd per axis.")] = 0.0,
+    missing: Annotated[float, typer.Option(min=0, max=1, help="Share of views that are missing.")] = 0.0,
+    outliers: Annotated[float, typer.Option(min=0, max=1, help="Share of views that are wrong.")] = 0.0,
+    frame: Annotated[Frame, typer.Option(help="World frame: axes along the bench, or any.")] = Frame.robot,
+    unit: Annotated[str, typer.Option(help="mm or m.")] = "mm",
+    seed: Seed = 0,
+    shots_seed: Annotated[int | None, typer.Option(min=0, help="Record the same rig again with other noise.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it exists.")] = False,
+    json: Json = False,
+) -> None:
+    """Write a dataset of a simulated rig, with the truth and the Cramer-Rao limit of every point beside it."""
+    if unit not in ("mm", "m"):
+        raise UsageError(f"a simulated rig has no unit {unit!r}.", fix="choose mm or m")
+    built = build_rig(
+        rig, seed=seed, lens_error=lens_error, noise=noise, frame=frame.value, unit="mm" if unit == "mm" else "m",
+        cameras=cameras,
+    )  # fmt: skip
+    shots = seed if shots_seed is None else shots_seed
+    if target is Target.board:
+        shown = moving_board(built, positions=boards)
+    elif positions is Positions.grid:
+        shown = ball_grid(built, _grid(grid))
+    else:
+        shown = random_positions(built, points, np.random.default_rng([shots, 1]))
+    data = simulate(built, shown, seed=shots, robot_noise=robot_noise, missing=missing, outliers=outliers)
+    files = {"truth.toml": toml_text({**write_rig(built), "shots_seed": shots})}
+    if check:
+        target_points = random_positions(built, check, np.random.default_rng([shots, 2]))
+        held_out = simulate(built, target_points, seed=shots + 1_000_003, missing=missing)
+        files |= {f"check/{name}": text for name, text in folder_files(held_out).items()}
+    write_dataset(data, out, overwrite=overwrite, also=files)
+    seen = int(data.observations.seen.sum())
+    if json:
+        show.emit_json({"dataset": str(out), "points": len(data), "views": seen, "check_points": check})
+    else:
+        show.out().print(f"{out}: {len(data)} points, {seen} views in {len(data.cameras)} cameras", soft_wrap=True)
+
+
+def _grid(text: str) -> tuple[int, int, int]:
+    try:
+        a, b, c = (int(part) for part in text.lower().split("x"))
+    except ValueError:
+        raise UsageError(f"--grid {text!r} is not a grid.", fix="write three numbers, for example 5x5x7") from None
+    return a, b, c
+
+
+@_command("calibrate")
+def calibrate_command(
+    dataset: Annotated[Path, typer.Argument(help="Known points and what the cameras saw of them.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The calibration file to write.")],
+    method: Method = None,
+    kernel: Kernel = None,
+    preset: Preset = None,
+    points: Annotated[int | None, typer.Option(min=1, help="Use so many points, drawn at random.")] = None,
+    cameras: Cameras = None,
+    without: Without = None,
+    unit: Unit = None,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Learn the rig from known points; points kept back with --points are there for `implicam evaluate`."""
+    data = _read(dataset, unit, cameras, without)
+    if points is not None and points != len(data):
+        data, _ = data.split(points, seed=seed)
+    with show.progress(json) as progress:
+        calibration = _calibrator(method, kernel, preset, seed).fit(data, progress)
+    calibration.save(output)
+    _tell_calibration(calibration, output, json)
+
+
+def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> None:
+    residuals = calibration.residuals()
+    unused = [asdict(unused) for unused in calibration.unused]
+    notes = calibration.notes()
+    if json:
+        show.emit_json(
+            {"calibration": str(output), "method": calibration.method, "residuals": residuals, "unused": unused,
+             "notes": notes, "length_unit": calibration.data.length_unit}
+        )  # fmt: skip
+        return
+    unit = calibration.data.length_unit
+    rms = residuals["leave_one_out_rms"]
+    show.out().print(
+        f"{output}: {calibration.method} from {residuals['points_used']} points; leaving each out in turn, the rest "
+        f"predicts it within {', '.join(f'{axis} {show.number(value)}' for axis, value in rms.items())} {unit} rms",
+        soft_wrap=True,
+    )
+    reasons: dict[str, int] = {}
+    for entry in calibration.unused:
+        reasons[entry.reason] = reasons.get(entry.reason, 0) + 1
+    for reason, count in reasons.items():
+        show.note(f"{count} known point{'s' * (count != 1)} not used: {reason}")
+    for text in notes:
+        show.note(text)
+
+
+@_command("measure")
+def measure_command(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    dataset: Annotated[Path, typer.Argument(help="What the cameras saw.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The table to write.")] = Path("measured.csv"),
+    unit: Unit = None,
+    json: Json = False,
+) -> None:
+    """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
+    fitted = load_calibration(calibration)
+    data = read_dataset(dataset, unit=unit or fitted.data.length_unit)
+    with show.progress(json) as progress:
+        progress("measuring", 0, 1)
+        measured = fitted.measure(data.observations)
+        progress("measuring", 1, 1)
+    measured.write_csv(output)
+    count, typical = int(measured.measured.sum()), _typical(measured.sd)
+    if json:
+        show.emit_json(
+            {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
+             "length_unit": measured.length_unit, "not_measured": show.reasons(measured)}
+        )  # fmt: skip
+        return
+    text = f"{output}: {len(measured)} rows, {count} measured"
+    if count:
+        text += f", typical sd {', '.join(f'{a} {show.number(v)}' for a, v in zip('xyz', typical, strict=True))} "
+        text += measured.length_unit
+    show.out().print(text, soft_wrap=True)
+    for reason in show.reasons(measured):
+        show.note(reason)
+
+
+def _typical(sd: Any) -> list[float]:
+    measured = sd[np.isfinite(sd[:, 0])]
+    return np.median(measured, axis=0).tolist() if len(measured) else [math.nan] * 3
+
+
+@_command("evaluate")
+def evaluate_command(
+    paths: Annotated[
+        list[Path], typer.Argument(metavar="[FILE] DATASET", help="A calibration and known points; or one, with --cv.")
+    ],
+    cv: Annotated[int | None, typer.Option("--cv", min=2, help="Hold each of so many folds out in turn.")] = None,
+    leave_out: Annotated[str | None, typer.Option("--leave-out", help='"shot": hold each shot out in turn.')] = None,
+    report: Report = None,
+    method: Method = None,
+    kernel: Kernel = None,
+    preset: Preset = None,
+    cameras: Cameras = None,
+    without: Without = None,
+    unit: Unit = None,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Hold the error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region.
+
+    FILE DATASET judges a calibration on points it was not fitted from. With --cv K or --leave-out shot, give a dataset
+    (and a method) or a calibration file (which carries its own data and options).
+    """
+    _check_evaluate(paths, cv, leave_out)
+    with show.progress(json) as progress:
+        if cv is None and leave_out is None:
+            evaluation = evaluate(load_calibration(paths[0]), _read(paths[1], unit, cameras, without))
+        else:
+            fit, data = _fit_and_data(paths[0], method, kernel, preset, seed, cameras, without, unit)
+            if cv is not None:
+                evaluation = cross_validate(fit, data, cv, seed=seed, progress=progress)
+            else:
+                evaluation = leave_out_shots(fit, data, progress=progress)
+    if report is not None:
+        _write_report(evaluation, report)
+    _tell_evaluation(evaluation, report, json)
+
+
+def _check_evaluate(paths: list[Path], cv: int | None, leave_out: str | None) -> None:
+    if leave_out not in (None, "shot"):
+        raise UsageError(f"--leave-out {leave_out!r} is not known.", fix="write --leave-out shot")
+    if cv is not None and leave_out is not None:
+        raise UsageError("--cv and --leave-out exclude each other.", fix="give one of them")
+    in_turn = cv is not None or leave_out is not None
+    if in_turn and len(paths) != 1:
+        raise UsageError("--cv and --leave-out take one path.", fix="give the dataset, or the calibration file")
+    if not in_turn and len(paths) != 2:
+        raise UsageError(
+            "evaluate needs a calibration file and a dataset.",
+            fix="implicam evaluate FILE DATASET, or implicam evaluate DATASET --cv 10",
+        )
+
+
+def _fit_and_data(
+    path: Path, method: str | None, kernel: str | None, preset: str | None, seed: int, cameras: str | None,
+    without: str | None, unit: str | None,
+) -> tuple[Any, Dataset]:  # fmt: skip
+    if path.suffix == ".implicam":
+        if method or kernel or preset:
+            raise UsageError("a calibration file brings its own method and options.", fix="leave --method and such out")
+        fitted = load_calibration(path)
+        return fitted.refit, fitted.data
+    return _calibrator(method, kernel, preset, seed).fit, _read(path, unit, cameras, without)
+
+
+def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) -> None:
+    if json:
+        show.emit_json(
+            {"method": evaluation.method, "how": evaluation.how, "against": evaluation.against,
+             "length_unit": evaluation.data.length_unit, **evaluation.coverage.as_dict(),
+             "not_measured": show.reasons(evaluation.measurement), "notes": list(evaluation.notes),
+             "report": None if report is None else str(report)}
+        )  # fmt: skip
+        return
+    console = show.out()
+    console.print(f"{evaluation.method} on {evaluation.data.name}: {evaluation.how}", soft_wrap=True)
+    for table in show.evaluation_tables(evaluation):
+        console.print(table)
+    overall = evaluation.coverage.overall
+    console.print(f"error bars: {overall.verdict} (multiply by {show.number(overall.sd_factor)} for 95 % to hold 95 %)")
+    if report is not None:
+        console.print(f"report: {report}", soft_wrap=True)
+    for text in (*show.reasons(evaluation.measurement), *evaluation.notes):
+        show.note(text)
+
+
+def _write_report(evaluation: Evaluation, path: Path) -> None:
+    from implicam.demo import report_of
+    from implicam.report import write_report
+
+    write_report(path, report_of(evaluation, f"{evaluation.data.name}, measured with {evaluation.method}"))
+
+
+@_command("compare")
+def compare_command(
+    dataset: Annotated[Path, typer.Argument(help="Known points.")],
+    methods: Annotated[
+        str | None, typer.Option("--methods", help="For example inverse-gp,inverse-gp:matern-5/2,inverse-gp:paper")
+    ] = None,
+    train: Annotated[str | None, typer.Option("--train", help="Numbers of known points, such as 17,35,87.")] = None,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Random splits for each number.")] = 5,
+    check: Annotated[Path | None, typer.Option("--check", help="Evaluate on this dataset of the same rig.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png or .pdf).")] = None,
+    cameras: Cameras = None,
+    without: Without = None,
+    unit: Unit = None,
+    json: Json = False,
+) -> None:
+    """All methods on the same splits: one table, one figure, error bars over seeds."""
+    data = _read(dataset, unit, cameras, without)
+    names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
+    check_data = None if check is None else _read(check, unit, cameras, without)
+    sizes = _sizes(train, len(data))
+    with show.progress(json) as progress:
+        chosen = {name: _named_method(name) for name in names}
+        trials = compare(data, chosen, sizes, seeds=seeds, check=check_data, progress=progress)
+    if output is not None:
+        _write_figure(trials, data.length_unit, output)
+    if json:
+        show.emit_json({"length_unit": data.length_unit, **as_json(trials), "figure": output and str(output)})
+        return
+    rows = summarise(trials)
+    show.out().print(show.compare_table(rows, data.length_unit))
+    if output is not None:
+        show.out().print(f"figure: {output}", soft_wrap=True)
+    for row in rows:
+        for failure in row.failures:
+            show.note(f"{row.method} with {row.known} points failed: {failure}")
+
+
+def _available_methods() -> list[str]:
+    try:
+        import gpytorch  # noqa: F401
+    except ImportError:
+        show.note('left out inverse-gp:paper (the paper\'s own software): pip install "implicam[paper]" to add it')
+        return ["inverse-gp", "inverse-gp:matern-5/2"]
+    return ["inverse-gp", "inverse-gp:matern-5/2", "inverse-gp:paper"]
+
+
+def _named_method(name: str) -> Any:
+    method, _, variant = name.partition(":")
+    option = {"paper": {"preset": "paper"}, "": {}}.get(variant, {"kernel": variant})
+    return calibrator(method, **option)
+
+
+def _sizes(text: str | None, n: int) -> list[int]:
+    if text is None:
+        return sorted({max(5, round(n * share)) for share in (0.1, 0.2, 0.5, 0.9)} - {n})
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise UsageError(f"--train {text!r} is not a list of numbers.", fix="write for example 17,35,87") from None
+
+
+def _write_figure(trials: Any, unit: str, path: Path) -> None:
+    from implicam.figures import compare_figure
+
+    if path.suffix not in (".png", ".pdf", ".svg"):
+        raise UsageError(f"{path} is no picture.", fix="end the name in .png, .pdf or .svg")
+    figure = compare_figure([asdict(trial) for trial in trials if not trial.failure], unit=unit)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:], dpi=160)
+
+
+@_command("report")
+def report_command(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    dataset: Annotated[Path | None, typer.Argument(help="Known points; without, its own by 10-fold.")] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The page to write.")] = Path("report.html"),
+    unit: Unit = None,
+    json: Json = False,
+) -> None:
+    """Write a one-page HTML report with an interactive 3D view."""
+    fitted = load_calibration(calibration)
+    with show.progress(json) as progress:
+        if dataset is None:
+            evaluation = cross_validate(fitted.refit, fitted.data, min(10, len(fitted.data)), progress=progress)
+        else:
+            evaluation = evaluate(fitted, _read(dataset, unit))
+    _write_report(evaluation, output)
+    if json:
+        show.emit_json({"report": str(output), "how": evaluation.how})
+    else:
+        show.out().print(f"{output}: {evaluation.how}", soft_wrap=True)
+
+
+@_command("convert")
+def convert_command(
+    dataset: Annotated[Path, typer.Argument(help="A folder, .csv, .parquet or .npz.")],
+    out: Annotated[Path, typer.Argument(help="The same, in another form: the ending chooses.")],
+    unit: Unit = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is a folder that exists.")] = False,
+    json: Json = False,
+) -> None:
+    """Write a dataset in another form: folder, wide CSV, Parquet, NPZ; nothing is lost."""
+    data = read_dataset(dataset, unit=unit)
+    write_dataset(data, out, overwrite=overwrite)
+    if json:
+        show.emit_json({"dataset": str(out), "points": len(data)})
+    else:
+        show.out().print(f"{out}: {len(data)} points, {len(data.cameras)} cameras", soft_wrap=True)
+
+
+@_command("info")
+def info_command(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    json: Json = False,
+) -> None:
+    """Show what a calibration file says about itself."""
+    load_calibration(calibration)  # a damaged file must not look healthy
+    table = calibration_file.describe(calibration)
+    if json:
+        show.emit_json(table)
+    else:
+        show.out().print(toml_text(table), markup=False, soft_wrap=True)
+
+
+def _version(shown: bool) -> None:
+    if shown:
+        typer.echo(f"implicam {calibration_file.package_version()}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Turn a set of fixed cameras into a 3D measuring instrument with honest error bars."""

@@ -1,0 +1,110 @@
+"""Everything once: simulate a rig, calibrate it with more and more known points, measure, judge, report."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from implicam.calibrators import Calibration, InverseGP
+from implicam.compare import Trial, trial_of
+from implicam.dataset import Dataset, folder_files, write_dataset
+from implicam.evaluate import Evaluation, evaluate
+from implicam.files import toml_text
+from implicam.progress import Progress, silent
+from implicam.report import ReportData, write_report
+from implicam.simulate import Rig, build_rig, random_positions, simulate, write_rig
+
+RIG, KNOWN, HELD_OUT = "bar6", 157, 500
+SETS = {"2R": "2 cameras", "2R2W": "4 cameras", "2R4W": "6 cameras"}
+SIZES = (35, 87, KNOWN)
+
+
+@dataclass(frozen=True, eq=False)
+class DemoRow:
+    """One line of the demo's table."""
+
+    cameras: str
+    trial: Trial
+
+
+@dataclass(frozen=True, eq=False)
+class Demo:
+    """What the demo made: the table, and the files."""
+
+    rows: list[DemoRow]
+    unit: str
+    dataset: Path
+    calibration: Path
+    measured: Path
+    report: Path
+
+
+def run(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Demo:
+    """Run the demo into `folder`, which it may replace."""
+    steps = len(SETS) * len(SIZES) + 2
+    progress("simulating", 0, steps)
+    rig = build_rig(RIG, seed=seed)
+    known, held_out = record(rig, KNOWN, seed=seed, shots=1), record(rig, HELD_OUT, seed=seed, shots=2)
+    unit = known.length_unit
+    extra = {"truth.toml": toml_text(write_rig(rig)), **{f"check/{k}": v for k, v in folder_files(held_out).items()}}
+    write_dataset(known, folder, overwrite=True, also=extra)
+    rows: list[DemoRow] = []
+    best: tuple[Calibration, Evaluation] | None = None
+    for cameras, label in SETS.items():
+        part = build_rig(RIG, seed=seed, cameras=cameras)
+        known, held_out = record(part, KNOWN, seed=seed, shots=1), record(part, HELD_OUT, seed=seed, shots=2)
+        for size in SIZES:
+            progress("calibrating and measuring", len(rows), steps)
+            calibration, evaluation, trial = _one(known, held_out, size, seed)
+            rows.append(DemoRow(label, trial))
+            best = calibration, evaluation
+    assert best is not None
+    progress("reporting", steps - 1, steps)
+    demo = Demo(rows, unit, folder, folder / "rig.implicam", folder / "measured.csv", folder / "report.html")
+    calibration, evaluation = best
+    calibration.save(demo.calibration)
+    evaluation.measurement.write_csv(demo.measured)
+    write_report(demo.report, report_of(evaluation, "implicam demo: a simulated six-camera rig"))
+    progress("reporting", steps, steps)
+    return demo
+
+
+def record(rig: Rig, n: int, *, seed: int, shots: int) -> Dataset:
+    """`n` random positions of the ball, seen by the rig; every `shots` gives others."""
+    target = random_positions(rig, n, np.random.default_rng([seed, shots]))
+    return simulate(rig, target, seed=1000 * seed + shots)
+
+
+def _one(known: Dataset, held_out: Dataset, size: int, seed: int) -> tuple[Calibration, Evaluation, Trial]:
+    start = time.perf_counter()
+    train = known if size == len(known) else known.split(size, seed=seed)[0]
+    calibration = InverseGP(seed=seed).fit(train)
+    seconds = time.perf_counter() - start
+    # against the check points only: the known ones that were not drawn are fewer, and differ from row to row
+    evaluation = evaluate(calibration, held_out)
+    return calibration, evaluation, trial_of(evaluation, calibration.method, size, seed, seconds)
+
+
+def report_of(evaluation: Evaluation, title: str) -> ReportData:
+    """The report of an evaluation."""
+    data = evaluation.data
+    facts = (
+        ("Dataset", data.name),
+        ("Method", evaluation.method),
+        ("Cameras", f"{len(data.cameras)}: {', '.join(camera.name for camera in data.cameras)}"),
+        ("Known points", str(len(evaluation.known_xyz))),
+        ("Judged on", evaluation.how),
+        ("Length unit", data.length_unit),
+    )
+    return ReportData(
+        title,
+        evaluation.measurement,
+        facts=facts,
+        coverage=evaluation.coverage,
+        true_xyz=evaluation.true_xyz,
+        known_xyz=evaluation.known_xyz,
+        notes=(f"Errors are taken against {evaluation.against}.", *evaluation.notes),
+    )

@@ -1,0 +1,160 @@
+"""Measure points whose positions are known, and hold the stated covariance against the errors.
+
+A point that the calibration was fitted from says nothing about its accuracy, so it is always left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators import Calibration
+from implicam.coverage import Coverage, assess, tercile_labels
+from implicam.dataset import Dataset, Floats, Names, Observations
+from implicam.errors import DatasetError
+from implicam.geometry import depth_of_points
+from implicam.measurement import Measurement
+from implicam.progress import Progress, silent
+
+
+class Fits(Protocol):
+    """Anything that turns data into a calibration: a calibrator, or a calibration's `refit`."""
+
+    def __call__(self, data: Dataset, progress: Progress = silent) -> Calibration:
+        """Fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Held-out points, measured, and what their errors say.
+
+    data: the held-out points, rows as in measurement. true_xyz: (n, 3) where they were: the simulated truth where the
+    dataset carries it, else the known positions; `against` says which. known_xyz: (m, 3) the points the calibration
+    learned from (all of them, where each was held out in turn). how: one sentence on what was held out.
+    """
+
+    method: str
+    data: Dataset
+    measurement: Measurement
+    true_xyz: Floats
+    known_xyz: Floats
+    coverage: Coverage
+    how: str
+    against: str
+    notes: tuple[str, ...] = ()
+
+
+def evaluate(calibration: Calibration, data: Dataset) -> Evaluation:
+    """Evaluate on the known points that the calibration was not fitted from."""
+    _ = data.positions
+    names = calibration.data.observations.camera_names
+    if set(names) <= set(data.observations.camera_names):
+        data = data.with_cameras(names)  # regions and limit are those of the cameras that measure
+    used = _same_views(calibration.data.observations, data.observations)
+    if used.all():
+        raise DatasetError(
+            f"all {len(data)} points of {data.name!r} were used to fit this calibration.",
+            why="errors at points it has learned say nothing about new ones",
+            fix="evaluate with --cv 10 or --leave-out shot, keep some points back (calibrate --points N), "
+            "or give another dataset of the rig",
+        )
+    held_out = data.select(~used)
+    how = f"{len(held_out)} points not used in the fit"
+    if used.any():
+        how += f"; {used.sum()} of this dataset were, and are left out"
+    measurement = calibration.measure(held_out.observations)
+    return _judge(calibration, held_out, measurement, calibration.data.xyz, how)
+
+
+def cross_validate(fit: Fits, data: Dataset, k: int, *, seed: int = 0, progress: Progress = silent) -> Evaluation:
+    """Hold each of `k` random folds out in turn: a fit to the others measures it."""
+    how = f"{k}-fold cross-validation (seed {seed})"
+    return _held_out_in_turn(fit, data, list(data.folds(k, seed=seed)), how, progress)
+
+
+def leave_out_shots(fit: Fits, data: Dataset, *, progress: Progress = silent) -> Evaluation:
+    """Hold each shot (a board, a plane) out in turn: a fit to the others measures it."""
+    rounds = list(data.leave_out_shots())
+    return _held_out_in_turn(fit, data, rounds, f"each of {len(rounds)} shots left out in turn", progress)
+
+
+def _held_out_in_turn(
+    fit: Fits, data: Dataset, rounds: list[tuple[str, Dataset, Dataset]], how: str, progress: Progress
+) -> Evaluation:
+    parts: list[tuple[Measurement, Dataset]] = []
+    progress(how, 0, len(rounds))
+    for i, (_, others, held_out) in enumerate(rounds):
+        calibration = fit(others)
+        parts.append((calibration.measure(held_out.observations), held_out))
+        progress(how, i + 1, len(rounds))
+    measurement = _stacked(m for m, _ in parts)
+    row = {str(name): i for i, name in enumerate(data.points)}
+    held_out = data.select([row[str(name)] for _, part in parts for name in part.points])
+    return _judge(calibration, held_out, measurement, data.xyz, how)
+
+
+def _stacked(parts: Iterable[Measurement]) -> Measurement:
+    all_parts = list(parts)
+
+    def together(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(part, name) for part in all_parts])
+
+    return Measurement(
+        together("points"),
+        together("xyz"),
+        together("cov"),
+        together("views"),
+        together("consistency"),
+        together("reason"),
+        all_parts[0].length_unit,
+    )
+
+
+def _judge(
+    calibration: Calibration, data: Dataset, measurement: Measurement, known_xyz: Floats, how: str
+) -> Evaluation:
+    truth = data.truth
+    true_xyz = data.xyz if truth is None else truth.xyz
+    coverage = assess(
+        measurement.xyz - true_xyz,
+        measurement.cov,
+        clusters=data.shots,
+        regions=_regions(data),
+        limit=None if truth is None else truth.limit,
+    )
+    against = "the known positions" if truth is None else "the simulated truth"
+    notes = tuple(calibration.notes())
+    return Evaluation(calibration.method, data, measurement, true_xyz, known_xyz, coverage, how, against, notes)
+
+
+def _regions(data: Dataset) -> dict[str, Names]:
+    """Labels by depth (terciles of the mean distance from the cameras) and by number of views."""
+    regions = {}
+    sizes = [(c.width, c.height) for c in data.cameras if c.width is not None and c.height is not None]
+    known_sizes = np.array(sizes, dtype=np.float64) if len(sizes) == len(data.cameras) else None
+    depth = depth_of_points(data.xyz, data.observations.uv, known_sizes)
+    if depth is not None:
+        regions["depth"] = np.asarray(tercile_labels(depth), dtype=np.str_)
+    views = data.observations.seen.sum(axis=1)
+    if np.ptp(views) > 0:
+        regions["views"] = np.array([f"{count} views" if count != 1 else "1 view" for count in views], dtype=np.str_)
+    return regions
+
+
+def _same_views(fitted: Observations, given: Observations) -> NDArray[np.bool_]:
+    """(n,) which given points are points of the fit: same name, and the same pixels in the cameras of the fit."""
+    names = fitted.camera_names
+    if not set(names) <= set(given.camera_names):
+        return np.zeros(len(given), dtype=np.bool_)  # measuring will say what is missing
+    uv = given.with_cameras(names).uv
+    row = {str(name): i for i, name in enumerate(fitted.points)}
+
+    def same(i: int) -> bool:
+        at = row.get(str(given.points[i]))
+        return at is not None and np.array_equal(fitted.uv[at], uv[i], equal_nan=True)
+
+    return np.array([same(i) for i in range(len(given))], dtype=np.bool_)
