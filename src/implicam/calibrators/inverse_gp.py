@@ -13,7 +13,7 @@ GPs know nothing of each other.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -32,6 +32,7 @@ from implicam.threads import side_by_side
 
 PRESETS = ("standardised", "paper")
 AXES = "xyz"
+EXTENT = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
 LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
 
@@ -64,11 +65,16 @@ class Hyperparameters:
 
 @dataclass(frozen=True)
 class InverseGP:
-    """The paper's method. kernel: `squared-exponential` or `matern-5/2`; preset: `standardised` or `paper`."""
+    """The paper's method. kernel: `squared-exponential` or `matern-5/2`; preset: `standardised` or `paper`.
+
+    shortest_lengthscale: bound of every lengthscale, in standard deviations of the pixels. Optics are smooth across
+    the image, so by default it is the extent of the pixels themselves (docs/decisions/0004-lattices.md).
+    """
 
     kernel: str = "squared-exponential"
     preset: str = "standardised"
     seed: int = 0
+    shortest_lengthscale: float = EXTENT
 
     method: ClassVar[str] = "inverse-gp"
 
@@ -79,6 +85,8 @@ class InverseGP:
                     f"inverse-gp has no {what} {value!r}{did_you_mean(value, known)}.",
                     fix=f"choose one of {', '.join(known)}",
                 )
+        if not 0 < self.shortest_lengthscale < np.inf:
+            raise UsageError(f"shortest_lengthscale is {self.shortest_lengthscale!r}; it must be positive and finite.")
         if self.preset == "paper" and self.kernel != "squared-exponential":
             raise UsageError("the paper preset has the squared-exponential kernel only.", fix="leave out --kernel")
 
@@ -137,7 +145,7 @@ def _train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple
     progress("fitting", 0, 3)
 
     def one(y: Floats) -> Hyperparameters:
-        fit = maximise(X, y, method.kernel, seed=method.seed)
+        fit = maximise(X, y, method.kernel, shortest=method.shortest_lengthscale, seed=method.seed)
         done.append(1)
         progress("fitting", len(done), 3)
         return Hyperparameters(fit.kernel, fit.noise_variance)
@@ -239,7 +247,7 @@ class InverseGPCalibration:
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Options, and the hyperparameters in standardised units with the scaling."""
         h = self.hyperparameters
-        table = {"kernel": self.calibrator.kernel, "preset": self.calibrator.preset, "seed": self.calibrator.seed}
+        table = asdict(self.calibrator)
         arrays = {
             "pixel_offset": self.pixels.offset,
             "pixel_scale": self.pixels.scale,
@@ -255,7 +263,9 @@ class InverseGPCalibration:
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> InverseGPCalibration:
         """Restore a calibration; the factors are computed again, which takes less time than reading them would."""
-        calibrator = InverseGP(str(table["kernel"]), str(table["preset"]), int(table["seed"]))
+        calibrator = InverseGP(
+            str(table["kernel"]), str(table["preset"]), int(table["seed"]), float(table["shortest_lengthscale"])
+        )
         _, unused = _usable(data)
         d = 2 * len(data.cameras)
         pixels = Scaling(_column(arrays, "pixel_offset", (d,)), _column(arrays, "pixel_scale", (d,), positive=True))

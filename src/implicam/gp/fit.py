@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 from implicam.errors import NumericalError
 from implicam.gp.kernels import SHAPES, Floats, Kernel, squared_distances
 
-LONGEST, SHORTEST = 1e6, 0.05  # lengthscale bounds, in standard deviations of an input
+LONGEST, SHORTEST = 1e6, 0.05  # default lengthscale bounds, in standard deviations of an input
 ALIVE = 30.0  # beyond this a lengthscale has next to no gradient: a search must not start there
 NOISIEST = 10.0  # largest noise-to-signal ratio
 SUBSET = 80
@@ -113,19 +113,26 @@ class ProfiledLikelihood:
 
 
 def maximise(
-    X: Floats, y: Floats, shape: str = "squared-exponential", *, start: Fit | None = None, seed: int = 0
+    X: Floats,
+    y: Floats,
+    shape: str = "squared-exponential",
+    *,
+    shortest: float = SHORTEST,
+    start: Fit | None = None,
+    seed: int = 0,
 ) -> Fit:
     """Hyperparameters of a zero-mean GP that maximise the marginal likelihood of y (n,) at X (n, d).
 
-    `start` continues from an earlier fit (a point was added), which is cheaper than a search from nothing.
-    `seed` draws the subset. Raises NumericalError where there is nothing to learn from.
+    `shortest` bounds every lengthscale from below, in standard deviations of its input: prior knowledge of how smooth
+    the function is. `start` continues from an earlier fit (a point was added), which is cheaper than a search from
+    nothing. `seed` draws the subset. Raises NumericalError where there is nothing to learn from.
     """
     X, y = np.asarray(X, dtype=np.float64), np.asarray(y, dtype=np.float64)
     _check(X, y)
     spread = X.std(axis=0)
     spread[spread == 0] = 1.0
     size = float(np.sqrt(np.mean(y**2)))
-    search = _Search((X - X.mean(axis=0)) / spread, y / size, shape, seed)
+    search = _Search((X - X.mean(axis=0)) / spread, y / size, shape, shortest, seed)
     theta, value = search.from_nothing() if start is None else search.continued(start, spread)
     n, d = X.shape
     signal = search.all_data.signal_variance(theta) * size**2
@@ -141,14 +148,14 @@ def maximise(
 class _Search:
     """One search for the optimum, on standardised data."""
 
-    def __init__(self, X: Floats, y: Floats, shape: str, seed: int) -> None:
+    def __init__(self, X: Floats, y: Floats, shape: str, shortest: float, seed: int) -> None:
         n, d = X.shape
         self.X, self.y, self.shape, self.d = X, y, shape, d
         self.all_data = ProfiledLikelihood(X, y, shape)
         self.subset = np.random.default_rng(seed).permutation(n)[:SUBSET]
         # Below this ratio rounding, about n times 1e-16, would make the Cholesky fail.
         quietest = max(1e-12, 20 * n * np.finfo(float).eps)
-        self.low = np.append(np.full(d, np.log(SHORTEST)), np.log(quietest))
+        self.low = np.append(np.full(d, np.log(shortest)), np.log(quietest))
         self.high = np.append(np.full(d, np.log(LONGEST)), np.log(NOISIEST))
         self.evaluations: dict[int, int] = {}
         self.converged = True
@@ -159,25 +166,41 @@ class _Search:
         theta, _ = min((self._descend(few, start, coarse=True) for start in starts), key=lambda found: found[1])
         found = [self._descend(self.all_data, theta)]
         if len(self.y) <= CHEAP:
-            # Steepest descent from short lengthscales drops the inputs one by one, and often ends better.
-            found.append(self._descend(self.all_data, self._isotropic(1.0, 1e-4), whiten=False))
+            found.append(self._from_short())
         return min(found, key=lambda result: result[1])
+
+    def _from_short(self) -> tuple[Floats, float]:
+        """From short lengthscales, unwhitened: the inputs are dropped one by one, which often ends better.
+
+        The lower bound holds at the end only, because the way there may lead through shorter ones.
+        """
+        bound, self.low = self.low, np.minimum(self.low, np.log(SHORTEST))
+        self.low[-1] = bound[-1]
+        theta, value = self._descend(self.all_data, self._isotropic(1.0, 1e-4), whiten=False)
+        self.low = bound
+        return (theta, value) if (theta >= bound).all() else self._descend(self.all_data, np.maximum(theta, bound))
 
     def continued(self, start: Fit, spread: Floats) -> tuple[Floats, float]:
         ratio = start.noise_variance / start.kernel.signal_variance
         theta = np.append(np.log(start.kernel.lengthscale / spread), np.log(ratio))
-        return self._descend(self.all_data, np.clip(theta, self.low, self.high))
+        return self._descend(self.all_data, theta, revive=False)
 
     def _isotropic(self, lengthscale: float, rho: float) -> Floats:
         # Distances grow with the square root of the dimension, and so must the lengthscale.
         return np.append(np.full(self.d, np.log(lengthscale * np.sqrt(self.d / 4))), np.log(rho))
 
     def _descend(
-        self, likelihood: ProfiledLikelihood, theta: Floats, *, coarse: bool = False, whiten: bool = True
+        self,
+        likelihood: ProfiledLikelihood,
+        theta: Floats,
+        *,
+        coarse: bool = False,
+        whiten: bool = True,
+        revive: bool = True,
     ) -> tuple[Floats, float]:
-        start = theta.copy()
-        start[: self.d] = np.minimum(start[: self.d], np.log(ALIVE))
-        start = np.clip(start, self.low, self.high)
+        start = np.clip(theta, self.low, self.high)
+        if revive:
+            start[: self.d] = np.minimum(start[: self.d], max(np.log(ALIVE), self.low[0]))
         unwhiten = self._whitening(start, len(likelihood.y)) if whiten else np.eye(self.d + 1)
 
         def whitened(z: Floats) -> tuple[float, Floats]:

@@ -1,0 +1,52 @@
+# make demo   the main job on a simulated rig          make test   every test
+# make check  all that CI checks                        make bench  speed against the limits
+# make real   the table of docs/real-data.md            make clean  start over
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: demo test test-slow check lint bench real clean
+
+demo: $(VENV)/.demo
+	$(BIN)/implicam demo
+
+test: $(VENV)/.dev
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow"
+
+test-slow: $(VENV)/.dev
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
+
+check: lint test
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+
+bench: $(VENV)/.dev
+	$(BIN)/python benchmarks/gp_fit.py
+
+real: $(VENV)/.dev
+	$(BIN)/python benchmarks/real_data.py ../shared/real
+
+clean:
+	rm -rf $(VENV) implicam-demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+# One environment; each stamp says what has been put into it.
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "implicam needs Python 3.11 or newer; found $$($(PYTHON) -V). Try: make PYTHON=python3.12"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+	  { echo "Python has no venv module here. On Debian or Ubuntu: apt install python3-venv"; rm -rf $(VENV); exit 1; }
+
+$(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
+	@echo "Setting up (once) ..."
+	@$(PIP) --editable ".[report]"
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
+	@echo "Setting up (once, a few minutes: the tests compare with PyTorch, scikit-learn and OpenCV) ..."
+	@$(PIP) --editable ".[dev]"
+	@touch $@
