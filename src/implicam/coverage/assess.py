@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy.special import chdtri, ndtr, ndtri  # scipy.stats would double the time of `import implicam`
 
 from implicam.coverage.intervals import Clusters, mean_interval, shares
 from implicam.coverage.model import LEVELS, Coverage, Level, Summary
@@ -22,7 +22,7 @@ from implicam.errors import UsageError
 READING_ORDER = ("near", "low", "middle", "far", "high")
 """Labels that rows follow in this order; others come after them, by alphabet."""
 
-_NEES_QUANTILE_95 = float(stats.chi2.ppf(0.95, 3))
+_NEES_QUANTILE_95 = float(chdtri(3, 0.05))
 # A correlation matrix this close to singular claims to know one direction a million times better than another.
 _SINGULAR = 1e-12
 # Beyond these, squares of squares overflow; no length unit makes sense of them.
@@ -129,10 +129,10 @@ def _summary(group: str, region: str, sample: _Sample) -> Summary:
 
 
 def _levels(z: Floats, nees: Floats, clusters: Clusters) -> tuple[Level, ...]:
-    bounds = stats.norm.ppf(0.5 + np.array(LEVELS) / 2)
+    bounds = ndtri(0.5 + np.array(LEVELS) / 2)
     pooled = shares(z, bounds, clusters)
     by_axis = [shares(z[:, [axis]], bounds, clusters) for axis in range(3)]
-    ellipsoid = shares(nees[:, None], stats.chi2.ppf(LEVELS, 3), clusters)
+    ellipsoid = shares(nees[:, None], chdtri(3, 1 - np.array(LEVELS)), clusters)
     return tuple(
         Level(nominal, pooled[i], (by_axis[0][i], by_axis[1][i], by_axis[2][i]), ellipsoid[i])
         for i, nominal in enumerate(LEVELS)
@@ -149,7 +149,8 @@ def _nees(e: Floats, cov: Floats, sd: Floats) -> tuple[Floats, Floats]:
 
 def _crps(e: Floats, sd: Floats) -> Floats:
     z = e / sd
-    crps: Floats = sd * (z * (2 * stats.norm.cdf(z) - 1) + 2 * stats.norm.pdf(z) - 1 / np.sqrt(np.pi))
+    density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+    crps: Floats = sd * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))
     return crps
 
 

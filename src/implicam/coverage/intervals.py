@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 from implicam.dataset import Floats
 
@@ -55,7 +55,7 @@ class Clusters:
     @property
     def t(self) -> float:
         """The factor from a standard error to half a 95 % interval."""
-        return float(stats.t.ppf(0.975, max(self.effective - 1, 1)))
+        return float(stdtrit(max(self.effective - 1, 1), 0.975))
 
     def sums(self, values: NDArray[Any]) -> Floats:
         """Sum of (n,) values per cluster."""
