@@ -139,7 +139,8 @@ def measure(n, d, runs, slow_runs):
 def table(rows, runs, slow_runs):
     lines = [
         f"{platform.machine()}, {torch.get_num_threads()} cores; Python {platform.python_version()}, "
-        f"NumPy {np.__version__}, SciPy {scipy.__version__}, GPyTorch {gpytorch.__version__}, scikit-learn {sklearn.__version__}. "
+        f"NumPy {np.__version__}, SciPy {scipy.__version__}, GPyTorch {gpytorch.__version__}, "
+        f"scikit-learn {sklearn.__version__}. "
         f"Medians of {runs} runs of ours and {slow_runs} of the others.",
         "",
         "| n | d | ours, s | GPyTorch / ours | scikit-learn / ours | ours / LAPACK | log marginal likelihood: ours "

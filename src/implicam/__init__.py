@@ -31,6 +31,7 @@ from implicam.errors import (
     NumericalError,
     UsageError,
 )
+from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.measurement import Measurement
 from implicam.simulate import simulated
 
@@ -44,6 +45,7 @@ __all__ = [
     "Coverage",
     "Dataset",
     "DatasetError",
+    "Evaluation",
     "FitError",
     "ImplicamError",
     "InverseGP",
@@ -56,7 +58,10 @@ __all__ = [
     "UsageError",
     "assess",
     "calibrator",
+    "cross_validate",
+    "evaluate",
     "join",
+    "leave_out_shots",
     "load_calibration",
     "read_dataset",
     "simulated",

@@ -1,0 +1,40 @@
+"""Draw the pictures of the docs from the demo: `python docs/make_pictures.py` (needs Chromium).
+
+Runs the demo in a temporary folder, opens its report in a real browser and photographs it.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from playwright.sync_api import sync_playwright
+
+IMAGES = Path(__file__).parent / "images"
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
+
+
+def photograph(report: Path) -> None:
+    """The first screen of the report."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        page = browser.new_page(viewport={"width": 1240, "height": 1230})
+        page.goto(report.as_uri())
+        page.wait_for_timeout(6000)  # software rendering of the 3D view takes its time
+        page.screenshot(path=IMAGES / "report.png")
+        browser.close()
+
+
+def main() -> None:
+    IMAGES.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        demo = Path(folder) / "demo"
+        subprocess.run([sys.executable, "-m", "implicam", "demo", str(demo)], check=True)
+        photograph(demo / "report.html")
+
+
+if __name__ == "__main__":
+    main()
