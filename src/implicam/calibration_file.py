@@ -11,6 +11,7 @@ Format versions: 1 (this one). A newer version is refused with the cure; an olde
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.tables import parse_toml
 from implicam.errors import CalibrationFileError, ImplicamError
-from implicam.files import npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
+from implicam.files import inflated_bytes, npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
 
 FORMAT_VERSION = 1
 MAX_BYTES = 1 << 31
@@ -121,7 +122,9 @@ def read(path: str | Path) -> Contents:
     table = _table(path, members[TOML])
     if table.get("arrays_sha256") != hashlib.sha256(members[ARRAYS]).hexdigest():
         raise refusal(path, "its arrays are not those it was written with (their SHA-256 differs)")
-    arrays = read_npz(members[ARRAYS], lambda reason: refusal(path, reason))
+    # a zip within a zip inflates twice: the bound is that of the outer one
+    most = inflated_bytes(path.stat().st_size)
+    arrays = read_npz(members[ARRAYS], lambda reason: refusal(path, reason), most=most)
     for older in range(table["format_version"], FORMAT_VERSION):
         _UPGRADES[older](table, arrays)
     method, options = table.get("method"), table.get("options")
@@ -158,9 +161,11 @@ def _members(path: Path) -> dict[str, bytes]:
         raise CalibrationFileError(
             f"{path} {what}.", fix="give a file made by `implicam calibrate DATASET -o rig.implicam`"
         )
+    if not os.access(path, os.R_OK):
+        raise CalibrationFileError(f"{path} cannot be read.", fix="check its permissions")
     if path.stat().st_size > MAX_BYTES or not zipfile.is_zipfile(path):
         raise refusal(path, "it is not a zip, or it is cut off")
-    members = read_zip(path.read_bytes(), lambda reason: refusal(path, reason))
+    members = read_zip(path, lambda reason: refusal(path, reason))
     if set(members) != {TOML, ARRAYS}:
         raise refusal(
             path, f"it must hold {TOML} and {ARRAYS}, and holds {', '.join(sorted(members))[:200] or 'nothing'}"

@@ -21,7 +21,8 @@ class Trial:
     """One method, one number of known points, one random split. Lengths in the dataset's unit.
 
     limit: rms of the Cramer-Rao limit at the same points, NaN where unknown. coverage_95: per axis, pooled;
-    ellipsoid_95: of the 3D ellipsoid. failure: why there are no numbers, else empty.
+    ellipsoid_95: of the 3D ellipsoid. held_out points were to be measured, and unmeasured of them could not be.
+    failure: why there are no numbers, else empty.
     """
 
     method: str
@@ -33,6 +34,7 @@ class Trial:
     coverage_95: float = float("nan")
     ellipsoid_95: float = float("nan")
     nees: float = float("nan")
+    held_out: int = 0
     unmeasured: int = 0
     fit_seconds: float = float("nan")
     failure: str = ""
@@ -40,7 +42,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Row:
-    """The trials of one method with one number of known points: means, and standard errors over the seeds."""
+    """The trials of one method with one number of known points: means, and standard errors over the seeds.
+
+    The keys are NUMBERS; `measured` is the share of the held-out points that could be measured.
+    """
 
     method: str
     known: int
@@ -50,7 +55,9 @@ class Row:
     failures: tuple[str, ...]
 
 
-NUMBERS = ("rmse", "median", "limit", "rmse_over_limit", "coverage_95", "ellipsoid_95", "nees", "fit_seconds")
+NUMBERS = (
+    "rmse", "median", "limit", "rmse_over_limit", "coverage_95", "ellipsoid_95", "nees", "measured", "fit_seconds",
+)  # fmt: skip
 
 
 def compare(
@@ -75,8 +82,8 @@ def compare(
             fix=f"choose numbers below {len(data)}, or give another dataset with --check",
         )
     trials: list[Trial] = []
-    total = len(methods) * len(sizes) * seeds
-    for size in sizes:
+    total = len(methods) * len(set(sizes)) * seeds
+    for size in dict.fromkeys(sizes):  # the same size again would count the same split twice
         for seed in range(seeds):
             train, rest = (data, data) if size == len(data) else data.split(size, seed=seed)
             for name, method in methods.items():
@@ -93,7 +100,7 @@ def _trial(name: str, method: Calibrator, train: Dataset, held_out: Dataset, see
     except (FitError, NumericalError) as error:
         return Trial(name, len(train), seed, failure=error.what)
     seconds = time.perf_counter() - start
-    return trial_of(evaluate(calibration, held_out), name, len(train), seed, seconds)
+    return trial_of(evaluate(calibration, held_out, regions=False), name, len(train), seed, seconds)
 
 
 def trial_of(evaluation: Evaluation, name: str, known: int, seed: int, seconds: float) -> Trial:
@@ -104,14 +111,15 @@ def trial_of(evaluation: Evaluation, name: str, known: int, seed: int, seconds: 
         name,
         known,
         seed,
-        overall.rmse,
-        overall.median_error,
-        overall.rmse / overall.rmse_over_limit,
-        level.pooled.value,
-        level.ellipsoid.value,
-        overall.nees.value,
-        overall.unmeasured,
-        seconds,
+        rmse=overall.rmse,
+        median=overall.median_error,
+        limit=overall.rmse / overall.rmse_over_limit,
+        coverage_95=level.pooled.value,
+        ellipsoid_95=level.ellipsoid.value,
+        nees=overall.nees.value,
+        held_out=len(evaluation.data),
+        unmeasured=overall.unmeasured,
+        fit_seconds=seconds,
     )
 
 
@@ -125,8 +133,7 @@ def summarise(trials: Sequence[Trial]) -> list[Row]:
 
 def _row(trials: list[Trial]) -> Row:
     good = [trial for trial in trials if not trial.failure]
-    numbers = [{**asdict(trial), "rmse_over_limit": trial.rmse / trial.limit} for trial in good]
-    table = np.array([[row[key] for key in NUMBERS] for row in numbers], dtype=np.float64).reshape(-1, len(NUMBERS))
+    table = np.array([[_number(trial, key) for key in NUMBERS] for trial in good]).reshape(-1, len(NUMBERS))
     n = len(table)
     mean = table.mean(axis=0) if n else np.full(len(NUMBERS), np.nan)
     error = table.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(len(NUMBERS), np.nan)
@@ -138,6 +145,14 @@ def _row(trials: list[Trial]) -> Row:
         dict(zip(NUMBERS, error.tolist(), strict=True)),
         tuple(dict.fromkeys(trial.failure for trial in trials if trial.failure)),
     )
+
+
+def _number(trial: Trial, key: str) -> float:
+    if key == "rmse_over_limit":
+        return trial.rmse / trial.limit
+    if key == "measured":
+        return 1 - trial.unmeasured / trial.held_out
+    return float(getattr(trial, key))
 
 
 def as_json(trials: Sequence[Trial]) -> dict[str, Any]:

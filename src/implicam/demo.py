@@ -11,6 +11,7 @@ import numpy as np
 from implicam.calibrators import Calibration, InverseGP
 from implicam.compare import Trial, trial_of
 from implicam.dataset import Dataset, folder_files, write_dataset
+from implicam.errors import UsageError, import_extra
 from implicam.evaluate import Evaluation, evaluate
 from implicam.files import toml_text
 from implicam.progress import Progress, silent
@@ -20,6 +21,7 @@ from implicam.simulate import Rig, build_rig, random_positions, simulate, write_
 RIG, KNOWN, HELD_OUT = "bar6", 157, 500
 SETS = {"2R": "2 cameras", "2R2W": "4 cameras", "2R4W": "6 cameras"}
 SIZES = (35, 87, KNOWN)
+MADE_HERE = "# made by implicam demo, which may replace this folder\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +45,21 @@ class Demo:
 
 
 def run(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Demo:
-    """Run the demo into `folder`, which it may replace."""
+    """Run the demo into `folder`, a new one or that of an earlier demo, which it replaces."""
+    if not _may_replace(folder):
+        raise UsageError(
+            f"{folder} exists and was not made by the demo.", fix="give another folder: implicam demo OTHER-NAME"
+        )
+    import_extra("plotly", "report", "the report of the demo")  # before the work, not after
     steps = len(SETS) * len(SIZES) + 2
     progress("simulating", 0, steps)
     rig = build_rig(RIG, seed=seed)
     known, held_out = record(rig, KNOWN, seed=seed, shots=1), record(rig, HELD_OUT, seed=seed, shots=2)
     unit = known.length_unit
-    extra = {"truth.toml": toml_text(write_rig(rig)), **{f"check/{k}": v for k, v in folder_files(held_out).items()}}
+    extra = {
+        "truth.toml": MADE_HERE + toml_text(write_rig(rig)),
+        **{f"check/{k}": v for k, v in folder_files(held_out).items()},
+    }
     write_dataset(known, folder, overwrite=True, also=extra)
     rows: list[DemoRow] = []
     best: tuple[Calibration, Evaluation] | None = None
@@ -72,6 +82,13 @@ def run(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Demo:
     return demo
 
 
+def _may_replace(folder: Path) -> bool:
+    if not folder.is_dir():
+        return not folder.exists()
+    truth = folder / "truth.toml"
+    return not any(folder.iterdir()) or (truth.is_file() and truth.read_bytes().startswith(MADE_HERE.encode()))
+
+
 def record(rig: Rig, n: int, *, seed: int, shots: int) -> Dataset:
     """`n` random positions of the ball, seen by the rig; every `shots` gives others."""
     target = random_positions(rig, n, np.random.default_rng([seed, shots]))
@@ -84,7 +101,7 @@ def _one(known: Dataset, held_out: Dataset, size: int, seed: int) -> tuple[Calib
     calibration = InverseGP(seed=seed).fit(train)
     seconds = time.perf_counter() - start
     # against the check points only: the known ones that were not drawn are fewer, and differ from row to row
-    evaluation = evaluate(calibration, held_out)
+    evaluation = evaluate(calibration, held_out, regions=size == KNOWN)
     return calibration, evaluation, trial_of(evaluation, calibration.method, size, seed, seconds)
 
 

@@ -60,9 +60,9 @@ class UsageError(ImplicamError):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`"; did you mean 'cam1'?"` where a known word is close, else nothing."""
+    """`" (did you mean 'cam1'?)"` where a known word is close, else nothing."""
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def import_extra(module: str, extra: str, purpose: str) -> ModuleType:

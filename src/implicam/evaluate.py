@@ -48,9 +48,18 @@ class Evaluation:
     notes: tuple[str, ...] = ()
 
 
-def evaluate(calibration: Calibration, data: Dataset) -> Evaluation:
-    """Evaluate on the known points that the calibration was not fitted from."""
+def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -> Evaluation:
+    """Evaluate on the known points that the calibration was not fitted from.
+
+    Finding the depth of each point for the regions takes longer than everything else; `regions=False` leaves it out.
+    """
     _ = data.positions
+    if data.length_unit != calibration.data.length_unit:
+        raise DatasetError(
+            f"{data.name!r} is in {data.length_unit}, and the calibration is in {calibration.data.length_unit}.",
+            why="errors are differences of positions, so both must be in one length unit",
+            fix="convert the known positions, or calibrate in the unit of this dataset",
+        )
     names = calibration.data.observations.camera_names
     if set(names) <= set(data.observations.camera_names):
         data = data.with_cameras(names)  # regions and limit are those of the cameras that measure
@@ -67,7 +76,7 @@ def evaluate(calibration: Calibration, data: Dataset) -> Evaluation:
     if used.any():
         how += f"; {used.sum()} of this dataset were, and are left out"
     measurement = calibration.measure(held_out.observations)
-    return _judge(calibration, held_out, measurement, calibration.data.xyz, how)
+    return _judge(calibration, held_out, measurement, calibration.data.xyz, how, regions=regions)
 
 
 def cross_validate(fit: Fits, data: Dataset, k: int, *, seed: int = 0, progress: Progress = silent) -> Evaluation:
@@ -115,7 +124,13 @@ def _stacked(parts: Iterable[Measurement]) -> Measurement:
 
 
 def _judge(
-    calibration: Calibration, data: Dataset, measurement: Measurement, known_xyz: Floats, how: str
+    calibration: Calibration,
+    data: Dataset,
+    measurement: Measurement,
+    known_xyz: Floats,
+    how: str,
+    *,
+    regions: bool = True,
 ) -> Evaluation:
     truth = data.truth
     true_xyz = data.xyz if truth is None else truth.xyz
@@ -123,7 +138,7 @@ def _judge(
         measurement.xyz - true_xyz,
         measurement.cov,
         clusters=data.shots,
-        regions=_regions(data),
+        regions=_regions(data) if regions else None,
         limit=None if truth is None else truth.limit,
     )
     against = "the known positions" if truth is None else "the simulated truth"
@@ -146,15 +161,21 @@ def _regions(data: Dataset) -> dict[str, Names]:
 
 
 def _same_views(fitted: Observations, given: Observations) -> NDArray[np.bool_]:
-    """(n,) which given points are points of the fit: same name, and the same pixels in the cameras of the fit."""
+    """(n,) which given points are points of the fit: the same pixels in the cameras of the fit, whatever their name.
+
+    A table without names numbers its rows, so a name says little; the same pixels to the last bit are the same views.
+    """
     names = fitted.camera_names
     if not set(names) <= set(given.camera_names):
         return np.zeros(len(given), dtype=np.bool_)  # measuring will say what is missing
-    uv = given.with_cameras(names).uv
-    row = {str(name): i for i, name in enumerate(fitted.points)}
+    learned = set(_fingerprints(fitted))
+    return np.array([views in learned for views in _fingerprints(given.with_cameras(names))], dtype=np.bool_)
 
-    def same(i: int) -> bool:
-        at = row.get(str(given.points[i]))
-        return at is not None and np.array_equal(fitted.uv[at], uv[i], equal_nan=True)
 
-    return np.array([same(i) for i in range(len(given))], dtype=np.bool_)
+def _fingerprints(observations: Observations) -> list[bytes]:
+    """Per point its pixels as bytes; a point without any is known by its name."""
+    uv = np.where(np.isnan(observations.uv), np.nan, observations.uv + 0.0)  # one NaN, one zero
+    return [
+        views.tobytes() if np.isfinite(views).any() else str(name).encode()
+        for views, name in zip(uv, observations.points, strict=True)
+    ]

@@ -10,7 +10,10 @@ from __future__ import annotations
 import io
 import math
 import os
+import re
 import shutil
+import struct
+import sys
 import tempfile
 import zipfile
 import zlib
@@ -25,14 +28,24 @@ from numpy.typing import NDArray
 from implicam.errors import ImplicamError
 
 # A calibration or dataset is stored uncompressed by us, so a member is never larger than its file. Others may
-# deflate: text shrinks perhaps tenfold, while the bombs we refuse shrink a thousandfold.
+# deflate: text shrinks perhaps tenfold, while the bombs we refuse shrink a thousandfold. Bzip2 and LZMA may ask for
+# gigabytes before the first byte, and nobody writes NumPy files with them: they are refused.
 MAX_INFLATION = 100
 SMALL_BYTES = 1 << 24
 
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, KeyError, ValueError, OSError,
-    IndexError, OverflowError, MemoryError,
+    IndexError, OverflowError, MemoryError, struct.error,
 )  # fmt: skip
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 0x1
+
+# The one header that NumPy writes. Matching it, rather than evaluating it as Python, is all the parsing we need.
+_NPY_HEADER = re.compile(
+    r"\{\s*'descr':\s*'([<>|=]?[fiubU][0-9]{1,6})',\s*'fortran_order':\s*(True|False),"
+    r"\s*'shape':\s*\(((?:[0-9]{1,15},\s*)*(?:[0-9]{1,15}\s*)?)\)\s*(?:,\s*)?\}\s*"
+)
+_MAX_NPY_HEADER = 10_000
 
 
 @contextmanager
@@ -40,22 +53,29 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path`; on leaving without error, rename it into place."""
     path = Path(path)
     parent = _existing_folder(path.parent)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        _flush(temporary)
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with _failing_to_write(path):
+        handle, name = tempfile.mkstemp(prefix=_partial_prefix(path), dir=parent)
+        os.close(handle)
+        temporary = Path(name)
+        try:
+            yield temporary
+            _flush(temporary)
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """The same for a folder. An existing one is refused unless `overwrite`, and then swapped when all is ready."""
-    path = Path(path)
+    """The same for a folder. An existing one is refused unless `overwrite`, and then swapped when all is ready.
+
+    No system swaps two folders in one step everywhere, so a kill in the instant between the two renames leaves the
+    old folder beside its place; `left_behind` finds it, and nothing is lost.
+    """
+    path = Path(path).resolve()
+    if path.exists() and not path.is_dir():
+        raise ImplicamError(f"{path} is a file, not a folder.", fix="choose another name, or remove the file")
     if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
         raise ImplicamError(
             f"{path} already exists.",
@@ -63,20 +83,61 @@ def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             fix="choose another name, remove it, or add --overwrite",
         )
     parent = _existing_folder(path.parent)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=parent))
-    retired = temporary.with_name(temporary.name + ".old")
-    try:
-        yield temporary
-        for file in sorted(temporary.rglob("*")):
-            if file.is_file():
-                _flush(file)
-        temporary.chmod(0o777 & ~_umask())
-        if path.exists():
-            path.rename(retired)
+    with _failing_to_write(path):
+        temporary = Path(tempfile.mkdtemp(prefix=_partial_prefix(path), dir=parent))
+        try:
+            yield temporary
+            for file in sorted(temporary.rglob("*")):
+                if file.is_file():
+                    _flush(file)
+            temporary.chmod(0o777 & ~_umask())
+            _swap_in(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _swap_in(temporary: Path, path: Path) -> None:
+    if not path.exists():
         temporary.rename(path)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        shutil.rmtree(retired, ignore_errors=True)
+        return
+    retired = temporary.with_name(temporary.name + _RETIRED)
+    path.rename(retired)
+    try:
+        temporary.rename(path)
+    except BaseException:
+        retired.rename(path)
+        raise
+    shutil.rmtree(retired, ignore_errors=True)
+
+
+_RETIRED = ".old"
+
+
+def _partial_prefix(path: Path) -> str:
+    return f".{path.name}.partial-"
+
+
+def left_behind(path: Path) -> Path | None:
+    """The old folder that a kill in the middle of `replacing_folder` left beside `path`, or None."""
+    path = Path(path).absolute()
+    if path.exists() or not path.parent.is_dir():
+        return None
+    found = [
+        entry
+        for entry in path.parent.iterdir()
+        if entry.name.startswith(_partial_prefix(path)) and entry.name.endswith(_RETIRED)
+    ]
+    return max(found, default=None, key=lambda entry: entry.stat().st_mtime)
+
+
+@contextmanager
+def _failing_to_write(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ImplicamError(
+            f"cannot write {path}.", why=str(error), fix="check the name, the permissions and the free space"
+        ) from error
 
 
 def _existing_folder(parent: Path) -> Path:
@@ -138,47 +199,82 @@ Refuse = Callable[[str], ImplicamError]
 """Turns a reason into the error of the room that reads."""
 
 
-def read_zip(source: bytes, refuse: Refuse) -> dict[str, bytes]:
-    """The members of a zip, after its directory has been checked; `refuse` makes the error."""
+def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -> dict[str, bytes]:
+    """The members of a zip, after its directory has been checked; `refuse` makes the error.
+
+    most: how many bytes all members may have together; without it, what a zip of this size can honestly hold.
+    """
     try:
-        with zipfile.ZipFile(io.BytesIO(source)) as archive:
+        with zipfile.ZipFile(source if isinstance(source, Path) else io.BytesIO(source)) as archive:
+            size = source.stat().st_size if isinstance(source, Path) else len(source)
             entries = archive.infolist()
-            if len(entries) != len({entry.filename for entry in entries}):
-                raise refuse("it names a member twice")
-            declared = sum(entry.file_size for entry in entries)
-            if declared > SMALL_BYTES + MAX_INFLATION * len(source):
-                raise refuse(f"it claims to unpack to {declared:,} bytes from {len(source):,}")
-            return {entry.filename: archive.read(entry) for entry in entries}
+            _check_directory(entries, size, inflated_bytes(size) if most is None else most, refuse)
+            return {entry.filename: _member(archive, entry) for entry in entries}
     except _ZIP_ERRORS as error:
-        raise refuse(f"not a readable zip: {error or type(error).__name__}") from error
+        raise refuse(f"not a readable zip: {str(error)[:200] or type(error).__name__}") from error
 
 
-def read_npz(source: bytes, refuse: Refuse) -> dict[str, NDArray[Any]]:
+def inflated_bytes(size: int) -> int:
+    """How much a zip of `size` bytes may honestly hold."""
+    return SMALL_BYTES + MAX_INFLATION * size
+
+
+def _check_directory(entries: list[zipfile.ZipInfo], size: int, most: int, refuse: Refuse) -> None:
+    if len(entries) != len({entry.filename for entry in entries}):
+        raise refuse("it names a member twice")
+    declared = sum(entry.file_size for entry in entries)
+    if declared > most:
+        raise refuse(f"it claims to unpack to {declared:,} bytes from {size:,}")
+    for entry in entries:
+        if entry.flag_bits & _ENCRYPTED:
+            raise refuse(f"its member {entry.filename[:60]!r} is encrypted")
+        if entry.compress_type not in _COMPRESSIONS:
+            raise refuse(f"its member {entry.filename[:60]!r} is compressed by an unusual method")
+
+
+def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
+    # read() without a number inflates everything first and cuts to the declared size afterwards: a bomb goes off
+    with archive.open(entry) as file:
+        content = file.read(entry.file_size)
+    if len(content) != entry.file_size:
+        raise EOFError(f"member {entry.filename[:60]!r} is cut off")
+    return content
+
+
+def read_npz(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz; no pickles, and no array larger than the bytes it came in."""
-    members = read_zip(source, refuse)
-    return {name.removesuffix(".npy"): _read_npy(name, content, refuse) for name, content in members.items()}
+    members = read_zip(source, refuse, most=most)
+    for name in members:
+        if not name.endswith(".npy"):
+            raise refuse(f"its member {name[:60]!r} is no array")
+    return {name.removesuffix(".npy"): _read_npy(name[:60], content, refuse) for name, content in members.items()}
 
 
 def _read_npy(name: str, content: bytes, refuse: Refuse) -> NDArray[Any]:
-    buffer = io.BytesIO(content)
+    if content[:8] not in (b"\x93NUMPY\x01\x00", b"\x93NUMPY\x02\x00"):
+        raise refuse(f"array {name!r} is not in a format that NumPy writes")
+    start, width = (10, "<H") if content[6] == 1 else (12, "<I")
+    if len(content) < start:
+        raise refuse(f"array {name!r} is cut off")
+    end = start + struct.unpack(width, content[8:start])[0]
+    header = content[start : min(end, start + _MAX_NPY_HEADER)].decode("latin-1")
+    match = _NPY_HEADER.fullmatch(header)
+    if match is None:
+        raise refuse(
+            f"array {name!r} holds objects, which could run code, or has a damaged header: {header[:80].strip()!r}; "
+            "only numbers and text are read"
+        )
     try:
-        version = np.lib.format.read_magic(buffer)
-        if version == (1, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_1_0(buffer)
-        elif version == (2, 0):
-            shape, fortran, dtype = np.lib.format.read_array_header_2_0(buffer)
-        else:
-            raise refuse(f"array {name!r} has the unknown format version {version}")
-    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, OverflowError) as error:
-        raise refuse(f"array {name!r} has a damaged header: {error}") from error
-    if dtype.kind not in "fiubU":
-        raise refuse(f"array {name!r} holds {dtype} objects, which could run code; only numbers and text are read")
-    expected = math.prod(shape) * dtype.itemsize
-    rest = content[buffer.tell() :]
-    if any(size < 0 for size in shape) or expected != len(rest):
-        raise refuse(f"array {name!r} claims {expected:,} bytes and has {len(rest):,}")
-    try:
-        flat = np.frombuffer(rest, dtype=dtype) if expected else np.zeros(0, dtype=dtype)
-        return flat.reshape(shape, order="F" if fortran else "C").copy()
+        dtype = np.dtype(match[1])
+        shape = tuple(int(size) for size in match[3].replace(",", " ").split())
+        expected = math.prod(shape) * dtype.itemsize
+        if expected != len(content) - end:
+            raise ValueError(f"its shape {shape} takes {expected:,} bytes, and it has {max(0, len(content) - end):,}")
+        flat = np.frombuffer(content, dtype=dtype, offset=end) if expected else np.zeros(0, dtype=dtype)
+        if dtype.kind == "U" and expected:
+            letters = np.frombuffer(content, dtype=np.dtype("u4").newbyteorder(dtype.byteorder), offset=end)
+            if letters.max() > sys.maxunicode:  # NumPy would make a str of it that crashes Python
+                raise ValueError("its text has letters that do not exist")
+        return flat.reshape(shape, order="F" if match[2] == "True" else "C").copy()
     except (ValueError, TypeError) as error:
-        raise refuse(f"array {name!r} is damaged: {error}") from error
+        raise refuse(f"array {name!r} is damaged: {str(error)[:200]}") from error

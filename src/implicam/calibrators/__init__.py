@@ -22,12 +22,8 @@ COMING = ("forward-gp", "mlp", "explicit")
 def calibrator(method: str, **options: Any) -> Calibrator:
     """The calibrator of a method by name; options that are None are left at their default."""
     if method not in METHODS:
-        coming = method in COMING
-        raise UsageError(
-            f"method {method!r} is {'not in this version yet' if coming else 'not known'}"
-            f"{'' if coming else did_you_mean(method, METHODS)}.",
-            fix=f"the methods are {', '.join(METHODS)}",
-        )
+        known = "not in this version yet" if method in COMING else f"not known{did_you_mean(method, METHODS)}"
+        raise UsageError(f"method {method!r} is {known}.", fix=f"this version has {', '.join(METHODS)}")
     made: Calibrator = METHODS[method][0](**{key: value for key, value in options.items() if value is not None})
     return made
 

@@ -117,12 +117,8 @@ def _usable(data: Dataset) -> tuple[Dataset, tuple[Unused, ...]]:
     _ = data.positions  # a clear error where there are none
     per_camera = ", ".join(f"{name} sees {count}" for name, count in zip(names, seen.sum(axis=0), strict=True))
     least = 5  # fewer than a line and a noise can be learned from
-    require_points(
-        int(complete.sum()),
-        least,
-        InverseGP.method,
-        f"only points seen by every camera can be used; of {len(data)} points, {per_camera}",
-    )
+    why = f"only points seen by every camera can be used; of {len(data)} points, {per_camera}" if unused else ""
+    require_points(int(complete.sum()), least, InverseGP.method, why)
     usable = data.select(complete)
     for axis, values in zip(AXES, usable.xyz.T, strict=True):
         if np.ptp(values) == 0:
@@ -219,10 +215,11 @@ class InverseGPCalibration:
         ]
         if not lattice:
             return []
+        in_shots = len(np.unique(self.data.shots)) < len(self.data)
         return [
             f"The known positions lie on a lattice ({', '.join(lattice)} at {len(self.data)} points). inverse-gp may "
-            "learn its planes instead of the space between them: judge it by --leave-out shot or by points off the "
-            "lattice, not by a random split."
+            "learn its planes instead of the space between them: judge it by points off the lattice"
+            f"{' or by --leave-out shot' * in_shots}, not by a random split."
         ]
 
     def residuals(self) -> dict[str, Any]:

@@ -25,11 +25,16 @@ STEPS, LEARNING_RATE = 100, 0.1
 
 def train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperparameters, ...]:
     """Hyperparameters of x, y and z after GPyTorch's training; X standardised pixels, Y in metres."""
-    import_extra("torch", "paper", "the paper preset")
+    torch = import_extra("torch", "paper", "the paper preset")
     import_extra("gpytorch", "paper", "the paper preset")
     outputs = []
-    for i, y in enumerate(Y.T):
-        outputs.append(train_one(X, y, lambda step, i=i: progress("training", i * STEPS + step, 3 * STEPS)))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # see implicam.threads: its pool was measured to stall for 20 s beside another process
+    try:
+        for i, y in enumerate(Y.T):
+            outputs.append(train_one(X, y, lambda step, i=i: progress("training", i * STEPS + step, 3 * STEPS)))
+    finally:
+        torch.set_num_threads(threads)
     return tuple(outputs)
 
 
@@ -56,9 +61,9 @@ def train_one(X: Floats, y: Floats, step_done: Any = lambda step: None) -> Hyper
     kernel = model.covar_module
     lengthscale = kernel.base_kernel.lengthscale.detach().numpy().ravel()
     return Hyperparameters(
-        Kernel("squared-exponential", float(kernel.outputscale), lengthscale),
-        float(likelihood.noise),
-        float(model.mean_module.constant),
+        Kernel("squared-exponential", kernel.outputscale.item(), lengthscale),
+        likelihood.noise.item(),
+        model.mean_module.constant.item(),
     )
 
 

@@ -101,15 +101,15 @@ def same_cameras(trained: Observations, observations: Observations) -> Observati
 def why_not_all_seen(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> str:
     """The reason for a point that not every camera saw."""
     blind = [name for name, ok in zip(names, seen, strict=True) if not ok]
-    return f"{method} needs all {len(names)} cameras; not seen by {', '.join(blind)}"
+    return f"{method} needs every camera; not seen by {', '.join(blind)}"
 
 
-def require_points(n: int, least: int, method: str, why: str) -> None:
-    """FitError for fewer usable points than a method needs."""
+def require_points(n: int, least: int, method: str, why: str = "") -> None:
+    """FitError for fewer usable points than a method needs; `why` others cannot be used, where there are others."""
     if n < least:
         raise FitError(
             f"{n} usable known point{'s' * (n != 1)}; {method} needs at least {least}.",
             why=why,
-            fix="add known points, leave out the camera that misses most of them (--without NAME), or choose a method "
-            "that copes with missing views",
+            fix="add known points"
+            + (", or leave out the camera that misses most of them (--without NAME)" if why else ""),
         )

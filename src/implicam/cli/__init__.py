@@ -1,12 +1,15 @@
 """The command line: thin. Each command reads, calls the library, prints.
 
-Exit codes: 0 fine, 1 failed, 2 wrong usage. Errors are three lines (what, why, fix); `--debug` adds the traceback.
+Exit codes: 0 fine, 1 failed, 2 wrong usage. Errors are three lines (what, why, fix); `--debug`, anywhere on the line,
+adds the traceback.
 """
 
 from __future__ import annotations
 
 import sys
+import traceback
 from collections.abc import Sequence
+from typing import NoReturn
 
 from implicam.errors import ImplicamError, UsageError
 
@@ -16,17 +19,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     given = [word for word in given if word != "--debug"]
-    from implicam.cli.commands import app  # late, so that a broken installation still prints a clear error
+    from implicam.cli.commands import app  # late: `import implicam.cli` stays cheap
 
     try:
         app(given, prog_name="implicam")
     except ImplicamError as error:
-        if debug:
-            raise
-        from implicam.cli.show import error_lines
+        _fail(str(error), 2 if isinstance(error, UsageError) else 1, debug)
+    except Exception as error:
+        _fail(str(_unexpected(error)), 1, debug)
 
-        error_lines(str(error))
-        sys.exit(2 if isinstance(error, UsageError) else 1)
+
+def _fail(text: str, code: int, debug: bool) -> NoReturn:
+    """Say what is wrong, with the traceback of the exception being handled under `--debug`, and exit."""
+    from implicam.cli.show import error_lines
+
+    if debug:
+        traceback.print_exc()
+    error_lines(text)
+    sys.exit(code)
+
+
+def _unexpected(error: Exception) -> ImplicamError:
+    if isinstance(error, OSError):
+        return ImplicamError(f"{error.filename or 'a file'}: {error.strerror or error}.", fix="check the file")
+    return ImplicamError(
+        f"an unexpected {type(error).__name__}: {error}",
+        why="probably a mistake in implicam itself",
+        fix="run the command again with --debug and report what it prints",
+    )
 
 
 if __name__ == "__main__":

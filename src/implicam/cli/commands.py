@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -15,9 +15,9 @@ import typer
 from implicam import calibration_file
 from implicam.calibrators import DEFAULT_METHOD, Calibration, calibrator, load_calibration
 from implicam.cli import show
-from implicam.compare import as_json, compare, summarise
+from implicam.compare import Trial, as_json, compare, summarise
 from implicam.dataset import Dataset, folder_files, read_dataset, write_dataset
-from implicam.errors import UsageError
+from implicam.errors import DatasetError, UsageError, import_extra
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import replacing, toml_text
 from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate, write_rig
@@ -35,7 +35,7 @@ app = typer.Typer(
 
 EXAMPLES = {
     "demo": "implicam demo",
-    "simulate": "implicam simulate my-rig --rig bar6 --positions random --points 157 --check 300",
+    "simulate": "implicam simulate my-rig --positions random --points 157 --check 300",
     "calibrate": "implicam calibrate my-rig -o my-rig.implicam",
     "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
     "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
@@ -46,6 +46,8 @@ EXAMPLES = {
 }
 """Command -> an example, in an order in which they can be run."""
 
+CALIBRATION_SUFFIX = ".implicam"
+FILE_SUFFIXES = (".csv", ".parquet", ".npz")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -76,20 +78,36 @@ class Frame(StrEnum):
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="The same seed gives the same numbers.")]
-Unit = Annotated[str | None, typer.Option("--unit", help="Length unit of a wide CSV that does not state it.")]
-Method = Annotated[str | None, typer.Option("--method", help=f"Calibration method (default {DEFAULT_METHOD}).")]
-Kernel = Annotated[str | None, typer.Option("--kernel", help="inverse-gp: squared-exponential or matern-5/2.")]
-Preset = Annotated[
-    str | None, typer.Option("--preset", help='inverse-gp: standardised, or "paper" for the paper\'s own software.')
+Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="The same seed gives the same numbers.")]
+Unit = Annotated[
+    str | None, typer.Option("--unit", metavar="UNIT", help="Length unit of a wide CSV that does not state it.")
 ]
-Cameras = Annotated[str | None, typer.Option("--cameras", help="Use only these cameras, separated by commas.")]
-Without = Annotated[str | None, typer.Option("--without", help="Leave these cameras out, separated by commas.")]
+Method = Annotated[
+    str | None, typer.Option("--method", metavar="NAME", help=f"Calibration method (default {DEFAULT_METHOD}).")
+]
+Kernel = Annotated[
+    str | None, typer.Option("--kernel", metavar="NAME", help="inverse-gp: squared-exponential or matern-5/2.")
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset", metavar="NAME", help='inverse-gp: standardised, or "paper" for the paper\'s own software.'
+    ),
+]
+Cameras = Annotated[
+    str | None, typer.Option("--cameras", metavar="LIST", help="Use only these cameras, separated by commas.")
+]
+Without = Annotated[
+    str | None, typer.Option("--without", metavar="LIST", help="Leave these cameras out, separated by commas.")
+]
 Report = Annotated[Path | None, typer.Option("--report", help="Also write a one-page HTML report with a 3D view.")]
 
 
 def _read(path: Path, unit: str | None, cameras: str | None = None, without: str | None = None) -> Dataset:
-    data = read_dataset(path, unit=unit)
+    return _chosen(read_dataset(path, unit=unit), cameras, without)
+
+
+def _chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:
     if cameras:
         data = data.with_cameras([name.strip() for name in cameras.split(",")])
     if without:
@@ -110,47 +128,70 @@ def demo_command(
     """Simulate a rig, calibrate, measure, judge, report: everything once, in about a minute."""
     from implicam.demo import run
 
-    if folder.exists() and any(folder.iterdir()) and not (folder / "truth.toml").exists():
-        raise UsageError(
-            f"{folder} exists and was not made by the demo.", fix="give another folder: implicam demo OTHER-NAME"
-        )
+    _must_be_folder(folder)
     with show.progress(json) as progress:
         made = run(folder, seed=seed, progress=progress)
     files = {key: str(getattr(made, key)) for key in ("dataset", "calibration", "measured", "report")}
     if json:
         show.emit_json({"rows": [{"cameras": r.cameras, **asdict(r.trial)} for r in made.rows], **files})
         return
-    console = show.out()
-    console.print(show.demo_table(made))
-    console.print("limit: the Cramer-Rao bound, what nobody can beat with this pixel noise and perfectly known cameras")
+    show.table(show.demo_table(made))
+    show.line(
+        "limit: the Cramer-Rao bound; with this pixel noise nobody can do better, even with perfectly known cameras"
+    )
     for key, path in files.items():
-        console.print(f"  {key:<12}{path}", soft_wrap=True)
+        show.line(f"  {key:<12}{path}")
+
+
+def _must_be_folder(path: Path) -> None:
+    if path.suffix.lower() in FILE_SUFFIXES:
+        raise UsageError(
+            f"{path} is the name of a file, and this command writes a folder.",
+            fix="leave the ending out; implicam convert makes a file of it",
+        )
 
 
 @_command("simulate")
 def simulate_command(
     out: Annotated[Path, typer.Argument(help="Folder to write the dataset to.")],
-    rig: Annotated[str, typer.Option(help="bar6 (the paper's), stereo, dome8, or any barN, domeN.")] = "bar6",
+    rig: Annotated[
+        str, typer.Option(metavar="NAME", help="bar6 (the paper's), stereo, dome8, or any barN, domeN.")
+    ] = "bar6",
     target: Annotated[Target, typer.Option(help="A ball on a robot, or a board on a slide.")] = Target.ball,
     positions: Annotated[Positions, typer.Option(help="Where the ball goes.")] = Positions.grid,
-    points: Annotated[int, typer.Option(min=1, help="How many random positions.")] = 157,
-    grid: Annotated[str, typer.Option(help="Positions of the grid along, down and away.")] = "5x5x7",
-    boards: Annotated[int, typer.Option(min=1, help="How many positions of the board.")] = 20,
-    check: Annotated[int, typer.Option(min=0, help="Also write so many random positions to OUT/check.")] = 0,
-    cameras: Annotated[str | None, typer.Option(help="2R, 2R2W, 2R4W, or names separated by commas.")] = None,
-    noise: Annotated[float, typer.Option(min=0, help="Pixel noise, standard deviation.")] = 0.2,
-    lens_error: Annotated[float, typer.Option(min=0, help="Error no lens model contains, rms pixels.")] = 0.5,
-    robot_noise: Annotated[float, typer.Option(min=0, help="Error of the known positions, sd per axis.")] = 0.0,
-    missing: Annotated[float, typer.Option(min=0, max=1, help="Share of views that are missing.")] = 0.0,
-    outliers: Annotated[float, typer.Option(min=0, max=1, help="Share of views that are wrong.")] = 0.0,
+    points: Annotated[int, typer.Option(min=1, metavar="N", help="How many random positions.")] = 157,
+    grid: Annotated[str, typer.Option(metavar="AxBxC", help="Positions of the grid along, down and away.")] = "5x5x7",
+    boards: Annotated[int, typer.Option(min=1, metavar="N", help="How many positions of the board.")] = 20,
+    check: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Also write so many random positions to OUT/check.")
+    ] = 0,
+    cameras: Annotated[
+        str | None, typer.Option(metavar="LIST", help="2R, 2R2W, 2R4W, or names separated by commas.")
+    ] = None,
+    noise: Annotated[float, typer.Option(min=0, metavar="PX", help="Pixel noise, standard deviation.")] = 0.2,
+    lens_error: Annotated[
+        float, typer.Option(min=0, metavar="PX", help="Error no lens model contains, rms pixels.")
+    ] = 0.5,
+    robot_noise: Annotated[
+        float, typer.Option(min=0, metavar="LENGTH", help="Error of the known positions, sd per axis.")
+    ] = 0.0,
+    missing: Annotated[
+        float, typer.Option(min=0, max=1, metavar="SHARE", help="Share of views that are missing.")
+    ] = 0.0,
+    outliers: Annotated[
+        float, typer.Option(min=0, max=1, metavar="SHARE", help="Share of views that are wrong.")
+    ] = 0.0,
     frame: Annotated[Frame, typer.Option(help="World frame: axes along the bench, or any.")] = Frame.robot,
-    unit: Annotated[str, typer.Option(help="mm or m.")] = "mm",
+    unit: Annotated[str, typer.Option(metavar="UNIT", help="mm or m.")] = "mm",
     seed: Seed = 0,
-    shots_seed: Annotated[int | None, typer.Option(min=0, help="Record the same rig again with other noise.")] = None,
+    shots_seed: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Record the same rig again with other noise.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it exists.")] = False,
     json: Json = False,
 ) -> None:
     """Write a dataset of a simulated rig, with the truth and the Cramer-Rao limit of every point beside it."""
+    _must_be_folder(out)
     if unit not in ("mm", "m"):
         raise UsageError(f"a simulated rig has no unit {unit!r}.", fix="choose mm or m")
     built = build_rig(
@@ -175,12 +216,16 @@ def simulate_command(
     if json:
         show.emit_json({"dataset": str(out), "points": len(data), "views": seen, "check_points": check})
     else:
-        show.out().print(f"{out}: {len(data)} points, {seen} views in {len(data.cameras)} cameras", soft_wrap=True)
+        show.line(f"{out}: {len(data)} points, {seen} views in {len(data.cameras)} cameras")
+        if check:
+            show.line(f"{out / 'check'}: {check} random positions to judge by")
 
 
 def _grid(text: str) -> tuple[int, int, int]:
     try:
         a, b, c = (int(part) for part in text.lower().split("x"))
+        if min(a, b, c) < 1:
+            raise ValueError(text)
     except ValueError:
         raise UsageError(f"--grid {text!r} is not a grid.", fix="write three numbers, for example 5x5x7") from None
     return a, b, c
@@ -193,7 +238,7 @@ def calibrate_command(
     method: Method = None,
     kernel: Kernel = None,
     preset: Preset = None,
-    points: Annotated[int | None, typer.Option(min=1, help="Use so many points, drawn at random.")] = None,
+    points: Annotated[int | None, typer.Option(min=1, metavar="N", help="Use so many points, drawn at random.")] = None,
     cameras: Cameras = None,
     without: Without = None,
     unit: Unit = None,
@@ -201,6 +246,10 @@ def calibrate_command(
     json: Json = False,
 ) -> None:
     """Learn the rig from known points; points kept back with --points are there for `implicam evaluate`."""
+    if output.suffix.lower() != CALIBRATION_SUFFIX:
+        raise UsageError(
+            f"{output} is no name for a calibration.", fix=f"end it in {CALIBRATION_SUFFIX}: -o {output.stem}.implicam"
+        )
     data = _read(dataset, unit, cameras, without)
     if points is not None and points != len(data):
         data, _ = data.split(points, seed=seed)
@@ -222,18 +271,11 @@ def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> Non
         return
     unit = calibration.data.length_unit
     rms = residuals["leave_one_out_rms"]
-    show.out().print(
-        f"{output}: {calibration.method} from {residuals['points_used']} points; leaving each out in turn, the rest "
-        f"predicts it within {', '.join(f'{axis} {show.number(value)}' for axis, value in rms.items())} {unit} rms",
-        soft_wrap=True,
-    )
-    reasons: dict[str, int] = {}
-    for entry in calibration.unused:
-        reasons[entry.reason] = reasons.get(entry.reason, 0) + 1
-    for reason, count in reasons.items():
-        show.note(f"{count} known point{'s' * (count != 1)} not used: {reason}")
-    for text in notes:
-        show.note(text)
+    show.line(f"{output}: {calibration.method} from {residuals['points_used']} points")
+    within = ", ".join(f"{axis} {show.number(value)}" for axis, value in rms.items())
+    show.line(f"each left out in turn is predicted from the rest within {within} {unit} rms")
+    show.notes(show.counted((entry.reason for entry in calibration.unused), "known points not used"))
+    show.notes(notes)
 
 
 @_command("measure")
@@ -246,7 +288,7 @@ def measure_command(
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
     fitted = load_calibration(calibration)
-    data = read_dataset(dataset, unit=unit or fitted.data.length_unit)
+    data = _read_to_measure(dataset, unit, fitted.data.length_unit)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
         measured = fitted.measure(data.observations)
@@ -263,9 +305,18 @@ def measure_command(
     if count:
         text += f", typical sd {', '.join(f'{a} {show.number(v)}' for a, v in zip('xyz', typical, strict=True))} "
         text += measured.length_unit
-    show.out().print(text, soft_wrap=True)
-    for reason in show.reasons(measured):
-        show.note(reason)
+    show.line(text)
+    show.notes(show.reasons(measured))
+
+
+def _read_to_measure(path: Path, unit: str | None, likely: str) -> Dataset:
+    """The unit of data to be measured does not matter; a wide CSV that states none is read as in the `likely` one."""
+    try:
+        return read_dataset(path, unit=unit)
+    except DatasetError:
+        if unit is not None or path.suffix.lower() != ".csv":
+            raise
+        return read_dataset(path, unit=likely)
 
 
 def _typical(sd: Any) -> list[float]:
@@ -275,11 +326,14 @@ def _typical(sd: Any) -> list[float]:
 
 @_command("evaluate")
 def evaluate_command(
-    paths: Annotated[
-        list[Path], typer.Argument(metavar="[FILE] DATASET", help="A calibration and known points; or one, with --cv.")
-    ],
-    cv: Annotated[int | None, typer.Option("--cv", min=2, help="Hold each of so many folds out in turn.")] = None,
-    leave_out: Annotated[str | None, typer.Option("--leave-out", help='"shot": hold each shot out in turn.')] = None,
+    file: Annotated[Path, typer.Argument(help="A calibration; with --cv or --leave-out, also known points.")],
+    dataset: Annotated[Path | None, typer.Argument(help="Known points that the calibration has not seen.")] = None,
+    cv: Annotated[
+        int | None, typer.Option("--cv", min=2, metavar="K", help="Hold each of K random folds out in turn.")
+    ] = None,
+    leave_out: Annotated[
+        str | None, typer.Option("--leave-out", metavar="shot", help="Hold each shot (a board, a plane) out in turn.")
+    ] = None,
     report: Report = None,
     method: Method = None,
     kernel: Kernel = None,
@@ -290,17 +344,15 @@ def evaluate_command(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Hold the error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region.
-
-    FILE DATASET judges a calibration on points it was not fitted from. With --cv K or --leave-out shot, give a dataset
-    (and a method) or a calibration file (which carries its own data and options).
-    """
-    _check_evaluate(paths, cv, leave_out)
+    """Hold the error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region."""
+    _check_evaluate(dataset, cv, leave_out, any((method, kernel, preset)))
+    if report is not None:
+        _need_plotly()
     with show.progress(json) as progress:
-        if cv is None and leave_out is None:
-            evaluation = evaluate(load_calibration(paths[0]), _read(paths[1], unit, cameras, without))
+        if dataset is not None:
+            evaluation = evaluate(load_calibration(file), _read(dataset, unit, cameras, without))
         else:
-            fit, data = _fit_and_data(paths[0], method, kernel, preset, seed, cameras, without, unit)
+            fit, data = _fit_and_data(file, method, kernel, preset, seed, cameras, without, unit)
             if cv is not None:
                 evaluation = cross_validate(fit, data, cv, seed=seed, progress=progress)
             else:
@@ -310,31 +362,39 @@ def evaluate_command(
     _tell_evaluation(evaluation, report, json)
 
 
-def _check_evaluate(paths: list[Path], cv: int | None, leave_out: str | None) -> None:
+def _check_evaluate(dataset: Path | None, cv: int | None, leave_out: str | None, options: bool) -> None:
     if leave_out not in (None, "shot"):
         raise UsageError(f"--leave-out {leave_out!r} is not known.", fix="write --leave-out shot")
     if cv is not None and leave_out is not None:
         raise UsageError("--cv and --leave-out exclude each other.", fix="give one of them")
     in_turn = cv is not None or leave_out is not None
-    if in_turn and len(paths) != 1:
+    if in_turn and dataset is not None:
         raise UsageError("--cv and --leave-out take one path.", fix="give the dataset, or the calibration file")
-    if not in_turn and len(paths) != 2:
+    if not in_turn and dataset is None:
         raise UsageError(
             "evaluate needs a calibration file and a dataset.",
             fix="implicam evaluate FILE DATASET, or implicam evaluate DATASET --cv 10",
         )
+    if not in_turn and options:
+        raise _own_options()
 
 
 def _fit_and_data(
     path: Path, method: str | None, kernel: str | None, preset: str | None, seed: int, cameras: str | None,
     without: str | None, unit: str | None,
 ) -> tuple[Any, Dataset]:  # fmt: skip
-    if path.suffix == ".implicam":
+    if path.suffix.lower() == CALIBRATION_SUFFIX:
         if method or kernel or preset:
-            raise UsageError("a calibration file brings its own method and options.", fix="leave --method and such out")
+            raise _own_options()
         fitted = load_calibration(path)
-        return fitted.refit, fitted.data
+        return fitted.refit, _chosen(fitted.data, cameras, without)
     return _calibrator(method, kernel, preset, seed).fit, _read(path, unit, cameras, without)
+
+
+def _own_options() -> UsageError:
+    return UsageError(
+        "a calibration file brings its own method and options.", fix="leave out --method, --kernel and --preset"
+    )
 
 
 def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) -> None:
@@ -346,16 +406,19 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
              "report": None if report is None else str(report)}
         )  # fmt: skip
         return
-    console = show.out()
-    console.print(f"{evaluation.method} on {evaluation.data.name}: {evaluation.how}", soft_wrap=True)
+    show.line(f"{evaluation.method} on {evaluation.data.name}: {evaluation.how}")
     for table in show.evaluation_tables(evaluation):
-        console.print(table)
-    overall = evaluation.coverage.overall
-    console.print(f"error bars: {overall.verdict} (multiply by {show.number(overall.sd_factor)} for 95 % to hold 95 %)")
+        show.table(table)
+    show.line(show.verdict(evaluation.coverage.overall))
     if report is not None:
-        console.print(f"report: {report}", soft_wrap=True)
-    for text in (*show.reasons(evaluation.measurement), *evaluation.notes):
-        show.note(text)
+        show.line(f"report: {report}")
+    show.notes(show.reasons(evaluation.measurement))
+    show.notes(evaluation.notes)
+
+
+def _need_plotly() -> None:
+    """Say what is missing before the work, not after."""
+    import_extra("plotly", "report", "the HTML report")
 
 
 def _write_report(evaluation: Evaluation, path: Path) -> None:
@@ -369,18 +432,25 @@ def _write_report(evaluation: Evaluation, path: Path) -> None:
 def compare_command(
     dataset: Annotated[Path, typer.Argument(help="Known points.")],
     methods: Annotated[
-        str | None, typer.Option("--methods", help="For example inverse-gp,inverse-gp:matern-5/2,inverse-gp:paper")
+        str | None,
+        typer.Option(
+            "--methods", metavar="LIST", help="Separated by commas; a variant follows a colon (default: all)."
+        ),
     ] = None,
-    train: Annotated[str | None, typer.Option("--train", help="Numbers of known points, such as 17,35,87.")] = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Random splits for each number.")] = 5,
-    check: Annotated[Path | None, typer.Option("--check", help="Evaluate on this dataset of the same rig.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png or .pdf).")] = None,
+    train: Annotated[
+        str | None, typer.Option("--train", metavar="LIST", help="Numbers of known points, such as 17,35,87.")
+    ] = None,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Random splits for each number.")] = 5,
+    check: Annotated[Path | None, typer.Option("--check", help="Judge on this dataset of the same rig.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf or .svg).")] = None,
     cameras: Cameras = None,
     without: Without = None,
     unit: Unit = None,
     json: Json = False,
 ) -> None:
     """All methods on the same splits: one table, one figure, error bars over seeds."""
+    if output is not None:
+        _check_figure(output)
     data = _read(dataset, unit, cameras, without)
     names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
     check_data = None if check is None else _read(check, unit, cameras, without)
@@ -394,9 +464,9 @@ def compare_command(
         show.emit_json({"length_unit": data.length_unit, **as_json(trials), "figure": output and str(output)})
         return
     rows = summarise(trials)
-    show.out().print(show.compare_table(rows, data.length_unit))
+    show.table(show.compare_table(rows, data.length_unit))
     if output is not None:
-        show.out().print(f"figure: {output}", soft_wrap=True)
+        show.line(f"figure: {output}")
     for row in rows:
         for failure in row.failures:
             show.note(f"{row.method} with {row.known} points failed: {failure}")
@@ -413,27 +483,36 @@ def _available_methods() -> list[str]:
 
 def _named_method(name: str) -> Any:
     method, _, variant = name.partition(":")
+    if variant == "paper":
+        import_extra("gpytorch", "paper", "the paper preset")  # now, so that no fit is charged for it
     option = {"paper": {"preset": "paper"}, "": {}}.get(variant, {"kernel": variant})
     return calibrator(method, **option)
 
 
 def _sizes(text: str | None, n: int) -> list[int]:
     if text is None:
-        return sorted({max(5, round(n * share)) for share in (0.1, 0.2, 0.5, 0.9)} - {n})
+        return sorted({min(n - 1, max(5, round(n * share))) for share in (0.1, 0.2, 0.5, 0.9)})
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
         raise UsageError(f"--train {text!r} is not a list of numbers.", fix="write for example 17,35,87") from None
 
 
-def _write_figure(trials: Any, unit: str, path: Path) -> None:
+def _check_figure(path: Path) -> None:
+    """Before the work, not after."""
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise UsageError(f"{path} is no picture.", fix="end the name in .png, .pdf or .svg")
+    import_extra("matplotlib", "report", "a figure for print")
+
+
+def _write_figure(trials: Sequence[Trial], unit: str, path: Path) -> None:
     from implicam.figures import compare_figure
 
-    if path.suffix not in (".png", ".pdf", ".svg"):
-        raise UsageError(f"{path} is no picture.", fix="end the name in .png, .pdf or .svg")
-    figure = compare_figure([asdict(trial) for trial in trials if not trial.failure], unit=unit)
+    # its right-hand side shows the share inside the 95 % ellipsoid
+    rows = [{**asdict(t), "coverage_95": t.ellipsoid_95} for t in trials if not t.failure]
+    figure = compare_figure(rows, unit=unit)
     with replacing(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:], dpi=160)
+        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=160)
 
 
 @_command("report")
@@ -445,6 +524,7 @@ def report_command(
     json: Json = False,
 ) -> None:
     """Write a one-page HTML report with an interactive 3D view."""
+    _need_plotly()
     fitted = load_calibration(calibration)
     with show.progress(json) as progress:
         if dataset is None:
@@ -455,7 +535,7 @@ def report_command(
     if json:
         show.emit_json({"report": str(output), "how": evaluation.how})
     else:
-        show.out().print(f"{output}: {evaluation.how}", soft_wrap=True)
+        show.line(f"{output}: {evaluation.how}")
 
 
 @_command("convert")
@@ -467,12 +547,14 @@ def convert_command(
     json: Json = False,
 ) -> None:
     """Write a dataset in another form: folder, wide CSV, Parquet, NPZ; nothing is lost."""
+    if out.exists() and out.resolve() == dataset.resolve():
+        raise UsageError(f"{dataset} would be replaced by itself.", fix="give another name to write to")
     data = read_dataset(dataset, unit=unit)
     write_dataset(data, out, overwrite=overwrite)
     if json:
         show.emit_json({"dataset": str(out), "points": len(data)})
     else:
-        show.out().print(f"{out}: {len(data)} points, {len(data.cameras)} cameras", soft_wrap=True)
+        show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
 
 
 @_command("info")
@@ -486,7 +568,7 @@ def info_command(
     if json:
         show.emit_json(table)
     else:
-        show.out().print(toml_text(table), markup=False, soft_wrap=True)
+        show.line(toml_text(table).rstrip())
 
 
 def _version(shown: bool) -> None:

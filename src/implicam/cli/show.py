@@ -6,12 +6,14 @@ import json
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement as Widths
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -30,12 +32,13 @@ from implicam.evaluate import Evaluation
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 
+MOST_NOTES = 6
 err = Console(stderr=True, highlight=False)
 
 
-def out() -> Console:
+def out(width: int | None = None) -> Console:
     """The console of results; made anew so that it follows a redirected stdout."""
-    return Console(highlight=False, soft_wrap=False)
+    return Console(highlight=False, width=width)
 
 
 @contextmanager
@@ -70,6 +73,11 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def line(text: str) -> None:
+    """A line of result on stdout, never wrapped."""
+    out().print(escape(text), soft_wrap=True)
+
+
 def say(text: str) -> None:
     """A line of talk on stderr."""
     err.print(escape(text), soft_wrap=True)
@@ -99,82 +107,143 @@ def number(value: float, digits: int = 3) -> str:
 
 
 def percent(share: Estimate) -> str:
-    """A share with its 95 % interval."""
+    """A share with its 95 % interval, both in whole per cent: more digits would be noise."""
     if not math.isfinite(share.value):
         return "-"
-    return f"{100 * share.value:.1f} [{100 * share.low:.1f}, {100 * share.high:.1f}]"
+    return f"{100 * share.value:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]"
 
 
 def reasons(measurement: Measurement) -> list[str]:
     """How many points could not be measured, and why, the commonest reason first."""
-    counts = Counter(str(reason) for reason in measurement.reason[~measurement.measured])
-    return [f"{count} not measured: {reason}" for reason, count in counts.most_common()]
+    return counted(map(str, measurement.reason[~measurement.measured]), "not measured")
+
+
+def counted(reasons: Iterable[str], what: str) -> list[str]:
+    """`<count> <what>: <reason>`, the commonest reason first."""
+    return [f"{count} {what}: {reason}" for reason, count in Counter(reasons).most_common()]
+
+
+def notes(texts: Sequence[str]) -> None:
+    """The first few of many notes, and how many more there are."""
+    for text in texts[:MOST_NOTES]:
+        note(text)
+    if len(texts) > MOST_NOTES:
+        note(f"and {len(texts) - MOST_NOTES} more such notes; --json lists them all")
+
+
+def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], *, left: int = 1) -> Table:
+    """A table of text; the first `left` columns are words, the others numbers."""
+    style: dict[str, Any] = {"box": box.SIMPLE_HEAD, "show_edge": False, "pad_edge": False, "padding": (0, 1, 0, 0)}
+    table = Table(title=title, title_justify="left", title_style="bold", **style)
+    for i, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if i < left else "right", no_wrap=True, vertical="bottom")
+    for cells in rows:
+        table.add_row(*map(escape, cells))
+    return table
+
+
+def table(shown: Table) -> None:
+    """Print a table on stdout, never cut: where the terminal is too narrow, its lines wrap."""
+    console = out(width=10_000)
+    console.width = max(1, Widths.get(console, console.options, shown).maximum)
+    console.print(shown)
+    console.print()
 
 
 def evaluation_tables(evaluation: Evaluation) -> list[Table]:
-    """Accuracy by region, and coverage by level."""
+    """Errors and error bars by region, and coverage by level; each fits into 80 columns."""
     unit = evaluation.data.length_unit
     rows = evaluation.coverage.rows
-    accuracy = Table(title=f"Errors ({unit}), against {evaluation.against}", title_justify="left", show_lines=False)
     limited = any(math.isfinite(row.rmse_over_limit) for row in rows)
-    headings = ["points", "n", "rmse x", "y", "z", "rmse 3D", "median", "stated", *(["rmse/limit"] if limited else []),
-                "NEES (3)", "NLL", "CRPS"]  # fmt: skip
-    for i, heading in enumerate(headings):
-        accuracy.add_column(heading, justify="left" if i == 0 else "right", no_wrap=True)
-    for row in rows:
-        accuracy.add_row(*_accuracy_cells(row, limited))
-    return [accuracy, _coverage_table(rows)]
+    errors = _table(
+        f"Errors in {unit}, against {evaluation.against}",
+        ["", "points", "rmse x", "y", "z", "3D", "median 3D", *(["rmse/limit"] if limited else [])],
+        [_error_cells(row, limited) for row in rows],
+    )
+    bars = _table(
+        f"Error bars in {unit}",
+        ["", "stated 3D", "NEES, ideal 3", "NLL", "CRPS", "they are"],
+        [
+            [row.region, number(row.stated_rms), interval(row.nees), number(row.nll), number(row.crps), row.verdict]
+            for row in rows
+            if row.n
+        ],
+    )
+    return [errors, bars, _coverage_table(rows)]
 
 
-def _accuracy_cells(row: Summary, limited: bool) -> list[str]:
-    axes = [number(value) for value in row.rmse_axes]
-    limit = [number(row.rmse_over_limit)] if limited else []
-    return [row.region, str(row.n), *axes, number(row.rmse), number(row.median_error), number(row.stated_rms), *limit,
-            number(row.nees.value), number(row.nll), number(row.crps)]  # fmt: skip
+def _error_cells(row: Summary, limited: bool) -> list[str]:
+    lengths = [number(value) for value in (*row.rmse_axes, row.rmse, row.median_error)]
+    points = f"{row.n} of {row.n + row.unmeasured}" if row.unmeasured else str(row.n)
+    return [row.region, points, *lengths, *([number(row.rmse_over_limit)] if limited else [])]
 
 
 def _coverage_table(rows: Sequence[Summary]) -> Table:
-    table = Table(title="Coverage in % [95 % interval]", title_justify="left")
-    table.add_column("points", no_wrap=True)
-    for nominal in (50, 68, 90, 95, 99):
-        table.add_column(f"{nominal} %", justify="right", no_wrap=True)
-    for row in rows[:1]:
-        table.add_row("per axis", *(percent(level.pooled) for level in row.levels))
-        table.add_row("3D ellipsoid", *(percent(level.ellipsoid) for level in row.levels))
-        for i, axis in enumerate("xyz"):
-            table.add_row(f"{axis} alone", *(percent(level.axes[i]) for level in row.levels))
-    for row in rows[1:]:
-        table.add_row(f"3D, {row.region}", *(percent(level.ellipsoid) for level in row.levels))
-    return table
+    overall, *regions = rows
+    cells = [["per axis", *(percent(level.pooled) for level in overall.levels)]]
+    cells += [[f"{axis} alone", *(percent(level.axes[i]) for level in overall.levels)] for i, axis in enumerate("xyz")]
+    cells += [["3D ellipsoid", *(percent(level.ellipsoid) for level in overall.levels)]]
+    cells += [[f"3D, {row.region}", *(percent(level.ellipsoid) for level in row.levels)] for row in regions if row.n]
+    headings = [f"{100 * level.nominal:.0f} %" for level in overall.levels]
+    return _table("How many % of the points lie within their error bars [95 % interval]", ["", *headings], cells)
+
+
+def interval(estimate: Estimate) -> str:
+    """A number with its 95 % interval."""
+    if not math.isfinite(estimate.low):
+        return number(estimate.value)
+    return f"{number(estimate.value)} [{number(estimate.low)}, {number(estimate.high)}]"
+
+
+def verdict(overall: Summary) -> str:
+    """What the coverage says of the error bars, in a sentence."""
+    text = f"error bars: {overall.verdict}"
+    if math.isfinite(overall.sd_factor):
+        inside = 100 * overall.level(0.95).ellipsoid.value
+        text += (
+            f"; the 95 % ellipsoids hold {inside:.1f} %, and {number(overall.sd_factor)} times as large would hold 95 %"
+        )
+    return text
 
 
 def demo_table(demo: Demo) -> Table:
     """Cameras and known points down, accuracy and honesty across."""
-    title = f"A simulated rig, judged at {HELD_OUT} random positions it has not seen"
-    table = Table(title=title, title_justify="left")
-    for heading in ("cameras", "method", "known points", f"rmse {demo.unit}", "rmse / limit", "95 % coverage"):
-        table.add_column(heading, justify="left" if heading in ("cameras", "method") else "right")
+    shown = _table(
+        f"A simulated rig, judged at {HELD_OUT} random positions it has not seen",
+        ("cameras", "method", "points", f"rmse {demo.unit}", "rmse/limit", "95 % coverage"),
+        [],
+        left=2,
+    )
     for row in demo.rows:
         t = row.trial
         cells = (number(t.rmse), number(t.rmse / t.limit), f"{100 * t.coverage_95:.1f} %")
-        table.add_row(row.cameras, t.method, str(t.known), *cells, end_section=t.known == demo.rows[-1].trial.known)
-    return table
+        shown.add_row(row.cameras, t.method, str(t.known), *cells, end_section=t.known == demo.rows[-1].trial.known)
+    return shown
 
 
 def compare_table(rows: Sequence[Row], unit: str) -> Table:
-    """Methods by number of known points: mean ± standard error over the seeds."""
-    table = Table(title=f"Means ± standard error over seeds; lengths in {unit}", title_justify="left")
+    """Methods by number of known points: mean ± standard error over the seeds; what fits into 80 columns."""
     limited = any(math.isfinite(row.mean["rmse_over_limit"]) for row in rows)
-    columns = [("rmse", "rmse 3D"), ("median", "median")]
-    columns += [("rmse_over_limit", "rmse/limit")] if limited else []
-    columns += [("coverage_95", "95 % per axis"), ("ellipsoid_95", "95 % ellipsoid"), ("nees", "NEES (3)")]
-    columns += [("fit_seconds", "fit, s")]
-    for heading in ("method", "known points", "seeds", *(heading for _, heading in columns)):
-        table.add_column(heading, justify="left" if heading == "method" else "right", no_wrap=True)
-    for row in rows:
-        cells = [_plus_minus(row.mean[key], row.standard_error[key]) for key, _ in columns]
-        table.add_row(row.method, str(row.known), str(row.seeds), *(cells if row.seeds else ["-"] * len(columns)))
-    return table
+    partial = any(row.mean["measured"] < 1 for row in rows)
+    headings = ["method", "points", *(["measured"] if partial else []), f"rmse 3D, {unit}"]
+    headings += [*(["/limit"] if limited else []), "% in bars", "NEES", "fit, s"]
+    cells = [[row.method, str(row.known), *_compare_cells(row, limited, partial)] for row in rows]
+    title = (
+        f"Means{' ± standard error' * (max(row.seeds for row in rows) > 1)} over the seeds; bars are 95 % ellipsoids"
+    )
+    return _table(title, headings, cells)
+
+
+def _compare_cells(row: Row, limited: bool, partial: bool) -> list[str]:
+    mean, error = row.mean, row.standard_error
+    return [
+        *([_plus_minus(100 * mean["measured"], math.nan) + " %"] if partial else []),
+        _plus_minus(mean["rmse"], error["rmse"]),
+        *([number(mean["rmse_over_limit"])] if limited else []),
+        _plus_minus(100 * mean["ellipsoid_95"], 100 * error["ellipsoid_95"]),
+        number(mean["nees"]),
+        number(mean["fit_seconds"], 2),
+    ]
 
 
 def _plus_minus(mean: float, error: float) -> str:

@@ -29,6 +29,7 @@ from implicam.dataset.wide import (
     write_wide_csv,
 )
 from implicam.errors import DatasetError
+from implicam.files import left_behind
 
 __all__ = [
     "TRUTH_COLUMNS",
@@ -52,10 +53,26 @@ __all__ = [
 def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
     """Read a dataset: a folder, a wide .csv, a .parquet or an .npz.
 
-    `unit` names the length unit of a wide CSV that has no description beside it. Raises DatasetError, which names
-    the file, the line, the value and the cure.
+    `unit` names the length unit of a wide CSV that has no description beside it; where the data state another, that
+    is an error. Raises DatasetError, which names the file, the line, the value and the cure.
     """
     path = Path(path)
+    try:
+        data = _read(path, unit)
+    except OSError as error:  # permissions, a broken disk, a name too long
+        raise DatasetError(
+            f"{path} cannot be read.", why=str(error), fix="check the name and the permissions"
+        ) from error
+    if unit is not None and data.length_unit != unit:
+        raise DatasetError(
+            f"{path} is in {data.length_unit!r}, not in {unit!r}.",
+            why="its own description states the length unit",
+            fix="leave out --unit, or correct the description",
+        )
+    return data
+
+
+def _read(path: Path, unit: str | None) -> Dataset:
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path)
@@ -65,6 +82,11 @@ def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
         return read_parquet(path)
     if suffix == ".npz":
         return read_npz_dataset(path)
+    old = left_behind(path)
+    if old:
+        raise DatasetError(
+            f"{path} does not exist.", why="a program was killed while replacing it", fix=f"rename {old} to {path.name}"
+        )
     raise DatasetError(
         f"{path} is not a dataset." if path.exists() else f"{path} does not exist.",
         why="" if path.exists() else f"the working folder is {Path.cwd()}",

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import csv
-import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,17 +11,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset.model import Camera, Dataset, Floats, KnownPositions, Names, Observations
-from implicam.dataset.tables import Row, description_from_toml, number, read_table, read_toml
+from implicam.dataset.model import (
+    POINT_COLUMNS,
+    SD_POINT,
+    SD_VIEW,
+    VIEW_COLUMNS,
+    Camera,
+    Dataset,
+    Floats,
+    KnownPositions,
+    Names,
+    Observations,
+    check_inside,
+)
+from implicam.dataset.tables import (
+    Row,
+    description_from_toml,
+    name_in,
+    naming,
+    number,
+    parse_toml,
+    read_table,
+    read_toml,
+)
 from implicam.errors import DatasetError, did_you_mean
 from implicam.files import replacing_folder, toml_text
 
-POINT_COLUMNS = ("point", "shot", "x", "y", "z")
-VIEW_COLUMNS = ("point", "camera", "u", "v")
-SD_POINT, SD_VIEW = ("sd_x", "sd_y", "sd_z"), ("sd_u", "sd_v")
-
-# A centroid may lie a little outside: half of the ball is still in the image.
-OUTSIDE_SHARE, OUTSIDE_PIXELS = 0.02, 2.0
+DESCRIPTION, POINTS, VIEWS, IMAGES = "dataset.toml", "points.csv", "observations.csv", "images"
 
 _NO_VIEW = "a view that is missing has no row: remove it"
 _NO_SD = "leave the cell empty where no uncertainty is stated"
@@ -30,11 +45,12 @@ _NO_SD = "leave the cell empty where no uncertainty is stated"
 
 def read_folder(path: Path) -> Dataset:
     """Read a dataset folder; every mistake is a DatasetError naming file, line, value and cure."""
-    toml = path / "dataset.toml"
+    toml = path / DESCRIPTION
     name, unit, cameras, extra = description_from_toml(read_toml(toml), toml)
-    points = _read_points(path / "points.csv") if (path / "points.csv").exists() else None
-    observations = _read_observations(path / "observations.csv", cameras, points)
-    return Dataset(name, unit, observations, points.known if points else None, extra)
+    points = _read_points(path / POINTS) if (path / POINTS).exists() else None
+    observations = _read_observations(path / VIEWS, cameras, points)
+    with naming(toml):
+        return Dataset(name, unit, observations, points.known if points else None, extra)
 
 
 @dataclass(frozen=True)
@@ -53,14 +69,14 @@ def _read_points(path: Path) -> _Points:
     extra: dict[str, list[str]] = {c: [] for c in extra_columns}
     for line, row in rows:
         place = f"{path}, line {line}"
-        name = _name(row[at["point"]], "point", place)
+        name = name_in(row[at["point"]], "point", place)
         if name in names:
             raise DatasetError(
                 f"{place}: point {name!r} is there twice (first on line {names[name]}).",
                 fix="remove one, or give each point a name of its own",
             )
         names[name] = line
-        shots.append(_name(row[at["shot"]], "shot", place))
+        shots.append(name_in(row[at["shot"]], "shot", place))
         xyz.append(
             [
                 number(
@@ -81,12 +97,13 @@ def _read_points(path: Path) -> _Points:
             fix="add the known positions, or delete the file if they are unknown",
         )
     n = len(names)
-    known = KnownPositions(
-        np.array(shots, dtype=np.str_),
-        np.reshape(xyz, (n, 3)),
-        np.reshape(sd, (n, 3)),
-        {c: np.array(values, dtype=np.str_) for c, values in extra.items()},
-    )
+    with naming(path):
+        known = KnownPositions(
+            np.array(shots, dtype=np.str_),
+            np.reshape(xyz, (n, 3)),
+            np.reshape(sd, (n, 3)),
+            {c: np.array(values, dtype=np.str_) for c, values in extra.items()},
+        )
     return _Points(path, list(names), known)
 
 
@@ -98,12 +115,15 @@ def _read_observations(path: Path, cameras: tuple[Camera, ...], points: _Points 
     n, c = len(index), len(cameras)
     i, j = np.array(views.point), np.array(views.camera)
     uv, sd = np.full((n, c, 2), np.nan), np.full((n, c, 2), np.nan)
-    uv[i, j], sd[i, j] = np.reshape(views.uv, (-1, 2)), np.reshape(views.sd, (-1, 2))
+    uv[i, j] = views.uv
+    if views.sd:
+        sd[i, j] = views.sd
     lines = np.zeros((n, c), dtype=np.int64)
     lines[i, j] = views.lines
     check_inside(uv, cameras, lambda p, k: f"{path}, line {lines[p, k]}")
     extra = {column: _spread(values, i, j, (n, c)) for column, values in views.extra.items()}
-    return Observations(np.array(list(index), dtype=np.str_), cameras, uv, sd, extra)
+    with naming(path):
+        return Observations(np.array(list(index), dtype=np.str_), cameras, uv, sd, extra)
 
 
 class _Views:
@@ -126,10 +146,12 @@ def _view_rows(
     camera_index = {camera.name: k for k, camera in enumerate(cameras)}
     index = {name: i for i, name in enumerate(points.names)} if points else {}
     seen: dict[tuple[int, int], int] = {}
+    in_file = f"{path}, line "  # formatted once: a table may have a million rows
+    stated = [c for c in SD_VIEW if c in at]
     for line, row in rows:
-        place = f"{path}, line {line}"
-        i = _point_index(_name(row[at["point"]], "point", place), index, points, place)
-        k = _camera_index(row[at["camera"]], camera_index, place)
+        place = f"{in_file}{line}"
+        i = _point_index(row[at["point"]].strip(), index, points, place)
+        k = _camera_index(row[at["camera"]].strip(), camera_index, place)
         if (i, k) in seen:
             raise DatasetError(
                 f"{place}: point {row[at['point']]!r} is seen twice by camera {row[at['camera']]!r} "
@@ -141,7 +163,8 @@ def _view_rows(
         views.point.append(i)
         views.camera.append(k)
         views.uv.append([number(row[at[c]], place, c, cure_nan=_NO_VIEW) for c in "uv"])
-        views.sd.append([_sd(row, at, c, place, zero=False) for c in SD_VIEW])
+        if stated:
+            views.sd.append([_sd(row, at, c, place, zero=False) for c in SD_VIEW])
         for c, values in views.extra.items():
             values.append(row[at[c]])
     return index, views
@@ -149,6 +172,7 @@ def _view_rows(
 
 def _point_index(name: str, index: dict[str, int], points: _Points | None, place: str) -> int:
     if name not in index:
+        name = name_in(name, "point", place)
         if points:
             raise DatasetError(
                 f"{place}: point {name!r} has no known position in {points.path.name}{did_you_mean(name, index)}.",
@@ -167,14 +191,8 @@ def _camera_index(name: str, cameras: dict[str, int], place: str) -> int:
     return cameras[name]
 
 
-def _name(text: str, what: str, place: str) -> str:
-    if text == "" or not text.isprintable():
-        raise DatasetError(f"{place}: {what} {text!r} is not a name.", fix=f"every row needs a printable {what} name")
-    return text
-
-
 def _sd(row: list[str], at: Mapping[str, int], column: str, place: str, *, zero: bool) -> float:
-    text = row[at[column]] if column in at else ""
+    text = row[at[column]].strip() if column in at else ""
     if text == "":
         return float("nan")
     value = number(text, place, column, cure_nan=_NO_SD)
@@ -187,24 +205,6 @@ def _sd(row: list[str], at: Mapping[str, int], column: str, place: str, *, zero:
     return value
 
 
-def check_inside(uv: Floats, cameras: tuple[Camera, ...], place: Any) -> None:
-    """Refuse pixels far outside the image; `place(point, camera)` says where the value stands."""
-    for k, camera in enumerate(cameras):
-        if camera.width is None or camera.height is None:
-            continue
-        size = np.array([camera.width, camera.height], dtype=np.float64)
-        margin = OUTSIDE_PIXELS + OUTSIDE_SHARE * size.max()
-        outside = (uv[:, k] < -0.5 - margin) | (uv[:, k] > size - 0.5 + margin)
-        for i in np.flatnonzero(outside.any(axis=1))[:1]:
-            u, v = uv[i, k]
-            raise DatasetError(
-                f"{place(i, k)}: pixel u = {u:g}, v = {v:g} is far outside the {camera.width} x {camera.height} "
-                f"image of {camera.name!r}.",
-                why="u is the column and v the row, counted from 0 at the centre of the top-left pixel",
-                fix="correct the value, remove the row, or correct width and height in dataset.toml",
-            )
-
-
 def _spread(values: list[str], i: NDArray[Any], j: NDArray[Any], shape: tuple[int, int]) -> Names:
     text = np.array(values, dtype=np.str_)
     table = np.full(shape, "", dtype=text.dtype)
@@ -214,19 +214,64 @@ def _spread(values: list[str], i: NDArray[Any], j: NDArray[Any], shape: tuple[in
 
 def write_folder(data: Dataset, path: Path, *, overwrite: bool = False, also: Mapping[str, str] | None = None) -> None:
     """Write a dataset folder, whole or not at all; `also` maps further relative file names to their text."""
+    files = {**folder_files(data), **(also or {})}
+    if overwrite:
+        _refuse_to_destroy(path)
     with replacing_folder(path, overwrite=overwrite) as temporary:
-        for name, text in {**folder_files(data), **(also or {})}.items():
+        for name, text in files.items():
             target = temporary / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(text, encoding="utf-8", newline="")
 
 
+def _refuse_to_destroy(path: Path) -> None:
+    """Overwriting replaces the whole folder: never one that is no dataset, never one with photographs."""
+    if not path.is_dir() or not any(path.iterdir()):
+        return
+    if not (path / DESCRIPTION).exists():
+        raise DatasetError(
+            f"{path} is not a dataset, so it is not overwritten.",
+            why=f"it has no {DESCRIPTION}, and replacing it would delete what it holds",
+            fix="choose another name, or remove the folder yourself",
+        )
+    if (path / IMAGES).exists():
+        raise DatasetError(
+            f"{path} holds {IMAGES}, so it is not overwritten.",
+            why="photographs cannot be computed again",
+            fix="choose another name, or move the images away first",
+        )
+
+
 def folder_files(data: Dataset) -> dict[str, str]:
-    """The files of a dataset folder: name -> text."""
-    files = {"dataset.toml": description_text(data), "observations.csv": _observations_text(data.observations)}
+    """The files of a dataset folder: name -> text. DatasetError for what this form cannot hold."""
+    _refuse_to_lose(data)
+    files = {DESCRIPTION: description_text(data), VIEWS: _observations_text(data.observations)}
     if data.known is not None:
-        files["points.csv"] = _points_text(data.points, data.known)
+        files[POINTS] = _points_text(data.points, data.known)
     return files
+
+
+def _refuse_to_lose(data: Dataset) -> None:
+    """observations.csv has a row per view, so what belongs to no view has no place in it."""
+    observations = data.observations
+    seen = observations.seen
+    instead = "write it as .csv, .parquet or .npz"
+    if not seen.any():
+        raise DatasetError(f"dataset {data.name!r} has no view at all.", fix="a folder needs one; " + instead)
+    unseen = data.points[~seen.any(axis=1)]
+    if data.known is None and len(unseen):
+        raise DatasetError(
+            f"point {str(unseen[0])!r} was seen by no camera, so a folder without {POINTS} would lose it"
+            f"{f' and {len(unseen) - 1} more' if len(unseen) > 1 else ''}.",
+            fix=f"leave such points out (data.select(data.observations.seen.any(axis=1))), or {instead}",
+        )
+    for column, text in observations.extra.items():
+        for i, k in np.argwhere((text != "") & ~seen)[:1]:
+            raise DatasetError(
+                f"point {str(data.points[i])!r}, camera {data.cameras[k].name!r}: the column {column!r} says "
+                f"{str(text[i, k])[:60]!r} of a view that is missing, which a folder would lose.",
+                fix="empty it, or " + instead,
+            )
 
 
 def description_text(data: Dataset) -> str:
@@ -236,48 +281,62 @@ def description_text(data: Dataset) -> str:
         sizes = {"width": camera.width, "height": camera.height}
         known = {key: size for key, size in sizes.items() if size is not None}
         cameras.append({"name": camera.name, **known, **camera.extra})
-    return toml_text({"name": data.name, "length_unit": data.length_unit, **data.extra, "cameras": cameras})
+    table = {"name": data.name, "length_unit": data.length_unit, **data.extra}
+    try:
+        text = _with_camera_tables(table, cameras)
+        parse_toml(text)  # what is written must be readable again: sizes, time zones
+    except ValueError as error:
+        raise DatasetError(
+            f"the description of dataset {data.name!r} cannot be written.",
+            why=str(error),
+            fix="shorten or leave out its extra entries, or those of its cameras",
+        ) from None
+    return text
+
+
+def _with_camera_tables(table: dict[str, Any], cameras: list[dict[str, Any]]) -> str:
+    """As people write it, a [[cameras]] table each; tomli_w would put short ones on one line."""
+    if any(isinstance(value, (dict, list)) for camera in cameras for value in camera.values()):
+        return toml_text({**table, "cameras": cameras})
+    return toml_text(table) + "".join(f"\n[[cameras]]\n{toml_text(camera)}" for camera in cameras)
 
 
 def _points_text(points: Names, known: KnownPositions) -> str:
-    stated = [c for c, column in zip(SD_POINT, known.sd.T, strict=True) if not np.isnan(column).all()]
-    header = [*POINT_COLUMNS, *stated, *known.extra]
-    sd = {c: column for c, column in zip(SD_POINT, known.sd.T, strict=True) if c in stated}
-    rows = (
-        [
-            p,
-            shot,
-            *map(cell, xyz),
-            *(cell(sd[c][i]) for c in stated),
-            *(column[i] for column in known.extra.values()),
-        ]
-        for i, (p, shot, xyz) in enumerate(zip(points, known.shots, known.xyz, strict=True))
-    )
-    return csv_text(header, rows)
+    sd = {c: column for c, column in zip(SD_POINT, known.sd.T, strict=True) if not np.isnan(column).all()}
+    columns = [points.tolist(), known.shots.tolist(), *map(cells, known.xyz.T), *map(cells, sd.values())]
+    columns += [column.tolist() for column in known.extra.values()]
+    return csv_text([*POINT_COLUMNS, *sd, *known.extra], zip(*columns, strict=True))
 
 
 def _observations_text(observations: Observations) -> str:
-    stated = [] if np.isnan(observations.sd).all() else list(SD_VIEW)
-    header = [*VIEW_COLUMNS, *stated, *observations.extra]
-    names = observations.camera_names
-    rows = (
-        [observations.points[i], names[k], *map(cell, observations.uv[i, k])]
-        + ([cell(x) for x in observations.sd[i, k]] if stated else [])
-        + [column[i, k] for column in observations.extra.values()]
-        for i, k in np.argwhere(observations.seen)
-    )
-    return csv_text(header, rows)
+    seen = observations.seen
+    i, k = np.nonzero(seen)
+    stated = () if np.isnan(observations.sd).all() else SD_VIEW
+    columns = [observations.points[i].tolist(), np.array(observations.camera_names)[k].tolist()]
+    columns += [cells(column) for column in observations.uv[seen].T]
+    columns += [cells(column) for column in observations.sd[seen].T] if stated else []
+    columns += [column[seen].tolist() for column in observations.extra.values()]
+    return csv_text([*VIEW_COLUMNS, *stated, *observations.extra], zip(*columns, strict=True))
 
 
-def cell(value: float) -> str:
-    """A number as the shortest text that reads back to the same bits; nothing for NaN."""
-    return "" if np.isnan(value) else repr(float(value))
+def cells(values: Floats) -> list[str]:
+    """Numbers as the shortest texts that read back to the same bits; nothing for NaN."""
+    return ["" if value != value else repr(value) for value in values.tolist()]
 
 
-def csv_text(header: list[str], rows: Iterable[list[Any]]) -> str:
+class _Lines(list[str]):
+    """Where csv.writer writes. It quotes every cell with a line break of either kind only if a row ends in both."""
+
+    ENDING = "\r\n"
+
+    def write(self, row: str) -> None:
+        self.append(row.removesuffix(self.ENDING))
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A comma-separated table."""
-    buffer = io.StringIO(newline="")
-    writer = csv.writer(buffer, lineterminator="\n")
+    lines = _Lines()
+    writer = csv.writer(lines, lineterminator=_Lines.ENDING)
     writer.writerow(header)
     writer.writerows(rows)
-    return buffer.getvalue()
+    return "\n".join([*lines, ""])

@@ -6,8 +6,10 @@ positions are in the dataset's own world frame and length unit. Missing is NaN.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import difflib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import date, time
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,21 @@ from implicam.errors import DatasetError, did_you_mean
 
 Floats = NDArray[np.float64]
 Names = NDArray[np.str_]
+
+POINT_COLUMNS = ("point", "shot", "x", "y", "z")
+VIEW_COLUMNS = ("point", "camera", "u", "v")
+SD_POINT, SD_VIEW = ("sd_x", "sd_y", "sd_z"), ("sd_u", "sd_v")
+
+WIDE_TABLE = "wide_table"  # what the description of a wide table says of its columns
+_CAMERA_KEYS, _DATASET_KEYS = ("name", "width", "height"), ("name", "length_unit", "cameras", WIDE_TABLE)
+
+# A text column is as wide as its longest text in every row, so one runaway cell would cost gigabytes.
+MAX_NAME, MAX_TEXT = 200, 1000
+MAX_IMAGE_SIZE = 1_000_000
+MAX_DEPTH = 50
+
+# A centroid may lie a little outside: half of the ball is still in the image.
+OUTSIDE_SHARE, OUTSIDE_PIXELS = 0.02, 2.0
 
 TRUTH_COLUMNS = (
     "true_x", "true_y", "true_z", "limit_sd_x", "limit_sd_y", "limit_sd_z",
@@ -37,18 +54,21 @@ class Camera:
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_name(self.name, "camera name")
+        check_name(self.name, "camera name")
         if set("/\\") & set(self.name) or self.name.startswith("."):
             raise DatasetError(
                 f"camera name {self.name!r} cannot name a folder.",
                 fix="leave out slashes, backslashes and a leading dot",
             )
         for what, size in (("width", self.width), ("height", self.height)):
-            if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 1):
+            if size is None:
+                _refuse_misspelt(what, self.extra, f"camera {self.name!r}")
+            elif isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= MAX_IMAGE_SIZE:
                 raise DatasetError(
                     f"camera {self.name!r} has {what} = {size!r}; it must be a whole number of pixels.",
                     fix=f"give the {what} of its images, for example {what} = 1280",
                 )
+        _freeze(self, extra=_described(self.extra, _CAMERA_KEYS, f"camera {self.name!r}"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +76,7 @@ class Observations:
     """Which point was seen by which camera, at which pixel.
 
     points: (n,) names, each once. uv: (n, cameras, 2) pixels, NaN where the camera did not see the point.
-    sd: standard uncertainty of each pixel coordinate, same shape, NaN where not stated.
+    sd: standard uncertainty of each pixel coordinate, same shape, NaN where not stated or not seen.
     extra: further columns of observations.csv as text, (n, cameras) each.
     """
 
@@ -71,13 +91,29 @@ class Observations:
         n, c = len(points), len(self.cameras)
         _check_unique(points, "point")
         _check_unique([camera.name for camera in self.cameras], "camera")
+        if not self.cameras:
+            raise DatasetError("there is no camera.", fix="keep at least one")
         uv = _array(self.uv, (n, c, 2), "uv")
-        if np.isinf(uv).any() or (np.isnan(uv[..., 0]) != np.isnan(uv[..., 1])).any():
-            raise DatasetError("a view must have both u and v, finite, or neither (NaN).")
+
+        def place(i: int, k: int) -> str:
+            return f"point {str(points[i])!r}, camera {self.cameras[k].name!r}"
+
+        for i, k in np.argwhere(np.isinf(uv).any(axis=2) | (np.isnan(uv[..., 0]) != np.isnan(uv[..., 1])))[:1]:
+            raise DatasetError(
+                f"{place(i, k)}: u = {uv[i, k, 0]:g}, v = {uv[i, k, 1]:g}.",
+                why="a view has both u and v, finite, or neither (NaN)",
+                fix="correct the value, or leave the view out",
+            )
+        check_inside(uv, self.cameras, place)
         sd = _array(self.sd, (n, c, 2), "sd")
-        if (sd <= 0).any() or np.isinf(sd).any():
-            raise DatasetError("sd_u and sd_v must be positive and finite, or not stated (NaN).")
-        extra = {key: _text(value, (n, c)) for key, value in self.extra.items()}
+        sd[np.isnan(uv)] = np.nan
+        for i, k in np.argwhere(((sd <= 0) | np.isinf(sd)).any(axis=2))[:1]:
+            raise DatasetError(
+                f"{place(i, k)}: sd_u = {sd[i, k, 0]:g}, sd_v = {sd[i, k, 1]:g}.",
+                why="a standard uncertainty is greater than zero and finite, or not stated (NaN)",
+                fix="correct the value, or leave it out",
+            )
+        extra = _columns(self.extra, (n, c), (*VIEW_COLUMNS, *SD_VIEW))
         _freeze(self, points=points, cameras=tuple(self.cameras), uv=uv, sd=sd, extra=extra)
 
     def __len__(self) -> int:
@@ -95,7 +131,7 @@ class Observations:
 
     def select(self, index: ArrayLike) -> Observations:
         """The observations of some points: a boolean mask, or positions in the order wanted."""
-        i = np.asarray(index)
+        i = _index(index)
         extra = {key: value[i] for key, value in self.extra.items()}
         return Observations(self.points[i], self.cameras, self.uv[i], self.sd[i], extra)
 
@@ -131,19 +167,19 @@ class KnownPositions:
         shots = _text(self.shots)
         n = len(shots)
         for shot in np.unique(shots):
-            _check_name(str(shot), "shot")
+            check_name(str(shot), "shot")
         xyz = _array(self.xyz, (n, 3), "xyz")
         if not np.isfinite(xyz).all():
             raise DatasetError("a known position must be finite.")
         sd = _array(self.sd, (n, 3), "sd")
         if (sd < 0).any() or np.isinf(sd).any():
             raise DatasetError("sd_x, sd_y and sd_z must be finite and not negative, or not stated (NaN).")
-        extra = {key: _text(value, (n,)) for key, value in self.extra.items()}
+        extra = _columns(self.extra, (n,), (*POINT_COLUMNS, *SD_POINT))
         _freeze(self, shots=shots, xyz=xyz, sd=sd, extra=extra)
 
     def select(self, index: ArrayLike) -> KnownPositions:
         """The positions of some points."""
-        i = np.asarray(index)
+        i = _index(index)
         extra = {key: value[i] for key, value in self.extra.items()}
         return KnownPositions(self.shots[i], self.xyz[i], self.sd[i], extra)
 
@@ -167,8 +203,9 @@ class Dataset:
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_name(self.name, "dataset name")
-        _check_name(self.length_unit, "length unit")
+        check_name(self.name, "dataset name")
+        check_name(self.length_unit, "length unit")
+        _freeze(self, extra=_described(self.extra, _DATASET_KEYS, f"dataset {self.name!r}"))
         if self.known is not None and len(self.known.shots) != len(self.observations):
             raise DatasetError(
                 f"{len(self.observations)} observed points, but {len(self.known.shots)} known positions.",
@@ -290,7 +327,7 @@ class Dataset:
 
 
 def join(first: Dataset, second: Dataset) -> Dataset:
-    """One dataset of the points of both; they must share cameras, unit and kind."""
+    """One dataset of the points of both, named and described as the first; they must share cameras, unit and kind."""
     if first.cameras != second.cameras or first.length_unit != second.length_unit:
         raise DatasetError(
             f"datasets {first.name!r} and {second.name!r} do not belong to one rig.",
@@ -349,23 +386,120 @@ def _text(value: ArrayLike, shape: tuple[int, ...] | None = None) -> Names:
     return array
 
 
-def _check_name(name: object, what: str) -> None:
-    ok = isinstance(name, str) and name != "" and name == name.strip() and name.isprintable()
-    if not ok:
+def _index(index: ArrayLike) -> NDArray[Any]:
+    i = np.asarray(index)
+    return i if i.size else i.astype(i.dtype if i.dtype.kind == "b" else np.intp)  # [] is no list of floats
+
+
+def check_name(name: object, what: str) -> None:
+    """Refuse what could not stand in every form of a dataset."""
+    if not (isinstance(name, str) and name.isprintable() and name == name.strip() and 0 < len(name) <= MAX_NAME):
         raise DatasetError(
-            f"{what} {name!r} is not usable.",
-            why="names are printable text without spaces at either end",
+            f"{what} {str(name)[:60]!r} is not usable.",
+            why=f"names are printable text of at most {MAX_NAME} characters without spaces at either end",
             fix="rename it",
         )
 
 
 def _check_unique(names: Sequence[str] | Names, what: str) -> None:
     seen: set[str] = set()
-    for name in names:
-        _check_name(str(name), what)
+    for name in names.tolist() if isinstance(names, np.ndarray) else names:
+        check_name(name, what)
         if name in seen:
-            raise DatasetError(f"{what} {str(name)!r} is there twice.", fix=f"give each {what} a name of its own")
-        seen.add(str(name))
+            raise DatasetError(f"{what} {name!r} is there twice.", fix=f"give each {what} a name of its own")
+        seen.add(name)
+
+
+def check_inside(uv: Floats, cameras: Sequence[Camera], place: Callable[[int, int], str]) -> None:
+    """Refuse pixels far outside the image; `place(point, camera)` says where the value stands."""
+    for k, camera in enumerate(cameras):
+        if camera.width is None or camera.height is None:
+            continue
+        size = np.array([camera.width, camera.height], dtype=np.float64)
+        margin = OUTSIDE_PIXELS + OUTSIDE_SHARE * size.max()
+        outside = (uv[:, k] < -0.5 - margin) | (uv[:, k] > size - 0.5 + margin)
+        for i in np.flatnonzero(outside.any(axis=1))[:1]:
+            u, v = uv[i, k]
+            raise DatasetError(
+                f"{place(int(i), k)}: pixel u = {u:g}, v = {v:g} is far outside the {camera.width} x {camera.height} "
+                f"image of {camera.name!r}.",
+                why="u is the column and v the row, counted from 0 at the centre of the top-left pixel",
+                fix="correct the value, remove the row, or correct width and height in dataset.toml",
+            )
+
+
+def _columns(extra: Mapping[str, ArrayLike], shape: tuple[int, ...], taken: Sequence[str]) -> dict[str, Names]:
+    """The extra columns, checked: names of their own, text that every form can hold."""
+    columns = {}
+    for name, value in extra.items():
+        check_name(name, "column name")
+        if name in taken:
+            raise DatasetError(f"an extra column cannot be named {name!r}.", fix="rename it")
+        columns[name] = column = _text(value, shape)
+        cells = column.ravel().tolist()
+        try:
+            readable = b"\0" not in "".join(cells).encode()
+        except UnicodeEncodeError:
+            readable = False
+        if not readable or max(map(len, cells), default=0) > MAX_TEXT:
+            raise DatasetError(
+                f"the column {name!r} holds something else than text.",
+                why=f"a cell has zero bytes, half a character, or more than {MAX_TEXT} characters",
+                fix="shorten or leave out the column",
+            )
+    return columns
+
+
+def _refuse_misspelt(key: str, extra: Mapping[str, Any], whose: str) -> None:
+    close = difflib.get_close_matches(key, [str(other) for other in extra], n=1, cutoff=0.75)
+    if close:
+        raise DatasetError(
+            f"{whose} has no {key}.",
+            why=f"{close[0]!r} may be a misspelling of it",
+            fix=f"write {key} = 1280, in pixels",
+        )
+
+
+def _described(extra: Mapping[str, Any], taken: Sequence[str], whose: str) -> dict[str, Any]:
+    """Further entries of dataset.toml, as plain values that TOML can hold."""
+    for key in taken:
+        if key in extra:
+            raise DatasetError(f"{whose}: an extra entry cannot be named {key!r}.", fix="rename it")
+    try:
+        entries: dict[str, Any] = plain(extra)
+    except ValueError as error:
+        raise DatasetError(
+            f"{whose} has an extra entry that dataset.toml cannot hold.",
+            why=str(error),
+            fix="use text, numbers, booleans, dates, and lists and tables of these",
+        ) from None
+    return entries
+
+
+def plain(value: Any, depth: int = 0) -> Any:
+    """A copy made of what TOML knows; ValueError for anything else."""
+    if depth > MAX_DEPTH:
+        raise ValueError("it is nested too deeply")
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        if not all(isinstance(key, str) for key in value):
+            raise ValueError("the keys of a table are text")
+        return {_encodable(key): plain(item, depth + 1) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item, depth + 1) for item in value]
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise ValueError("a whole number has more than 64 bits")
+    if isinstance(value, str):
+        return _encodable(value)
+    if not isinstance(value, int | float | date | time):
+        raise ValueError(f"a value of type {type(value).__name__} has no form in TOML")
+    return value
+
+
+def _encodable(text: str) -> str:
+    text.encode()  # UnicodeEncodeError, a ValueError, for half a character
+    return text
 
 
 def _freeze(value: object, **fields: Any) -> None:

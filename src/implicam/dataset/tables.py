@@ -3,49 +3,68 @@
 from __future__ import annotations
 
 import csv
+import difflib
 import math
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from implicam.dataset.model import Camera
-from implicam.errors import DatasetError, did_you_mean
+from implicam.dataset.model import MAX_NAME, MAX_TEXT, WIDE_TABLE, Camera, check_name, plain
+from implicam.errors import DatasetError
 
 MAX_LINE_BYTES = 1 << 18  # no line of a table is longer; a longer one means that the file is something else
-MAX_TOML_BYTES = 1 << 20
+MAX_TOML_BYTES = 1 << 19
+MAX_TOML_DOTS = 500  # in one line; tomllib takes quadratic time for a key of many parts
 
 Row = tuple[int, list[str]]
 
 
-def read_table(path: Path, required: Sequence[str]) -> tuple[list[str], Iterator[Row]]:
-    """The header, and the rows with their line numbers, read as they are asked for."""
-    if not path.is_file():
-        raise DatasetError(
-            f"{path} does not exist.",
-            why=f"{path.parent} holds: {_listing(path.parent)}",
-            fix=f"put a comma-separated table with the columns {','.join(required)} there",
-        )
+def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[list[str], Iterator[Row]]:
+    """The header, and the rows with their line numbers, read as they are asked for; blank lines are skipped."""
+    example = example or ",".join(required)
+    require_file(path, f"put a comma-separated table with the columns {example} there")
     rows = _rows(path)
     _, header = next(rows, (1, []))
     if not header:
-        raise DatasetError(
-            f"{path} is empty.", fix=f"its first line must be {','.join(required)}, then one row per entry"
-        )
+        raise DatasetError(f"{path} is empty.", fix=f"its first line must be {example}, then one row per entry")
     header = [name.strip() for name in header]
     _check_header(path, header, required)
     return header, _checked_width(path, len(header), rows)
 
 
+def require_file(path: Path, fix: str) -> None:
+    """DatasetError where there is no such file."""
+    if path.is_dir():
+        raise DatasetError(f"{path} is a folder, not a file.", fix=fix)
+    if not path.is_file():
+        raise DatasetError(f"{path} does not exist.", why=f"{path.parent} holds: {_listing(path.parent)}", fix=fix)
+
+
+@contextmanager
+def naming(place: Path | str) -> Iterator[None]:
+    """Put the file's name before an error of the values themselves."""
+    try:
+        yield
+    except DatasetError as error:
+        if str(place) in error.what:
+            raise
+        raise DatasetError(f"{place}: {error.what}", why=error.why, fix=error.fix) from None
+
+
 def _rows(path: Path) -> Iterator[Row]:
     reader = csv.reader(_lines(path), strict=True)
+    first = 1  # the line on which the row begins; a quoted cell may go on over several
     try:
         for row in reader:
-            if row:
-                yield reader.line_num, row
+            if len(row) > 1 or (row and row[0].strip()):
+                yield first, row
+            first = reader.line_num + 1
     except csv.Error as error:
         raise DatasetError(
-            f"{path}, line {reader.line_num}: not a well-formed CSV row.",
+            f"{path}, line {first}: not a well-formed CSV row.",
             why=str(error),
             fix='write a cell that contains a comma or a quote as "...", with inner quotes doubled',
         ) from error
@@ -60,7 +79,7 @@ def _lines(path: Path) -> Iterator[str]:
                 return
             if number == 1:
                 line = line.removeprefix(b"\xef\xbb\xbf")  # the mark that Excel puts before UTF-8
-                _refuse_utf16(path, line)
+                _refuse_other_text(path, line)
             if len(line) > MAX_LINE_BYTES or b"\0" in line:
                 raise DatasetError(
                     f"{path}, line {number}: this is not a text table.",
@@ -82,9 +101,14 @@ def _decoded(path: Path, number: int, line: bytes) -> str:
         ) from None
 
 
-def _refuse_utf16(path: Path, line: bytes) -> None:
+def _refuse_other_text(path: Path, line: bytes) -> None:
     if line.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise DatasetError(f"{path}, line 1: the file is UTF-16 text.", fix="save it as CSV UTF-8")
+    if b"\r" in line.rstrip(b"\r\n") and b"\0" not in line:
+        raise DatasetError(
+            f"{path}, line 1: the lines end as on old Macintosh computers (carriage return alone).",
+            fix="save it as CSV UTF-8 with the line ends of Windows or Unix",
+        )
 
 
 def _check_header(path: Path, header: list[str], required: Sequence[str]) -> None:
@@ -101,15 +125,18 @@ def _check_header(path: Path, header: list[str], required: Sequence[str]) -> Non
         if name not in header:
             raise DatasetError(
                 f"{path}, line 1: the column {name!r} is missing; found {','.join(header)[:120]!r}.",
-                why=f"a column may be misspelt{did_you_mean(name, header)}" if did_you_mean(name, header) else "",
+                why=_misspelt(name, header),
                 fix=f"the first line must name at least the columns {','.join(required)}",
             )
-    for name in header:
-        if name == "" or not name.isprintable() or header.count(name) > 1:
+    for name, times in Counter(header).items():
+        if times > 1:
             raise DatasetError(
-                f"{path}, line 1: column name {name!r} is empty, unprintable or there twice.",
+                f"{path}, line 1: the column {name[:60]!r} is there {times} times.",
+                why="cells beyond the last name may be empty" if name == "" else "",
                 fix="give every column a name of its own",
             )
+        with naming(f"{path}, line 1"):
+            check_name(name, "column name")
 
 
 def _checked_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]:
@@ -120,11 +147,29 @@ def _checked_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]
                 why="a decimal comma splits a number in two" if len(row) > width else "the row may be cut off",
                 fix="give every column one cell; use decimal points",
             )
-        yield line, [cell.strip() for cell in row]
+        if max(map(len, row)) > MAX_TEXT:
+            raise DatasetError(
+                f"{path}, line {line}: a cell has {max(map(len, row))} characters: {max(row, key=len)[:40]!r}...",
+                why="a quote may be missing" if any("\n" in cell for cell in row) else "",
+                fix=f"shorten it to {MAX_TEXT} characters",
+            )
+        yield line, row
+
+
+def name_in(text: str, what: str, place: str) -> str:
+    """A name without the spaces around it, or an error that names the place."""
+    name = text.strip()
+    if name == "" or not name.isprintable() or len(name) > MAX_NAME:
+        raise DatasetError(
+            f"{place}: {what} {name[:60]!r} is not a name.",
+            fix=f"every row needs a printable {what} name of at most {MAX_NAME} characters",
+        )
+    return name
 
 
 def number(text: str, place: str, column: str, *, cure_nan: str) -> float:
     """A finite number, or an error that names the place, the value and the cure."""
+    text = text.strip()
     try:
         if "_" in text or not text.isascii():
             raise ValueError
@@ -132,7 +177,7 @@ def number(text: str, place: str, column: str, *, cure_nan: str) -> float:
     except ValueError:
         comma = "," in text
         raise DatasetError(
-            f"{place}: {column} = {text!r} is not a number.",
+            f"{place}: {column} = {text[:60]!r} is not a number.",
             why="it has a decimal comma" if comma else "the cell is empty" if text == "" else "",
             fix="write it with a decimal point"
             if comma
@@ -141,28 +186,30 @@ def number(text: str, place: str, column: str, *, cure_nan: str) -> float:
             else "correct the value or remove the row",
         ) from None
     if not math.isfinite(value):
-        raise DatasetError(f"{place}: {column} = {text!r} is not a finite number.", fix=cure_nan)
+        raise DatasetError(f"{place}: {column} = {text[:60]!r} is not a finite number.", fix=cure_nan)
     return value
 
 
 def read_toml(path: Path) -> dict[str, Any]:
     """A TOML file as a dict."""
-    if not path.is_file():
-        raise DatasetError(
-            f"{path} does not exist.",
-            why=f"{path.parent} holds: {_listing(path.parent)}",
-            fix="a dataset is a folder with dataset.toml, observations.csv and (unless it is to be measured) "
-            "points.csv; see docs/formats.md",
-        )
+    require_file(
+        path,
+        "a dataset is a folder with dataset.toml, observations.csv and (unless it is to be measured) points.csv; "
+        "see docs/formats.md",
+    )
     if path.stat().st_size > MAX_TOML_BYTES:
         raise DatasetError(
             f"{path} is {path.stat().st_size:,} bytes long; this is no dataset.toml.",
             fix="see docs/formats.md",
         )
+    content = path.read_bytes()
     try:
-        return parse_toml(path.read_bytes().decode("utf-8-sig"))
+        return parse_toml(content.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise DatasetError(f"{path}: byte {error.start} is not UTF-8 text.", fix="save the file as UTF-8") from None
+        line = content.count(b"\n", 0, error.start) + 1
+        raise DatasetError(
+            f"{path}, line {line}: byte {content[error.start]:#04x} is not UTF-8 text.", fix="save the file as UTF-8"
+        ) from None
     except ValueError as error:
         raise DatasetError(
             f"{path}: not valid TOML: {error}.",
@@ -172,50 +219,59 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def parse_toml(text: str) -> dict[str, Any]:
     """TOML text as a dict; ValueError for whatever is wrong with it."""
+    if len(text) > MAX_TOML_BYTES:
+        raise ValueError(f"it is {len(text):,} characters long")
+    for line, content in enumerate(text.split("\n"), 1):
+        if content.count(".") > MAX_TOML_DOTS:
+            raise ValueError(f"more than {MAX_TOML_DOTS} dots in one line (at line {line}); break it into several")
     try:
-        return tomllib.loads(text.replace("\r\n", "\n"))
+        table: dict[str, Any] = plain(tomllib.loads(text))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+    return table
 
 
 def description_from_toml(table: dict[str, Any], path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
     """Name, length unit, cameras and whatever else dataset.toml says."""
     extra = dict(table)
+    extra.pop(WIDE_TABLE, None)
     name = _text_entry(extra, "name", path, example="my-rig")
     unit = _text_entry(extra, "length_unit", path, example="mm")
     cameras = extra.pop("cameras", None)
     if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
         raise DatasetError(
-            f"{path}: there is no [[cameras]] table{did_you_mean('cameras', extra)}.",
+            f"{path}: there is no [[cameras]] table.",
+            why=_misspelt("cameras", extra),
             fix='add, for each camera, [[cameras]] with name = "cam1", width = 1280, height = 800',
         )
-    return name, unit, tuple(_camera(dict(c), path) for c in cameras), extra
+    made = tuple(_camera(dict(c), path) for c in cameras)
+    for camera, times in Counter(camera.name for camera in made).items():
+        if times > 1:
+            raise DatasetError(
+                f"{path}: camera {camera!r} is there {times} times.", fix="give each camera a name of its own"
+            )
+    return name, unit, made, extra
 
 
 def _camera(table: dict[str, Any], path: Path) -> Camera:
     name = _text_entry(table, "name", path, example="cam1")
-    sizes = {}
-    for key in ("width", "height"):
-        if key not in table and did_you_mean(key, table):
-            raise DatasetError(
-                f"{path}: camera {name!r} has no {key}{did_you_mean(key, table)}.",
-                fix=f"write {key} = 1280, in pixels",
-            )
-        sizes[key] = table.pop(key, None)
-    try:
-        return Camera(name, sizes["width"], sizes["height"], table)
-    except DatasetError as error:
-        raise DatasetError(f"{path}: {error.what}", why=error.why, fix=error.fix) from None
+    with naming(path):
+        return Camera(name, table.pop("width", None), table.pop("height", None), table)
+
+
+def _misspelt(word: str, found: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word, list(found), n=1)
+    return f"{close[0]!r} may be a misspelling of it" if close else ""
 
 
 def _text_entry(table: dict[str, Any], key: str, path: Path, *, example: str) -> str:
     if key not in table:
         raise DatasetError(
-            f"{path}: {key!r} is missing{did_you_mean(key, table)}.", fix=f'add the line {key} = "{example}"'
+            f"{path}: {key!r} is missing.", why=_misspelt(key, table), fix=f'write the line {key} = "{example}"'
         )
     value = table.pop(key)
     if not isinstance(value, str) or value.strip() == "":
-        raise DatasetError(f"{path}: {key} = {value!r} must be text.", fix=f'write {key} = "{example}"')
+        raise DatasetError(f"{path}: {key} = {repr(value)[:60]} must be text.", fix=f'write {key} = "{example}"')
     return value.strip()
 
 

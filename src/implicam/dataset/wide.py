@@ -1,13 +1,14 @@
 """A dataset as one table: x,y,z,u_cam1,v_cam1,... in CSV or Parquet, or as the arrays of an NPZ.
 
 The table has one row per point; an empty cell is a missing view. What dataset.toml says (name, unit, image sizes)
-travels in `<file>.toml` beside a CSV, in the schema of a Parquet file, in the array `dataset` of an NPZ. A CSV
+travels in `<file>.csv.toml` beside a CSV, in the schema of a Parquet file, in the array `dataset` of an NPZ. A CSV
 without it still reads: name from the file, cameras from the columns, image sizes unknown, unit from `unit`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset.folder import SD_POINT, SD_VIEW, cell, check_inside, csv_text, description_text
-from implicam.dataset.model import Camera, Dataset, Floats, KnownPositions, Names, Observations
-from implicam.dataset.tables import description_from_toml, number, parse_toml, read_table, read_toml
-from implicam.errors import DatasetError, ImplicamError, import_extra
+from implicam.dataset.folder import cells, csv_text, description_text
+from implicam.dataset.model import (
+    SD_POINT,
+    SD_VIEW,
+    WIDE_TABLE,
+    Camera,
+    Dataset,
+    Floats,
+    KnownPositions,
+    Names,
+    Observations,
+    check_inside,
+    check_name,
+)
+from implicam.dataset.tables import (
+    description_from_toml,
+    name_in,
+    naming,
+    number,
+    parse_toml,
+    read_table,
+    read_toml,
+    require_file,
+)
+from implicam.errors import DatasetError, ImplicamError, did_you_mean, import_extra
 from implicam.files import npz_bytes, read_npz, replacing, toml_text, write_text
 
-_META = "wide_table"  # the table of the sidecar that tells apart columns a name alone cannot
+_EXAMPLE = "x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ..."
 
 
 @dataclass(frozen=True)
@@ -40,6 +62,10 @@ class _Layout:
         return ["x", "y", "z", *SD_POINT, *views]
 
 
+def _sidecar(path: Path) -> Path:
+    return path.with_name(path.name + ".toml")  # not rig.toml, which may be anything
+
+
 def _layout(header: list[str], description: dict[str, Any] | None, path: Path, unit: str | None) -> _Layout:
     extra: dict[str, Any] = {}
     view_extra: tuple[str, ...] = ()
@@ -47,29 +73,43 @@ def _layout(header: list[str], description: dict[str, Any] | None, path: Path, u
         if unit is None:
             raise DatasetError(
                 f"{path}: the length unit of x, y, z is not stated.",
-                why=f"a wide CSV carries it in {path.with_suffix('.toml').name} beside it, which is not there",
+                why=f"a wide CSV carries it in {_sidecar(path).name} beside it, which is not there",
                 fix='add --unit mm, or unit="mm" in read_dataset(...)',
             )
-        cameras = tuple(
-            Camera(column[2:]) for column in header if column.startswith("u_") and "v_" + column[2:] in header
-        )
+        cameras = tuple(Camera(name) for name in _cameras_named(header))
         name = path.stem
     else:
-        described = dict(description)
-        meta = described.pop(_META, {})
-        view_extra = tuple(map(str, meta.get("view_columns", ()))) if isinstance(meta, dict) else ()
-        name, unit, cameras, extra = description_from_toml(described, path)
+        meta = description.get(WIDE_TABLE, {})
+        listed = meta.get("view_columns", ()) if isinstance(meta, dict) else ()
+        view_extra = tuple(map(str, listed)) if isinstance(listed, list) else ()
+        name, unit, cameras, extra = description_from_toml(description, path)
+        known = [camera.name for camera in cameras]
+        for camera in _cameras_named(header):
+            if camera not in known:
+                raise DatasetError(
+                    f"{path}, line 1: the columns u_{camera} and v_{camera} belong to no camera of the description"
+                    f"{did_you_mean(camera, known)}.",
+                    fix=f"the cameras are {', '.join(known)}; rename the columns, or add a [[cameras]] table",
+                )
     if not cameras:
         raise DatasetError(
             f"{path}, line 1: there are no camera columns.", fix="name them u_cam1,v_cam1,u_cam2,v_cam2, ..."
         )
+    columns = set(header)
     for column in (f"{q}_{camera.name}" for camera in cameras for q in "uv"):
-        if column not in header:
+        if column not in columns:
             raise DatasetError(f"{path}, line 1: the column {column!r} is missing.", fix="every camera needs u_ and v_")
     taken = {"point", "shot", "x", "y", "z", *SD_POINT}
     taken |= {f"{q}_{c.name}" for c in cameras for q in ("u", "v", *SD_VIEW, *view_extra)}
     point_extra = tuple(column for column in header if column not in taken)
     return _Layout(cameras, view_extra, point_extra, name, unit, extra)
+
+
+def _cameras_named(header: Iterable[str]) -> list[str]:
+    """The cameras that have both a column u_ and a column v_."""
+    columns = list(header)
+    second = {column[2:] for column in columns if column.startswith("v_")}
+    return [column[2:] for column in columns if column.startswith("u_") and column[2:] in second]
 
 
 Cells = Mapping[str, NDArray[Any]]
@@ -93,14 +133,34 @@ def _assemble(cells: Cells, layout: _Layout, n: int, place: Callable[[int], str]
             fix="a missing view leaves both empty",
         )
     check_inside(uv, cameras, lambda i, k: place(i))
+    sd = views(*SD_VIEW)
+    for i, k in np.argwhere(((sd <= 0) & ~half[..., None] & ~np.isnan(uv)).any(axis=2))[:1]:
+        raise DatasetError(
+            f"{place(i)}: sd_u_{cameras[k].name} and sd_v_{cameras[k].name} must be greater than zero.",
+            why="they are standard uncertainties",
+            fix="leave the cell empty where no uncertainty is stated",
+        )
     points = cells.get("point", np.array([f"p{i + 1:04d}" for i in range(n)]))
+    _check_points(points, place)
     view_extra = {
         key: np.stack([cells.get(f"{key}_{c.name}", text) for c in cameras], axis=1).astype(np.str_)
         for key in layout.view_extra
     }
-    observations = Observations(points, cameras, uv, views(*SD_VIEW), view_extra)
+    observations = Observations(points, cameras, uv, sd, view_extra)
     known = _known(cells, layout, points, place) if "x" in cells else None
     return Dataset(layout.name, layout.unit, observations, known, layout.extra)
+
+
+def _check_points(points: Names, place: Callable[[int], str]) -> None:
+    first: dict[str, int] = {}
+    for i, name in enumerate(points.tolist()):
+        name_in(name, "point", place(i))
+        if name in first:
+            raise DatasetError(
+                f"{place(i)}: point {name!r} is there twice (first at {place(first[name])}).",
+                fix="remove one, or give each point a name of its own",
+            )
+        first[name] = i
 
 
 def _known(cells: Cells, layout: _Layout, points: Names, place: Callable[[int], str]) -> KnownPositions:
@@ -112,50 +172,55 @@ def _known(cells: Cells, layout: _Layout, points: Names, place: Callable[[int], 
         )
     nan = np.full(len(points), np.nan)
     sd = np.stack([cells.get(c, nan) for c in SD_POINT], axis=1)
+    for i, k in np.argwhere(sd < 0)[:1]:
+        raise DatasetError(
+            f"{place(i)}: {SD_POINT[k]} = {sd[i, k]:g} must be at least zero.",
+            why="it is a standard uncertainty",
+            fix="leave the cell empty where no uncertainty is stated",
+        )
     extra = {c: cells[c].astype(np.str_) for c in layout.point_extra}
-    return KnownPositions(cells.get("shot", points), xyz, sd, extra)
+    shots = cells.get("shot", points)
+    for i, shot in enumerate(shots.tolist()):
+        name_in(shot, "shot", place(i))
+    return KnownPositions(shots, xyz, sd, extra)
 
 
 def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
     """Read `x,y,z,u_cam1,v_cam1,...`, with or without point, shot, sd_x, sd_u_cam1 and further columns."""
-    header, rows = read_table(path, ())
-    sidecar = path.with_suffix(".toml")
+    header, rows = read_table(path, (), _EXAMPLE)
+    sidecar = _sidecar(path)
     layout = _layout(header, read_toml(sidecar) if sidecar.exists() else None, path, unit)
     for axis in "xyz":
         if ("x" in header) != (axis in header):
             raise DatasetError(f"{path}, line 1: x, y and z must all be there, or none.", fix="add the missing column")
     numeric = set(layout.numbers()) & set(header)
     columns: dict[str, list[Any]] = {column: [] for column in header}
+    is_number = [(column, column in numeric, column in ("point", "shot")) for column in header]
     lines = []
+    in_file = f"{path}, line "
     for line, row in rows:
         lines.append(line)
-        for column, text in zip(header, row, strict=True):
-            value = _optional(text, f"{path}, line {line}", column) if column in numeric else text
+        for (column, numerical, name), text in zip(is_number, row, strict=True):
+            value = _optional(text, in_file, line, column) if numerical else text.strip() if name else text
             columns[column].append(value)
     if not lines:
         raise DatasetError(f"{path} has a header and no rows.", fix="add one row per point")
-    cells = {c: np.array(v, dtype=np.float64 if c in numeric else np.str_) for c, v in columns.items()}
-    return _named(path, lambda: _assemble(cells, layout, len(lines), lambda i: f"{path}, line {lines[i]}"))
+    table = {c: np.array(v, dtype=np.float64 if c in numeric else np.str_) for c, v in columns.items()}
+    with naming(path):
+        return _assemble(table, layout, len(lines), lambda i: f"{path}, line {lines[i]}")
 
 
-def _optional(text: str, place: str, column: str) -> float:
+def _optional(text: str, in_file: str, line: int, column: str) -> float:
+    text = text.strip()
     if text == "" or text.lower() == "nan":  # in a wide table this is how a missing view is written
         return float("nan")
-    return number(text, place, column, cure_nan="leave the cell empty where there is no value")
-
-
-def _named(path: Path, read: Callable[[], Dataset]) -> Dataset:
-    """Put the file's name before an error of the values themselves."""
-    try:
-        return read()
-    except DatasetError as error:
-        if str(path) in error.what:
-            raise
-        raise DatasetError(f"{path}: {error.what}", why=error.why, fix=error.fix) from None
+    return number(text, f"{in_file}{line}", column, cure_nan="leave the cell empty where there is no value")
 
 
 def _columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
     """The columns of the table (numbers or text), and the sidecar's text."""
+    if not len(data):
+        raise DatasetError(f"dataset {data.name!r} has no points.", fix="a table needs one; write it as .npz")
     observations = data.observations
     columns: dict[str, NDArray[Any]] = {"point": data.points}
     if data.known:
@@ -168,53 +233,85 @@ def _columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
         }
         if not np.isnan(observations.sd).all():
             columns |= {f"sd_{q}_{camera.name}": observations.sd[:, k, i] for i, q in enumerate("uv")}
-    view_extra = {
-        f"{key}_{c.name}": v[:, k] for key, v in observations.extra.items() for k, c in enumerate(data.cameras)
-    }
-    point_extra = dict(data.known.extra) if data.known else {}
-    for column in [*view_extra, *point_extra]:
-        clash = column in columns or (column in view_extra and column in point_extra)
-        if clash or (column in SD_POINT):
-            raise DatasetError(
-                f"the extra column {column!r} would stand twice in one wide table.",
-                fix="rename it, or write the dataset as a folder or NPZ",
-            )
+    view_extra = [
+        (f"{key}_{c.name}", v[:, k]) for key, v in observations.extra.items() for k, c in enumerate(data.cameras)
+    ]
+    extra = [*(data.known.extra.items() if data.known else ()), *view_extra]
+    _check_distinct(data.cameras, [column for column, _ in extra])
     description = parse_toml(description_text(data))
     if observations.extra:
-        description = {_META: {"view_columns": list(observations.extra)}, **description}
-    return {**columns, **point_extra, **view_extra}, toml_text(description)
+        description = {WIDE_TABLE: {"view_columns": list(observations.extra)}, **description}
+    return {**columns, **dict(extra)}, toml_text(description)
+
+
+def _check_distinct(cameras: tuple[Camera, ...], extra: list[str]) -> None:
+    """Refuse extra columns that a reader could take for something else, or for each other."""
+    taken = {"point", "shot", *_Layout(cameras, (), (), "", "", {}).numbers()}
+    taken |= {column for column, times in Counter(extra).items() if times > 1}
+    taken |= {f"u_{name}" for name in _cameras_named([*extra, *taken])}
+    for column in extra:
+        if column in taken:
+            raise DatasetError(
+                f"the extra column {column!r} could be mistaken for another in one wide table.",
+                fix="rename it, or write the dataset as a folder or NPZ",
+            )
+        with naming("as a wide table"):
+            check_name(column, "column name")
 
 
 def write_wide_csv(data: Dataset, path: Path) -> None:
     """Write one wide CSV, and its description beside it as `<name>.toml`."""
     columns, description = _columns(data)
-    cells = [v if v.dtype.kind == "U" else np.array([cell(x) for x in v]) for v in columns.values()]
-    write_text(path.with_suffix(".toml"), description)
-    write_text(path, csv_text(list(columns), (list(row) for row in zip(*cells, strict=True))))
+    text = [v.tolist() if v.dtype.kind == "U" else cells(v) for v in columns.values()]
+    write_text(_sidecar(path), description)
+    write_text(path, csv_text(list(columns), zip(*text, strict=True)))
 
 
 def read_parquet(path: Path) -> Dataset:
     """Read a wide table from Parquet."""
     parquet = import_extra("pyarrow.parquet", "parquet", "reading Parquet")
-    _must_exist(path)
+    arrow = import_extra("pyarrow", "parquet", "reading Parquet")
+    require_file(path, "check the name")
     try:
-        table = parquet.read_table(path)
-        description = parse_toml((table.schema.metadata or {})[b"implicam"].decode())
-        cells = {c: np.array(table.column(c).to_pylist()) for c in table.column_names}
-    except KeyError:
+        # pre_buffer and threads off: a damaged file is to fail here, not in another thread
+        table = parquet.ParquetFile(path, pre_buffer=False).read(use_threads=False)
+        metadata = table.schema.metadata or {}
+        description = parse_toml(metadata[b"implicam"].decode()) if b"implicam" in metadata else None
+        columns = {c: table.column(i).to_pylist() for i, c in enumerate(table.column_names)}
+    except (arrow.ArrowException, OSError, ValueError, TypeError, KeyError, OverflowError, MemoryError) as error:
+        raise DatasetError(
+            f"{path} is not a readable Parquet file.", why=str(error)[:300], fix="write it again"
+        ) from None
+    if description is None:
         raise DatasetError(
             f"{path} carries no implicam description.",
             why="name, unit and image sizes are kept in the metadata of the schema",
             fix="write it with implicam, or convert it to a wide CSV and state the unit",
-        ) from None
-    except (OSError, ValueError, TypeError, MemoryError) as error:
-        raise DatasetError(
-            f"{path} is not a readable Parquet file.", why=str(error)[:300], fix="write it again"
-        ) from None
+        )
+    for column, times in Counter(table.column_names).items():
+        if times > 1:
+            raise DatasetError(f"{path}: the column {column[:60]!r} is there {times} times.", fix="leave one out")
     layout = _layout(table.column_names, description, path, None)
+    if "x" in columns and not {"y", "z"} <= set(columns):
+        raise DatasetError(f"{path}: x, y and z must all be there, or none.", fix="add the missing column")
     numeric = set(layout.numbers())
-    cells = {c: v.astype(np.float64 if c in numeric else np.str_) for c, v in cells.items()}
-    return _named(path, lambda: _assemble(cells, layout, table.num_rows, lambda i: f"{path}, row {i + 1}"))
+    typed = {c: _typed(v, c, c in numeric, path) for c, v in columns.items()}
+    with naming(path):
+        return _assemble(typed, layout, table.num_rows, lambda i: f"{path}, row {i + 1}")
+
+
+def _typed(values: list[Any], column: str, numerical: bool, path: Path) -> NDArray[Any]:
+    """A column of Parquet as numbers (NaN where there is none) or text (empty where there is none)."""
+    wanted: type | tuple[type, ...] = (int, float) if numerical else str
+    for i, value in enumerate(values):
+        if value is not None and (not isinstance(value, wanted) or isinstance(value, bool)):
+            raise DatasetError(
+                f"{path}, row {i + 1}: {column} = {str(value)[:60]!r} is not {'a number' if numerical else 'text'}.",
+                fix="convert the column, or leave it out",
+            )
+    if numerical:
+        return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    return np.array([value or "" for value in values], dtype=np.str_)
 
 
 def write_parquet(data: Dataset, path: Path) -> None:
@@ -252,17 +349,16 @@ def arrays_from_dataset(data: Dataset) -> dict[str, NDArray[Any]]:
 def dataset_from_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> Dataset:
     """The inverse; whatever does not fit together is a DatasetError."""
     try:
-        description = parse_toml(str(arrays["dataset"][()]))
-        name, unit, cameras, extra = description_from_toml(description, path)
-        columns = [str(c) for c in arrays["view_columns"]]
-        view_extra = dict(zip(columns, arrays["view_text"], strict=True))
-        observations = Observations(arrays["points"], cameras, arrays["uv"], arrays["uv_sd"], view_extra)
-        known = None
-        if "xyz" in arrays:
-            columns = [str(c) for c in arrays["point_columns"]]
-            point_extra = dict(zip(columns, arrays["point_text"], strict=True))
-            known = KnownPositions(arrays["shots"], arrays["xyz"], arrays["xyz_sd"], point_extra)
-        return _named(path, lambda: Dataset(name, unit, observations, known, extra))
+        with naming(path):
+            description = parse_toml(str(arrays["dataset"][()]))
+            name, unit, cameras, extra = description_from_toml(description, path)
+            view_extra = dict(zip(arrays["view_columns"].tolist(), arrays["view_text"], strict=True))
+            observations = Observations(arrays["points"], cameras, arrays["uv"], arrays["uv_sd"], view_extra)
+            known = None
+            if "xyz" in arrays:
+                point_extra = dict(zip(arrays["point_columns"].tolist(), arrays["point_text"], strict=True))
+                known = KnownPositions(arrays["shots"], arrays["xyz"], arrays["xyz_sd"], point_extra)
+            return Dataset(name, unit, observations, known, extra)
     except KeyError as error:
         raise DatasetError(f"{path} has no array {error}.", fix="write it again with implicam") from None
     except (ValueError, TypeError, IndexError) as error:
@@ -271,13 +367,11 @@ def dataset_from_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> Datas
 
 def read_npz_dataset(path: Path) -> Dataset:
     """Read a dataset from NPZ, never with pickle."""
-    _must_exist(path)
+    require_file(path, "check the name")
     with path.open("rb") as file:
         if file.read(2) != b"PK":
             raise DatasetError(f"{path} is not an NPZ file.", fix="write it with implicam")
-        file.seek(0)
-        content = file.read()
-    arrays = read_npz(content, lambda reason: _refused(path, reason))
+    arrays = read_npz(path, lambda reason: _refused(path, reason))
     return dataset_from_arrays(arrays, path)
 
 
@@ -289,8 +383,3 @@ def write_npz_dataset(data: Dataset, path: Path) -> None:
     """Write a dataset as NPZ."""
     with replacing(path) as temporary:
         temporary.write_bytes(npz_bytes(arrays_from_dataset(data)))
-
-
-def _must_exist(path: Path) -> None:
-    if not path.is_file():
-        raise DatasetError(f"{path} does not exist.", fix="check the name")
