@@ -23,7 +23,7 @@ from implicam.calibrators import (
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import DatasetError, FitError, MissingExtraError, UsageError
 from implicam.evaluate import evaluate
-from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate
+from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate, simulated
 from implicam.threads import cores, side_by_side
 
 KNOWN, HELD_OUT = 60, 40
@@ -579,3 +579,13 @@ def test_side_by_side_limits_the_blas_and_lets_go_again() -> None:
     during = side_by_side(lambda _: max(threads(), default=1), range(4))
     assert max(during) <= max(1, cores() // min(4, cores()))
     assert threads() == before
+
+
+def test_a_wrong_known_point_is_named():
+    data = simulated("bar6", points=150, seed=3)
+    assert not any("far from what all others" in note for note in InverseGP().fit(data).notes())
+    xyz = data.xyz.copy()
+    xyz[17] += 20.0
+    wrong = replace(data, known=replace(data.positions, xyz=xyz))
+    notes = InverseGP().fit(wrong).notes()
+    assert any(f"1 known point far from what all others predict: {data.points[17]} (" in note for note in notes), notes

@@ -46,7 +46,7 @@ class Demo:
 
 def run(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Demo:
     """Run the demo into `folder`, a new one or that of an earlier demo, which it replaces."""
-    if not _may_replace(folder):
+    if not may_replace(folder):
         raise UsageError(
             f"{folder} exists and was not made by the demo.", fix="give another folder: implicam demo OTHER-NAME"
         )
@@ -82,7 +82,8 @@ def run(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Demo:
     return demo
 
 
-def _may_replace(folder: Path) -> bool:
+def may_replace(folder: Path) -> bool:
+    """Whether nothing of anybody else stands there: nothing at all, or an earlier demo."""
     if not folder.is_dir():
         return not folder.exists()
     truth = folder / "truth.toml"

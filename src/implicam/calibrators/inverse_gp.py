@@ -33,6 +33,7 @@ from implicam.threads import side_by_side
 PRESETS = ("standardised", "paper")
 AXES = "xyz"
 EXTENT = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
+SUSPECT = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
 LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
 
@@ -208,6 +209,26 @@ class InverseGPCalibration:
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
+        return [*self._lattice(), *self._suspects()]
+
+    def _suspects(self) -> list[str]:
+        """Known points that the others contradict: a wrong detection, a wrong position."""
+        errors = []
+        for gp in self.processes:
+            mean, variance = gp.leave_one_out()
+            errors.append(np.abs(gp.y - mean) / np.sqrt(variance))
+        worst = np.max(errors, axis=0)
+        names = self.data.points[self.data.observations.seen.all(axis=1)]
+        found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > SUSPECT]
+        if not found:
+            return []
+        more = f" and {len(found) - 5} more" if len(found) > 5 else ""
+        return [
+            f"{len(found)} known point{'s' * (len(found) > 1)} far from what all others predict: "
+            f"{', '.join(found[:5])}{more}. Look for a wrong detection or position: nothing is rejected here."
+        ]
+
+    def _lattice(self) -> list[str]:
         lattice = [
             f"{axis} has {len(np.unique(values))} values"
             for axis, values in zip(AXES, self.data.xyz.T, strict=True)

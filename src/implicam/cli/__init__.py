@@ -43,7 +43,7 @@ def _unexpected(error: Exception) -> ImplicamError:
     if isinstance(error, OSError):
         return ImplicamError(f"{error.filename or 'a file'}: {error.strerror or error}.", fix="check the file")
     return ImplicamError(
-        f"an unexpected {type(error).__name__}: {error}",
+        f"an unexpected {type(error).__name__}: {' '.join(str(error).split())}",
         why="probably a mistake in implicam itself",
         fix="run the command again with --debug and report what it prints",
     )

@@ -39,7 +39,7 @@ EXAMPLES = {
     "calibrate": "implicam calibrate my-rig -o my-rig.implicam",
     "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
     "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
-    "compare": "implicam compare my-rig --train 17,35,87 --seeds 3 -o compare.png",
+    "compare": "implicam compare my-rig --train 35,87 --seeds 3 -o compare.png",
     "report": "implicam report my-rig.implicam -o report.html",
     "convert": "implicam convert my-rig my-rig.csv",
     "info": "implicam info my-rig.implicam",
@@ -452,9 +452,9 @@ def compare_command(
     if output is not None:
         _check_figure(output)
     data = _read(dataset, unit, cameras, without)
+    sizes = _sizes(train, len(data))
     names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
     check_data = None if check is None else _read(check, unit, cameras, without)
-    sizes = _sizes(train, len(data))
     with show.progress(json) as progress:
         chosen = {name: _named_method(name) for name in names}
         trials = compare(data, chosen, sizes, seeds=seeds, check=check_data, progress=progress)

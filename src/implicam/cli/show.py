@@ -110,7 +110,7 @@ def percent(share: Estimate) -> str:
     """A share with its 95 % interval, both in whole per cent: more digits would be noise."""
     if not math.isfinite(share.value):
         return "-"
-    return f"{100 * share.value:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]"
+    return f"{100 * share.value:.0f} [{100 * share.low:.0f},{100 * share.high:.0f}]"
 
 
 def reasons(measurement: Measurement) -> list[str]:
@@ -182,8 +182,8 @@ def _coverage_table(rows: Sequence[Summary]) -> Table:
     overall, *regions = rows
     cells = [["per axis", *(percent(level.pooled) for level in overall.levels)]]
     cells += [[f"{axis} alone", *(percent(level.axes[i]) for level in overall.levels)] for i, axis in enumerate("xyz")]
-    cells += [["3D ellipsoid", *(percent(level.ellipsoid) for level in overall.levels)]]
-    cells += [[f"3D, {row.region}", *(percent(level.ellipsoid) for level in row.levels)] for row in regions if row.n]
+    cells += [["ellipsoid", *(percent(level.ellipsoid) for level in overall.levels)]]
+    cells += [[f"  {row.region}", *(percent(level.ellipsoid) for level in row.levels)] for row in regions if row.n]
     headings = [f"{100 * level.nominal:.0f} %" for level in overall.levels]
     return _table("How many % of the points lie within their error bars [95 % interval]", ["", *headings], cells)
 
