@@ -581,7 +581,7 @@ def test_side_by_side_limits_the_blas_and_lets_go_again() -> None:
     assert threads() == before
 
 
-def test_a_wrong_known_point_is_named():
+def test_a_wrong_known_point_is_named() -> None:
     data = simulated("bar6", points=150, seed=3)
     assert not any("far from what all others" in note for note in InverseGP().fit(data).notes())
     xyz = data.xyz.copy()
