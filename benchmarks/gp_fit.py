@@ -31,9 +31,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from implicam.calibrators.inverse_gp import EXTENT, Scaling
 from implicam.calibrators.paper_preset import LEARNING_RATE, STEPS, exact_gp
 from implicam.files import write_text
-from implicam.gp import Fit, GaussianProcess, Kernel, maximise
+from implicam.gp import Fit, GaussianProcess, Kernel, maximise_each
 from implicam.simulate import simulated
-from implicam.threads import side_by_side
 
 SETS = {4: "2R", 8: "2R2W", 12: "2R4W"}
 
@@ -45,7 +44,7 @@ def problem(n, d, seed):
 
 
 def ours(X, Y):
-    return side_by_side(lambda y: maximise(X, y, shortest=EXTENT), Y.T)
+    return maximise_each(X, Y, shortest=EXTENT)
 
 
 def with_gpytorch(X, Y):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from implicam.errors import NumericalError, UsageError
-from implicam.gp import SHAPES, GaussianProcess, Kernel, maximise
+from implicam.gp import SHAPES, GaussianProcess, Kernel, maximise, maximise_each
 from implicam.gp.fit import ProfiledLikelihood
 
 ALL_SHAPES = pytest.mark.parametrize("shape", list(SHAPES))
@@ -190,6 +190,18 @@ def test_a_warm_start_reaches_the_same_optimum_in_fewer_evaluations():
     warm = maximise(X, y, start=before)
     assert warm.log_marginal_likelihood == pytest.approx(fresh.log_marginal_likelihood, abs=1e-3)
     assert sum(warm.evaluations.values()) < sum(fresh.evaluations.values()) / 2
+
+
+def test_outputs_side_by_side_are_outputs_one_by_one():
+    X, y = problem(n=100)
+    Y = np.column_stack([y, X[:, 0] ** 2, np.cos(X[:, 1])])
+    steps = []
+    together = maximise_each(X, Y, done=lambda done, of: steps.append((done, of)))
+    for fit, column in zip(together, Y.T, strict=True):
+        alone = maximise(X, column)
+        assert fit.log_marginal_likelihood == pytest.approx(alone.log_marginal_likelihood, abs=1e-6)
+        assert fit.evaluations == alone.evaluations
+    assert sorted(steps) == [(k, 6) for k in range(1, 7)]
 
 
 def test_the_same_seed_gives_the_same_bits():

@@ -82,13 +82,14 @@ def compare(
             fix=f"choose numbers below {len(data)}, or give another dataset with --check",
         )
     trials: list[Trial] = []
-    total = len(methods) * len(set(sizes)) * seeds
-    for size in dict.fromkeys(sizes):  # the same size again would count the same split twice
-        for seed in range(seeds):
-            train, rest = (data, data) if size == len(data) else data.split(size, seed=seed)
-            for name, method in methods.items():
-                progress("comparing", len(trials), total)
-                trials.append(_trial(name, method, train, rest if check is None else check, seed))
+    # No split is drawn twice: neither for the same size again, nor where all points are taken.
+    splits = [(size, seed) for size in dict.fromkeys(sizes) for seed in range(1 if size == len(data) else seeds)]
+    total = len(methods) * len(splits)
+    for size, seed in splits:
+        train, rest = (data, data) if size == len(data) else data.split(size, seed=seed)
+        for name, method in methods.items():
+            progress("comparing", len(trials), total)
+            trials.append(_trial(name, method, train, rest if check is None else check, seed))
     progress("comparing", total, total)
     return trials
 

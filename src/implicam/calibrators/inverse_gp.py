@@ -25,7 +25,7 @@ from implicam import calibration_file
 from implicam.calibrators.protocol import Arrays, Unused, require_points, same_cameras, why_not_all_seen
 from implicam.dataset import Dataset, Floats, Names, Observations
 from implicam.errors import FitError, UsageError, did_you_mean
-from implicam.gp import SHAPES, GaussianProcess, Kernel, maximise
+from implicam.gp import SHAPES, GaussianProcess, Kernel, maximise_each
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
@@ -138,16 +138,15 @@ def _pixels(data: Dataset) -> Floats:
 
 def _train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperparameters, ...]:
     """Our own fit, the three outputs side by side."""
-    done: list[int] = []
-    progress("fitting", 0, 3)
-
-    def one(y: Floats) -> Hyperparameters:
-        fit = maximise(X, y, method.kernel, shortest=method.shortest_lengthscale, seed=method.seed)
-        done.append(1)
-        progress("fitting", len(done), 3)
-        return Hyperparameters(fit.kernel, fit.noise_variance)
-
-    return tuple(side_by_side(one, Y.T))
+    fits = maximise_each(
+        X,
+        Y,
+        method.kernel,
+        shortest=method.shortest_lengthscale,
+        seed=method.seed,
+        done=lambda done, of: progress("fitting", done, of),
+    )
+    return tuple(Hyperparameters(fit.kernel, fit.noise_variance) for fit in fits)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Gaussian-process mathematics only; knows nothing of cameras."""
 
-from implicam.gp.fit import Fit, maximise
+from implicam.gp.fit import Fit, maximise, maximise_each
 from implicam.gp.kernels import SHAPES, Floats, Kernel
 from implicam.gp.regression import GaussianProcess
 
-__all__ = ["SHAPES", "Fit", "Floats", "GaussianProcess", "Kernel", "maximise"]
+__all__ = ["SHAPES", "Fit", "Floats", "GaussianProcess", "Kernel", "maximise", "maximise_each"]
