@@ -103,7 +103,8 @@ def _held_out_in_turn(
     measurement = _stacked(m for m, _ in parts)
     row = {str(name): i for i, name in enumerate(data.points)}
     held_out = data.select([row[str(name)] for _, part in parts for name in part.points])
-    return _judge(calibration, held_out, measurement, data.xyz, how)
+    # what there is to note is of all points, not of those that the last round happened to leave
+    return _judge(fit(data), held_out, measurement, data.xyz, how)
 
 
 def _stacked(parts: Iterable[Measurement]) -> Measurement:

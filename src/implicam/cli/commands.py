@@ -125,7 +125,7 @@ def demo_command(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Simulate a rig, calibrate, measure, judge, report: everything once, in about a minute."""
+    """Simulate a rig, calibrate, measure, judge, report: everything once, in seconds."""
     from implicam.demo import run
 
     _must_be_folder(folder)
@@ -274,7 +274,7 @@ def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> Non
     show.line(f"{output}: {calibration.method} from {residuals['points_used']} points")
     within = ", ".join(f"{axis} {show.number(value)}" for axis, value in rms.items())
     show.line(f"each left out in turn is predicted from the rest within {within} {unit} rms")
-    show.notes(show.counted((entry.reason for entry in calibration.unused), "known points not used"))
+    show.notes(show.counted((entry.reason for entry in calibration.unused), "known point", "not used"))
     show.notes(notes)
 
 
@@ -344,7 +344,7 @@ def evaluate_command(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Hold the error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region."""
+    """Judge errors and error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region."""
     _check_evaluate(dataset, cv, leave_out, any((method, kernel, preset)))
     if report is not None:
         _need_plotly()

@@ -115,12 +115,13 @@ def percent(share: Estimate) -> str:
 
 def reasons(measurement: Measurement) -> list[str]:
     """How many points could not be measured, and why, the commonest reason first."""
-    return counted(map(str, measurement.reason[~measurement.measured]), "not measured")
+    return counted(map(str, measurement.reason[~measurement.measured]), "point", "not measured")
 
 
-def counted(reasons: Iterable[str], what: str) -> list[str]:
-    """`<count> <what>: <reason>`, the commonest reason first."""
-    return [f"{count} {what}: {reason}" for reason, count in Counter(reasons).most_common()]
+def counted(reasons: Iterable[str], noun: str, what: str) -> list[str]:
+    """`<count> <noun>s <what>: <reason>`, the commonest reason first."""
+    counts = Counter(reasons).most_common()
+    return [f"{count} {noun}{'s' * (count != 1)} {what}: {reason}" for reason, count in counts]
 
 
 def notes(texts: Sequence[str]) -> None:

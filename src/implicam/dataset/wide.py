@@ -260,11 +260,20 @@ def _check_distinct(cameras: tuple[Camera, ...], extra: list[str]) -> None:
 
 
 def write_wide_csv(data: Dataset, path: Path) -> None:
-    """Write one wide CSV, and its description beside it as `<name>.toml`."""
+    """Write one wide CSV, and its description beside it as `<name>.csv.toml`.
+
+    Two files cannot change at one instant. Where the description changes, the old one goes first: a kill in between
+    leaves a table without a description, which reading reports, never a table with the description of another.
+    """
     columns, description = _columns(data)
     text = [v.tolist() if v.dtype.kind == "U" else cells(v) for v in columns.values()]
-    write_text(_sidecar(path), description)
+    sidecar = _sidecar(path)
+    unchanged = sidecar.is_file() and sidecar.read_bytes() == description.encode()
+    if not unchanged:
+        sidecar.unlink(missing_ok=True)
     write_text(path, csv_text(list(columns), zip(*text, strict=True)))
+    if not unchanged:
+        write_text(sidecar, description)
 
 
 def read_parquet(path: Path) -> Dataset:
