@@ -17,18 +17,19 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas
 from scipy.optimize import minimize
 
 from implicam.errors import NumericalError
 from implicam.gp.kernels import SHAPES, Floats, Kernel, squared_distances
+from implicam.gp.linalg import cholesky, factor_in_place, invert_in_place, solve
 from implicam.threads import side_by_side
 
 LONGEST, SHORTEST = 1e6, 0.05  # default lengthscale bounds, in standard deviations of an input
 ALIVE = 30.0  # beyond this a lengthscale has next to no gradient: a search must not start there
 NOISIEST = 10.0  # largest noise-to-signal ratio
 SUBSET = 80
-CHEAP = 300  # up to this many points, several searches on all data cost nothing
+FEW, SEVERAL = 100, 300  # points: every search costs next to nothing; one on all data costs little
 _FAILED = 1e12
 
 
@@ -54,6 +55,7 @@ class ProfiledLikelihood:
         # Fresh n x n arrays would cost more in page faults than the arithmetic on them.
         self._d2: Floats = np.empty((n, n))
         self._A: Floats = np.empty((n, n))
+        self._upper: Floats = np.triu(np.ones((n, n)))
         self._left, self._right = np.ones((n, d + 2)), np.ones((n, d + 2))
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
@@ -63,17 +65,19 @@ class ProfiledLikelihood:
         rho = float(np.exp(theta[d]))
         scaled = self.X * np.exp(-theta[:d])
         correlation, slope = self.shape(self._squared_distances(scaled))
-        np.copyto(self._A, correlation)
+        # LAPACK sees the transpose: what is upper here is lower there, and the other half stays zero.
+        np.multiply(correlation, self._upper, out=self._A)
         self._A.flat[:: n + 1] = 1.0 + rho
-        L, info = lapack.dpotrf(self._A.T, lower=1, clean=1, overwrite_a=1)
-        if info != 0:
+        L = self._A.T
+        if factor_in_place(L) != 0:
             return _FAILED, np.zeros(d + 1)
-        a, _ = lapack.dpotrs(L, self.y, lower=1)
+        a = solve(L, self.y)
         signal = float(self.y @ a) / n
         value = 0.5 * n * (np.log(2 * np.pi * signal) + 1) + np.log(np.diagonal(L)).sum()
 
         # gradient = ½ tr((A^-1 - a a^T / signal) dA); only the lower triangle is ever formed
-        inverse, _ = lapack.dpotri(L, lower=1, overwrite_c=1)
+        invert_in_place(L)
+        inverse = L
         gradient = np.empty(d + 1)
         gradient[d] = 0.5 * rho * (np.trace(inverse) - a @ a / signal)
         blas.dsyr(-1.0 / signal, a, lower=1, a=inverse, overwrite_a=1)
@@ -97,9 +101,7 @@ class ProfiledLikelihood:
         scaled = self.X * np.exp(-theta[:d])
         A = self.shape(squared_distances(scaled, scaled))[0]
         A.flat[:: len(A) + 1] = 1.0 + np.exp(theta[d])
-        L, _ = lapack.dpotrf(A, lower=1)
-        a, _ = lapack.dpotrs(L, self.y, lower=1)
-        return float(self.y @ a) / len(A)
+        return float(self.y @ solve(cholesky(A.T), self.y)) / len(A)
 
     def fisher_information(self, theta: Floats) -> Floats:
         """(d + 1, d + 1) expected second derivatives, ½ tr(A^-1 dA A^-1 dA') less what the profiled signal absorbs."""
@@ -159,8 +161,9 @@ def maximise_each(
 
 
 def _ways(n: int) -> tuple[str, ...]:
-    # The longer first, so that the last ones to end are short.
-    return ("from_short", "from_subset") if n <= CHEAP else ("from_subset",)
+    if n <= FEW:
+        return "from_short", "from_subset"  # the longer first, so that the last ones to end are short
+    return ("from_short",) if n <= SEVERAL else ("from_subset",)
 
 
 def _best(fits: list[Fit]) -> Fit:

@@ -1,9 +1,17 @@
-"""Cholesky factors that either succeed or say why not. No jitter is ever added in silence."""
+"""Cholesky factors that either succeed or say why not. No jitter is ever added in silence.
+
+SciPy's Python wrappers of LAPACK keep the interpreter locked while they work, so two threads take turns. The costly
+calls therefore go to the same routines by their C pointers, which ctypes calls with the lock released.
+"""
 
 from __future__ import annotations
 
+import ctypes
+from ctypes import byref, c_char, c_int
+from typing import Any
+
 import numpy as np
-from scipy.linalg import lapack
+from scipy.linalg import cython_lapack, lapack
 
 from implicam.errors import NumericalError
 from implicam.gp.kernels import Floats
@@ -32,12 +40,50 @@ def _reason(K: Floats, info: int) -> NumericalError:
     )
 
 
+def _routine(name: str, arguments: int) -> Any:
+    """A LAPACK routine by the pointer that SciPy publishes for C callers."""
+    capsule = cython_lapack.__pyx_capi__[name]
+    get_name, get_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
+    get_name.restype, get_name.argtypes = ctypes.c_char_p, [ctypes.py_object]
+    get_pointer.restype, get_pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    prototype = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * arguments)
+    return prototype(get_pointer(capsule, get_name(capsule)))
+
+
+_DPOTRF, _DPOTRI, _DTRTRS = _routine("dpotrf", 5), _routine("dpotri", 5), _routine("dtrtrs", 10)
+
+
+def _address(A: Floats) -> int:
+    if A.dtype != np.float64 or not A.flags.f_contiguous or not A.flags.writeable:
+        raise TypeError("LAPACK works in place on writeable Fortran-ordered float64 arrays")
+    return int(A.ctypes.data)
+
+
+def factor_in_place(A: Floats) -> int:
+    """Replace the lower triangle of A by its Cholesky factor; the upper is not touched. 0, or the row that failed."""
+    n, info = c_int(len(A)), c_int(0)
+    _DPOTRF(byref(c_char(b"L")), byref(n), _address(A), byref(n), byref(info))
+    return info.value
+
+
+def invert_in_place(L: Floats) -> None:
+    """Replace a Cholesky factor in the lower triangle by the inverse of the matrix it factors, lower triangle only."""
+    n, info = c_int(len(L)), c_int(0)
+    _DPOTRI(byref(c_char(b"L")), byref(n), _address(L), byref(n), byref(info))
+
+
 def solve_lower(L: Floats, B: Floats) -> Floats:
-    """`L^-1 B` for lower-triangular L; B is (n,) or (n, m)."""
-    x, info = lapack.dtrtrs(L, B, lower=1)
-    if info != 0:
-        raise NumericalError(f"the triangular factor has a zero in row {info}.", fix="raise the noise variance")
-    return x  # type: ignore[no-any-return]
+    """`L^-1 B` for lower-triangular Fortran-ordered L; B is (n,) or (n, m)."""
+    x = np.array(B, dtype=np.float64, order="F")
+    n, m, info = c_int(len(L)), c_int(1 if x.ndim == 1 else x.shape[1]), c_int(0)
+    factor = np.asfortranarray(L)
+    lower, plain, not_unit = (byref(c_char(letter)) for letter in (b"L", b"N", b"N"))
+    _DTRTRS(
+        lower, plain, not_unit, byref(n), byref(m), factor.ctypes.data, byref(n), _address(x), byref(n), byref(info)
+    )
+    if info.value != 0:
+        raise NumericalError(f"the triangular factor has a zero in row {info.value}.", fix="raise the noise variance")
+    return x
 
 
 def solve(L: Floats, b: Floats) -> Floats:
