@@ -32,7 +32,11 @@ def blas_threads(count: int) -> Iterator[None]:
 
 
 def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """`work` on each item, results in order, on all cores: NumPy and LAPACK release the interpreter."""
+    """`work` on each item, results in order, on all cores.
+
+    It helps where NumPy works, or LAPACK through implicam.gp.linalg: they release the interpreter. SciPy's own wrappers
+    of LAPACK do not.
+    """
     tasks = list(items)
     workers = max(1, min(len(tasks), cores()))
     with blas_threads(max(1, cores() // workers)), ThreadPoolExecutor(workers) as pool:
