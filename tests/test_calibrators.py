@@ -589,3 +589,11 @@ def test_a_wrong_known_point_is_named() -> None:
     wrong = replace(data, known=replace(data.positions, xyz=xyz))
     notes = InverseGP().fit(wrong).notes()
     assert any(f"1 known point far from what all others predict: {data.points[17]} (" in note for note in notes), notes
+
+
+def test_a_slanted_plane_is_noted():
+    rig = build_rig("bar6", seed=2, frame="random", cameras="2R")
+    boards = simulate(rig, moving_board(rig, positions=2), seed=2)
+    both, one = InverseGP().fit(boards), InverseGP().fit(boards.select(boards.shots == "board01"))
+    assert not any("lie in one plane" in note for note in both.notes())
+    assert any("lie in one plane" in note for note in one.notes())

@@ -33,6 +33,7 @@ from implicam.threads import side_by_side
 PRESETS = ("standardised", "paper")
 AXES = "xyz"
 EXTENT = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
+FLAT = 1e-3  # thickness over width of what is called a plane
 SUSPECT = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
 LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
@@ -208,7 +209,18 @@ class InverseGPCalibration:
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*self._lattice(), *self._suspects()]
+        return [*self._flat(), *self._lattice(), *self._suspects()]
+
+    def _flat(self) -> list[str]:
+        """Known points in one plane, whichever way it lies."""
+        centred = self.data.xyz - self.data.xyz.mean(axis=0)
+        extents = np.linalg.svd(centred, compute_uv=False)
+        if extents[-1] > FLAT * extents[0]:
+            return []
+        return [
+            "The known positions lie in one plane. Positions off it are not measured but guessed, and their error bars "
+            "cannot say how badly: add known points in front of it and behind."
+        ]
 
     def _suspects(self) -> list[str]:
         """Known points that the others contradict: a wrong detection, a wrong position."""
