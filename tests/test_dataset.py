@@ -9,6 +9,7 @@ import difflib
 import math
 import os
 import random
+import sys
 import time
 import tracemalloc
 from collections.abc import Callable
@@ -1311,6 +1312,7 @@ def test_a_link_to_a_dataset_stays_a_link(tmp_path: Path) -> None:
 
 def test_a_failed_swap_keeps_the_old_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_dataset(numbered(3), tmp_path / "rig")
+    monkeypatch.setattr("implicam.files._exchanged", lambda a, b: False)  # a system that cannot swap in one step
     rename = Path.rename
 
     def fail(self: Path, target: Path) -> Path:
@@ -1326,9 +1328,21 @@ def test_a_failed_swap_keeps_the_old_folder(tmp_path: Path, monkeypatch: pytest.
     assert [p.name for p in tmp_path.iterdir()] == ["rig"]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux swaps two folders in one step")
+def test_a_folder_is_swapped_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "rig").mkdir()
+    (tmp_path / "rig" / "old").touch()
+    monkeypatch.setattr(Path, "rename", lambda a, b: pytest.fail("the folder is gone between two renames"))
+    with replacing_folder(tmp_path / "rig", overwrite=True) as folder:
+        (folder / "new").touch()
+    assert [entry.name for entry in (tmp_path / "rig").iterdir()] == ["new"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["rig"]
+
+
 def test_a_kill_between_the_renames_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A kill runs no `except`: as if every later file operation did nothing."""
     write_dataset(numbered(3), tmp_path / "rig")
+    monkeypatch.setattr("implicam.files._exchanged", lambda a, b: False)  # a system that cannot swap in one step
     rename = Path.rename
     monkeypatch.setattr(Path, "rename", lambda a, b: rename(a, b) if b.name.endswith(".old") else a)
     monkeypatch.setattr("shutil.rmtree", lambda *_, **__: None)

@@ -7,6 +7,7 @@ never with pickle.
 
 from __future__ import annotations
 
+import ctypes
 import io
 import math
 import os
@@ -70,8 +71,8 @@ def replacing(path: Path) -> Iterator[Path]:
 def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """The same for a folder. An existing one is refused unless `overwrite`, and then swapped when all is ready.
 
-    No system swaps two folders in one step everywhere, so a kill in the instant between the two renames leaves the
-    old folder beside its place; `left_behind` finds it, and nothing is lost.
+    Where the system cannot swap two folders in one step, a kill in the instant between two renames leaves the old
+    folder beside its place; `left_behind` finds it, and nothing is lost.
     """
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
@@ -100,6 +101,8 @@ def _swap_in(temporary: Path, path: Path) -> None:
     if not path.exists():
         temporary.rename(path)
         return
+    if _exchanged(temporary, path):
+        return  # the caller removes what is the old folder now
     retired = temporary.with_name(temporary.name + _RETIRED)
     path.rename(retired)
     try:
@@ -108,6 +111,16 @@ def _swap_in(temporary: Path, path: Path) -> None:
         retired.rename(path)
         raise
     shutil.rmtree(retired, ignore_errors=True)
+
+
+def _exchanged(a: Path, b: Path) -> bool:
+    """Swap two folders in one step, where the system can: Linux, and most of its file systems."""
+    try:
+        swap = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError, TypeError):
+        return False
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return bool(swap(here, os.fsencode(a), here, os.fsencode(b), exchange) == 0)
 
 
 _RETIRED = ".old"
