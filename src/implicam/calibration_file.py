@@ -84,10 +84,6 @@ def save(calibration: Savable, path: str | Path) -> None:
 def _description(calibration: Savable) -> dict[str, Any]:
     data = calibration.data
     known = data.xyz
-    cameras = [
-        {key: value for key, value in (("name", c.name), ("width", c.width), ("height", c.height)) if value is not None}
-        for c in data.cameras
-    ]
     return {
         "format_version": FORMAT_VERSION,
         "method": calibration.method,
@@ -103,7 +99,7 @@ def _description(calibration: Savable) -> dict[str, Any]:
             "numpy": np.__version__,
             "scipy": scipy.__version__,
         },
-        "cameras": cameras,
+        "cameras": [camera.as_table() for camera in data.cameras],
     }
 
 

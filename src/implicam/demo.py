@@ -15,7 +15,7 @@ from implicam.errors import UsageError, import_extra
 from implicam.evaluate import Evaluation, evaluate
 from implicam.files import toml_text
 from implicam.progress import Progress, silent
-from implicam.report import ReportData, write_report
+from implicam.report import report_of, write_report
 from implicam.simulate import Rig, build_rig, random_positions, simulate, write_rig
 
 RIG, KNOWN, HELD_OUT = "bar6", 157, 500
@@ -104,25 +104,3 @@ def _one(known: Dataset, held_out: Dataset, size: int, seed: int) -> tuple[Calib
     # against the check points only: the known ones that were not drawn are fewer, and differ from row to row
     evaluation = evaluate(calibration, held_out, regions=size == KNOWN)
     return calibration, evaluation, trial_of(evaluation, calibration.method, size, seed, seconds)
-
-
-def report_of(evaluation: Evaluation, title: str) -> ReportData:
-    """The report of an evaluation."""
-    data = evaluation.data
-    facts = (
-        ("Dataset", data.name),
-        ("Method", evaluation.method),
-        ("Cameras", f"{len(data.cameras)}: {', '.join(camera.name for camera in data.cameras)}"),
-        ("Known points", str(len(evaluation.known_xyz))),
-        ("Judged on", evaluation.how),
-        ("Length unit", data.length_unit),
-    )
-    return ReportData(
-        title,
-        evaluation.measurement,
-        facts=facts,
-        coverage=evaluation.coverage,
-        true_xyz=evaluation.true_xyz,
-        known_xyz=evaluation.known_xyz,
-        notes=(f"Errors are taken against {evaluation.against}.", *evaluation.notes),
-    )

@@ -422,8 +422,7 @@ def _need_plotly() -> None:
 
 
 def _write_report(evaluation: Evaluation, path: Path) -> None:
-    from implicam.demo import report_of
-    from implicam.report import write_report
+    from implicam.report import report_of, write_report
 
     write_report(path, report_of(evaluation, f"{evaluation.data.name}, measured with {evaluation.method}"))
 

@@ -276,11 +276,7 @@ def _refuse_to_lose(data: Dataset) -> None:
 
 def description_text(data: Dataset) -> str:
     """dataset.toml as text."""
-    cameras = []
-    for camera in data.cameras:
-        sizes = {"width": camera.width, "height": camera.height}
-        known = {key: size for key, size in sizes.items() if size is not None}
-        cameras.append({"name": camera.name, **known, **camera.extra})
+    cameras = [{**camera.as_table(), **camera.extra} for camera in data.cameras]
     table = {"name": data.name, "length_unit": data.length_unit, **data.extra}
     try:
         text = _with_camera_tables(table, cameras)

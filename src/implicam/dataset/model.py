@@ -70,6 +70,11 @@ class Camera:
                 )
         _freeze(self, extra=_described(self.extra, _CAMERA_KEYS, f"camera {self.name!r}"))
 
+    def as_table(self) -> dict[str, Any]:
+        """Name and image size, as far as it is known, as plain values."""
+        sizes = {"width": self.width, "height": self.height}
+        return {"name": self.name, **{key: size for key, size in sizes.items() if size is not None}}
+
 
 @dataclass(frozen=True, eq=False)
 class Observations:

@@ -5,9 +5,10 @@ best value is `y^T A^-1 y / n`, so only the log lengthscales and log rho are sea
 with that substitution). One evaluation costs one Cholesky, one inverse and four cheap matrix products, whatever the
 number of lengthscales.
 
-Finding the optimum: the likelihood has several local optima, most of them with a lengthscale stuck at its bound. We
-search a small subset from several starts, pull every lengthscale back to where its gradient is alive, and search all
-data from there in coordinates whitened by the Fisher information, which makes most directions equally steep.
+Finding the optimum: the likelihood has several local optima, most of them with a lengthscale stuck at its bound. Two
+ways lead to a good one: from short lengthscales on all data, where that is cheap; and from the best of a small subset,
+every lengthscale pulled back to where its gradient is alive, in coordinates whitened by the Fisher information, which
+makes most directions equally steep. `_ways` chooses.
 See docs/decisions/0003-gp-fit.md for what was tried.
 """
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from implicam.coverage import Coverage
 from implicam.dataset import Floats
 from implicam.errors import UsageError
+from implicam.evaluate import Evaluation
 from implicam.measurement import Measurement
 
 
@@ -74,3 +75,25 @@ class ReportData:
         """Name and reason of each point without a position."""
         m = self.measurement
         return [(str(m.points[i]), str(m.reason[i]) or "no reason given") for i in np.flatnonzero(~m.measured)]
+
+
+def report_of(evaluation: Evaluation, title: str) -> ReportData:
+    """The report of an evaluation."""
+    data = evaluation.data
+    facts = (
+        ("Dataset", data.name),
+        ("Method", evaluation.method),
+        ("Cameras", f"{len(data.cameras)}: {', '.join(camera.name for camera in data.cameras)}"),
+        ("Known points", str(len(evaluation.known_xyz))),
+        ("Judged on", evaluation.how),
+        ("Length unit", data.length_unit),
+    )
+    return ReportData(
+        title,
+        evaluation.measurement,
+        facts=facts,
+        coverage=evaluation.coverage,
+        true_xyz=evaluation.true_xyz,
+        known_xyz=evaluation.known_xyz,
+        notes=(f"Errors are taken against {evaluation.against}.", *evaluation.notes),
+    )
