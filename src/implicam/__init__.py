@@ -2,7 +2,7 @@
 
 >>> import implicam as ic
 >>> rig = ic.simulated("stereo", points=60, seed=1)         # or ic.read_dataset("my-rig")
->>> calibration = ic.InverseGP().fit(rig)
+>>> calibration = ic.ForwardGP().fit(rig)
 >>> measured = calibration.measure(rig.observations)
 >>> measured.xyz.shape, measured.cov.shape, str(measured.reason[0])
 ((60, 3), (60, 3, 3), '')
@@ -11,7 +11,16 @@
 """
 
 from implicam.calibration_file import package_version
-from implicam.calibrators import METHODS, Calibration, InverseGP, InverseGPCalibration, calibrator, load_calibration
+from implicam.calibrators import (
+    METHODS,
+    Calibration,
+    ForwardGP,
+    ForwardGPCalibration,
+    InverseGP,
+    InverseGPCalibration,
+    calibrator,
+    load_calibration,
+)
 from implicam.coverage import Coverage, assess
 from implicam.dataset import (
     Camera,
@@ -47,6 +56,8 @@ __all__ = [
     "DatasetError",
     "Evaluation",
     "FitError",
+    "ForwardGP",
+    "ForwardGPCalibration",
     "ImplicamError",
     "InverseGP",
     "InverseGPCalibration",

@@ -167,6 +167,20 @@ class KannalaBrandt:
         jacobian: Floats = np.array([self.fx, self.fy])[:, None] * out
         return jacobian
 
+    def parameter_jacobian(self, points: Floats) -> Floats:
+        """(n, 2, 8) derivative of the pixels with respect to fx, fy, cx, cy, k1 ... k4; NaN where there is no pixel."""
+        xyz, _ = self._valid(points)
+        r = np.hypot(xyz[:, 0], xyz[:, 1])
+        theta = np.arctan2(r, xyz[:, 2])
+        outward = np.column_stack([_ratio(xyz[:, 0], r, 1.0), _ratio(xyz[:, 1], r, 0.0)])  # on the axis any will do
+        out = np.zeros((len(xyz), 2, 8))
+        diagonal = outward * _odd(theta, self._radial)[:, None]
+        out[:, 0, 0], out[:, 1, 1] = diagonal.T
+        out[:, 0, 2] = out[:, 1, 3] = np.where(np.isnan(theta), np.nan, 1.0)
+        powers = theta[:, None] ** np.arange(3, 11, 2)
+        out[:, :, 4:] = (outward * [self.fx, self.fy])[:, :, None] * powers[:, None, :]
+        return out
+
     def ray_from_pixel(self, uv: Floats) -> tuple[Floats, Bools]:
         """Unit rays (n, 3) in the camera frame of pixels (n, 2); and (n,) where they exist, else NaN."""
         bent = _plane_from_pixel(self, uv)

@@ -8,8 +8,8 @@ camera. Chapters and algorithms: Hartley & Zisserman, Multiple View Geometry, 2n
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,12 @@ UNDETERMINED = 1e-14
 
 PINHOLE_TO = 1.2
 """Radians off the axis beyond which no lens is a pinhole."""
+
+SUSPECT, FEW_SUSPECTS = 6.0, 0.04
+"""Errors so many times the median are suspect; a larger part of suspects asks for random subsets."""
+
+POOR = 0.02
+"""A median error that is this part of the median distance from the middle is no fit: it asks for them, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +108,7 @@ def register(source: Floats, target: Floats) -> tuple[Pose, float]:
             why="it takes three that are not on one line",
             fix="give more points, spread out",
         )
-    rotation = _nearest_rotation((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
+    rotation = _nearest_rotations(((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))[None])[0]
     pose = Pose(rotation, b.mean(axis=0) - rotation @ a.mean(axis=0))
     return pose, float(np.sqrt(np.mean(np.sum((pose.apply(a) - b) ** 2, axis=1))))
 
@@ -117,7 +123,10 @@ def resect(xyz: Floats, uv: Floats) -> Floats:
     _check_spread(xyz)
     world, pixel = _normalising(xyz), _normalising(uv)
     rays = _homogeneous(uv) @ pixel.T
-    p = np.linalg.inv(pixel) @ _linear_camera(_homogeneous(xyz) @ world.T, rays) @ world
+    cameras, determined = _linear_cameras(_homogeneous(xyz) @ world.T, rays[None])
+    if not determined[0]:
+        raise _undetermined()
+    p: Floats = np.linalg.inv(pixel) @ cameras[0] @ world
     p = p / np.linalg.norm(p[2, :3])
     in_front = np.median(_homogeneous(xyz) @ p[2]) > 0
     return p if in_front else -p
@@ -157,7 +166,7 @@ def depth_of_points(xyz: Floats, uv: Floats, sizes: Floats | None = None) -> Flo
     for c in range(uv.shape[1]):
         try:
             middle = None if sizes is None else (sizes[c] - 1) / 2
-            centres.append(resect_any_lens(xyz, uv[:, c], middle=middle)[0].centre)
+            centres.append(resect_any_lens(xyz, uv[:, c], middle=middle).camera_from_world.centre)
         except FitError:
             continue
     if not centres:
@@ -165,29 +174,77 @@ def depth_of_points(xyz: Floats, uv: Floats, sizes: Floats | None = None) -> Flo
     return np.asarray(np.mean([np.linalg.norm(xyz - centre, axis=1) for centre in centres], axis=0), dtype=np.float64)
 
 
-def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None) -> tuple[Pose, float]:
-    """`camera_from_world` of a camera with an unknown lens, and the rms it leaves in pixels; no starting guess.
+class Resection(NamedTuple):
+    """A camera with an unknown lens, placed roughly: `focal` in pixels; `pinhole` says which of two lens models won.
+
+    rms: in pixels, over the points `kept` (n,), those that were not far off.
+    """
+
+    camera_from_world: Pose
+    focal: float
+    pinhole: bool
+    rms: float
+    kept: Bools
+
+
+def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None) -> Resection:
+    """Place a camera with an unknown lens; no starting guess.
 
     Known points (n, 3), their pixels (n, 2), NaN where not seen. Pixels become rays by the equidistant and the
     pinhole model for a ladder of focal lengths about `middle` (where the axis meets the image; else the middle of the
-    pixels), a linear resection follows, and the best wins. Views far off are then left out and it is done again, which
-    bears a tenth of wrong detections. At most `ENOUGH` points are used, drawn at random but always the same. Fails as
-    `resect`.
+    pixels), a linear resection follows, and the best wins. Views far off are then left out and it is done again; where
+    that is not enough, it starts from random subsets (RANSAC) too, which bears a third of wrong detections. At most
+    `ENOUGH` points are used, drawn at random but always the same. Fails as `resect`.
     """
-    xyz, uv = _seen(xyz, uv)
-    if len(xyz) > ENOUGH:
-        drawn = np.random.default_rng(0).choice(len(xyz), ENOUGH, replace=False)
-        xyz, uv = xyz[drawn], uv[drawn]
-    _check_spread(xyz)
-    middle = np.quantile(uv, (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
-    keep = np.ones(len(xyz), dtype=np.bool_)
+    there = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
+    rows = np.flatnonzero(there)
+    if len(rows) > ENOUGH:
+        rows = np.sort(np.random.default_rng(0).choice(rows, ENOUGH, replace=False))
+    _check_spread(xyz[rows])
+    middle = np.quantile(uv[rows], (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
+    points, offset = xyz[rows], uv[rows] - middle
+    found, errors, keep = _trimmed(points, offset, np.ones(len(rows), dtype=np.bool_))
+    bad = float(np.median(errors))
+    poor = bad > POOR * np.median(np.linalg.norm(offset, axis=1))
+    if poor or np.mean(errors > SUSPECT * bad) > FEW_SUSPECTS:
+        for start in _by_subsets(points, offset):
+            again = _trimmed(points, offset, start)
+            if np.median(again[1]) < np.median(errors):
+                found, errors, keep = again
+    kept = np.zeros(len(xyz), dtype=np.bool_)
+    kept[rows[keep]] = True
+    return Resection(
+        found.camera_from_world, found.focal, found.pinhole, float(np.sqrt(np.mean(errors[keep] ** 2))), kept
+    )
+
+
+def _trimmed(xyz: Floats, offset: Floats, keep: Bools) -> tuple[_Candidate, Floats, Bools]:
+    """The best lens for the points kept; those far off left out, others taken in, until nothing changes."""
     for _ in range(8):
-        pose, errors = _best_lens(xyz, uv - middle, keep)
+        found, errors = _best_lens(xyz, offset, keep)
         inside = errors <= 2.5 * np.median(errors)
         if inside.sum() < 2 * FEWEST or _extents(xyz[inside])[2] < FLAT or (inside == keep).all():
             break
         keep = inside
-    return pose, float(np.sqrt(np.mean(errors[keep] ** 2)))
+    return found, errors, keep
+
+
+def _by_subsets(xyz: Floats, offset: Floats) -> list[Bools]:
+    """RANSAC: for the best few of a hundred random subsets, the points (n,) that agree with it best.
+
+    Of subsets of seven points a hundred hold several clean ones, even where a third of the views is wrong.
+    """
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(100):
+        subset = np.zeros(len(xyz), dtype=np.bool_)
+        subset[rng.choice(len(xyz), min(7, len(xyz)), replace=False)] = True
+        try:
+            found.append(_best_lens(xyz, offset, subset, every=3)[1])
+        except FitError:  # a subset can be degenerate where the points are not
+            continue
+    best = sorted(found, key=lambda errors: float(np.median(errors)))[:4]
+    return [errors <= np.quantile(errors, 0.6) for errors in best]
 
 
 def resect_rays(xyz: Floats, rays: Floats) -> Pose:
@@ -195,59 +252,85 @@ def resect_rays(xyz: Floats, rays: Floats) -> Pose:
 
     Linear: ray x (M x + t) = 0, then the rotation nearest to M, then the translation for that rotation.
     """
+    rotations, translations, determined = _resect_many(xyz, rays[None])
+    if not determined[0]:
+        raise _undetermined()
+    return Pose(rotations[0], translations[0])
+
+
+def _resect_many(xyz: Floats, rays: Floats) -> tuple[Floats, Floats, Bools]:
+    """Rotations (k, 3, 3) and translations (k, 3) for k sets of rays (k, n, 3) of the same points; and where fixed."""
     world = _normalising(xyz)
-    m = (_linear_camera(_homogeneous(xyz) @ world.T, rays) @ world)[:, :3]
-    facing = np.sign(np.linalg.det(m)) or 1.0
-    rotation = _nearest_rotation(facing * m)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]  # what of a vector is not along the ray
-    turned = xyz @ rotation.T
-    return Pose(rotation, -np.linalg.solve(across.sum(axis=0), np.einsum("nij,nj->i", across, turned)))
+    cameras, determined = _linear_cameras(_homogeneous(xyz) @ world.T, rays)
+    m = (cameras @ world)[:, :, :3]
+    facing = np.where(np.linalg.det(m) < 0, -1.0, 1.0)
+    rotations = _nearest_rotations(facing[:, None, None] * m)
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # what of a vector is not along the ray
+    turned = xyz @ rotations.swapaxes(1, 2)
+    pull = np.einsum("knij,knj->ki", across, turned)
+    return rotations, -np.linalg.solve(across.sum(axis=1), pull[..., None])[..., 0], determined
 
 
-def _best_lens(xyz: Floats, offset: Floats, keep: Bools) -> tuple[Pose, Floats]:
+class _Candidate(NamedTuple):
+    camera_from_world: Pose
+    focal: float
+    pinhole: bool
+
+
+def _best_lens(xyz: Floats, offset: Floats, keep: Bools, *, every: int = 1) -> tuple[_Candidate, Floats]:
     """The pose for the lens that fits the points kept best, and the errors (n,) of all points in pixels."""
-    fits = []
-    for focal, rays in _candidate_rays(offset):
-        pose = resect_rays(xyz[keep], rays[keep])
-        points = pose.apply(xyz)
-        sine, cosine = np.linalg.norm(np.cross(rays, points), axis=1), np.sum(rays * points, axis=1)
-        # In pixels: angles would favour the longest lens, where all of them are small.
-        fits.append((pose, focal * np.arctan2(sine, cosine)))
-    return min(fits, key=lambda fit: float(np.sum(fit[1][keep] ** 2)))
+    focal, pinhole, rays = _candidate_rays(offset, every)
+    rotations, translations, determined = _resect_many(xyz[keep], rays[:, keep])
+    if not determined.any():
+        raise _undetermined()
+    points = xyz @ rotations.swapaxes(1, 2) + translations[:, None]
+    along = np.sum(rays * points, axis=2)
+    aside = np.sqrt(np.maximum(np.sum(points**2, axis=2) - along**2, 0))
+    # In pixels: angles would favour the longest lens, where all of them are small.
+    errors = focal[:, None] * np.arctan2(aside, along)
+    best = int(np.argmin(np.where(determined, np.sum(errors[:, keep] ** 2, axis=1), np.inf)))
+    pose = Pose(rotations[best], translations[best])
+    return _Candidate(pose, float(focal[best]), bool(pinhole[best])), errors[best]
 
 
-def _candidate_rays(offset: Floats) -> Iterator[tuple[float, Floats]]:
-    """Focal lengths in pixels, and the unit rays (n, 3) of pixels (n, 2) from the middle, from fisheye to telephoto."""
+def _candidate_rays(offset: Floats, every: int = 1) -> tuple[Floats, Bools, Floats]:
+    """Focal lengths (k,) in pixels, pinhole or not (k,), and unit rays (k, n, 3) of pixels (n, 2) off the middle."""
     radius = np.linalg.norm(offset, axis=1)
     outermost = float(radius.max()) or 1.0
-    for widest in np.geomspace(0.03, 2.5, 40):  # radians at the outermost point
-        focal = outermost / widest
-        theta = radius / focal
-        sideways = offset / focal * np.sinc(theta / np.pi)[:, None]
-        yield focal, np.column_stack([sideways, np.cos(theta)])
-        if widest < PINHOLE_TO:
-            focal = outermost / np.tan(widest)
-            rays = _homogeneous(offset / focal)
-            yield focal, rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    widest = np.geomspace(0.03, 2.5, 40)[::every]  # radians at the outermost point
+    bent = outermost / widest[:, None]
+    theta = radius / bent
+    sideways = offset / bent[..., None] * np.sinc(theta / np.pi)[..., None]
+    equidistant = np.concatenate([sideways, np.cos(theta)[..., None]], axis=2)
+    straight = outermost / np.tan(widest[widest < PINHOLE_TO, None])
+    flat = np.concatenate([offset / straight[..., None], np.ones((len(straight), len(offset), 1))], axis=2)
+    rays = np.concatenate([equidistant, flat / np.linalg.norm(flat, axis=2, keepdims=True)])
+    focal = np.concatenate([bent, straight])[:, 0]
+    return focal, np.arange(len(focal)) >= len(widest), rays
 
 
-def _linear_camera(points: Floats, rays: Floats) -> Floats:
-    """The (3, 4) matrix A, up to scale, that brings points (n, 4) onto rays (n, 3): least squares of ray x (A point).
+def _linear_cameras(points: Floats, rays: Floats) -> tuple[Floats, Bools]:
+    """The (k, 3, 4) matrices A, up to scale, that bring points (n, 4) onto rays (k, n, 3): least squares of
+    ray x (A point); and (k,) where the points fix it.
 
     Solved with the 12 x 12 normal matrix, the sum of (|ray|² I - ray ray^T) (x) point point^T: normalised coordinates
     keep it well conditioned, and its size does not grow with n.
     """
-    outer = (points[:, :, None] * points[:, None, :]).reshape(-1, 16)
-    across = np.sum(rays**2, axis=1)[:, None, None] * np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    normal = (across.reshape(-1, 9).T @ outer).reshape(3, 3, 4, 4).swapaxes(1, 2).reshape(12, 12)
+    k, n = rays.shape[:2]
+    outer = (points[:, :, None] * points[:, None, :]).reshape(n, 16)
+    across = np.sum(rays**2, axis=2)[..., None, None] * np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    normal = (across.reshape(k, n, 9).swapaxes(1, 2) @ outer).reshape(k, 3, 3, 4, 4).swapaxes(2, 3).reshape(k, 12, 12)
     values, vectors = np.linalg.eigh(normal)
-    if values[1] < UNDETERMINED * values[-1]:
-        raise FitError(
-            "the known points do not fix the camera.",
-            why="more than one camera sees them at these pixels: they lie on one plane, or on a curve through it",
-            fix="add points elsewhere in the volume",
-        )
-    return np.asarray(vectors[:, 0].reshape(3, 4), dtype=np.float64)
+    determined = values[:, 1] >= UNDETERMINED * values[:, -1]
+    return vectors[:, :, 0].reshape(k, 3, 4), np.asarray(determined, dtype=np.bool_)
+
+
+def _undetermined() -> FitError:
+    return FitError(
+        "the known points do not fix the camera.",
+        why="more than one camera sees them at these pixels: they lie on one plane, or on a curve through it",
+        fix="add points elsewhere in the volume",
+    )
 
 
 def _seen(xyz: Floats, uv: Floats) -> tuple[Floats, Floats]:
@@ -286,10 +369,10 @@ def _normalising(points: Floats) -> Floats:
     return transform
 
 
-def _nearest_rotation(m: Floats) -> Floats:
-    """The rotation R that maximises trace(R^T m), never a mirror image."""
+def _nearest_rotations(m: Floats) -> Floats:
+    """The rotations R (k, 3, 3) that maximise trace(R^T m), never a mirror image."""
     u, _, vt = np.linalg.svd(m)
-    u[:, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
     return np.asarray(u @ vt, dtype=np.float64)
 
 

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from implicam import calibration_file
+from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
-from implicam.calibrators.protocol import Calibration, Calibrator, Unused
+from implicam.calibrators.protocol import Calibration, Calibrator, Rejected, Unused
 from implicam.errors import CalibrationFileError, UsageError, did_you_mean
 
 METHODS: dict[str, tuple[type[Any], type[Any]]] = {
+    ForwardGP.method: (ForwardGP, ForwardGPCalibration),
     InverseGP.method: (InverseGP, InverseGPCalibration),
 }
 """Method name -> (calibrator, calibration)."""
 
-DEFAULT_METHOD = InverseGP.method
-COMING = ("forward-gp", "mlp", "explicit")
+DEFAULT_METHOD = ForwardGP.method
+COMING = ("mlp", "explicit")
 
 
 def calibrator(method: str, **options: Any) -> Calibrator:
@@ -24,7 +27,15 @@ def calibrator(method: str, **options: Any) -> Calibrator:
     if method not in METHODS:
         known = "not in this version yet" if method in COMING else f"not known{did_you_mean(method, METHODS)}"
         raise UsageError(f"method {method!r} is {known}.", fix=f"this version has {', '.join(METHODS)}")
-    made: Calibrator = METHODS[method][0](**{key: value for key, value in options.items() if value is not None})
+    given = {key: value for key, value in options.items() if value is not None}
+    known_options = [field.name for field in fields(METHODS[method][0])]
+    for key in given:
+        if key not in known_options:
+            raise UsageError(
+                f"{method} has no option {key!r}{did_you_mean(key, known_options)}.",
+                fix=f"leave it out; {method} has {', '.join(known_options)}",
+            )
+    made: Calibrator = METHODS[method][0](**given)
     return made
 
 
@@ -48,8 +59,11 @@ __all__ = [
     "METHODS",
     "Calibration",
     "Calibrator",
+    "ForwardGP",
+    "ForwardGPCalibration",
     "InverseGP",
     "InverseGPCalibration",
+    "Rejected",
     "Unused",
     "calibrator",
     "load_calibration",

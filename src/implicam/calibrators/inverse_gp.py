@@ -22,9 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam import calibration_file
-from implicam.calibrators.protocol import Arrays, Unused, require_points, same_cameras, why_not_all_seen
+from implicam.calibrators.protocol import (
+    FLAT,
+    Arrays,
+    Rejected,
+    Unused,
+    finite_column,
+    require_points,
+    require_two_values,
+    same_cameras,
+    why_not_all_seen,
+)
 from implicam.dataset import Dataset, Floats, Names, Observations
-from implicam.errors import FitError, UsageError, did_you_mean
+from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, GaussianProcess, Kernel, maximise_each
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -33,7 +43,6 @@ from implicam.threads import side_by_side
 PRESETS = ("standardised", "paper")
 AXES = "xyz"
 EXTENT = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
-FLAT = 1e-3  # thickness over width of what is called a plane
 SUSPECT = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
 LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
@@ -122,13 +131,7 @@ def _usable(data: Dataset) -> tuple[Dataset, tuple[Unused, ...]]:
     why = f"only points seen by every camera can be used; of {len(data)} points, {per_camera}" if unused else ""
     require_points(int(complete.sum()), least, InverseGP.method, why)
     usable = data.select(complete)
-    for axis, values in zip(AXES, usable.xyz.T, strict=True):
-        if np.ptp(values) == 0:
-            raise FitError(
-                f"all {len(usable)} usable points have the same {axis} = {values[0]:g}.",
-                why=f"inverse-gp learns {axis} from examples, and has seen one value only",
-                fix=f"add points with other {axis}, for example a second position of the board",
-            )
+    require_two_values(usable.xyz, InverseGP.method)
     return usable, unused
 
 
@@ -162,6 +165,11 @@ class InverseGPCalibration:
     hyperparameters: tuple[Hyperparameters, ...] = field(repr=False)
 
     method: ClassVar[str] = "inverse-gp"
+
+    @property
+    def rejected(self) -> tuple[Rejected, ...]:
+        """None: this method uses every view of the points it uses; `notes` names suspects."""
+        return ()
 
     @cached_property
     def processes(self) -> tuple[GaussianProcess, ...]:
@@ -297,13 +305,15 @@ class InverseGPCalibration:
         )
         _, unused = _usable(data)
         d = 2 * len(data.cameras)
-        pixels = Scaling(_column(arrays, "pixel_offset", (d,)), _column(arrays, "pixel_scale", (d,), positive=True))
-        positions = Scaling(
-            _column(arrays, "position_offset", (3,)), _column(arrays, "position_scale", (3,), positive=True)
+        pixels = Scaling(
+            finite_column(arrays, "pixel_offset", (d,)), finite_column(arrays, "pixel_scale", (d,), positive=True)
         )
-        lengthscale = _column(arrays, "lengthscale", (3, d), positive=True)
-        signal = _column(arrays, "signal_variance", (3,), positive=True)
-        noise, mean = _column(arrays, "noise_variance", (3,), positive=True), _column(arrays, "mean", (3,))
+        positions = Scaling(
+            finite_column(arrays, "position_offset", (3,)), finite_column(arrays, "position_scale", (3,), positive=True)
+        )
+        lengthscale = finite_column(arrays, "lengthscale", (3, d), positive=True)
+        signal = finite_column(arrays, "signal_variance", (3,), positive=True)
+        noise, mean = finite_column(arrays, "noise_variance", (3,), positive=True), finite_column(arrays, "mean", (3,))
         hyper = tuple(
             Hyperparameters(
                 Kernel(calibrator.kernel, float(signal[i]), lengthscale[i]), float(noise[i]), float(mean[i])
@@ -316,12 +326,3 @@ class InverseGPCalibration:
 def _reasons(seen: NDArray[np.bool_], names: tuple[str, ...]) -> Names:
     reasons = ["" if row.all() else why_not_all_seen(row, names, InverseGP.method) for row in seen]
     return np.array(reasons, dtype=np.str_)
-
-
-def _column(arrays: Arrays, name: str, shape: tuple[int, ...], *, positive: bool = False) -> Floats:
-    array = arrays[name]
-    if array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be finite float64 of shape {shape}, and is {array.dtype} {array.shape}")
-    if positive and not (array > 0).all():
-        raise ValueError(f"{name} must be positive")
-    return array

@@ -31,6 +31,15 @@ class Unused:
     reason: str
 
 
+@dataclass(frozen=True)
+class Rejected:
+    """A view that the fit does not use, because it contradicts the others: `residual` pixels off what they predict."""
+
+    point: str
+    camera: str
+    residual: float
+
+
 class Calibration(Protocol):
     """A fitted map of a rig, and the data it was fitted from."""
 
@@ -43,6 +52,10 @@ class Calibration(Protocol):
     @property
     def unused(self) -> tuple[Unused, ...]:
         """The known points that the fit could not use."""
+
+    @property
+    def rejected(self) -> tuple[Rejected, ...]:
+        """The views that the fit does not use because they contradict the others, the farthest first."""
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure each point; one that cannot be measured keeps its row, with a reason."""
@@ -113,3 +126,42 @@ def require_points(n: int, least: int, method: str, why: str = "") -> None:
             fix="add known points"
             + (", or leave out the camera that misses most of them (--without NAME)" if why else ""),
         )
+
+
+FLAT = 1e-3
+"""Thickness over width of what is called a plane, or a line."""
+
+
+def require_volume(xyz: NDArray[np.float64], method: str) -> None:
+    """FitError for points (n, 3) on one plane or line."""
+    require_two_values(xyz, method)
+    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    if extents[2] > FLAT * extents[0]:
+        return
+    shape = "line" if extents[1] <= FLAT * extents[0] else "plane"
+    raise FitError(
+        f"the {len(xyz)} known points lie on one {shape}.",
+        why=f"{method} cannot tell from them how far a camera is",
+        fix="add known points in front of it and behind, for example a second position of the board",
+    )
+
+
+def require_two_values(xyz: NDArray[np.float64], method: str) -> None:
+    """FitError where all points (n, 3) have the same x, y or z."""
+    for axis, values in zip("xyz", xyz.T, strict=True):
+        if np.ptp(values) == 0:
+            raise FitError(
+                f"all {len(xyz)} usable points have the same {axis} = {values[0]:g}.",
+                why=f"{method} learns {axis} from examples, and has seen one value only",
+                fix=f"add points with other {axis}, for example a second position of the board",
+            )
+
+
+def finite_column(arrays: Arrays, name: str, shape: tuple[int, ...], *, positive: bool = False) -> NDArray[np.float64]:
+    """An array of a calibration file; ValueError where it is not finite float64 of this shape."""
+    array = arrays[name]
+    if array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite float64 of shape {shape}, and is {array.dtype} {array.shape}")
+    if positive and not (array > 0).all():
+        raise ValueError(f"{name} must be positive")
+    return array

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -13,7 +13,14 @@ import numpy as np
 import typer
 
 from implicam import calibration_file
-from implicam.calibrators import DEFAULT_METHOD, Calibration, calibrator, load_calibration
+from implicam.calibrators import (
+    DEFAULT_METHOD,
+    Calibration,
+    ForwardGP,
+    InverseGP,
+    calibrator,
+    load_calibration,
+)
 from implicam.cli import show
 from implicam.compare import Trial, as_json, compare, summarise
 from implicam.dataset import Dataset, folder_files, read_dataset, write_dataset
@@ -94,6 +101,9 @@ Preset = Annotated[
         "--preset", metavar="NAME", help='inverse-gp: standardised, or "paper" for the paper\'s own software.'
     ),
 ]
+Lens = Annotated[
+    str | None, typer.Option("--lens", metavar="NAME", help="forward-gp: central, one model for all lenses, or none.")
+]
 Cameras = Annotated[
     str | None, typer.Option("--cameras", metavar="LIST", help="Use only these cameras, separated by commas.")
 ]
@@ -115,8 +125,24 @@ def _chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:
     return data
 
 
-def _calibrator(method: str | None, kernel: str | None, preset: str | None, seed: int) -> Any:
-    return calibrator(method or DEFAULT_METHOD, kernel=kernel, preset=preset, seed=seed)
+@dataclass(frozen=True)
+class _Wanted:
+    """A method and its options, as far as they were given."""
+
+    method: str | None
+    lens: str | None
+    kernel: str | None
+    preset: str | None
+    seed: int
+
+    @property
+    def given(self) -> bool:
+        return any((self.method, self.lens, self.kernel, self.preset))
+
+    def calibrator(self) -> Any:
+        only_inverse = self.kernel or self.preset  # so nobody means another method
+        method = self.method or (InverseGP.method if only_inverse and not self.lens else DEFAULT_METHOD)
+        return calibrator(method, lens=self.lens, kernel=self.kernel, preset=self.preset, seed=self.seed)
 
 
 @_command("demo")
@@ -236,6 +262,7 @@ def calibrate_command(
     dataset: Annotated[Path, typer.Argument(help="Known points and what the cameras saw of them.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The calibration file to write.")],
     method: Method = None,
+    lens: Lens = None,
     kernel: Kernel = None,
     preset: Preset = None,
     points: Annotated[int | None, typer.Option(min=1, metavar="N", help="Use so many points, drawn at random.")] = None,
@@ -254,7 +281,7 @@ def calibrate_command(
     if points is not None and points != len(data):
         data, _ = data.split(points, seed=seed)
     with show.progress(json) as progress:
-        calibration = _calibrator(method, kernel, preset, seed).fit(data, progress)
+        calibration = _Wanted(method, lens, kernel, preset, seed).calibrator().fit(data, progress)
     calibration.save(output)
     _tell_calibration(calibration, output, json)
 
@@ -266,7 +293,8 @@ def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> Non
     if json:
         show.emit_json(
             {"calibration": str(output), "method": calibration.method, "residuals": residuals, "unused": unused,
-             "notes": notes, "length_unit": calibration.data.length_unit}
+             "rejected": [asdict(view) for view in calibration.rejected], "notes": notes,
+             "length_unit": calibration.data.length_unit}
         )  # fmt: skip
         return
     unit = calibration.data.length_unit
@@ -336,6 +364,7 @@ def evaluate_command(
     ] = None,
     report: Report = None,
     method: Method = None,
+    lens: Lens = None,
     kernel: Kernel = None,
     preset: Preset = None,
     cameras: Cameras = None,
@@ -345,14 +374,15 @@ def evaluate_command(
     json: Json = False,
 ) -> None:
     """Judge errors and error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region."""
-    _check_evaluate(dataset, cv, leave_out, any((method, kernel, preset)))
+    wanted = _Wanted(method, lens, kernel, preset, seed)
+    _check_evaluate(dataset, cv, leave_out, wanted.given)
     if report is not None:
         _need_plotly()
     with show.progress(json) as progress:
         if dataset is not None:
             evaluation = evaluate(load_calibration(file), _read(dataset, unit, cameras, without))
         else:
-            fit, data = _fit_and_data(file, method, kernel, preset, seed, cameras, without, unit)
+            fit, data = _fit_and_data(file, wanted, cameras, without, unit)
             if cv is not None:
                 evaluation = cross_validate(fit, data, cv, seed=seed, progress=progress)
             else:
@@ -380,20 +410,19 @@ def _check_evaluate(dataset: Path | None, cv: int | None, leave_out: str | None,
 
 
 def _fit_and_data(
-    path: Path, method: str | None, kernel: str | None, preset: str | None, seed: int, cameras: str | None,
-    without: str | None, unit: str | None,
-) -> tuple[Any, Dataset]:  # fmt: skip
+    path: Path, wanted: _Wanted, cameras: str | None, without: str | None, unit: str | None
+) -> tuple[Any, Dataset]:
     if path.suffix.lower() == CALIBRATION_SUFFIX:
-        if method or kernel or preset:
+        if wanted.given:
             raise _own_options()
         fitted = load_calibration(path)
         return fitted.refit, _chosen(fitted.data, cameras, without)
-    return _calibrator(method, kernel, preset, seed).fit, _read(path, unit, cameras, without)
+    return wanted.calibrator().fit, _read(path, unit, cameras, without)
 
 
 def _own_options() -> UsageError:
     return UsageError(
-        "a calibration file brings its own method and options.", fix="leave out --method, --kernel and --preset"
+        "a calibration file brings its own method and options.", fix="leave out --method, --lens, --kernel and --preset"
     )
 
 
@@ -476,15 +505,16 @@ def _available_methods() -> list[str]:
         import gpytorch  # noqa: F401
     except ImportError:
         show.note('left out inverse-gp:paper (the paper\'s own software): pip install "implicam[paper]" to add it')
-        return ["inverse-gp", "inverse-gp:matern-5/2"]
-    return ["inverse-gp", "inverse-gp:matern-5/2", "inverse-gp:paper"]
+        return ["forward-gp", "inverse-gp", "inverse-gp:matern-5/2"]
+    return ["forward-gp", "inverse-gp", "inverse-gp:matern-5/2", "inverse-gp:paper"]
 
 
 def _named_method(name: str) -> Any:
     method, _, variant = name.partition(":")
     if variant == "paper":
         import_extra("gpytorch", "paper", "the paper preset")  # now, so that no fit is charged for it
-    option = {"paper": {"preset": "paper"}, "": {}}.get(variant, {"kernel": variant})
+    usual = {"lens": variant} if method == ForwardGP.method else {"kernel": variant}
+    option = {"paper": {"preset": "paper"}, "": {}}.get(variant, usual)
     return calibrator(method, **option)
 
 

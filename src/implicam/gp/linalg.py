@@ -40,7 +40,7 @@ def _reason(K: Floats, info: int) -> NumericalError:
     )
 
 
-def _routine(name: str, arguments: int) -> Any:
+def routine(name: str, arguments: int) -> Any:
     """A LAPACK routine by the pointer that SciPy publishes for C callers."""
     capsule = cython_lapack.__pyx_capi__[name]
     get_name, get_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
@@ -50,10 +50,11 @@ def _routine(name: str, arguments: int) -> Any:
     return prototype(get_pointer(capsule, get_name(capsule)))
 
 
-_DPOTRF, _DPOTRI, _DTRTRS = _routine("dpotrf", 5), _routine("dpotri", 5), _routine("dtrtrs", 10)
+_DPOTRF, _DPOTRI, _DTRTRS = routine("dpotrf", 5), routine("dpotri", 5), routine("dtrtrs", 10)
 
 
-def _address(A: Floats) -> int:
+def address(A: Floats) -> int:
+    """Where LAPACK finds the numbers of A."""
     if A.dtype != np.float64 or not A.flags.f_contiguous or not A.flags.writeable:
         raise TypeError("LAPACK works in place on writeable Fortran-ordered float64 arrays")
     return int(A.ctypes.data)
@@ -62,14 +63,14 @@ def _address(A: Floats) -> int:
 def factor_in_place(A: Floats) -> int:
     """Replace the lower triangle of A by its Cholesky factor; the upper is not touched. 0, or the row that failed."""
     n, info = c_int(len(A)), c_int(0)
-    _DPOTRF(byref(c_char(b"L")), byref(n), _address(A), byref(n), byref(info))
+    _DPOTRF(byref(c_char(b"L")), byref(n), address(A), byref(n), byref(info))
     return info.value
 
 
 def invert_in_place(L: Floats) -> None:
     """Replace a Cholesky factor in the lower triangle by the inverse of the matrix it factors, lower triangle only."""
     n, info = c_int(len(L)), c_int(0)
-    _DPOTRI(byref(c_char(b"L")), byref(n), _address(L), byref(n), byref(info))
+    _DPOTRI(byref(c_char(b"L")), byref(n), address(L), byref(n), byref(info))
 
 
 def solve_lower(L: Floats, B: Floats) -> Floats:
@@ -78,9 +79,7 @@ def solve_lower(L: Floats, B: Floats) -> Floats:
     n, m, info = c_int(len(L)), c_int(1 if x.ndim == 1 else x.shape[1]), c_int(0)
     factor = np.asfortranarray(L)
     lower, plain, not_unit = (byref(c_char(letter)) for letter in (b"L", b"N", b"N"))
-    _DTRTRS(
-        lower, plain, not_unit, byref(n), byref(m), factor.ctypes.data, byref(n), _address(x), byref(n), byref(info)
-    )
+    _DTRTRS(lower, plain, not_unit, byref(n), byref(m), factor.ctypes.data, byref(n), address(x), byref(n), byref(info))
     if info.value != 0:
         raise NumericalError(f"the triangular factor has a zero in row {info.value}.", fix="raise the noise variance")
     return x

@@ -1,0 +1,5 @@
+"""forward-gp: world to pixels, learned with a lens model and a Gaussian process; measured by inversion."""
+
+from implicam.calibrators.forward_gp.calibration import ForwardGP, ForwardGPCalibration
+
+__all__ = ["ForwardGP", "ForwardGPCalibration"]

@@ -1,0 +1,231 @@
+"""How smooth, how large and how noisy: the hyperparameters by marginal likelihood, the lens integrated out.
+
+Eqs. (8) to (12) of docs/method.md. Every camera has the same lengthscales; the size of the residual field and the
+noise have a centre for the whole rig and a deviation of each camera from it, held by a prior: with a dozen points one
+camera alone cannot tell its field from its noise, the rig together can; with many points each speaks for itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from implicam.calibrators.forward_gp.lens import Floats, Prior
+from implicam.gp import Kernel
+from implicam.gp.low_rank import pivoted_cholesky
+
+LENGTHSCALE = np.log([1.0, 2.0])
+"""Prior medians: across the image in half its longer side, and in log distance. Optics vary smoothly across the image;
+refraction and the entrance pupil vary with the distance as 1 / distance does."""
+LENGTHSCALE_SD = np.array([0.7, 1.0])
+SHORTEST = np.log([0.15, 0.1])
+LONGEST = np.log([30.0, 100.0])
+
+GRID = ((0.6, 1.5, 4.0), (0.15, 0.5, 2.0))
+"""Where the search looks first."""
+
+SIGNAL = {"central": (np.log(5e-4), 1.0), "none": (np.log(2e-2), 2.0)}
+"""Prior of the field's sd, median and log sd, in half the longer side: what good lens models leave, 0.3 px in 1280."""
+
+NOISE = (np.log(3e-4), 1.0)
+"""The same for the noise: 0.2 px in 1280."""
+
+STATED = 0.2
+"""Log sd of the noise about what the observations state, where they do."""
+
+OWN_SIGNAL, OWN_NOISE = 0.3, 0.15
+"""Log sd of one camera's field and noise about the rig's."""
+
+DETERMINED = 1e-12
+"""Eigenvalues below this part of the largest add nothing."""
+
+
+class Hyperparameters(NamedTuple):
+    """lengthscale (2,): across the image, in half its longer side, and in log distance; signal and noise sd (C,) px."""
+
+    lengthscale: Floats
+    signal: Floats
+    noise: Floats
+
+
+def field_kernel(lengthscale: Floats) -> Kernel:
+    """Of a residual field over (u, v) in half the longer side and the log distance, eq. (8); unit variance."""
+    return Kernel("squared-exponential", 1.0, lengthscale[[0, 0, 1]])
+
+
+class Spectrum(NamedTuple):
+    """One camera's data in the eigenbasis of its field: eigenvalues e (m,), and what lies outside of it."""
+
+    e: Floats
+    y: Floats  # (m, 2)
+    X: Floats  # (m, 2, p)
+    yy: float
+    Xy: Floats
+    XX: Floats
+    outside: int  # dimensions
+
+
+@dataclass(frozen=True, eq=False)
+class CameraEvidence:
+    """Residuals (n, 2) of one camera, linear in parameters with prior: `residual = X step + field + noise`.
+
+    X: (n, 2, p). off: (p,) prior mean minus where it is linearised. q: (n, 3) field coordinates. relative: (n,) the
+    noise of each view over the camera's.
+    """
+
+    residual: Floats
+    X: Floats
+    off: Floats
+    prior: Prior
+    q: Floats
+    relative: Floats
+
+    def spectrum(self, lengthscale: Floats, tolerance: float) -> Spectrum:
+        """The data seen from the field's eigenvectors."""
+        p = self.X.shape[2]
+        _, phi = pivoted_cholesky(field_kernel(lengthscale)(self.q, self.q), tolerance)
+        phi /= self.relative[:, None]
+        both = np.concatenate([self.residual[:, :, None], self.X], axis=2) / self.relative[:, None, None]
+        e, V = np.linalg.eigh(phi.T @ phi)
+        good = e > DETERMINED * e[-1]
+        e, V = e[good], V[:, good]
+        basis = (phi @ V) / np.sqrt(e)
+        flat = both.reshape(len(both), -1)
+        inside = basis.T @ flat
+        rest = (flat - basis @ inside).reshape(-1, p + 1)
+        gram = rest.T @ rest
+        inside = inside.reshape(len(e), 2, p + 1)
+        return Spectrum(
+            e, inside[:, :, 0], inside[:, :, 1:], float(gram[0, 0]), gram[1:, 0], gram[1:, 1:], 2 * (len(both) - len(e))
+        )
+
+    def objective(self, spectrum: Spectrum, signal: float, noise: float) -> tuple[float, float, float]:
+        """Minus the log marginal likelihood, eq. (11), and its derivatives by log signal and log noise."""
+        e, y, X, yy, Xy, XX, outside = spectrum
+        v = signal**2 * e + noise**2
+        weighted = X / v[:, None, None]
+        p = X.shape[2]
+        A = self.prior.precision + XX / noise**2 + weighted.reshape(-1, p).T @ X.reshape(-1, p)
+        b = self.prior.precision @ self.off + Xy / noise**2 + weighted.reshape(-1, p).T @ y.ravel()
+        scale = 1 / np.sqrt(np.diag(A))  # lens parameters differ by many orders of magnitude
+        L = np.linalg.cholesky(A * scale[:, None] * scale)
+        inverse = np.linalg.inv(L) * scale
+        covariance = inverse.T @ inverse
+        step = covariance @ b
+        left = y - X @ step
+        left_outside = yy - 2 * step @ Xy + step @ XX @ step
+        away = self.off - step
+        quadratic = np.sum(left**2 / v[:, None]) + left_outside / noise**2 + away @ self.prior.precision @ away
+        logs = 2 * np.sum(np.log(v)) + 2 * outside * np.log(noise) + 2 * np.sum(np.log(np.diag(L) / scale))
+        spread = np.einsum("mkp,mkp->m", X @ covariance, X)
+        by_v = 0.5 * (2 / v - (np.sum(left**2, axis=1) + spread) / v**2)
+        by_noise2 = np.sum(by_v) + 0.5 * (outside / noise**2 - (left_outside + np.sum(covariance * XX)) / noise**4)
+        return 0.5 * (quadratic + logs), 2 * signal**2 * float(by_v @ e), 2 * noise**2 * float(by_noise2)
+
+
+@dataclass(frozen=True, eq=False)
+class RigEvidence:
+    """All cameras together. half: (C,) half the longer side in pixels; stated: (C,) stated noise in pixels or NaN."""
+
+    cameras: list[CameraEvidence]
+    half: Floats
+    stated: Floats
+    lens: str
+    tolerance: float
+
+    def maximise(self, start: Hyperparameters | None = None) -> Hyperparameters:
+        """The most probable hyperparameters; `start` is a good guess, from a moment ago."""
+        shared = np.zeros(2)  # log deviations of signal and noise from their prior medians
+        known: dict[tuple[float, ...], tuple[float, Floats]] = {}
+
+        def at(log_lengthscale: Floats) -> float:
+            nonlocal shared
+            inside = np.clip(log_lengthscale, SHORTEST, LONGEST)
+            found = self._minimum(self._sizes_objective(self._spectra(inside), own=False)[0], shared)
+            shared = found.x
+            penalty = 0.5 * np.sum(((inside - LENGTHSCALE) / LENGTHSCALE_SD) ** 2)
+            known[tuple(inside)] = float(found.fun + penalty), shared
+            return known[tuple(inside)][0] + float(np.sum((log_lengthscale - inside) ** 2))
+
+        if start is None:  # a second, shorter range can be as likely: look everywhere first
+            for across in GRID[0]:
+                for along in GRID[1]:
+                    at(np.log([across, along]))
+            first, size = np.array(min(known, key=lambda key: known[key][0])), 0.5
+        else:
+            first, size = np.log(start.lengthscale), 0.2
+        shared = known[tuple(first)][1] if start is None else shared
+        simplex = first + size * np.array([[0, 0], [-1, 0.3], [0.3, -1]])
+        minimize(
+            at,
+            first,
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": 12},
+        )
+        lengthscale = np.array(min(known, key=lambda key: known[key][0]))
+        shared = known[tuple(lengthscale)][1]
+        signal, noise = self._averaged(self._spectra(lengthscale), shared)
+        return Hyperparameters(np.exp(lengthscale), signal, noise)
+
+    def _averaged(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
+        """Signal and noise (C,) whose squares are the posterior means of the variances, eq. (12).
+
+        The most probable variance is smaller than the mean one, much so with few points: error bars made from it would
+        be too small. In the logarithms the posterior is nearly normal, and the mean follows from its covariance.
+        """
+        objective, sds = self._sizes_objective(spectra, own=True)
+        C = len(self.cameras)
+        z = self._minimum(objective, np.concatenate([shared, np.zeros(2 * C)])).x
+        h = 1e-3
+        hessian = np.stack([(objective(z + d)[1] - objective(z - d)[1]) / (2 * h) for d in h * np.eye(len(z))])
+        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+        spread = vectors / np.maximum(values, 1 / sds.max() ** 2) @ vectors.T
+        to_logs = np.zeros((2 * C, len(z)))  # log signal and log noise of each camera
+        to_logs[:C, 0] = to_logs[C:, 1] = 1
+        to_logs[:, 2:] = np.eye(2 * C)
+        larger = np.exp(np.einsum("ij,jk,ik->i", to_logs, spread, to_logs))
+        signal, noise = self._sizes(z)
+        return signal * larger[:C], noise * larger[C:]
+
+    def _spectra(self, log_lengthscale: Floats) -> list[Spectrum]:
+        return [camera.spectrum(np.exp(log_lengthscale), self.tolerance) for camera in self.cameras]
+
+    def _medians(self) -> tuple[Floats, Floats]:
+        known = np.isfinite(self.stated)
+        noise = np.where(known, self.stated, np.exp(NOISE[0]) * self.half)
+        return np.exp(SIGNAL[self.lens][0]) * self.half, noise
+
+    def _sizes(self, z: Floats) -> tuple[Floats, Floats]:
+        """Signal and noise (C,) from (shared signal, shared noise, own signals, own noises)."""
+        signal, noise = self._medians()
+        C = len(self.cameras)
+        own = z[2:] if len(z) > 2 else np.zeros(2 * C)
+        return signal * np.exp(z[0] + own[:C]), noise * np.exp(z[1] + own[C:])
+
+    def _sizes_objective(
+        self, spectra: list[Spectrum], *, own: bool
+    ) -> tuple[Callable[[Floats], tuple[float, Floats]], Floats]:
+        """Minus the log posterior of the sizes with its gradient, and the prior sd of each."""
+        C = len(self.cameras)
+        noise_sd = STATED if np.isfinite(self.stated).all() else NOISE[1]
+        sds = np.array([SIGNAL[self.lens][1], noise_sd])
+        if own:
+            sds = np.concatenate([sds, np.full(C, OWN_SIGNAL), np.full(C, OWN_NOISE)])
+
+        def objective(z: Floats) -> tuple[float, Floats]:
+            signal, noise = self._sizes(z)
+            each = [c.objective(s, *sizes) for c, s, *sizes in zip(self.cameras, spectra, signal, noise, strict=True)]
+            value, by_signal, by_noise = np.array(each).T
+            gradient = np.concatenate([[by_signal.sum(), by_noise.sum()], by_signal, by_noise][: 3 if own else 1])
+            return float(value.sum() + 0.5 * np.sum((z / sds) ** 2)), gradient + z / sds**2
+
+        return objective, sds
+
+    @staticmethod
+    def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats) -> Any:
+        bounds = [(-6.0, 6.0)] * len(start)
+        return minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-7})

@@ -1,0 +1,205 @@
+"""One central camera for every lens, and a camera without any lens model; with their derivatives and priors.
+
+Both see points (n, 3) of the working frame (world, centred and scaled; frame.py) and offer the same:
+`view(points)`, `pixel(points)`, `moved(step)`, `lines(uv)` and `prior`. Equation numbers: docs/method.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.cameras import KannalaBrandt
+from implicam.geometry import Pose, camera_centre, rotation_from_vector
+
+Floats = NDArray[np.float64]
+
+TANGENT = np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
+"""k1 ... k4 of a perspective lens: tan(t) = t + t^3/3 + 2 t^5/15 + ..."""
+
+BENT = np.array([0.15, 0.1, 0.05, 0.02])
+"""Prior sd of k1 ... k4 about the line from an equidistant to a perspective lens ..."""
+
+BENT_AT_EDGE = np.array([0.15, 0.1, 0.07, 0.05])
+"""... and of what each term may do at the edge of the image, as a part of the radius: it tames fisheyes."""
+
+ASPECT = 0.002
+"""Prior sd of log(fy / fx): pixels are square."""
+
+CENTRE = 0.02
+"""Prior sd of the principal point about the image's centre, as a part of the longer side."""
+
+
+class Image(NamedTuple):
+    """Where pixels are measured from: centre (2,) and half the longer side, in pixels."""
+
+    centre: Floats
+    half: float
+
+
+class View(NamedTuple):
+    """What a camera sees of n points: pixels (n, 2), log distance (n,), and derivatives.
+
+    by_parameters (n, 2, p); by_point (n, 2, 3); distance_by_point (n, 3). NaN where the lens has no answer.
+    """
+
+    uv: Floats
+    log_distance: Floats
+    by_parameters: Floats
+    by_point: Floats
+    distance_by_point: Floats
+
+
+class Prior(NamedTuple):
+    """A normal prior on the parameters: mean (p,), precision (p, p); zero where nothing is known, as of the pose."""
+
+    mean: Floats
+    precision: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class CentralCamera:
+    """A Kannala-Brandt lens and its place, eq. (2). A step is (8 lens parameters, rotation vector, translation)."""
+
+    lens: KannalaBrandt
+    pose: Pose  # camera_from_world
+
+    kind: ClassVar[str] = "central"
+    size: ClassVar[int] = 14
+
+    def view(self, points: Floats) -> View:
+        """Everything at once, of points (n, 3)."""
+        turned = points @ self.pose.rotation.T
+        there = turned + self.pose.translation
+        uv, _ = self.lens.pixel_from_camera_point(there)
+        slope = self.lens.jacobian(there)
+        by_parameters = np.empty((len(points), 2, self.size))
+        by_parameters[:, :, :8] = self.lens.parameter_jacobian(there)
+        by_parameters[:, :, 8:11] = np.cross(turned[:, None, :], slope)  # slope . (omega x turned)
+        by_parameters[:, :, 11:] = slope
+        squared = np.sum(there**2, axis=1)
+        return View(
+            uv,
+            0.5 * np.log(squared),
+            by_parameters,
+            slope @ self.pose.rotation,
+            there @ self.pose.rotation / squared[:, None],
+        )
+
+    def pixel(self, points: Floats) -> Floats:
+        """(n, 2) pixels, NaN where there is none."""
+        return self.lens.pixel_from_camera_point(self.pose.apply(points))[0]
+
+    def lines(self, uv: Floats) -> tuple[Floats, Floats]:
+        """The lines of sight of pixels (n, 2): the camera's centre (3,) and unit directions (n, 3), NaN for none."""
+        rays, _ = self.lens.ray_from_pixel(uv)
+        return self.pose.centre, rays @ self.pose.rotation
+
+    @property
+    def parameters(self) -> Floats:
+        """(14,) what the prior is about; the pose has no prior and is zero here."""
+        return np.concatenate([astuple(self.lens), np.zeros(6)])
+
+    @property
+    def sane(self) -> bool:
+        """Not inside out."""
+        return self.lens.fx > 0 and self.lens.fy > 0
+
+    def moved(self, step: Floats) -> CentralCamera:
+        """The camera with its parameters changed by (14,)."""
+        lens = KannalaBrandt(*(np.array(astuple(self.lens)) + step[:8]).tolist())
+        turn = rotation_from_vector(step[8:11])
+        return CentralCamera(lens, Pose(turn @ self.pose.rotation, self.pose.translation + step[11:]))
+
+    def prior(self, image: Image, widest: float) -> Prior:
+        """Eq. (3), for a lens that is used up to `widest` radians off its axis."""
+        mean, precision = np.zeros(self.size), np.zeros((self.size, self.size))
+        aspect = 1 / (ASPECT * self.lens.fx) ** 2
+        precision[:2, :2] = aspect * np.array([[1, -1], [-1, 1]])
+        mean[2:4] = image.centre
+        precision[2, 2] = precision[3, 3] = 1 / (CENTRE * 2 * image.half) ** 2
+        own = np.minimum(BENT, BENT_AT_EDGE / widest ** np.array([2, 4, 6, 8]))
+        mean[4:8] = 0.5 * TANGENT
+        precision[4:8, 4:8] = np.linalg.inv(np.diag(own**2) + 0.25 * np.outer(TANGENT, TANGENT))
+        return Prior(mean, precision)
+
+    def as_array(self) -> Floats:
+        """(20,) lens, rotation and translation."""
+        return np.concatenate([astuple(self.lens), self.pose.rotation.ravel(), self.pose.translation])
+
+    @classmethod
+    def from_array(cls, array: Floats) -> CentralCamera:
+        """The inverse of `as_array`."""
+        rotation = array[8:17].reshape(3, 3)
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise ValueError("a camera's rotation is not one")
+        return cls(KannalaBrandt(*array[:8].tolist()), Pose(rotation, array[17:]))
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectiveCamera:
+    """A linear projection, w (u, v, 1) = P (x, y, z, 1), eq. (4): no lens model at all. A step is that of P."""
+
+    P: Floats
+
+    kind: ClassVar[str] = "none"
+    size: ClassVar[int] = 12
+
+    def view(self, points: Floats) -> View:
+        """As of `CentralCamera`; the distance is w, up to a factor."""
+        homogeneous = np.column_stack([points, np.ones(len(points))])
+        x, y, w = (homogeneous @ self.P.T).T
+        w = np.where(w > 0, w, np.nan)
+        uv = np.column_stack([x / w, y / w])
+        by_parameters = np.zeros((len(points), 2, 12))
+        for row in range(2):
+            by_parameters[:, row, 4 * row : 4 * row + 4] = homogeneous / w[:, None]
+            by_parameters[:, row, 8:] = -uv[:, row, None] * homogeneous / w[:, None]
+        by_point = (self.P[None, :2, :3] - uv[:, :, None] * self.P[2, :3]) / w[:, None, None]
+        return View(uv, np.log(w), by_parameters, by_point, self.P[2, :3] / w[:, None])
+
+    def pixel(self, points: Floats) -> Floats:
+        """(n, 2) pixels, NaN behind the camera."""
+        x, y, w = (np.column_stack([points, np.ones(len(points))]) @ self.P.T).T
+        w = np.where(w > 0, w, np.nan)
+        return np.column_stack([x / w, y / w])
+
+    def lines(self, uv: Floats) -> tuple[Floats, Floats]:
+        """The lines of sight, as of `CentralCamera`."""
+        directions = np.linalg.solve(self.P[:, :3], np.column_stack([uv, np.ones(len(uv))]).T).T
+        return camera_centre(self.P), directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+    @property
+    def parameters(self) -> Floats:
+        """(12,)."""
+        return self.P.ravel()
+
+    @property
+    def sane(self) -> bool:
+        """Anything goes."""
+        return True
+
+    def moved(self, step: Floats) -> ProjectiveCamera:
+        """The camera with its matrix changed by (12,)."""
+        return ProjectiveCamera(self.P + step.reshape(3, 4))
+
+    def prior(self, image: Image, widest: float) -> Prior:
+        """Nothing but that the scale of P, which no pixel shows, stays about what it is."""
+        scale = np.maximum(np.abs(self.P), 1e-3 * np.abs(self.P).max(axis=1, keepdims=True))
+        along = (self.P / scale**2).ravel()
+        return Prior(self.P.ravel(), np.diag(1 / (100 * scale.ravel()) ** 2) + 1e4 * np.outer(along, along))
+
+    def as_array(self) -> Floats:
+        """(12,)."""
+        return self.P.ravel()
+
+    @classmethod
+    def from_array(cls, array: Floats) -> ProjectiveCamera:
+        """The inverse of `as_array`."""
+        return cls(array.reshape(3, 4))
+
+
+AnyCamera = CentralCamera | ProjectiveCamera

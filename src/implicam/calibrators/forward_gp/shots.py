@@ -1,0 +1,115 @@
+"""Known positions that are off, a whole shot at a time: eqs. (16) and (17) of docs/method.md.
+
+Two kinds. *Declared* errors (sd_x, sd_y, sd_z) are random: each shot is shifted on its own, the true positions are
+measured. Errors that are *not declared* are looked for where shots of many points contradict each other: a plate on a
+traverse whose scale is not quite right. There the known positions are all there is to say what the world is, so what
+varies smoothly from shot to shot (up to a parabola along the traverse) is the world, and what is left is the error of
+a shot, whose size is estimated. Positions are measured in the world as labelled; away from the shots the error bar
+includes that a label there would be off as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.lens import Floats
+from implicam.calibrators.forward_gp.posterior import ShotErrors
+
+POINTS = 6
+"""A shot's position is judged by its own points: so many at least."""
+
+SMOOTH = 3
+"""Constant, linear, quadratic: what of the shots' errors is the world."""
+
+FIRST_GUESS = 2e-3
+"""Sd of a shot's error to begin with, in the working frame."""
+
+REACH = 0.25
+"""How far the label of a shot holds around it, as a part of the distance to the next one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """Shots whose errors are estimated. shot (n,) of each point; centre (S, 3); axes (S, 3, 3) rows: principal
+    directions of each shot's points; extent (S, 3) half sizes along them; radius (S,); along (3, 3) rows: first the
+    direction in which the shots follow each other; pattern (S, S - SMOOTH) orthonormal, what is not smooth."""
+
+    shot: NDArray[np.int64]
+    centre: Floats
+    axes: Floats
+    extent: Floats
+    radius: Floats
+    along: Floats
+    pattern: Floats
+
+    @classmethod
+    def of(cls, points: Floats, labels: NDArray[np.str_]) -> Shots | None:
+        """None where there are too few shots, or too few points in them."""
+        _, shot, count = np.unique(labels, return_inverse=True, return_counts=True)
+        S = len(count)
+        if S <= SMOOTH or count.min() < POINTS:
+            return None
+        members = [points[shot == s] for s in range(S)]
+        centre = np.array([m.mean(axis=0) for m in members])
+        axes = np.array([np.linalg.svd(m - c, full_matrices=True)[2] for m, c in zip(members, centre, strict=True)])
+        spans = [np.abs((m - c) @ a.T) for m, c, a in zip(members, centre, axes, strict=True)]
+        extent = np.array([span.max(axis=0) for span in spans])
+        radius = np.array([np.sqrt(np.mean(np.sum(span**2, axis=1))) for span in spans])
+        along = np.linalg.svd(centre - centre.mean(axis=0))[2]
+        t = (centre - centre.mean(axis=0)) @ along[0]
+        if np.ptp(t) < 1e-9 or len(np.unique(np.round(t / np.ptp(t), 6))) <= SMOOTH:
+            return None
+        smooth = np.vander(t / np.abs(t).max(), SMOOTH)
+        pattern = np.linalg.qr(smooth, mode="complete")[0][:, SMOOTH:]
+        return cls(shot.astype(np.int64), centre, axes, extent, radius, along, pattern)
+
+    def errors(self, points: Floats) -> ShotErrors:
+        """All shots as one: shift along, across (2), and three tilts, each with every pattern."""
+        own = self._rigid(points, self.shot)  # (n, 3, 6)
+        basis = own[:, :, :, None] * self.pattern[self.shot][:, None, None, :]
+        group = np.repeat([0, 1, 1, 2, 2, 2], self.pattern.shape[1])
+        basis = basis.reshape(len(points), 3, -1)
+        return ShotErrors(
+            np.zeros(len(points), dtype=np.int64), basis, np.full((1, basis.shape[2]), FIRST_GUESS), group
+        )
+
+    def _rigid(self, points: Floats, shot: NDArray[np.int64]) -> Floats:
+        """(n, 3, 6) displacement of points with their shot: by a unit along, across and by a tilt of a unit at rms."""
+        lever = (points - self.centre[shot]) / self.radius[shot][:, None]
+        shifts = np.broadcast_to(self.along.T, (len(points), 3, 3))
+        tilts = np.cross(np.eye(3)[None], lever[:, None, :]).swapaxes(1, 2)
+        return np.concatenate([shifts, tilts], axis=2)
+
+    @cached_property
+    def _reach(self) -> float:
+        """The distance over which the label of a shot holds; zero where shots overlap."""
+        nearest = [
+            np.min(self._outside(self.centre[[s]])[0, np.arange(len(self.centre)) != s])
+            for s in range(len(self.centre))
+        ]
+        return REACH * float(np.median(nearest))
+
+    def _outside(self, points: Floats) -> Floats:
+        """(n, S) how far points are outside the box of each shot's points."""
+        local = np.abs(np.einsum("sij,nsj->nsi", self.axes, points[:, None] - self.centre))
+        return np.asarray(np.linalg.norm(np.maximum(local - self.extent, 0), axis=2), dtype=np.float64)
+
+    def labels(self, points: Floats, sd: Floats) -> tuple[Floats, Floats]:
+        """How far a label near each point is off: its dependence (n, 3, K) on the unknowns, in their sds, and the
+        covariance (n, 3, 3) of what they do not tell. sd: (K,)."""
+        n = len(points)
+        nearest = np.argmin(outside := self._outside(points), axis=1)
+        distance = outside[np.arange(n), nearest]
+        holds = np.exp(-0.5 * (distance / self._reach) ** 2) if self._reach > 0 else np.zeros(n)
+        rigid = self._rigid(points, nearest)
+        known = holds[:, None, None, None] * rigid[:, :, :, None] * self.pattern[nearest][:, None, None, :]
+        per_kind = sd.reshape(6, -1)[:, 0]
+        lever = np.minimum(np.abs(rigid), 2.0)  # beyond twice a plate's size a tilt says nothing
+        spread = (lever * per_kind) ** 2
+        spread[:, :, :3] = (rigid[:, :, :3] * per_kind[:3]) ** 2
+        left = (1 - holds**2)[:, None] * spread.sum(axis=2)
+        return known.reshape(n, 3, -1) * sd, left[:, :, None] * np.eye(3)

@@ -1,0 +1,115 @@
+"""One camera from known points, from no guess at all: eqs. (5) to (7) of docs/method.md.
+
+A linear resection tries a ladder of lenses (geometry.resect_any_lens), Levenberg-Marquardt refines the winner with the
+lens prior, and views that stay far off what most agree on are set aside, for the fit proper to judge.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.lens import (
+    TANGENT,
+    AnyCamera,
+    CentralCamera,
+    Floats,
+    Image,
+    Prior,
+    ProjectiveCamera,
+)
+from implicam.cameras import KannalaBrandt
+from implicam.geometry import resect, resect_any_lens
+
+Bools = NDArray[np.bool_]
+
+FEWEST = 8
+"""Known points that a camera must see: an equation more than its pose, focal length and centre have unknowns."""
+
+FAR = 8.0
+"""Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
+
+
+class Started(NamedTuple):
+    """A camera that fits, its prior, and the views (n,) it was started from."""
+
+    camera: AnyCamera
+    prior: Prior
+    kept: Bools
+
+
+def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> Started:
+    """A camera of the kind `lens` from points (n, 3), all seen at uv (n, 2); FitError where they do not fix one."""
+    if lens == "none":
+        return _start_projective(points, uv, image)
+    found = resect_any_lens(points, uv, middle=image.centre)
+    k = TANGENT if found.pinhole else np.zeros(4)
+    camera = CentralCamera(
+        KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist()), found.camera_from_world
+    )
+    there = camera.pose.apply(points[found.kept])
+    widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
+    return _refined(camera, camera.prior(image, widest), points, uv, image, found.kept)
+
+
+def _start_projective(points: Floats, uv: Floats, image: Image) -> Started:
+    kept = np.ones(len(points), dtype=np.bool_)
+    for _ in range(5):
+        camera = ProjectiveCamera(resect(points[kept], uv[kept]))
+        error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+        inside = ~(error > FAR * np.nanmedian(error))
+        if inside.sum() < FEWEST or (inside == kept).all():
+            break
+        kept = inside
+    front = ~np.isnan(camera.pixel(points)[:, 0])  # no linear projection sees what is behind it
+    return Started(camera, camera.prior(image, 1.0), kept & front)
+
+
+def _refined(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, kept: Bools) -> Started:
+    """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong."""
+    sd = 1e-3 * image.half
+    for _ in range(4):
+        camera = levenberg_marquardt(camera, prior, points[kept], uv[kept], sd)
+        error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+        sd = max(float(np.median(error[kept])), 1e-5 * image.half)
+        inside = error <= max(FAR * float(np.median(error[kept])), 1e-4 * image.half)
+        if inside.sum() < FEWEST or (inside == kept).all():
+            break
+        kept = inside
+    return Started(camera, prior, kept)
+
+
+def levenberg_marquardt(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, sd: float) -> AnyCamera:
+    """The camera that minimises `sum (residual / sd)^2` plus the prior's own square, eq. (6)."""
+
+    def cost(candidate: AnyCamera) -> float:
+        if not candidate.sane:
+            return np.inf
+        off = prior.mean - candidate.parameters
+        total = float(np.sum((uv - candidate.pixel(points)) ** 2) / sd**2 + off @ prior.precision @ off)
+        return total if np.isfinite(total) else np.inf
+
+    best, damping = cost(camera), 1e-3
+    for _ in range(60):
+        view = camera.view(points)
+        J = view.by_parameters.reshape(-1, camera.size) / sd
+        off = prior.mean - camera.parameters
+        normal = J.T @ J + prior.precision
+        gradient = J.T @ ((uv - view.uv).ravel() / sd) + prior.precision @ off
+        if not np.isfinite(normal).all():
+            break
+        previous = best
+        while damping < 1e9:
+            damped = normal + damping * np.diag(np.diag(normal))
+            step = np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
+            candidate = camera.moved(step)
+            now = cost(candidate)
+            if now < best:
+                camera, best, damping = candidate, now, max(damping / 8, 1e-12)
+                break
+            damping *= 6
+        if best > previous * (1 - 1e-9):
+            break
+    return camera
