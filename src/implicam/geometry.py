@@ -26,7 +26,7 @@ FLAT = 1e-3
 FEWEST = 6
 """Known points that fix the 11 numbers of a camera matrix."""
 
-ENOUGH = 300
+ENOUGH = 120
 """Points beyond which a rough resection gains nothing."""
 
 UNDETERMINED = 1e-14
@@ -35,10 +35,10 @@ UNDETERMINED = 1e-14
 PINHOLE_TO = 1.2
 """Radians off the axis beyond which no lens is a pinhole."""
 
-SUSPECT, FEW_SUSPECTS = 6.0, 0.04
+SUSPECT, FEW_SUSPECTS = 6.0, 0.08
 """Errors so many times the median are suspect; a larger part of suspects asks for random subsets."""
 
-POOR = 0.02
+POOR = 0.05
 """A median error that is this part of the median distance from the middle is no fit: it asks for them, too."""
 
 
@@ -205,8 +205,8 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None) ->
     points, offset = xyz[rows], uv[rows] - middle
     found, errors, keep = _trimmed(points, offset, np.ones(len(rows), dtype=np.bool_))
     bad = float(np.median(errors))
-    poor = bad > POOR * np.median(np.linalg.norm(offset, axis=1))
-    if poor or np.mean(errors > SUSPECT * bad) > FEW_SUSPECTS:
+    tolerable = POOR * float(np.median(np.linalg.norm(offset, axis=1)))
+    if bad > tolerable or np.mean(errors > max(SUSPECT * bad, tolerable)) > FEW_SUSPECTS:
         for start in _by_subsets(points, offset):
             again = _trimmed(points, offset, start)
             if np.median(again[1]) < np.median(errors):

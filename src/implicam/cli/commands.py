@@ -151,7 +151,7 @@ def demo_command(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Simulate a rig, calibrate, measure, judge, report: everything once, in seconds."""
+    """Simulate a rig, calibrate, measure, judge, report: both methods, in seconds."""
     from implicam.demo import run
 
     _must_be_folder(folder)
@@ -163,7 +163,8 @@ def demo_command(
         return
     show.table(show.demo_table(made))
     show.line(
-        "limit: the Cramer-Rao bound; with this pixel noise nobody can do better, even with perfectly known cameras"
+        "limit: the Cramer-Rao bound; with this pixel noise nobody does better on average, even with perfectly known "
+        "cameras"
     )
     for key, path in files.items():
         show.line(f"  {key:<12}{path}")
@@ -326,7 +327,8 @@ def measure_command(
     if json:
         show.emit_json(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
-             "length_unit": measured.length_unit, "not_measured": show.reasons(measured)}
+             "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
+             "views_left_out": show.left_out(measured)}
         )  # fmt: skip
         return
     text = f"{output}: {len(measured)} rows, {count} measured"
@@ -335,6 +337,7 @@ def measure_command(
         text += measured.length_unit
     show.line(text)
     show.notes(show.reasons(measured))
+    show.notes(show.left_out(measured))
 
 
 def _read_to_measure(path: Path, unit: str | None, likely: str) -> Dataset:
@@ -431,8 +434,8 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
         show.emit_json(
             {"method": evaluation.method, "how": evaluation.how, "against": evaluation.against,
              "length_unit": evaluation.data.length_unit, **evaluation.coverage.as_dict(),
-             "not_measured": show.reasons(evaluation.measurement), "notes": list(evaluation.notes),
-             "report": None if report is None else str(report)}
+             "not_measured": show.reasons(evaluation.measurement), "views_left_out": show.left_out(evaluation.measurement),
+             "notes": list(evaluation.notes), "report": None if report is None else str(report)}
         )  # fmt: skip
         return
     show.line(f"{evaluation.method} on {evaluation.data.name}: {evaluation.how}")
@@ -442,6 +445,7 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
     if report is not None:
         show.line(f"report: {report}")
     show.notes(show.reasons(evaluation.measurement))
+    show.notes(show.left_out(evaluation.measurement))
     show.notes(evaluation.notes)
 
 
@@ -511,11 +515,14 @@ def _available_methods() -> list[str]:
 
 def _named_method(name: str) -> Any:
     method, _, variant = name.partition(":")
+    if not variant:
+        return calibrator(method)
+    if method == ForwardGP.method:
+        return calibrator(method, lens=variant)
     if variant == "paper":
         import_extra("gpytorch", "paper", "the paper preset")  # now, so that no fit is charged for it
-    usual = {"lens": variant} if method == ForwardGP.method else {"kernel": variant}
-    option = {"paper": {"preset": "paper"}, "": {}}.get(variant, usual)
-    return calibrator(method, **option)
+        return calibrator(method, preset=variant)
+    return calibrator(method, kernel=variant)
 
 
 def _sizes(text: str | None, n: int) -> list[int]:

@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.progress import Progress as Bars
 from rich.table import Table
 
-from implicam.compare import Row
+from implicam.compare import Row, Trial
 from implicam.coverage import Estimate, Summary
 from implicam.demo import HELD_OUT, Demo
 from implicam.evaluate import Evaluation
@@ -118,10 +118,25 @@ def reasons(measurement: Measurement) -> list[str]:
     return counted(map(str, measurement.reason[~measurement.measured]), "point", "not measured")
 
 
+def left_out(measurement: Measurement) -> list[str]:
+    """How many points were measured without one of their views, and without which, the commonest first.
+
+    The reason of a measured point says so, and goes on from its name: `measured without cam3, whose view ...`.
+    """
+    without = Counter(map(str, measurement.reason[measurement.measured & (measurement.reason != "")]))
+    each = [f"{_count(count, 'point')} {reason}" for reason, count in without.most_common()]
+    total = f"{without.total()} points measured without a view that contradicts the others; of these:"
+    return each if len(each) < 2 else [total, *each]
+
+
 def counted(reasons: Iterable[str], noun: str, what: str) -> list[str]:
     """`<count> <noun>s <what>: <reason>`, the commonest reason first."""
     counts = Counter(reasons).most_common()
-    return [f"{count} {noun}{'s' * (count != 1)} {what}: {reason}" for reason, count in counts]
+    return [f"{_count(count, noun)} {what}: {reason}" for reason, count in counts]
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def notes(texts: Sequence[str]) -> None:
@@ -208,17 +223,25 @@ def verdict(overall: Summary) -> str:
 
 
 def demo_table(demo: Demo) -> Table:
-    """Cameras and known points down, accuracy and honesty across."""
+    """Cameras and known points down, accuracy and honesty of each method across."""
+    lines: dict[tuple[str, int], list[Trial]] = {}
+    for row in demo.rows:
+        lines.setdefault((row.cameras, row.trial.known), []).append(row.trial)
+    methods = dict.fromkeys(row.trial.method for row in demo.rows)
     shown = _table(
         f"A simulated rig, judged at {HELD_OUT} random positions it has not seen",
-        ("cameras", "method", "points", f"rmse {demo.unit}", "rmse/limit", "95 % coverage"),
+        (
+            "cameras", "points",
+            *(text for name in methods for text in (f"{name}\nrmse {demo.unit}", "rmse/limit", "95 %\ncoverage")),
+        ),
         [],
-        left=2,
-    )
-    for row in demo.rows:
-        t = row.trial
-        cells = (number(t.rmse), number(t.rmse / t.limit), f"{100 * t.coverage_95:.1f} %")
-        shown.add_row(row.cameras, t.method, str(t.known), *cells, end_section=t.known == demo.rows[-1].trial.known)
+    )  # fmt: skip
+    for (cameras, known), trials in lines.items():
+        cells = [
+            text for t in trials for text in
+            (number(t.rmse), number(t.rmse / t.limit), f"{100 * t.coverage_95:.1f} %")
+        ]  # fmt: skip
+        shown.add_row(cameras, str(known), *cells, end_section=known == demo.rows[-1].trial.known)
     return shown
 
 

@@ -141,9 +141,13 @@ def _hover(names: Any, views: Any, sd: Floats, error: Floats | None, unit: str) 
         off = "" if error is None or not np.isfinite(error[k]) else f"error {number(error[k])} {plain(unit)}<br>"
         x, y, z = (number(float(s)) for s in sd[k])
         texts.append(
-            f"<b>{plain(name)}</b><br>{off}sd x {x}, y {y}, z {z} {plain(unit)}<br>seen by {int(views[k])} cameras"
+            f"<b>{plain(name)}</b><br>{off}sd x {x}, y {y}, z {z} {plain(unit)}<br>from {_views(int(views[k]))}"
         )
     return texts
+
+
+def _views(count: int) -> str:
+    return f"{count} view" + "s" * (count != 1)
 
 
 def _sizes(spread: Floats) -> Floats:

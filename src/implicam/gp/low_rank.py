@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from implicam.gp.kernels import Floats, Kernel
 from implicam.gp.linalg import address, cholesky, routine, solve_lower
 
-DRAWN = 2000
+DRAWN = 1000
 """Points of many among which the inducing points are looked for; drawn at random but always the same."""
 
 _DPSTRF = routine("dpstrf", 9)

@@ -19,7 +19,8 @@ from implicam.measurement import Measurement
 class ReportData:
     """A measurement and all that is known about it; everything but title and measurement may be left out.
 
-    measurement: brings names, positions, covariances, views, unit, and the reasons of points not measured.
+    measurement: brings names, positions, covariances, views, unit, the reasons of points not measured, and which
+    views others were measured without.
     true_xyz: (n, 3) where its points really were, NaN where unknown. coverage: `implicam.coverage.assess` of the same
     points, the base of the headline and of the verdict. known_xyz: (m, 3) points the rig was calibrated from.
     cameras: name -> (3,) centre. facts: label and value pairs for the head (rig, method, date, ...). notes: sentences
@@ -75,6 +76,12 @@ class ReportData:
         """Name and reason of each point without a position."""
         m = self.measurement
         return [(str(m.points[i]), str(m.reason[i]) or "no reason given") for i in np.flatnonzero(~m.measured)]
+
+    @property
+    def without_a_view(self) -> list[tuple[str, str]]:
+        """Name of each point that was measured without one of its views, and which one."""
+        m = self.measurement
+        return [(str(m.points[i]), str(m.reason[i])) for i in np.flatnonzero(m.measured & (m.reason != ""))]
 
 
 def report_of(evaluation: Evaluation, title: str) -> ReportData:

@@ -137,8 +137,14 @@ def _left_out(data: ReportData) -> str:
     judged = () if data.coverage is None else data.coverage.reasons
     unjudged = [(str(data.measurement.points[i]), reason) for i, reason in judged]
     text = "Every point was measured." if not points else ""
-    listed = _reasons("Not measured", points) + _reasons("Measured, but the covariance could not be judged", unjudged)
-    return f'<section id="left-out">\n<h2>Points that could not be measured</h2>\n<p>{text}</p>{listed}\n</section>'
+    listed = "".join(
+        [
+            _reasons("Not measured", points),
+            _reasons("Measured without a view that contradicts the others", data.without_a_view),
+            _reasons("Measured, but the covariance could not be judged", unjudged),
+        ]
+    )
+    return f'<section id="left-out">\n<h2>What was left out</h2>\n<p>{text}</p>{listed}\n</section>'
 
 
 def _reasons(title: str, points: Sequence[tuple[str, str]]) -> str:

@@ -40,6 +40,9 @@ STATED = 0.2
 OWN_SIGNAL, OWN_NOISE = 0.3, 0.15
 """Log sd of one camera's field and noise about the rig's."""
 
+FTOL = 3e-5
+"""Relative change of the log posterior at which the search for the sizes ends: some hundredths of a nat."""
+
 DETERMINED = 1e-12
 """Eigenvalues below this part of the largest add nothing."""
 
@@ -106,25 +109,29 @@ class CameraEvidence:
     def objective(self, spectrum: Spectrum, signal: float, noise: float) -> tuple[float, float, float]:
         """Minus the log marginal likelihood, eq. (11), and its derivatives by log signal and log noise."""
         e, y, X, yy, Xy, XX, outside = spectrum
-        v = signal**2 * e + noise**2
-        weighted = X / v[:, None, None]
-        p = X.shape[2]
-        A = self.prior.precision + XX / noise**2 + weighted.reshape(-1, p).T @ X.reshape(-1, p)
-        b = self.prior.precision @ self.off + Xy / noise**2 + weighted.reshape(-1, p).T @ y.ravel()
-        scale = 1 / np.sqrt(np.diag(A))  # lens parameters differ by many orders of magnitude
+        v, noise2 = signal**2 * e + noise**2, noise**2
+        m, _, p = X.shape
+        precision, off = self.prior.precision, self.off
+        flat = X.reshape(2 * m, p)
+        weighted = flat / np.repeat(v, 2)[:, None]
+        A = precision + XX / noise2 + weighted.T @ flat
+        b = precision @ off + Xy / noise2 + weighted.T @ y.ravel()
+        scale = 1 / np.sqrt(A.diagonal())  # lens parameters differ by many orders of magnitude
         L = np.linalg.cholesky(A * scale[:, None] * scale)
         inverse = np.linalg.inv(L) * scale
         covariance = inverse.T @ inverse
         step = covariance @ b
-        left = y - X @ step
+        left = (y.ravel() - flat @ step).reshape(m, 2)
         left_outside = yy - 2 * step @ Xy + step @ XX @ step
-        away = self.off - step
-        quadratic = np.sum(left**2 / v[:, None]) + left_outside / noise**2 + away @ self.prior.precision @ away
-        logs = 2 * np.sum(np.log(v)) + 2 * outside * np.log(noise) + 2 * np.sum(np.log(np.diag(L) / scale))
-        spread = np.einsum("mkp,mkp->m", X @ covariance, X)
-        by_v = 0.5 * (2 / v - (np.sum(left**2, axis=1) + spread) / v**2)
-        by_noise2 = np.sum(by_v) + 0.5 * (outside / noise**2 - (left_outside + np.sum(covariance * XX)) / noise**4)
-        return 0.5 * (quadratic + logs), 2 * signal**2 * float(by_v @ e), 2 * noise**2 * float(by_noise2)
+        away = off - step
+        squares = (left * left).sum(axis=1)
+        quadratic = (squares / v).sum() + left_outside / noise2 + away @ precision @ away
+        logs = 2 * np.log(v).sum() + outside * np.log(noise2) + 2 * np.log(L.diagonal() / scale).sum()
+        half = flat @ inverse.T
+        spread = (half * half).sum(axis=1).reshape(m, 2).sum(axis=1)
+        by_v = 0.5 * (2 / v - (squares + spread) / v**2)
+        by_noise2 = by_v.sum() + 0.5 * (outside / noise2 - (left_outside + (covariance * XX).sum()) / noise2**2)
+        return 0.5 * (quadratic + logs), 2 * signal**2 * float(by_v @ e), 2 * noise2 * float(by_noise2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,4 +235,4 @@ class RigEvidence:
     @staticmethod
     def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats) -> Any:
         bounds = [(-6.0, 6.0)] * len(start)
-        return minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-7})
+        return minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": FTOL})

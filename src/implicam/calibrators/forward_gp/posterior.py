@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from implicam.calibrators.forward_gp.evidence import field_kernel
 from implicam.calibrators.forward_gp.lens import AnyCamera, Floats, Image, Prior, View
@@ -193,12 +194,10 @@ def condition(
 
     The models returned have moved to the posterior mean, so that a second call linearises there.
     """
-    normals = side_by_side(
-        lambda pair: _normal(pair[0], points, pair[1], errors), list(zip(models, sightings, strict=True))
-    )
+    normals = side_by_side(lambda pair: _normal(pair[0], points, pair[1]), list(zip(models, sightings, strict=True)))
     if errors is None:
         return _independent(models, normals)
-    return _tied(models, normals, errors)
+    return _tied(models, points, sightings, normals, errors)
 
 
 def _independent(models: tuple[CameraModel, ...], normals: list[_Normal]) -> Posterior:
@@ -213,19 +212,35 @@ def _independent(models: tuple[CameraModel, ...], normals: list[_Normal]) -> Pos
     return Posterior(_moved(models, means), alone, alone, None, _steps(models, means), value)
 
 
-def _tied(models: tuple[CameraModel, ...], normals: list[_Normal], errors: ShotErrors) -> Posterior:
+def _tied(
+    models: tuple[CameraModel, ...],
+    points: Floats,
+    sightings: tuple[Sightings, ...],
+    normals: list[_Normal],
+    errors: ShotErrors,
+) -> Posterior:
     """All cameras see the same errors of the known positions, eqs. (14) and (15)."""
-    A, b, squares, logs = _without_shots(normals, errors)
-    joint, mean, log_determinant = _solve(A, b)
-    value = float(b @ mean) - log_determinant + squares - logs - sum(n.squares + n.logs for n in normals)
     ends = np.cumsum([normal.b.size for normal in normals])
+    A, b = block_diag(*(normal.A for normal in normals)), np.concatenate([normal.b for normal in normals])
+    value = -sum(normal.squares + normal.logs for normal in normals)
+    parts = list(_by_shots(sightings, errors))
+
+    def meeting(seen: tuple[Sightings, ...], part: slice) -> _Meeting:
+        return _Meeting.of(models, points, seen, errors, part)
+
+    kept = meeting(*parts[0]) if len(parts) == 1 else None  # of many, each is made twice and never kept
+    for each in parts:
+        block = kept or meeting(*each)
+        squares, logs = block.eliminate(A, b)
+        value += squares - logs
+    joint, mean, log_determinant = _solve(A, b)
+    value += float(b @ mean) - log_determinant
     means = np.split(mean, ends[:-1])
     covariances = tuple(np.array(joint[e - len(m) : e, e - len(m) : e]) for e, m in zip(ends, means, strict=True))
     alone = tuple(_solve(normal.A, normal.b)[0] for normal in normals)
-    H, g, G = _shots(normals, slice(None))
-    each = np.linalg.solve(H, (g - G @ mean)[..., None])[..., 0]
-    displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, each[errors.shot]), dtype=np.float64)
-    unknowns = _unknowns(normals, means, joint) if errors.estimated else None
+    found = np.concatenate([(kept or meeting(*each)).unknowns(mean) for each in parts])
+    displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
+    unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
     return Posterior(
         _moved(models, means), covariances, alone, joint, _steps(models, means), 0.5 * value, unknowns, displacement
     )
@@ -247,36 +262,24 @@ def _steps(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[Floats
     return tuple(mean[: model.camera.size] for model, mean in zip(models, means, strict=True))
 
 
-@dataclass(eq=False)
-class _Normal:
-    """The normal equations of one camera, and how they meet the shots' unknowns: eq. (14)."""
+class _Normal(NamedTuple):
+    """The normal equations of one camera, eq. (13): A step = b, with the sum of squares and of the noise's logs."""
 
     A: Floats
     b: Floats
     squares: float
     logs: float
-    H: Floats | None = None  # (shots, k, k)
-    g: Floats | None = None  # (shots, k)
-    G: Floats | None = None  # (shots, k, P)
 
 
-def _normal(model: CameraModel, points: Floats, seen: Sightings, errors: ShotErrors | None) -> _Normal:
+def _normal(model: CameraModel, points: Floats, seen: Sightings) -> _Normal:
     p, m, P = model.camera.size, len(model.field.inducing), model.size
     off = model.prior.mean - model.camera.parameters
     A, b = np.zeros((P, P)), np.zeros(P)
     A[:p, :p] = model.prior.precision
     A[range(p, P), range(p, P)] = 1.0
     b[:p] = model.prior.precision @ off
-    total = _Normal(A, b, float(off @ b[:p]), 0.0)
-    if errors is not None:
-        k = errors.basis.shape[2]
-        total.H, total.g = np.zeros((errors.count, k, k)), np.zeros((errors.count, k))
-        total.G = np.zeros((errors.count, k, P))
-    bare = replace(model, weights=np.zeros_like(model.weights))
-    for part in _chunks(len(seen.rows)):
-        index, sd = seen.rows[part], model.noise * seen.relative[part]
-        rows = bare.rows(points[index])
-        y, J, phi = (seen.uv[part] - rows.mean) / sd[:, None], rows.J / sd[:, None, None], rows.phi / sd[:, None]
+    squares, logs = float(off @ b[:p]), 0.0
+    for sd, y, J, phi, _ in _whitened(model, points, seen):
         flat = J.reshape(-1, p)
         A[:p, :p] += flat.T @ flat
         b[:p] += flat.T @ y.ravel()
@@ -288,75 +291,113 @@ def _normal(model: CameraModel, points: Floats, seen: Sightings, errors: ShotErr
             A[:p, block] += across
             A[block, :p] += across.T
             b[block] += phi.T @ y[:, axis]
-        total.squares += float(np.sum(y**2))
-        total.logs += 4 * float(np.sum(np.log(sd)))
-        if errors is not None:
-            _meet_shots(total, errors, index, rows.by_point / sd[:, None, None], y, J, phi)
-    return total
+        squares += float(np.sum(y**2))
+        logs += 4 * float(np.sum(np.log(sd)))
+    return _Normal(A, b, squares, logs)
 
 
-def _meet_shots(
-    total: _Normal, errors: ShotErrors, index: NDArray[np.int64], D: Floats, y: Floats, J: Floats, phi: Floats
-) -> None:
-    assert total.H is not None
-    assert total.g is not None
-    assert total.G is not None
-    p, m = J.shape[2], phi.shape[1]
-    B = D @ errors.scaled[index]  # (n, 2, k)
-    shot = errors.shot[index]
-    order = np.argsort(shot, kind="stable")
-    shots, starts = np.unique(shot[order], return_index=True)
-
-    def summed(values: Floats) -> Floats:
-        return np.asarray(np.add.reduceat(values[order], starts, axis=0), dtype=np.float64)
-
-    Bt = B.swapaxes(1, 2)
-    total.H[shots] += summed(Bt @ B)
-    total.g[shots] += summed(np.einsum("nik,ni->nk", B, y))
-    total.G[shots, :, :p] += summed(Bt @ J)
-    for axis in range(2):
-        total.G[shots, :, p + axis * m : p + (axis + 1) * m] += summed(B[:, axis, :, None] * phi[:, None, :])
+def _whitened(
+    model: CameraModel, points: Floats, seen: Sightings
+) -> Iterator[tuple[Floats, Floats, Floats, Floats, Floats]]:
+    """In parts: the noise (n,), and in units of it the residuals, their slopes by lens, field and point."""
+    bare = replace(model, weights=np.zeros_like(model.weights))
+    for part in _chunks(len(seen.rows)):
+        sd = model.noise * seen.relative[part]
+        rows = bare.rows(points[seen.rows[part]])
+        yield (
+            sd,
+            (seen.uv[part] - rows.mean) / sd[:, None],
+            rows.J / sd[:, None, None],
+            rows.phi / sd[:, None],
+            rows.by_point / sd[:, None, None],
+        )
 
 
-def _without_shots(normals: list[_Normal], errors: ShotErrors) -> tuple[Floats, Floats, float, float]:
-    """The joint normal equations after the shots' unknowns are eliminated, eq. (15)."""
-    sizes = [normal.b.size for normal in normals]
-    ends = np.cumsum(sizes)
-    A, b = np.zeros((ends[-1], ends[-1])), np.concatenate([normal.b for normal in normals])
-    for normal, end in zip(normals, ends, strict=True):
-        A[end - len(normal.A) : end, end - len(normal.A) : end] = normal.A
-    squares = logs = 0.0
+def _by_shots(sightings: tuple[Sightings, ...], errors: ShotErrors) -> Iterator[tuple[tuple[Sightings, ...], slice]]:
+    """The sightings of some shots at a time, so that memory does not grow with their number."""
     for part in _chunks(errors.count, 512):
-        H, g, G = _shots(normals, part)
-        L = np.linalg.cholesky(H)
-        half = np.linalg.solve(L, np.concatenate([G, g[..., None]], axis=2))
+        inside = (errors.shot >= part.start) & (errors.shot < part.stop)
+        yield tuple(seen.select(inside[seen.rows]) for seen in sightings), part
+
+
+class _Meeting(NamedTuple):
+    """How some shots' unknowns meet each other and the cameras', eq. (14): H (S, k, k), g (S, k), G (S, k, sum P)."""
+
+    H: Floats
+    g: Floats
+    G: Floats
+
+    @classmethod
+    def of(
+        cls,
+        models: tuple[CameraModel, ...],
+        points: Floats,
+        sightings: tuple[Sightings, ...],
+        errors: ShotErrors,
+        part: slice,
+    ) -> _Meeting:
+        """From the views of these shots."""
+        S, k = part.stop - part.start, errors.basis.shape[2]
+        found = side_by_side(
+            lambda pair: _meet(pair[0], points, pair[1], errors, part), list(zip(models, sightings, strict=True))
+        )
+        H = np.eye(k) + np.sum([one.H for one in found], axis=0)
+        assert H.shape == (S, k, k)
+        return cls(H, np.sum([one.g for one in found], axis=0), np.concatenate([one.G for one in found], axis=2))
+
+    def eliminate(self, A: Floats, b: Floats) -> tuple[float, float]:
+        """Take the shots out of the cameras' normal equations, eq. (15); what they add to the evidence."""
+        L = np.linalg.cholesky(self.H)
+        half = np.linalg.solve(L, np.concatenate([self.G, self.g[..., None]], axis=2))
         flat = half.reshape(-1, half.shape[2])
         A -= flat[:, :-1].T @ flat[:, :-1]
         b -= flat[:, :-1].T @ flat[:, -1]
-        squares += float(np.sum(flat[:, -1] ** 2))
-        logs += 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
-    return A, b, squares, logs
+        logs = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
+        return float(np.sum(flat[:, -1] ** 2)), logs
+
+    def unknowns(self, mean: Floats) -> Floats:
+        """(S, k) posterior mean, from that of the cameras."""
+        found = np.linalg.solve(self.H, (self.g - self.G @ mean)[..., None])[..., 0]
+        return np.asarray(found, dtype=np.float64)
+
+    def all_unknowns(self, mean: Floats, joint: Floats) -> Unknowns:
+        """What is known of the shots' errors, after that of the cameras."""
+        S, k = self.g.shape
+        inverse = np.linalg.inv(self.H)
+        pull = (inverse @ self.G).reshape(S * k, -1)
+        cross = -joint @ pull.T
+        covariance = -pull @ cross
+        for s in range(S):
+            covariance[s * k : (s + 1) * k, s * k : (s + 1) * k] += inverse[s]
+        return Unknowns(self.unknowns(mean).ravel(), covariance, cross)
 
 
-def _shots(normals: list[_Normal], part: slice) -> tuple[Floats, Floats, Floats]:
-    H = np.sum([normal.H[part] for normal in normals], axis=0)  # type: ignore[index]
-    g = np.sum([normal.g[part] for normal in normals], axis=0)  # type: ignore[index]
-    G = np.concatenate([normal.G[part] for normal in normals], axis=2)  # type: ignore[index]
-    return H + np.eye(H.shape[1]), g, G
-
-
-def _unknowns(normals: list[_Normal], means: list[Floats], joint: Floats) -> Unknowns:
-    """What is known of the shots' errors, after that of the cameras."""
-    H, g, G = _shots(normals, slice(None))
-    shots, k = g.shape
-    inverse = np.linalg.inv(H)
-    mean = np.einsum("skl,sl->sk", inverse, g - G @ np.concatenate(means)).ravel()
-    pull = (inverse @ G).reshape(shots * k, -1)
-    cross = -joint @ pull.T
-    covariance = -pull @ cross
-    for s in range(shots):
-        covariance[s * k : (s + 1) * k, s * k : (s + 1) * k] += inverse[s]
-    return Unknowns(mean, covariance, cross)
+def _meet(model: CameraModel, points: Floats, seen: Sightings, errors: ShotErrors, part: slice) -> _Meeting:
+    S, k = part.stop - part.start, errors.basis.shape[2]
+    p, m = model.camera.size, len(model.field.inducing)
+    total = _Meeting(np.zeros((S, k, k)), np.zeros((S, k)), np.zeros((S, k, model.size)))
+    start = 0
+    for sd, y, J, phi, by_point in _whitened(model, points, seen):
+        rows = seen.rows[start : start + len(sd)]
+        start += len(sd)
+        B = by_point @ errors.scaled[rows]  # (n, 2, k)
+        if S == 1:  # all points in one sum: a matrix product
+            flat = B.reshape(-1, k)
+            total.H[0] += flat.T @ flat
+            total.g[0] += flat.T @ y.ravel()
+            total.G[0, :, :p] += flat.T @ J.reshape(-1, p)
+            for axis in range(2):
+                total.G[0, :, p + axis * m : p + (axis + 1) * m] += B[:, axis].T @ phi
+            continue
+        shot = errors.shot[rows] - part.start
+        Bt = B.swapaxes(1, 2)
+        np.add.at(total.H, shot, Bt @ B)
+        np.add.at(total.g, shot, np.einsum("nik,ni->nk", B, y))
+        np.add.at(total.G[:, :, :p], shot, Bt @ J)
+        for axis in range(2):
+            block = total.G[:, :, p + axis * m : p + (axis + 1) * m]
+            np.add.at(block, shot, B[:, axis, :, None] * phi[:, None, :])
+    return total
 
 
 def _solve(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:

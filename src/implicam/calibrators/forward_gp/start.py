@@ -110,6 +110,6 @@ def levenberg_marquardt(camera: AnyCamera, prior: Prior, points: Floats, uv: Flo
                 camera, best, damping = candidate, now, max(damping / 8, 1e-12)
                 break
             damping *= 6
-        if best > previous * (1 - 1e-9):
+        if best > previous * (1 - 1e-6):
             break
     return camera
