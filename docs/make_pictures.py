@@ -21,7 +21,7 @@ def photograph(report: Path) -> None:
     """The first screen of the report."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
-        page = browser.new_page(viewport={"width": 1240, "height": 1450})
+        page = browser.new_page(viewport={"width": 1240, "height": 1360})
         page.goto(report.as_uri())
         page.wait_for_timeout(6000)  # software rendering of the 3D view takes its time
         page.screenshot(path=IMAGES / "report.png")

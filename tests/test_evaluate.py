@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from implicam import demo
-from implicam.calibrators import Calibration, InverseGP
+from implicam.calibrators import Calibration, ForwardGP, InverseGP
 from implicam.compare import NUMBERS, Trial, as_json, compare, summarise
 from implicam.dataset import Dataset, KnownPositions, Observations, join
 from implicam.errors import DatasetError, FitError, NumericalError, UsageError
@@ -219,6 +219,14 @@ class Recorder:
     def __call__(self, data: Dataset, progress: Progress = silent) -> Calibration:
         self.learned.append([str(name) for name in data.points])
         return InverseGP().fit(data)
+
+
+def test_learned_points_are_left_out_where_the_data_lack_a_camera_too() -> None:
+    known, _ = sets()
+    calibration = ForwardGP().fit(known)
+    fewer = known.without(["cam3"])
+    with pytest.raises(DatasetError, match="were used to fit this calibration"):
+        evaluate(calibration, fewer)
 
 
 def test_cross_validation_holds_each_point_out_once() -> None:

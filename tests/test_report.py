@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
@@ -121,6 +122,29 @@ def test_page_says_what_was_found():
     assert "Cramér–Rao limit" in text
     assert "a note b" in text
     assert "numpy" in text
+
+
+def test_a_measured_point_with_a_reason_is_not_called_unmeasured():
+    data = report_data(n=80)
+    m = data.measurement
+    why = "measured without cam3, whose view contradicts the others"
+    reason = m.reason.astype(object)
+    reason[[7, 8]] = why
+    data = replace(data, measurement=replace(m, reason=reason.astype(np.str_)))
+    assert [name for name, _ in data.unmeasured] == ["b005", "b062"]
+    assert data.without_a_view == [("b007", why), ("b008", why)]
+    text = Reader(page(data)).text
+    assert "78 of 80" in text
+    assert "Not measured: 2 " in text
+    assert "Measured without a view that contradicts the others: 2 " in text
+    assert text.count(why) == 2
+    every = replace(
+        m, xyz=np.nan_to_num(m.xyz), cov=np.where(np.isfinite(m.cov), m.cov, np.eye(3)), reason=np.full(80, why)
+    )
+    text = Reader(page(ReportData("rig", every))).text
+    assert "Every point was measured." in text
+    assert "Not measured" not in text
+    assert "others: 80 " in text
 
 
 @pytest.mark.parametrize(

@@ -166,10 +166,10 @@ def _same_views(fitted: Observations, given: Observations) -> NDArray[np.bool_]:
 
     A table without names numbers its rows, so a name says little; the same pixels to the last bit are the same views.
     """
-    names = fitted.camera_names
-    if not set(names) <= set(given.camera_names):
+    names = [name for name in fitted.camera_names if name in given.camera_names]  # a camera left out hides nothing
+    if not names:
         return np.zeros(len(given), dtype=np.bool_)  # measuring will say what is missing
-    learned = set(_fingerprints(fitted))
+    learned = set(_fingerprints(fitted.with_cameras(names)))
     return np.array([views in learned for views in _fingerprints(given.with_cameras(names))], dtype=np.bool_)
 
 

@@ -22,7 +22,8 @@ MEASURED_COLUMNS = (
 class Measurement:
     """Positions of n points, in the world frame and length unit of the calibration.
 
-    xyz: (n, 3), NaN where the point could not be measured; reason then says why, else it is empty.
+    xyz: (n, 3), NaN where the point could not be measured; reason then says why. Of a point that was
+    measured it names the views that were left out, else it is empty.
     cov: (n, 3, 3) covariance of the *position*, everything included: pixel noise of this measurement, lack of
     calibration data, parameters. views: (n,) number of views used. consistency: (n,) p-value of the chi-squared test
     that the views agree, NaN where it cannot be tested.

@@ -434,8 +434,9 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
         show.emit_json(
             {"method": evaluation.method, "how": evaluation.how, "against": evaluation.against,
              "length_unit": evaluation.data.length_unit, **evaluation.coverage.as_dict(),
-             "not_measured": show.reasons(evaluation.measurement), "views_left_out": show.left_out(evaluation.measurement),
-             "notes": list(evaluation.notes), "report": None if report is None else str(report)}
+             "not_measured": show.reasons(evaluation.measurement),
+             "views_left_out": show.left_out(evaluation.measurement), "notes": list(evaluation.notes),
+             "report": None if report is None else str(report)}
         )  # fmt: skip
         return
     show.line(f"{evaluation.method} on {evaluation.data.name}: {evaluation.how}")

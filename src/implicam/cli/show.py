@@ -228,19 +228,14 @@ def demo_table(demo: Demo) -> Table:
     for row in demo.rows:
         lines.setdefault((row.cameras, row.trial.known), []).append(row.trial)
     methods = dict.fromkeys(row.trial.method for row in demo.rows)
-    shown = _table(
-        f"A simulated rig, judged at {HELD_OUT} random positions it has not seen",
-        (
-            "cameras", "points",
-            *(text for name in methods for text in (f"{name}\nrmse {demo.unit}", "rmse/limit", "95 %\ncoverage")),
-        ),
-        [],
-    )  # fmt: skip
+    headings = ["cameras", "points"]
+    for name in methods:
+        headings += [f"{name}\nrmse {demo.unit}", "rmse/\nlimit", "95 %\ncoverage"]
+    shown = _table(f"A simulated rig, judged at {HELD_OUT} random positions it has not seen", headings, [])
     for (cameras, known), trials in lines.items():
-        cells = [
-            text for t in trials for text in
-            (number(t.rmse), number(t.rmse / t.limit), f"{100 * t.coverage_95:.1f} %")
-        ]  # fmt: skip
+        cells: list[str] = []
+        for t in trials:
+            cells += [number(t.rmse), number(t.rmse / t.limit), f"{100 * t.coverage_95:.1f} %"]
         shown.add_row(cameras, str(known), *cells, end_section=known == demo.rows[-1].trial.known)
     return shown
 

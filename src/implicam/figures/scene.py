@@ -164,7 +164,7 @@ def _room(unit: str) -> dict[str, Any]:
         title = {"text": plain(f"{name} ({unit})")}
         return {"title": title, "gridcolor": GREY, "gridwidth": 0.5, "zeroline": False, "showbackground": False}
 
-    eye, centre = {"x": 1.5, "y": 1.5, "z": 0.8}, {"x": 0, "y": 0, "z": -0.16}
+    eye, centre = {"x": 1.36, "y": 1.36, "z": 0.73}, {"x": 0, "y": 0, "z": -0.16}
     view = {"eye": eye, "center": centre}
     return {"xaxis": side("x"), "yaxis": side("y"), "zaxis": side("z"), "aspectmode": "data", "camera": view}
 

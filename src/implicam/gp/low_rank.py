@@ -60,10 +60,9 @@ class LowRank:
         scaled = X / self.kernel.lengthscale**2
         pulled = self.inducing / self.kernel.lengthscale**2
         value = K @ coefficients
-        toward = K @ (coefficients[:, :, None] * pulled[:, None, :]).reshape(len(K.T), -1)
-        return np.asarray(
-            toward.reshape(len(X), coefficients.shape[1], -1) - value[:, :, None] * scaled[:, None, :], dtype=np.float64
-        )
+        both = coefficients[:, :, None] * pulled[:, None, :]
+        toward = np.einsum("nm,mkd->nkd", K, both, optimize=True)
+        return np.asarray(toward - value[:, :, None] * scaled[:, None, :], dtype=np.float64)
 
 
 def pivoted_cholesky(K: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:

@@ -14,7 +14,7 @@ h2 { font-size: 19px; margin: 44px 0 12px; padding-top: 14px; border-top: 1px so
 .kind { margin: 0 0 6px; font-size: 13px; letter-spacing: .08em; text-transform: uppercase; color: var(--soft); }
 .subtitle { margin: 4px 0 0; color: var(--soft); font-size: 17px; }
 dl, dd, dt, figure { margin: 0; }
-.facts { display: flex; flex-wrap: wrap; gap: 10px 36px; margin-top: 20px; }
+.facts { display: flex; flex-wrap: wrap; gap: 10px 22px; margin-top: 20px; }
 .facts dt, .tile dt { font-size: 13px; color: var(--soft); }
 .facts dd { overflow-wrap: anywhere; }
 .headline { font-size: 25px; line-height: 1.35; font-weight: 600; margin: 34px 0 18px; max-width: 42em;

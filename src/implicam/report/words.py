@@ -87,7 +87,7 @@ def tiles(data: ReportData) -> list[tuple[str, str, str]]:
     ]
     if math.isfinite(row.rmse_over_limit):
         times = f"{number(row.rmse_over_limit)}×"
-        found.append(("rms error over the Cramér–Rao limit", times, "1× is the best these pixels allow"))
+        found.append(("rms error over the Cramér–Rao limit", times, "1× is the best these pixels allow on average"))
     return [*found, count]
 
 

@@ -65,7 +65,14 @@ class ForwardGP:
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """Fit to all known points that any camera saw."""
         frame = Frame.of(data)
-        fitted = fit_rig(_problem(self.lens, data, frame), progress)
+        try:
+            fitted = fit_rig(_problem(self.lens, data, frame), progress)
+        except np.linalg.LinAlgError as error:
+            raise FitError(
+                "the known points do not fix the rig: the equations have no solution.",
+                why=str(error),
+                fix="add known points elsewhere in the volume, and look for wrong ones (implicam info DATASET)",
+            ) from error
         names = data.observations.camera_names
         if len(fitted.cameras) < 2:
             raise FitError(
@@ -93,7 +100,8 @@ class Frame:
         require_points(int(seen.sum()), FEWEST, ForwardGP.method, why)
         xyz = data.xyz[seen]
         require_volume(xyz, ForwardGP.method)
-        return cls(xyz.mean(axis=0), float(xyz.std(axis=0).max()))
+        offset = xyz.mean(axis=0)
+        return cls(offset, float(np.sqrt(np.mean((xyz - offset) ** 2))))
 
     def inward(self, xyz: Floats) -> Floats:
         """World to working frame."""
@@ -410,10 +418,11 @@ class ForwardGPCalibration:
         for number, model in enumerate(posterior.models):
             arrays |= {
                 f"{number}/camera": model.camera.as_array(),
+                f"{number}/ruler": model.ruler.as_array(),
                 f"{number}/inducing": model.field.inducing,
                 f"{number}/weights": model.weights,
                 f"{number}/kept": fitted.kept[number],
-                f"{number}/alone": posterior.alone[number],
+                f"{number}/root": posterior.alone[number],
             }
         if posterior.joint is not None:
             arrays["joint"] = posterior.joint
@@ -475,18 +484,21 @@ def _restored_model(
     lens: str, arrays: Arrays, number: int, sizes: Floats, lengthscale: Floats
 ) -> tuple[CameraModel, Floats]:
     kind = LENSES[lens]
-    camera = kind.from_array(finite_column(arrays, f"{number}/camera", (20 if kind is CentralCamera else 12,)))
+    numbers = (20 if kind is CentralCamera else 12,)
+    camera, ruler = (
+        kind.from_array(finite_column(arrays, f"{number}/{what}", numbers)) for what in ("camera", "ruler")
+    )
     m = len(arrays[f"{number}/inducing"])
     inducing = finite_column(arrays, f"{number}/inducing", (m, 3))
     weights = finite_column(arrays, f"{number}/weights", (m, 2))
     size = kind.size + 2 * m
-    alone = finite_column(arrays, f"{number}/alone", (size, size))
+    alone = finite_column(arrays, f"{number}/root", (size, size))
     signal, noise, *centre, half = sizes.tolist()
     if not (signal > 0 and noise > 0 and half > 0):
         raise ValueError("signal, noise and image size must be positive")
     none = Prior(np.zeros(kind.size), np.zeros((kind.size, kind.size)))  # only a fit needs it
     field = LowRank(field_kernel(lengthscale), inducing)
-    return CameraModel(camera, none, Image(np.array(centre), half), field, signal, noise, weights), alone
+    return CameraModel(camera, ruler, none, Image(np.array(centre), half), field, signal, noise, weights), alone
 
 
 def _restored_posterior(
@@ -495,16 +507,16 @@ def _restored_posterior(
     total = sum(model.size for model in models)
     joint = finite_column(arrays, "joint", (total, total)) if "joint" in arrays else None
     displacement = finite_column(arrays, "displacement", (len(data), 3)) if "displacement" in arrays else None
+    if (joint is None) != (displacement is None):
+        raise ValueError("joint and displacement belong together")
     unknowns = None
-    if "shots/mean" in arrays:
+    if any(name.startswith("shots/") for name in arrays):
+        if joint is None:
+            raise ValueError("the errors of shots tie the cameras: joint is missing")
         k = len(arrays["shots/mean"])
         unknowns = Unknowns(
             finite_column(arrays, "shots/mean", (k,)),
             finite_column(arrays, "shots/covariance", (k, k)),
             finite_column(arrays, "shots/cross", (total, k)),
         )
-    covariances = alone
-    if joint is not None:
-        ends = np.cumsum([model.size for model in models])
-        covariances = tuple(np.array(joint[e - m.size : e, e - m.size : e]) for e, m in zip(ends, models, strict=True))
-    return Posterior(models, covariances, alone, joint, (), 0.0, unknowns, displacement)
+    return Posterior(models, alone, joint, (), 0.0, unknowns, displacement)

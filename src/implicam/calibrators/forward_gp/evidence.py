@@ -40,8 +40,9 @@ STATED = 0.2
 OWN_SIGNAL, OWN_NOISE = 0.3, 0.15
 """Log sd of one camera's field and noise about the rig's."""
 
-FTOL = 3e-5
-"""Relative change of the log posterior at which the search for the sizes ends: some hundredths of a nat."""
+FTOL = 1e-4
+"""Change of the log posterior at which the search for the sizes ends, as a part of what it has gained: hundredths of a
+nat."""
 
 DETERMINED = 1e-12
 """Eigenvalues below this part of the largest add nothing."""
@@ -235,4 +236,12 @@ class RigEvidence:
     @staticmethod
     def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats) -> Any:
         bounds = [(-6.0, 6.0)] * len(start)
-        return minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": FTOL})
+        before = objective(start)[0]  # its zero depends on the unit: what counts is what is gained
+
+        def gained(z: Floats) -> tuple[float, Floats]:
+            value, gradient = objective(z)
+            return value - before, gradient
+
+        found = minimize(gained, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": FTOL})
+        found.fun += before
+        return found

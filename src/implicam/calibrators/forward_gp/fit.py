@@ -6,6 +6,7 @@ The order of docs/method.md, section "Fit".
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,9 @@ from implicam.calibrators.forward_gp.posterior import (
     Sightings,
     condition,
     empty_field,
+    spread,
 )
-from implicam.calibrators.forward_gp.start import Started, start_camera
+from implicam.calibrators.forward_gp.start import FEWEST, Started, start_camera
 from implicam.errors import FitError
 from implicam.progress import Progress
 from implicam.threads import side_by_side
@@ -35,6 +37,9 @@ MOST_UNCERTAIN = 120
 
 OUTLIER = 25.0
 """Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
+
+TOLERABLE = {"central": 0.05, "none": 0.3}
+"""Median error of a start, in half the extent of the pixels, beyond which it is none."""
 
 TOLERANCE = {"central": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
@@ -83,6 +88,7 @@ def fit_rig(problem: Problem, progress: Progress) -> FittedRig:
     models = tuple(
         CameraModel(
             started[c].camera,
+            started[c].camera,
             started[c].prior,
             image,
             empty_field(np.ones(2), np.zeros((1, 3)), 1.0),
@@ -94,34 +100,69 @@ def fit_rig(problem: Problem, progress: Progress) -> FittedRig:
     )
     progress("fitting", 1, 3)
     stated = problem.stated[list(cameras)]
-    hyper: Hyperparameters | None = None
-    errors, moved, label_sd = problem.errors, None, None
-    estimated = errors is not None and errors.estimated
-    for _ in range(ROUNDS_WITH_SHOTS if estimated else ROUNDS):
-        used = tuple(s.select(k) for s, k in zip(seen, kept, strict=True))
-        hyper = _hyperparameters(problem, models, used, images, stated, hyper, moved)
-        posterior = _conditioned(problem, models, used, hyper, errors)
-        models = posterior.models
-        if errors is not None and posterior.unknowns is not None:
-            before, moved = errors.sd, posterior.displacement
-            mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
-            errors, label_sd = errors.updated(mean.reshape(before.shape), variance.reshape(before.shape))
-            if not np.allclose(errors.sd, before, rtol=SETTLED):  # too early to say what contradicts the others
-                continue
-        judged = _judged_all(posterior, problem.points, seen, kept)
-        if all((j == k).all() for j, k in zip(judged, kept, strict=True)):
+    rounds = ROUNDS_WITH_SHOTS if problem.errors is not None and problem.errors.estimated else ROUNDS
+    state = _Round(None, models, None, kept, problem.errors, None, settled=False)
+    for number in range(rounds):
+        state = _round(problem, state, seen, images, stated)
+        judged = state.kept
+        if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
+            judged = _judged_all(state.posterior, problem.points, seen, state.kept)
+        if state.settled and all((j == k).all() for j, k in zip(judged, state.kept, strict=True)):
             break
-        kept = judged
+        progress("fitting", 2, 3)
+        if number < rounds - 1:  # the last round's views stay those of its posterior
+            state = state._replace(kept=judged)
     progress("fitting", 3, 3)
-    assert hyper is not None
-    return FittedRig(posterior, cameras, tuple(blind), kept, hyper, errors, label_sd)
+    assert state.hyper is not None
+    return FittedRig(state.posterior, cameras, tuple(blind), state.kept, state.hyper, state.errors, state.label_sd)
+
+
+class _Round(NamedTuple):
+    """What a round of the fit hands to the next; errors: those of its posterior, next_errors: more probable ones."""
+
+    hyper: Hyperparameters | None
+    models: tuple[CameraModel, ...]
+    found: Posterior | None
+    kept: tuple[Bools, ...]
+    next_errors: ShotErrors | None
+    label_sd: Floats | None
+    settled: bool
+    errors: ShotErrors | None = None
+
+    @property
+    def posterior(self) -> Posterior:
+        assert self.found is not None
+        return self.found
+
+
+def _round(
+    problem: Problem, last: _Round, seen: tuple[Sightings, ...], images: tuple[Image, ...], stated: Floats
+) -> _Round:
+    """Sizes, posterior, and how far the shots are off."""
+    kept = tuple(
+        k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
+        for k, m, s in zip(last.kept, last.models, seen, strict=True)
+    )
+    used = tuple(s.select(k) for s, k in zip(seen, kept, strict=True))
+    moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
+    hyper = _hyperparameters(problem, last.models, used, images, stated, last.hyper, moved)
+    errors = last.next_errors
+    posterior = _conditioned(problem, last.models, used, hyper, errors)
+    following, label_sd, settled = errors, None, True
+    if errors is not None and posterior.unknowns is not None:
+        mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
+        following, label_sd = errors.updated(mean.reshape(errors.sd.shape), variance.reshape(errors.sd.shape))
+        settled = bool(np.allclose(following.sd, errors.sd, rtol=SETTLED))
+    return _Round(hyper, posterior.models, posterior, kept, following, label_sd, settled, errors)
 
 
 def _start(problem: Problem) -> tuple[dict[int, Started], list[tuple[int, str]]]:
     def one(c: int) -> Started | FitError:
         seen = problem.sightings[c]
         try:
-            return start_camera(problem.points[seen.rows], seen.uv, problem.images[c], problem.lens)
+            started = start_camera(problem.points[seen.rows], seen.uv, problem.images[c], problem.lens)
+            _check_start(started, problem.points[seen.rows], seen.uv, problem)
+            return started
         except FitError as error:
             return error
 
@@ -132,6 +173,15 @@ def _start(problem: Problem) -> tuple[dict[int, Started], list[tuple[int, str]]]
         else:
             started[c] = found
     return started, blind
+
+
+def _check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:
+    error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.kept]
+    half = float(np.ptp(uv, axis=0).max()) / 2
+    if len(error) < FEWEST or not np.median(error) < TOLERABLE[problem.lens] * half:
+        raise FitError(
+            f"no camera sees the known points at these pixels: the best of all fits leaves {np.median(error):.3g} px."
+        )
 
 
 def _hyperparameters(
@@ -196,6 +246,7 @@ def _conditioned(
         field = empty_field(hyper.lengthscale, model.coordinates(view), tolerance)
         return replace(
             model,
+            ruler=model.camera,
             field=field,
             signal=float(hyper.signal[c]),
             noise=float(hyper.noise[c]),
@@ -205,51 +256,53 @@ def _conditioned(
     models = tuple(sized(c) for c in range(len(models)))
     for _ in range(4):
         posterior = condition(models, problem.points, used, errors)
-        models = posterior.models
-        if all(_small(step, cov) for step, cov in zip(posterior.steps, posterior.covariances, strict=True)):
+        models = tuple(
+            _in_front(before, after, step, problem.points[seen.rows])
+            for before, after, step, seen in zip(models, posterior.models, posterior.steps, used, strict=True)
+        )
+        if all(_small(step, posterior.root(c)) for c, step in enumerate(posterior.steps)):
             break
-    return posterior
+    return replace(posterior, models=models)
 
 
-def _small(step: Floats, covariance: Floats) -> bool:
-    return bool(np.all(np.abs(step) <= 0.02 * np.sqrt(np.diag(covariance)[: len(step)])))
+def _in_front(before: CameraModel, after: CameraModel, step: Floats, points: Floats) -> CameraModel:
+    """A camera never steps so far that it loses a point it saw: half the step, then, or half of that."""
+    for halvings in range(20):
+        camera = after.camera if halvings == 0 else before.camera.moved(step * 0.5**halvings)
+        if camera.sane and np.isfinite(camera.pixel(points)).all():
+            return after if halvings == 0 else replace(after, camera=camera)
+    return before
+
+
+def _small(step: Floats, root: Floats) -> bool:
+    sd = np.sqrt(np.sum(root[:, : len(step)] ** 2, axis=0))
+    return bool(np.all(np.abs(step) <= 0.02 * sd))
 
 
 def squared_distances(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> Floats:
     """(n,) how far each view is from what the others predict: closed form for the views used, eq. (18)."""
-    residual, spread = left_out(posterior, c, points, seen, kept)
-    inverse = np.linalg.inv(spread)
+    residual, covariance = left_out(posterior, c, points, seen, kept)
+    inverse = np.linalg.inv(covariance)
     distance = np.einsum("ni,nij,nj->n", residual, inverse, residual)
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf), dtype=np.float64)
 
 
 def left_out(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> tuple[Floats, Floats]:
     """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px."""
-    model, covariance = posterior.models[c], posterior.alone[c]
+    model = posterior.models[c]
     sd = model.noise * seen.relative
     where = points[seen.rows]
     if posterior.displacement is not None:
         where = where + posterior.displacement[seen.rows]
     rows = model.rows(where)
-    reach = projected(rows.J, rows.phi, covariance)
+    half = spread(rows, posterior.alone[c])
+    reach = half @ half.swapaxes(1, 2)
     residual = seen.uv - rows.mean
     smooth = reach / (sd**2)[:, None, None]
     inside = np.linalg.inv(np.where(kept[:, None, None], np.eye(2) - smooth, np.eye(2)))
     residual = np.einsum("nij,nj->ni", inside, residual)
     extra = np.where(kept[:, None, None], 0, reach)
     return residual, inside * (sd**2)[:, None, None] + extra + rows.rest[:, None, None] * np.eye(2)
-
-
-def projected(J: Floats, phi: Floats, covariance: Floats) -> Floats:
-    """(n, 2, 2) covariance of the mean pixels from that of a camera's unknowns."""
-    p, m = J.shape[2], phi.shape[1]
-    out = np.empty((len(J), 2, 2))
-    half = [J[:, i] @ covariance[:p] + phi @ covariance[p + i * m : p + (i + 1) * m] for i in range(2)]
-    for i in range(2):
-        for j in range(2):
-            out[:, i, j] = np.sum(half[i][:, :p] * J[:, j], axis=1)
-            out[:, i, j] += np.sum(half[i][:, p + j * m : p + (j + 1) * m] * phi, axis=1)
-    return out
 
 
 def _judged_all(

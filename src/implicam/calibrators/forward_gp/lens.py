@@ -1,6 +1,6 @@
 """One central camera for every lens, and a camera without any lens model; with their derivatives and priors.
 
-Both see points (n, 3) of the working frame (world, centred and scaled; frame.py) and offer the same:
+Both see points (n, 3) of the working frame (world, centred and scaled; calibration.Frame) and offer the same:
 `view(points)`, `pixel(points)`, `moved(step)`, `lines(uv)` and `prior`. Equation numbers: docs/method.md.
 """
 
@@ -31,6 +31,10 @@ ASPECT = 0.002
 
 CENTRE = 0.02
 """Prior sd of the principal point about the image's centre, as a part of the longer side."""
+
+
+NEAR = 0.3
+"""Prior sd of the numbers of a linear projection about those of its start, as a part of them."""
 
 
 class Image(NamedTuple):
@@ -134,7 +138,7 @@ class CentralCamera:
     def from_array(cls, array: Floats) -> CentralCamera:
         """The inverse of `as_array`."""
         rotation = array[8:17].reshape(3, 3)
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
             raise ValueError("a camera's rotation is not one")
         return cls(KannalaBrandt(*array[:8].tolist()), Pose(rotation, array[17:]))
 
@@ -187,10 +191,10 @@ class ProjectiveCamera:
         return ProjectiveCamera(self.P + step.reshape(3, 4))
 
     def prior(self, image: Image, widest: float) -> Prior:
-        """Nothing but that the scale of P, which no pixel shows, stays about what it is."""
+        """Roughly what the linear resection found; and the scale of P, which no pixel shows, stays what it is."""
         scale = np.maximum(np.abs(self.P), 1e-3 * np.abs(self.P).max(axis=1, keepdims=True))
         along = (self.P / scale**2).ravel()
-        return Prior(self.P.ravel(), np.diag(1 / (100 * scale.ravel()) ** 2) + 1e4 * np.outer(along, along))
+        return Prior(self.P.ravel(), np.diag(1 / (NEAR * scale.ravel()) ** 2) + 1e4 * np.outer(along, along))
 
     def as_array(self) -> Floats:
         """(12,)."""

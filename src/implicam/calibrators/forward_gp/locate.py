@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from implicam.calibrators.forward_gp.fit import projected
 from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import CHUNK, Posterior, Unknowns
+from implicam.calibrators.forward_gp.posterior import CHUNK, Posterior, Unknowns, spread
 from implicam.calibrators.forward_gp.shots import Shots
 from implicam.threads import side_by_side
 
@@ -24,7 +23,7 @@ CONVERGED = 1e-3
 DISAGREE = 1e-4
 """Below this p-value the views disagree, and one or two are looked for that the others would do better without."""
 
-AGREE = 1e-2
+AGREE = 1e-3
 """The p-value that the others must have among themselves then."""
 
 CLEARLY = 100.0
@@ -36,7 +35,7 @@ IMPOSSIBLE = 1e-10
 
 class Located(NamedTuple):
     """xyz (n, 3) and cov (n, 3, 3), NaN where the point has no position; p (n,) that the views agree, NaN where it
-    cannot be tested; left_out (n,) the number of a camera whose view was not used, or -1."""
+    cannot be tested; left_out (n, C) the views not used."""
 
     xyz: Floats
     cov: Floats
@@ -186,7 +185,6 @@ class _Weights:
 
     def __init__(self, posterior: Posterior, x: Floats, noise: Floats, seen: Bools) -> None:
         self.models = posterior.models
-        self.offsets = posterior.offsets
         rows = [model.rows(x) for model in self.models]
         C = len(self.models)
         own = [(noise[:, c] ** 2 + rows[c].rest)[:, None, None] * np.eye(2) for c in range(C)]
@@ -194,44 +192,25 @@ class _Weights:
         self.joint: Floats | None = None
         if posterior.joint is None:
             for c in range(C):
-                spread = own[c] + projected(rows[c].J, rows[c].phi, posterior.covariances[c])
-                self.each.append(_inverted(np.where(seen[:, c, None, None], spread, np.eye(2))))
+                covariance = own[c] + _square(spread(rows[c], posterior.alone[c]))
+                self.each.append(_inverted(np.where(seen[:, c, None, None], covariance, np.eye(2))))
             return
-        S = np.zeros((len(x), C, 2, C, 2))
-        offsets = posterior.offsets
-        wide = [np.zeros((len(x), 2, offsets[-1])) for _ in range(C)]
-        for c, (J, phi) in enumerate((r.J, r.phi) for r in rows):
-            p, m, o = J.shape[2], phi.shape[1], offsets[c]
-            for i in range(2):
-                block = slice(o + p + i * m, o + p + (i + 1) * m)
-                wide[c][:, i] = J[:, i] @ posterior.joint[o : o + p] + phi @ posterior.joint[block]
+        self.half = np.concatenate([spread(rows[c], posterior.root(c)) for c in range(C)], axis=1)  # (n, 2C, sum P)
+        S = _square(self.half).reshape(len(x), C, 2, C, 2)
         for c in range(C):
-            for k, (J, phi) in enumerate((r.J, r.phi) for r in rows):
-                p, m, o = J.shape[2], phi.shape[1], offsets[k]
-                for j in range(2):
-                    block = slice(o + p + j * m, o + p + (j + 1) * m)
-                    S[:, c, :, k, j] = np.einsum("nip,np->ni", wide[c][:, :, o : o + p], J[:, j])
-                    S[:, c, :, k, j] += np.einsum("nim,nm->ni", wide[c][:, :, block], phi)
             S[:, c, :, c] += own[c]
         both = seen[:, :, None, None, None] & seen[:, None, None, :, None]
         masked = np.where(both, S, np.eye(2 * C).reshape(C, 2, C, 2))
         self.joint = _inverted(masked.reshape(len(x), 2 * C, 2 * C))
 
     def with_cameras(self, x: Floats, cov: Floats, seen: Bools, cross: Floats) -> Floats:
-        """(n, 3, k) covariance of the positions' error with unknowns whose covariance with the cameras' is `cross`."""
+        """(n, 3, k) covariance of the positions' error with unknowns that `cross` ties to the cameras'."""
         assert self.joint is not None
-        n, C = len(x), len(self.models)
-        D, through = np.zeros((n, C, 2, 3)), np.zeros((n, C, 2, cross.shape[1]))
-        for c, model in enumerate(self.models):
-            rows = model.rows(x)
-            p, m, o = model.camera.size, len(model.field.inducing), self.offsets[c]
-            for i in range(2):
-                block = slice(o + p + i * m, o + p + (i + 1) * m)
-                through[:, c, i] = rows.J[:, i] @ cross[o : o + p] + rows.phi @ cross[block]
-            D[:, c] = model.predict(x)[1]
-        D, through = np.where(seen[..., None, None], D, 0), np.where(seen[..., None, None], through, 0)
-        gain = cov @ D.reshape(n, 2 * C, 3).swapaxes(1, 2) @ self.joint
-        return gain @ through.reshape(n, 2 * C, -1)
+        n, C = seen.shape
+        D = np.stack([model.predict(x)[1] for model in self.models], axis=1)
+        D = np.where(seen[..., None, None], D, 0).reshape(n, 2 * C, 3)
+        through = np.where(seen.repeat(2, axis=1)[..., None], self.half @ cross, 0)
+        return np.asarray(cov @ D.swapaxes(1, 2) @ self.joint @ through, dtype=np.float64)
 
     def normal(self, x: Floats, uv: Floats, seen: Bools) -> tuple[Floats, Floats, Floats]:
         """H (n, 3, 3), gradient (n, 3) and weighted squares (n,) of the residuals at x (n, 3)."""
@@ -251,6 +230,10 @@ class _Weights:
         H = Dt @ WD.reshape(n, 2 * C, 3)
         g = (Dt @ Wr.reshape(n, 2 * C, 1))[..., 0]
         return 0.5 * (H + H.swapaxes(1, 2)), g, np.sum(r * Wr, axis=(1, 2))
+
+
+def _square(half: Floats) -> Floats:
+    return np.asarray(half @ half.swapaxes(1, 2), dtype=np.float64)
 
 
 def _solved(A: Floats, b: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""What is known of every camera after seeing the known points: one joint normal distribution, eqs. (13) to (17).
+"""What is known of every camera after seeing the known points: one joint normal distribution, eqs. (13) to (15), (17).
 
 The unknowns of a camera are its lens and pose (a step from where it is linearised) and the weights of its residual
 field, first of u, then of v. Where known positions are exact, cameras are independent. Where positions have an error,
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 
 from implicam.calibrators.forward_gp.evidence import field_kernel
 from implicam.calibrators.forward_gp.lens import AnyCamera, Floats, Image, Prior, View
@@ -31,9 +31,14 @@ LIKELY = (np.log(3e-3), 1.0)
 
 @dataclass(frozen=True, eq=False)
 class CameraModel:
-    """A camera, its residual field and its noise; weights (m, 2) of the field's features, zero before the fit."""
+    """A camera, its residual field and its noise; weights (m, 2) of the field's features, zero before the fit.
+
+    The field is looked up where the `ruler` sees a point: the camera as it was when the field was laid out. It stays
+    when the camera moves, for a telephoto lens may move far along its axis with its focal length, and no pixel shows.
+    """
 
     camera: AnyCamera
+    ruler: AnyCamera
     prior: Prior
     image: Image
     field: LowRank
@@ -46,6 +51,11 @@ class CameraModel:
         """Number of unknowns."""
         return self.camera.size + 2 * len(self.field.inducing)
 
+    def _views(self, points: Floats) -> tuple[View, View]:
+        """What the camera sees, and its ruler."""
+        view = self.camera.view(points)
+        return view, view if self.ruler is self.camera else self.ruler.view(points)
+
     def coordinates(self, view: View) -> Floats:
         """(n, 3) where the field is looked up: pixel about the centre in half the longer side, log distance."""
         return np.column_stack([(view.uv - self.image.centre) / self.image.half, view.log_distance])
@@ -56,22 +66,21 @@ class CameraModel:
 
     def predict(self, points: Floats) -> tuple[Floats, Floats]:
         """Mean pixels (n, 2) and their derivative by the point (n, 2, 3); NaN where the lens has no answer."""
-        view = self.camera.view(points)
-        q = self.coordinates(view)
+        view, measured = self._views(points)
+        q = self.coordinates(measured)
         K = self.field.kernel(q, self.field.inducing)
         by_q = self.field.slope(q, K, self._coefficients)
         by_point = (
             view.by_point
-            + by_q[:, :, :2] @ (view.by_point / self.image.half)
-            + by_q[:, :, 2, None] * view.distance_by_point[:, None, :]
+            + by_q[:, :, :2] @ (measured.by_point / self.image.half)
+            + by_q[:, :, 2, None] * measured.distance_by_point[:, None, :]
         )
         return view.uv + K @ self._coefficients, by_point
 
     def rows(self, points: Floats) -> Rows:
         """How the pixels of points (n, 3) depend on the camera's unknowns, about the present mean."""
-        view = self.camera.view(points)
-        q = self.coordinates(view)
-        K = self.field.kernel(q, self.field.inducing)
+        view, measured = self._views(points)
+        K = self.field.kernel(self.coordinates(measured), self.field.inducing)
         phi = self.field.features_from(K)
         left = np.maximum(1 - np.sum(phi**2, axis=1), 0)
         mean = view.uv + K @ self._coefficients
@@ -90,6 +99,15 @@ class Rows(NamedTuple):
     phi: Floats
     rest: Floats
     by_point: Floats
+
+
+def spread(rows: Rows, root: Floats) -> Floats:
+    """(n, 2, q) whose products `spread spread^T` are the covariances of mean pixels, from a camera's root (q, P)."""
+    p, m = rows.J.shape[2], rows.phi.shape[1]
+    out = rows.J @ root[:, :p].T
+    for i in range(2):
+        out[:, i] += rows.phi @ root[:, p + i * m : p + (i + 1) * m].T
+    return np.asarray(out, dtype=np.float64)
 
 
 class Sightings(NamedTuple):
@@ -155,7 +173,8 @@ class ShotErrors:
 
 
 class Unknowns(NamedTuple):
-    """Of all shots, in their sds: mean (shots * k,), covariance, and cross, (sum P, shots * k), with the cameras'."""
+    """Of all shots, in their sds: mean (shots * k,), covariance, and cross, of which `joint^T cross` is
+    the covariance with the cameras' (sum P, shots * k)."""
 
     mean: Floats
     covariance: Floats
@@ -166,19 +185,25 @@ class Unknowns(NamedTuple):
 class Posterior:
     """All cameras and what is unknown of them.
 
-    covariances: per camera (P, P); alone: the same if the known positions were where they seem now; joint:
-    (sum P, sum P) where the cameras are tied, else None. steps: how far each lens moved. evidence: log marginal
-    likelihood, up to a constant. displacement: (n, 3) of the known points, the posterior mean.
+    Covariances are kept as *roots* W with `covariance = W^T W`: where parameters nearly make up for each other (focal
+    length and distance of a telephoto lens) the covariance itself would lose all digits of what pixels show.
+    alone: of each camera (P, P), if the known positions were where they seem now; joint: (sum P, sum P) where unknown
+    positions tie the cameras, else None. steps: how far each lens moved. evidence: log marginal likelihood, up to a
+    constant. displacement: (n, 3) of the known points, the posterior mean.
     """
 
     models: tuple[CameraModel, ...]
-    covariances: tuple[Floats, ...]
     alone: tuple[Floats, ...]
     joint: Floats | None
     steps: tuple[Floats, ...]
     evidence: float
     unknowns: Unknowns | None = None
     displacement: Floats | None = None
+
+    def root(self, c: int) -> Floats:
+        """(., P) root of the covariance of camera c's unknowns, everything included."""
+        start, end = self.offsets[c : c + 2]
+        return self.alone[c] if self.joint is None else self.joint[:, start:end]
 
     @property
     def offsets(self) -> list[int]:
@@ -202,14 +227,13 @@ def condition(
 
 def _independent(models: tuple[CameraModel, ...], normals: list[_Normal]) -> Posterior:
     """Known positions are exact: every camera on its own, eq. (13)."""
-    value, means, covariances = 0.0, [], []
+    value, means, roots = 0.0, [], []
     for normal in normals:
-        covariance, mean, log_determinant = _solve(normal.A, normal.b)
+        root, mean, log_determinant = _solve(normal.A, normal.b)
         value += 0.5 * (float(normal.b @ mean) - log_determinant - normal.squares - normal.logs)
         means.append(mean)
-        covariances.append(covariance)
-    alone = tuple(covariances)
-    return Posterior(_moved(models, means), alone, alone, None, _steps(models, means), value)
+        roots.append(root)
+    return Posterior(_moved(models, means), tuple(roots), None, _steps(models, means), value)
 
 
 def _tied(
@@ -236,14 +260,11 @@ def _tied(
     joint, mean, log_determinant = _solve(A, b)
     value += float(b @ mean) - log_determinant
     means = np.split(mean, ends[:-1])
-    covariances = tuple(np.array(joint[e - len(m) : e, e - len(m) : e]) for e, m in zip(ends, means, strict=True))
     alone = tuple(_solve(normal.A, normal.b)[0] for normal in normals)
     found = np.concatenate([(kept or meeting(*each)).unknowns(mean) for each in parts])
     displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
     unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
-    return Posterior(
-        _moved(models, means), covariances, alone, joint, _steps(models, means), 0.5 * value, unknowns, displacement
-    )
+    return Posterior(_moved(models, means), alone, joint, _steps(models, means), 0.5 * value, unknowns, displacement)
 
 
 def _moved(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
@@ -366,7 +387,7 @@ class _Meeting(NamedTuple):
         inverse = np.linalg.inv(self.H)
         pull = (inverse @ self.G).reshape(S * k, -1)
         cross = -joint @ pull.T
-        covariance = -pull @ cross
+        covariance = cross.T @ cross
         for s in range(S):
             covariance[s * k : (s + 1) * k, s * k : (s + 1) * k] += inverse[s]
         return Unknowns(self.unknowns(mean).ravel(), covariance, cross)
@@ -401,12 +422,12 @@ def _meet(model: CameraModel, points: Floats, seen: Sightings, errors: ShotError
 
 
 def _solve(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
-    """Covariance, mean and log determinant; scaled first, since lens parameters differ by many orders of magnitude."""
+    """Root of the covariance, mean and log determinant; scaled first, since lens parameters differ by many orders of
+    magnitude."""
     scale = 1 / np.sqrt(np.diag(A))
     L = np.linalg.cholesky(A * scale[:, None] * scale)
-    inverse = np.linalg.inv(L) * scale
-    covariance = inverse.T @ inverse
-    return covariance, covariance @ b, float(2 * np.sum(np.log(np.diag(L) / scale)))
+    root = np.ascontiguousarray(solve_triangular(L, np.diag(scale), lower=True))
+    return root, root.T @ (root @ b), float(2 * np.sum(np.log(np.diag(L) / scale)))
 
 
 def _chunks(n: int, size: int = CHUNK) -> Iterator[slice]:

@@ -1,4 +1,4 @@
-"""Known positions that are off, a whole shot at a time: eqs. (16) and (17) of docs/method.md.
+"""Known positions that are off, a whole shot at a time: eqs. (16) and (22) of docs/method.md.
 
 Two kinds. *Declared* errors (sd_x, sd_y, sd_z) are random: each shot is shifted on its own, the true positions are
 measured. Errors that are *not declared* are looked for where shots of many points contradict each other: a plate on a
@@ -27,6 +27,9 @@ SMOOTH = 3
 
 FIRST_GUESS = 2e-3
 """Sd of a shot's error to begin with, in the working frame."""
+
+FARTHEST_TILT = 2.0
+"""Plate radii off its centre beyond which a tilt says no more: it is small, and not a matter of the whole world."""
 
 REACH = 0.25
 """How far the label of a shot holds around it, as a part of the distance to the next one."""
@@ -104,12 +107,14 @@ class Shots:
         n = len(points)
         nearest = np.argmin(outside := self._outside(points), axis=1)
         distance = outside[np.arange(n), nearest]
-        holds = np.exp(-0.5 * (distance / self._reach) ** 2) if self._reach > 0 else np.zeros(n)
+        if self._reach == 0:  # shots that overlap contradict each other in one place: what is measured is their mean
+            return np.zeros((n, 3, len(sd))), np.zeros((n, 3, 3))
+        holds = np.exp(-0.5 * (distance / self._reach) ** 2)
         rigid = self._rigid(points, nearest)
         known = holds[:, None, None, None] * rigid[:, :, :, None] * self.pattern[nearest][:, None, None, :]
-        per_kind = sd.reshape(6, -1)[:, 0]
-        lever = np.minimum(np.abs(rigid), 2.0)  # beyond twice a plate's size a tilt says nothing
-        spread = (lever * per_kind) ** 2
-        spread[:, :, :3] = (rigid[:, :, :3] * per_kind[:3]) ** 2
-        left = (1 - holds**2)[:, None] * spread.sum(axis=2)
-        return known.reshape(n, 3, -1) * sd, left[:, :, None] * np.eye(3)
+        lengths = np.linalg.norm(points - self.centre[nearest], axis=1) / self.radius[nearest]
+        within = np.minimum(1, FARTHEST_TILT / np.maximum(lengths, 1e-12))
+        lever = rigid * sd.reshape(6, -1)[:, 0]
+        lever[:, :, 3:] *= within[:, None, None]
+        left = (1 - holds**2)[:, None, None] * (lever @ lever.swapaxes(1, 2))
+        return known.reshape(n, 3, -1) * sd, left

@@ -21,12 +21,13 @@ from implicam.calibrators.forward_gp.lens import (
     ProjectiveCamera,
 )
 from implicam.cameras import KannalaBrandt
+from implicam.errors import FitError
 from implicam.geometry import resect, resect_any_lens
 
 Bools = NDArray[np.bool_]
 
 FEWEST = 8
-"""Known points that a camera must see: an equation more than its pose, focal length and centre have unknowns."""
+"""Known points that a camera must see: 16 numbers for the 14 of lens and pose."""
 
 FAR = 8.0
 """Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
@@ -42,6 +43,8 @@ class Started(NamedTuple):
 
 def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> Started:
     """A camera of the kind `lens` from points (n, 3), all seen at uv (n, 2); FitError where they do not fix one."""
+    if len(points) < FEWEST:
+        raise FitError(f"{len(points)} known points are seen; a camera needs at least {FEWEST}.")
     if lens == "none":
         return _start_projective(points, uv, image)
     found = resect_any_lens(points, uv, middle=image.centre)
@@ -92,7 +95,7 @@ def levenberg_marquardt(camera: AnyCamera, prior: Prior, points: Floats, uv: Flo
         return total if np.isfinite(total) else np.inf
 
     best, damping = cost(camera), 1e-3
-    for _ in range(60):
+    for _ in range(300):
         view = camera.view(points)
         J = view.by_parameters.reshape(-1, camera.size) / sd
         off = prior.mean - camera.parameters
@@ -110,6 +113,6 @@ def levenberg_marquardt(camera: AnyCamera, prior: Prior, points: Floats, uv: Flo
                 camera, best, damping = candidate, now, max(damping / 8, 1e-12)
                 break
             damping *= 6
-        if best > previous * (1 - 1e-6):
+        if best > previous * (1 - 1e-9):
             break
     return camera
