@@ -135,14 +135,20 @@ def _judge(
 ) -> Evaluation:
     truth = data.truth
     true_xyz = data.xyz if truth is None else truth.xyz
+    cov = measurement.cov
+    if truth is None:  # the difference from a known position that is itself uncertain
+        cov = cov + np.nan_to_num(data.positions.sd)[:, :, None] ** 2 * np.eye(3)
     coverage = assess(
         measurement.xyz - true_xyz,
-        measurement.cov,
+        cov,
         clusters=data.shots,
         regions=_regions(data) if regions else None,
         limit=None if truth is None else truth.limit,
     )
-    against = "the known positions" if truth is None else "the simulated truth"
+    against = "the simulated truth"
+    if truth is None:
+        declared = bool((data.positions.sd > 0).any())
+        against = "the known positions" + ", whose declared sd is part of the error bars" * declared
     notes = tuple(calibration.notes())
     return Evaluation(calibration.method, data, measurement, true_xyz, known_xyz, coverage, how, against, notes)
 

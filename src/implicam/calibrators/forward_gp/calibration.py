@@ -73,13 +73,6 @@ class ForwardGP:
                 why=str(error),
                 fix="add known points elsewhere in the volume, and look for wrong ones (implicam info DATASET)",
             ) from error
-        names = data.observations.camera_names
-        if len(fitted.cameras) < 2:
-            raise FitError(
-                f"{len(fitted.cameras)} of {len(names)} cameras can be calibrated; a position takes two.",
-                why="; ".join(f"{names[c]}: {why}" for c, why in fitted.blind) or "there is one camera",
-                fix="show the cameras more known points, in the whole volume",
-            )
         return ForwardGPCalibration(self, data, frame, fitted)
 
 
@@ -123,7 +116,7 @@ def _problem(lens: str, data: Dataset, frame: Frame) -> Problem:
     images = tuple(_image(observations, c) for c in range(len(observations.cameras)))
     shots = _shots(data, points)
     errors = shots.errors(points) if shots is not None else _declared(data, frame)
-    return Problem(points, tuple(sightings), images, stated, errors, lens)
+    return Problem(points, observations.camera_names, tuple(sightings), images, stated, errors, lens)
 
 
 def _image(observations: Observations, c: int) -> Image:
@@ -223,6 +216,19 @@ class ForwardGPCalibration:
             reasons,
             self.data.length_unit,
         )
+
+    def predict(self, xyz: Floats) -> Floats:
+        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
+        points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        uv = np.full((len(points), len(self.data.observations.cameras), 2), np.nan)
+        there = np.isfinite(points).all(axis=1)
+        where = points[there]
+        if self._labels is not None:
+            known, _ = self._labels.shots.labels(where, self._labels.sd)
+            where = where + known @ self._labels.unknowns.mean
+        for number, c in enumerate(self.fitted.cameras):
+            uv[there, c] = self.posterior.models[number].predict(where)[0]
+        return uv
 
     def _noise(self, observations: Observations, c: int, k: int) -> Floats:
         """(n,) of camera c's views, in pixels: as they state it, corrected as the calibration's own views were."""

@@ -55,6 +55,7 @@ class Problem:
     pixels or NaN; how the points may be off; lens: "central" or "none"."""
 
     points: Floats
+    names: tuple[str, ...]
     sightings: tuple[Sightings, ...]
     images: tuple[Image, ...]
     stated: Floats
@@ -82,6 +83,12 @@ def fit_rig(problem: Problem, progress: Progress) -> FittedRig:
     progress("fitting", 0, 3)
     started, blind = _start(problem)
     cameras = tuple(started)
+    if len(cameras) < 2:
+        raise FitError(
+            f"{len(cameras)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
+            why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
+            fix="show the cameras more known points, in the whole volume",
+        )
     seen = tuple(problem.sightings[c] for c in cameras)
     images = tuple(problem.images[c] for c in cameras)
     kept = tuple(started[c].kept for c in cameras)

@@ -424,6 +424,8 @@ def _meet(model: CameraModel, points: Floats, seen: Sightings, errors: ShotError
 def _solve(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
     """Root of the covariance, mean and log determinant; scaled first, since lens parameters differ by many orders of
     magnitude."""
+    if not np.isfinite(A).all():
+        raise np.linalg.LinAlgError("a camera has turned its back on points that it saw")
     scale = 1 / np.sqrt(np.diag(A))
     L = np.linalg.cholesky(A * scale[:, None] * scale)
     root = np.ascontiguousarray(solve_triangular(L, np.diag(scale), lower=True))

@@ -58,7 +58,7 @@ def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> Started
 
 
 def _start_projective(points: Floats, uv: Floats, image: Image) -> Started:
-    kept = np.ones(len(points), dtype=np.bool_)
+    kept = resect_any_lens(points, uv, middle=image.centre).kept  # any lens at all tells the wrong views from the right
     for _ in range(5):
         camera = ProjectiveCamera(resect(points[kept], uv[kept]))
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
