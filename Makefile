@@ -1,12 +1,13 @@
 # make demo   the main job on a simulated rig          make test   every test
 # make check  all that CI checks                        make bench  speed against the limits
-# make real   the table of docs/real-data.md            make clean  start over
+# make real   the table of docs/real-data.md            make rigs   the table of docs/choose.md
+# make clean  start over
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-slow check lint bench real clean
+.PHONY: demo test test-slow check lint bench real rigs clean
 
 demo: $(VENV)/.demo
 	$(BIN)/implicam demo
@@ -27,6 +28,10 @@ lint: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/gp_fit.py
+	$(BIN)/python benchmarks/forward_speed.py
+
+rigs: $(VENV)/.dev
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/forward.py --rigs 16
 
 real: $(VENV)/.dev
 	$(BIN)/python benchmarks/real_data.py ../shared/real

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam import calibration_file
-from implicam.calibrators.forward_gp.evidence import Hyperparameters, field_kernel
+from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.fit import FittedRig, Problem, fit_rig, left_out
-from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.calibrators.forward_gp.lens import LENSES, Image
 from implicam.calibrators.forward_gp.locate import Labels, Located, locate
-from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, ShotErrors, Sightings, Unknowns
+from implicam.calibrators.forward_gp.posterior import Posterior, ShotErrors, Sightings
 from implicam.calibrators.forward_gp.shots import Shots
 from implicam.calibrators.forward_gp.start import FEWEST
 from implicam.calibrators.protocol import (
@@ -34,11 +34,9 @@ from implicam.calibrators.protocol import (
 )
 from implicam.dataset import Dataset, Floats, Names, Observations
 from implicam.errors import FitError, UsageError, did_you_mean
-from implicam.gp.low_rank import LowRank
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 
-LENSES: dict[str, type[CentralCamera] | type[ProjectiveCamera]] = {"central": CentralCamera, "none": ProjectiveCamera}
 NAMED = 5
 """Things that a note names one by one; of more it gives the number."""
 
@@ -410,119 +408,17 @@ class ForwardGPCalibration:
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The options; and per camera lens, field, weights and covariance, in the working frame."""
-        fitted, posterior, names = self.fitted, self.posterior, self.data.observations.camera_names
-        table = {
-            **asdict(self.calibrator),
-            "calibrated": list(self.camera_names),
-            "not_calibrated": {names[c]: why for c, why in fitted.blind},
-        }
-        arrays: dict[str, NDArray[Any]] = {
-            "frame": np.append(self.frame.offset, self.frame.scale),
-            "lengthscale": np.asarray(fitted.hyperparameters.lengthscale),
-            "sizes": np.array([[m.signal, m.noise, *m.image.centre, m.image.half] for m in posterior.models]),
-        }
-        for number, model in enumerate(posterior.models):
-            arrays |= {
-                f"{number}/camera": model.camera.as_array(),
-                f"{number}/ruler": model.ruler.as_array(),
-                f"{number}/inducing": model.field.inducing,
-                f"{number}/weights": model.weights,
-                f"{number}/kept": fitted.kept[number],
-                f"{number}/root": posterior.alone[number],
-            }
-        if posterior.joint is not None:
-            arrays["joint"] = posterior.joint
-        if posterior.displacement is not None:
-            arrays["displacement"] = posterior.displacement
-        if posterior.unknowns is not None and fitted.errors is not None and fitted.label_sd is not None:
-            arrays |= {f"shots/{key}": value for key, value in posterior.unknowns._asdict().items()}
-            arrays |= {"shots/sd": fitted.errors.sd, "shots/label_sd": fitted.label_sd}
-        return table, arrays
+        table, arrays = saved.state(self.fitted, self.data.observations.camera_names)
+        arrays["frame"] = np.append(self.frame.offset, self.frame.scale)
+        return {**asdict(self.calibrator), **table}, arrays
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ForwardGPCalibration:
         """Restore a calibration; nothing is computed again."""
-        return _restored(data, table, arrays)
-
-
-def _restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ForwardGPCalibration:
-    calibrator = ForwardGP(str(table["lens"]), int(table["seed"]))
-    names = data.observations.camera_names
-    cameras = tuple(names.index(str(name)) for name in table["calibrated"])
-    blind = tuple((names.index(str(name)), str(why)) for name, why in table["not_calibrated"].items())
-    if sorted([*cameras, *(c for c, _ in blind)]) != list(range(len(names))) or len(cameras) < 2:
-        raise ValueError("the cameras calibrated and not calibrated are not those of the data")
-    frame = finite_column(arrays, "frame", (4,))
-    if frame[3] <= 0:
-        raise ValueError("the scale of the frame must be positive")
-    lengthscale = finite_column(arrays, "lengthscale", (2,), positive=True)
-    sizes = finite_column(arrays, "sizes", (len(cameras), 5))
-    models, alone, kept = [], [], []
-    for number, c in enumerate(cameras):
-        model, covariance = _restored_model(calibrator.lens, arrays, number, sizes[number], lengthscale)
-        models.append(model)
-        alone.append(covariance)
-        used = arrays[f"{number}/kept"]
-        if used.dtype != np.bool_ or used.shape != (int(data.observations.seen[:, c].sum()),):
-            raise ValueError(f"{number}/kept must say of each view whether it is used")
-        kept.append(used)
-    posterior = _restored_posterior(data, arrays, tuple(models), tuple(alone))
-    errors = label_sd = None
-    if posterior.unknowns is not None:
-        points = (data.xyz - frame[:3]) / float(frame[3])
-        shots = Shots.of(points, data.shots)
-        if shots is None:
-            raise ValueError("the data have no shots of which errors were estimated")
-        errors = shots.errors(points)
-        k = errors.sd.shape[1]
-        errors = ShotErrors(
-            errors.shot, errors.basis, finite_column(arrays, "shots/sd", (1, k), positive=True), errors.group
-        )
-        label_sd = finite_column(arrays, "shots/label_sd", (1, k), positive=True)
-        if posterior.unknowns.mean.shape != (k,):
-            raise ValueError("shots/mean does not fit the shots")
-    hyper = Hyperparameters(lengthscale, sizes[:, 0], sizes[:, 1])
-    fitted = FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd)
-    return ForwardGPCalibration(calibrator, data, Frame(frame[:3], float(frame[3])), fitted)
-
-
-def _restored_model(
-    lens: str, arrays: Arrays, number: int, sizes: Floats, lengthscale: Floats
-) -> tuple[CameraModel, Floats]:
-    kind = LENSES[lens]
-    numbers = (20 if kind is CentralCamera else 12,)
-    camera, ruler = (
-        kind.from_array(finite_column(arrays, f"{number}/{what}", numbers)) for what in ("camera", "ruler")
-    )
-    m = len(arrays[f"{number}/inducing"])
-    inducing = finite_column(arrays, f"{number}/inducing", (m, 3))
-    weights = finite_column(arrays, f"{number}/weights", (m, 2))
-    size = kind.size + 2 * m
-    alone = finite_column(arrays, f"{number}/root", (size, size))
-    signal, noise, *centre, half = sizes.tolist()
-    if not (signal > 0 and noise > 0 and half > 0):
-        raise ValueError("signal, noise and image size must be positive")
-    none = Prior(np.zeros(kind.size), np.zeros((kind.size, kind.size)))  # only a fit needs it
-    field = LowRank(field_kernel(lengthscale), inducing)
-    return CameraModel(camera, ruler, none, Image(np.array(centre), half), field, signal, noise, weights), alone
-
-
-def _restored_posterior(
-    data: Dataset, arrays: Arrays, models: tuple[CameraModel, ...], alone: tuple[Floats, ...]
-) -> Posterior:
-    total = sum(model.size for model in models)
-    joint = finite_column(arrays, "joint", (total, total)) if "joint" in arrays else None
-    displacement = finite_column(arrays, "displacement", (len(data), 3)) if "displacement" in arrays else None
-    if (joint is None) != (displacement is None):
-        raise ValueError("joint and displacement belong together")
-    unknowns = None
-    if any(name.startswith("shots/") for name in arrays):
-        if joint is None:
-            raise ValueError("the errors of shots tie the cameras: joint is missing")
-        k = len(arrays["shots/mean"])
-        unknowns = Unknowns(
-            finite_column(arrays, "shots/mean", (k,)),
-            finite_column(arrays, "shots/covariance", (k, k)),
-            finite_column(arrays, "shots/cross", (total, k)),
-        )
-    return Posterior(models, alone, joint, (), 0.0, unknowns, displacement)
+        calibrator = ForwardGP(str(table["lens"]), int(table["seed"]))
+        frame = finite_column(arrays, "frame", (4,))
+        if frame[3] <= 0:
+            raise ValueError("the scale of the frame must be positive")
+        working = Frame(frame[:3], float(frame[3]))
+        fitted = saved.restored(calibrator.lens, data, working.inward(data.xyz), table, arrays)
+        return cls(calibrator, data, working, fitted)

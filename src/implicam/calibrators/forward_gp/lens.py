@@ -207,3 +207,8 @@ class ProjectiveCamera:
 
 
 AnyCamera = CentralCamera | ProjectiveCamera
+
+LENSES: dict[str, type[CentralCamera] | type[ProjectiveCamera]] = {
+    kind.kind: kind for kind in (CentralCamera, ProjectiveCamera)
+}
+"""Name -> camera."""
