@@ -26,7 +26,7 @@ import pytest
 
 from implicam import calibration_file
 from implicam.calibration_file import ARRAYS, TOML
-from implicam.calibrators import InverseGP, InverseGPCalibration, load_calibration
+from implicam.calibrators import ForwardGP, InverseGP, InverseGPCalibration, load_calibration
 from implicam.dataset import Dataset, Observations, arrays_from_dataset, dataset_from_arrays
 from implicam.errors import CalibrationFileError, ImplicamError
 from implicam.files import npz_bytes, toml_text, write_zip
@@ -158,6 +158,30 @@ def test_a_file_of_format_1_measures_as_on_the_day_it_was_made() -> None:
     assert np.isnan(measured.xyz[2]).all()
     assert measured.reason[2] == expected["reason"]
     assert len(calibration.data) == 14
+
+
+FORWARD = REFERENCE.with_name("v1-forward-gp.implicam")
+
+
+def test_a_forward_gp_file_of_format_1_measures_as_on_the_day_it_was_made() -> None:
+    calibration = load_calibration(FORWARD)
+    expected = tomllib.loads(FORWARD.with_suffix(".toml").read_text())
+    measured = calibration.measure(calibration.data.observations.select(np.arange(3)))
+    np.testing.assert_allclose(measured.xyz, expected["xyz"], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(measured.sd, expected["sd"], rtol=1e-6)
+    assert [str(view) for view in measured.reason] == expected["reasons"]
+    assert calibration.rejected == ()
+
+
+def make_forward_reference() -> None:
+    """Write the reference file of forward-gp, with declared position errors, and what it measures."""
+    rig = build_rig("stereo", seed=3)
+    known = simulate(rig, random_positions(rig, 14, np.random.default_rng(3)), seed=3, robot_noise=0.1)
+    calibration = ForwardGP().fit(known)
+    calibration.save(FORWARD)
+    m = calibration.measure(known.observations.select(np.arange(3)))
+    numbers = {"xyz": m.xyz.tolist(), "sd": m.sd.tolist(), "reasons": [str(reason) for reason in m.reason]}
+    FORWARD.with_suffix(".toml").write_text(toml_text(numbers))
 
 
 def make_reference() -> None:
