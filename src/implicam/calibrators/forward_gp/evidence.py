@@ -207,6 +207,17 @@ class RigEvidence:
         noise = np.where(known, self.stated, np.exp(NOISE[0]) * self.half)
         return np.exp(SIGNAL[self.lens][0]) * self.half, noise
 
+    def penalty(self, signal: Floats, noise: Floats) -> float:
+        """Minus the log prior of sizes (C,) in pixels, as far as the rig shares them."""
+        medians = self._medians()
+        shared = [
+            float(np.mean(np.log(found / median))) for found, median in zip((signal, noise), medians, strict=True)
+        ]
+        return 0.5 * float(np.sum((np.array(shared) / self._shared_sds()) ** 2))
+
+    def _shared_sds(self) -> Floats:
+        return np.array([SIGNAL[self.lens][1], STATED if np.isfinite(self.stated).all() else NOISE[1]])
+
     def _sizes(self, z: Floats) -> tuple[Floats, Floats]:
         """Signal and noise (C,) from (shared signal, shared noise, own signals, own noises)."""
         signal, noise = self._medians()
@@ -219,8 +230,7 @@ class RigEvidence:
     ) -> tuple[Callable[[Floats], tuple[float, Floats]], Floats]:
         """Minus the log posterior of the sizes with its gradient, and the prior sd of each."""
         C = len(self.cameras)
-        noise_sd = STATED if np.isfinite(self.stated).all() else NOISE[1]
-        sds = np.array([SIGNAL[self.lens][1], noise_sd])
+        sds = self._shared_sds()
         if own:
             sds = np.concatenate([sds, np.full(C, OWN_SIGNAL), np.full(C, OWN_NOISE)])
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, Hyperparameters, RigEvidence
 from implicam.calibrators.forward_gp.lens import Floats, Image
@@ -202,7 +203,11 @@ def _hyperparameters(
 ) -> Hyperparameters:
     evidence = [_evidence(problem, model, seen, moved) for model, seen in zip(models, used, strict=True)]
     half = np.array([image.half for image in images])
-    return RigEvidence(evidence, half, stated, problem.lens, TOLERANCE[problem.lens]).maximise(before)
+    rig = RigEvidence(evidence, half, stated, problem.lens, TOLERANCE[problem.lens])
+    found = rig.maximise(before)
+    if problem.errors is None or problem.errors.estimated:
+        return found
+    return _joint_sizes(problem, models, used, found, rig)
 
 
 def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floats | None) -> CameraEvidence:
@@ -244,23 +249,7 @@ def _conditioned(
     errors: ShotErrors | None,
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
-    tolerance = TOLERANCE[problem.lens]
-
-    def sized(c: int) -> CameraModel:
-        model = models[c]
-        points = problem.points[used[c].rows]
-        view = model.camera.view(points[:: max(1, len(points) // 4000)])
-        field = empty_field(hyper.lengthscale, model.coordinates(view), tolerance)
-        return replace(
-            model,
-            ruler=model.camera,
-            field=field,
-            signal=float(hyper.signal[c]),
-            noise=float(hyper.noise[c]),
-            weights=np.zeros((len(field.inducing), 2)),
-        )
-
-    models = tuple(sized(c) for c in range(len(models)))
+    models = _sized(problem, models, used, hyper)
     for _ in range(4):
         posterior = condition(models, problem.points, used, errors)
         models = tuple(
@@ -270,6 +259,62 @@ def _conditioned(
         if all(_small(step, posterior.root(c)) for c, step in enumerate(posterior.steps)):
             break
     return replace(posterior, models=models)
+
+
+def _sized(
+    problem: Problem, models: tuple[CameraModel, ...], used: tuple[Sightings, ...], hyper: Hyperparameters
+) -> tuple[CameraModel, ...]:
+    """The cameras with fields laid out anew."""
+
+    def one(c: int) -> CameraModel:
+        model = models[c]
+        points = problem.points[used[c].rows]
+        view = model.camera.view(points[:: max(1, len(points) // 4000)])
+        field = empty_field(hyper.lengthscale, model.coordinates(view), TOLERANCE[problem.lens])
+        return replace(
+            model,
+            ruler=model.camera,
+            field=field,
+            signal=float(hyper.signal[c]),
+            noise=float(hyper.noise[c]),
+            weights=np.zeros((len(field.inducing), 2)),
+        )
+
+    return tuple(one(c) for c in range(len(models)))
+
+
+def _joint_sizes(
+    problem: Problem,
+    models: tuple[CameraModel, ...],
+    used: tuple[Sightings, ...],
+    hyper: Hyperparameters,
+    rig: RigEvidence,
+) -> Hyperparameters:
+    """Signal and noise from all cameras at once, where positions have errors of their own.
+
+    One camera cannot tell the error of a position from its own noise; together they can, for all see the same error.
+    """
+    points = np.unique(np.concatenate([seen.rows for seen in used]))
+    if len(points) > MOST:
+        points = np.random.default_rng(0).choice(points, MOST, replace=False)
+    some = tuple(seen.select(np.isin(seen.rows, points)) for seen in used)
+    laid_out = _sized(problem, models, some, hyper)
+
+    def loss(z: Floats) -> float:
+        signal, noise = np.exp(z)
+        sized = tuple(replace(m, signal=m.signal * signal, noise=m.noise * noise) for m in laid_out)
+        evidence = condition(sized, problem.points, some, problem.errors).evidence
+        return rig.penalty(hyper.signal * signal, hyper.noise * noise) - evidence
+
+    first = min((np.array([0.0, noise]) for noise in (0.0, 1.0, 2.0)), key=loss)
+    simplex = first + np.array([[0, 0], [0.4, 0], [0, 0.4]])
+    options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.05, "maxfev": 24}
+    z = minimize(loss, first, method="Nelder-Mead", options=options).x
+    curvature = np.empty(2)
+    for axis, h in enumerate(0.2 * np.eye(2)):
+        curvature[axis] = (loss(z + h) - 2 * loss(z) + loss(z - h)) / 0.2**2
+    signal, noise = np.exp(z + 1 / np.maximum(curvature, 1.0))  # the mean variance, eq. (12)
+    return Hyperparameters(hyper.lengthscale, hyper.signal * signal, hyper.noise * noise)
 
 
 def _in_front(before: CameraModel, after: CameraModel, step: Floats, points: Floats) -> CameraModel:
