@@ -219,8 +219,8 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None) ->
 
 
 def _trimmed(xyz: Floats, offset: Floats, keep: Bools) -> tuple[_Candidate, Floats, Bools]:
-    """The best lens for the points kept; those far off left out, others taken in, until nothing changes."""
-    for _ in range(8):
+    """The best lens for the points kept; those far off left out, others taken in, four times at most."""
+    for _ in range(4):
         found, errors = _best_lens(xyz, offset, keep)
         inside = errors <= 2.5 * np.median(errors)
         if inside.sum() < 2 * FEWEST or _extents(xyz[inside])[2] < FLAT or (inside == keep).all():

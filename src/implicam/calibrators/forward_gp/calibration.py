@@ -36,6 +36,7 @@ from implicam.dataset import Dataset, Floats, Names, Observations
 from implicam.errors import FitError, UsageError, did_you_mean
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
+from implicam.threads import blas_threads
 
 NAMED = 5
 """Things that a note names one by one; of more it gives the number."""
@@ -64,7 +65,8 @@ class ForwardGP:
         """Fit to all known points that any camera saw."""
         frame = Frame.of(data)
         try:
-            fitted = fit_rig(_problem(self.lens, data, frame), progress)
+            with blas_threads(1):  # many small matrices, one after the other: two threads would wait for each other
+                fitted = fit_rig(_problem(self.lens, data, frame), progress)
         except np.linalg.LinAlgError as error:
             raise FitError(
                 "the known points do not fix the rig: the equations have no solution.",

@@ -109,30 +109,73 @@ class CameraEvidence:
 
     def objective(self, spectrum: Spectrum, signal: float, noise: float) -> tuple[float, float, float]:
         """Minus the log marginal likelihood, eq. (11), and its derivatives by log signal and log noise."""
-        e, y, X, yy, Xy, XX, outside = spectrum
-        v, noise2 = signal**2 * e + noise**2, noise**2
-        m, _, p = X.shape
-        precision, off = self.prior.precision, self.off
-        flat = X.reshape(2 * m, p)
-        weighted = flat / np.repeat(v, 2)[:, None]
-        A = precision + XX / noise2 + weighted.T @ flat
-        b = precision @ off + Xy / noise2 + weighted.T @ y.ravel()
-        scale = 1 / np.sqrt(A.diagonal())  # lens parameters differ by many orders of magnitude
-        L = np.linalg.cholesky(A * scale[:, None] * scale)
-        inverse = np.linalg.inv(L) * scale
-        covariance = inverse.T @ inverse
-        step = covariance @ b
-        left = (y.ravel() - flat @ step).reshape(m, 2)
-        left_outside = yy - 2 * step @ Xy + step @ XX @ step
-        away = off - step
-        squares = (left * left).sum(axis=1)
-        quadratic = (squares / v).sum() + left_outside / noise2 + away @ precision @ away
-        logs = 2 * np.log(v).sum() + outside * np.log(noise2) + 2 * np.log(L.diagonal() / scale).sum()
-        half = flat @ inverse.T
-        spread = (half * half).sum(axis=1).reshape(m, 2).sum(axis=1)
-        by_v = 0.5 * (2 / v - (squares + spread) / v**2)
-        by_noise2 = by_v.sum() + 0.5 * (outside / noise2 - (left_outside + (covariance * XX).sum()) / noise2**2)
-        return 0.5 * (quadratic + logs), 2 * signal**2 * float(by_v @ e), 2 * noise2 * float(by_noise2)
+        value, by_signal, by_noise = _Together.of([self], [spectrum]).objective(np.array([signal]), np.array([noise]))
+        return float(value[0]), float(by_signal[0]), float(by_noise[0])
+
+
+class _Together(NamedTuple):
+    """Several cameras with as many parameters each, in stacks (C, ...): small matrices are fast only together.
+
+    A camera with fewer eigenvalues than others is filled up with zeros, that is, with noise and no field.
+    """
+
+    e: Floats  # (C, m)
+    y: Floats  # (C, 2 m)
+    X: Floats  # (C, 2 m, p)
+    yy: Floats
+    Xy: Floats
+    XX: Floats
+    outside: Floats
+    off: Floats
+    precision: Floats
+
+    @classmethod
+    def of(cls, cameras: list[CameraEvidence], spectra: list[Spectrum]) -> _Together:
+        m, p = max(len(s.e) for s in spectra), cameras[0].X.shape[2]
+        e, y, X = np.zeros((len(spectra), m)), np.zeros((len(spectra), m, 2)), np.zeros((len(spectra), m, 2, p))
+        for c, s in enumerate(spectra):
+            e[c, : len(s.e)], y[c, : len(s.e)], X[c, : len(s.e)] = s.e, s.y, s.X
+        return cls(
+            e,
+            y.reshape(len(e), 2 * m),
+            X.reshape(len(e), 2 * m, p),
+            np.array([s.yy for s in spectra]),
+            np.array([s.Xy for s in spectra]),
+            np.array([s.XX for s in spectra]),
+            np.array([s.outside - 2.0 * (m - len(s.e)) for s in spectra]),
+            np.array([camera.off for camera in cameras]),
+            np.array([camera.prior.precision for camera in cameras]),
+        )
+
+    def objective(self, signal: Floats, noise: Floats) -> tuple[Floats, Floats, Floats]:
+        """(C,) each of `CameraEvidence.objective`, for signal and noise (C,)."""
+        signal2, noise2 = signal**2, noise**2
+        v = signal2[:, None] * self.e + noise2[:, None]
+        v2 = v.repeat(2, axis=1)
+        weighted = (self.X / v2[..., None]).swapaxes(1, 2)
+        A = self.precision + self.XX / noise2[:, None, None] + weighted @ self.X
+        pull = (self.precision @ self.off[..., None])[..., 0]
+        b = pull + self.Xy / noise2[:, None] + (weighted @ self.y[..., None])[..., 0]
+        scale = 1 / np.sqrt(np.diagonal(A, axis1=1, axis2=2))  # lens parameters differ by many orders of magnitude
+        L = np.linalg.cholesky(A * scale[:, :, None] * scale[:, None, :])
+        inverse = np.linalg.inv(L) * scale[:, None, :]
+        half = (inverse @ b[..., None])[..., 0]
+        step = (inverse.swapaxes(1, 2) @ half[..., None])[..., 0]
+        left = self.y - (self.X @ step[..., None])[..., 0]
+        through = (self.XX @ step[..., None])[..., 0]
+        left_outside = self.yy - 2 * (step * self.Xy).sum(axis=1) + (step * through).sum(axis=1)
+        away = self.off - step
+        prior = (away * (self.precision @ away[..., None])[..., 0]).sum(axis=1)
+        quadratic = (left * left / v2).sum(axis=1) + left_outside / noise2 + prior
+        logs = 2 * np.log(v).sum(axis=1) + self.outside * np.log(noise2)
+        logs += 2 * np.log(np.diagonal(L, axis1=1, axis2=2) / scale).sum(axis=1)
+        reach = self.X @ inverse.swapaxes(1, 2)
+        spread = (reach * reach).sum(axis=2)
+        by_v = 0.5 * (1 / v2 - (left * left + spread) / v2**2)
+        outer = (inverse @ self.XX * inverse).sum(axis=(1, 2))  # trace(covariance XX)
+        by_noise2 = by_v.sum(axis=1) + 0.5 * (self.outside / noise2 - (left_outside + outer) / noise2**2)
+        by_signal2 = (by_v * self.e.repeat(2, axis=1)).sum(axis=1)
+        return 0.5 * (quadratic + logs), 2 * signal2 * by_signal2, 2 * noise2 * by_noise2
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,11 +277,22 @@ class RigEvidence:
         if own:
             sds = np.concatenate([sds, np.full(C, OWN_SIGNAL), np.full(C, OWN_NOISE)])
 
+        alike: dict[int, list[int]] = {}
+        for c, camera in enumerate(self.cameras):
+            alike.setdefault(camera.X.shape[2], []).append(c)
+        groups = [
+            (group, _Together.of([self.cameras[c] for c in group], [spectra[c] for c in group]))
+            for group in alike.values()
+        ]
+
         def objective(z: Floats) -> tuple[float, Floats]:
             signal, noise = self._sizes(z)
-            each = [c.objective(s, *sizes) for c, s, *sizes in zip(self.cameras, spectra, signal, noise, strict=True)]
-            value, by_signal, by_noise = np.array(each).T
-            gradient = np.concatenate([[by_signal.sum(), by_noise.sum()], by_signal, by_noise][: 3 if own else 1])
+            found = np.empty((3, C))
+            for group, together in groups:
+                found[:, group] = together.objective(signal[group], noise[group])
+            value, by_signal, by_noise = found
+            shared = np.array([by_signal.sum(), by_noise.sum()])
+            gradient = np.concatenate([shared, by_signal, by_noise]) if own else shared
             return float(value.sum() + 0.5 * np.sum((z / sds) ** 2)), gradient + z / sds**2
 
         return objective, sds
