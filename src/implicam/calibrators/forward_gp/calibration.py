@@ -108,15 +108,18 @@ class Frame:
 def _problem(lens: str, data: Dataset, frame: Frame) -> Problem:
     observations, points = data.observations, frame.inward(data.xyz)
     stated = stated_noise(observations)
-    relative = relative_noise(observations, stated)
-    sightings = []
-    for c in range(len(observations.cameras)):
-        rows = np.flatnonzero(observations.seen[:, c])
-        sightings.append(Sightings(rows, observations.uv[rows, c], relative[rows, c]))
     images = tuple(_image(observations, c) for c in range(len(observations.cameras)))
     shots = _shots(data, points)
     errors = shots.errors(points) if shots is not None else _declared(data, frame)
-    return Problem(points, observations.camera_names, tuple(sightings), images, stated, errors, lens)
+    sightings = _sightings(observations, stated)
+    return Problem(points, observations.camera_names, sightings, images, stated, errors, lens)
+
+
+def _sightings(observations: Observations, stated: Floats) -> tuple[Sightings, ...]:
+    """What each camera saw, all of it."""
+    relative = relative_noise(observations, stated)
+    seen = (np.flatnonzero(there) for there in observations.seen.T)
+    return tuple(Sightings(rows, observations.uv[rows, c], relative[rows, c]) for c, rows in enumerate(seen))
 
 
 def _image(observations: Observations, c: int) -> Image:
@@ -246,7 +249,7 @@ class ForwardGPCalibration:
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
         if errors is None or unknowns is None or self.fitted.label_sd is None:
             return None
-        shots = Shots.of(self.frame.inward(self.data.xyz), self.data.shots)
+        shots = Shots.of(self._points, self.data.shots)
         return None if shots is None else Labels(shots, errors.sd[0], self.fitted.label_sd[0], unknowns)
 
     def _reasons(self, observations: Observations, seen: NDArray[np.bool_], found: Located) -> Names:
@@ -278,7 +281,7 @@ class ForwardGPCalibration:
             kept = self.fitted.kept[number]
             if kept.all():
                 continue
-            seen = self._sightings(c)
+            seen = self._sightings[c]
             residual, _ = left_out(self.posterior, number, self._points, seen, kept)
             for row in np.flatnonzero(~kept):
                 point = str(self.data.points[seen.rows[row]])
@@ -302,18 +305,16 @@ class ForwardGPCalibration:
     def _points(self) -> Floats:
         return self.frame.inward(self.data.xyz)
 
-    def _sightings(self, c: int) -> Sightings:
-        observations = self.data.observations
-        rows = np.flatnonzero(observations.seen[:, c])
-        relative = relative_noise(observations, self._stated)
-        return Sightings(rows, observations.uv[rows, c], relative[rows, c])
+    @cached_property
+    def _sightings(self) -> tuple[Sightings, ...]:
+        return _sightings(self.data.observations, self._stated)
 
     @cached_property
     def _used(self) -> NDArray[np.bool_]:
         """(n, calibrated cameras) the views used."""
         used = np.zeros((len(self.data), len(self.fitted.cameras)), dtype=np.bool_)
         for number, c in enumerate(self.fitted.cameras):
-            used[np.flatnonzero(self.data.observations.seen[:, c]), number] = self.fitted.kept[number]
+            used[self._sightings[c].rows, number] = self.fitted.kept[number]
         return used
 
     def refit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
@@ -375,7 +376,7 @@ class ForwardGPCalibration:
         H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
         views = np.zeros(n)
         for number, c in enumerate(self.fitted.cameras):
-            seen, kept = self._sightings(c), self.fitted.kept[number]
+            seen, kept = self._sightings[c], self.fitted.kept[number]
             residual, spread = left_out(self.posterior, number, self._points, seen, kept)
             rows = seen.rows[kept]
             where = self._points[rows]
