@@ -2,6 +2,7 @@
 
     ImplicamError
     ├── DatasetError          a file or a value in a dataset is wrong
+    ├── ImageError            a photograph cannot be read, or is not what the rig records
     ├── FitError              a calibration cannot be computed from these data
     ├── CalibrationFileError  a .implicam file is damaged, hostile or too new
     ├── NumericalError        a matrix that must be positive definite is not
@@ -37,6 +38,10 @@ class ImplicamError(Exception):
 
 class DatasetError(ImplicamError):
     """A file or a value in a dataset is wrong; names the file, the line and the value."""
+
+
+class ImageError(ImplicamError):
+    """A photograph cannot be read, or is not what the rig records; names the file."""
 
 
 class FitError(ImplicamError):

@@ -1,0 +1,1 @@
+"""From photographs to observations: a ball, a board, dots."""

@@ -1,0 +1,88 @@
+"""What a detector finds in one picture, and what every detector offers.
+
+To add a target: 1. write `detect/<target>.py` with a frozen `Detector`; 2. add it to `TARGETS` in detect/__init__.py;
+3. run the tests: one contract runs over every detector.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.images import Grey
+
+
+class View(NamedTuple):
+    """One picture: which camera took it in which shot."""
+
+    camera: str
+    shot: str
+
+
+@dataclass(frozen=True, eq=False)
+class Detected:
+    """What was found in one picture.
+
+    points: n names, those of points.csv. uv: (n, 2) pixels, (0, 0) the centre of the top-left pixel; sd: (n, 2) their
+    standard uncertainties. reason: why nothing, or not everything, was found; empty where all is well. outlines:
+    curves (k, 2) in pixels for the overlay, such as the edge of a ball. others: what else might have been meant, the
+    likelier first; only `Detector.settle` looks at it. notes: anything a detector wants to remember, as plain values.
+    """
+
+    points: tuple[str, ...] = ()
+    uv: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    sd: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    reason: str = ""
+    outlines: tuple[Floats, ...] = ()
+    others: tuple[Detected, ...] = ()
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values, which `from_dict` turns back to the same bits."""
+        return {
+            "points": list(self.points),
+            "uv": self.uv.tolist(),
+            "sd": self.sd.tolist(),
+            "reason": self.reason,
+            "outlines": [curve.tolist() for curve in self.outlines],
+            "others": [other.as_dict() for other in self.others],
+            "notes": dict(self.notes),
+        }
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Detected:
+        """The inverse of `as_dict`."""
+        return cls(
+            tuple(table["points"]),
+            np.array(table["uv"], dtype=np.float64).reshape(-1, 2),
+            np.array(table["sd"], dtype=np.float64).reshape(-1, 2),
+            str(table["reason"]),
+            tuple(np.array(curve, dtype=np.float64).reshape(-1, 2) for curve in table["outlines"]),
+            tuple(cls.from_dict(other) for other in table["others"]),
+            dict(table["notes"]),
+        )
+
+
+def nothing(reason: str, **more: Any) -> Detected:
+    """Nothing found, and why."""
+    return Detected(reason=reason, **more)
+
+
+class Detector(Protocol):
+    """Finds one kind of target; a frozen value, so that its options can be written beside its results."""
+
+    def options(self) -> dict[str, Any]:
+        """All that its results depend on, as plain values: other options, other results."""
+
+    def detect(self, picture: Grey, view: View) -> Detected:
+        """Look at one picture. Never raises for what is in the picture: nothing found is a reason."""
+
+    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
+        """A second look when all pictures are known: what recurs in every shot is no target, and so on."""
