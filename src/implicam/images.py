@@ -6,8 +6,10 @@ name = same instant. OpenCV is imported when the first picture is read.
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,20 @@ def opencv() -> Any:
     return import_extra("cv2", "images", "reading and writing photographs")
 
 
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """For many pictures side by side: OpenCV starts no threads of its own, and does not write on the screen."""
+    cv2 = opencv()
+    threads, level = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
+    cv2.setNumThreads(1)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+        cv2.utils.logging.setLogLevel(level)
+
+
 def read_picture(path: Path) -> Grey:
     """A photograph as grey values from 0 to 1: PNG, JPEG or TIFF, grey or colour, 8 or 16 bits.
 
@@ -45,6 +61,12 @@ def read_picture(path: Path) -> Grey:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ImageError(f"{path} cannot be read.", why=str(error), fix="export it again as PNG or TIFF") from error
+    if image is None and data.startswith(_BEGINNINGS):
+        raise ImageError(
+            f"{path} is damaged or cut off.",
+            why=f"it begins as a picture does, but its {len(data):,} bytes cannot be decoded",
+            fix="copy it again from where it was recorded",
+        )
     if image is None:
         raise ImageError(
             f"{path} is not a picture that can be read.",
@@ -52,6 +74,10 @@ def read_picture(path: Path) -> Grey:
             fix="export it again as PNG, JPEG or TIFF",
         )
     return _grey(image, path)
+
+
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_BEGINNINGS = (_PNG, _JPEG, b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 def _bytes(path: Path) -> bytes:
@@ -64,16 +90,27 @@ def _bytes(path: Path) -> bytes:
         raise ImageError(f"{path} cannot be read.", why=str(error), fix="check the file and its permissions") from error
     if not data:
         raise ImageError(f"{path} is empty.", fix="copy it again from where it was recorded")
-    # The decoders fill what is missing with grey, and say nothing that a program could hear.
-    cut_png = data.startswith(b"\x89PNG\r\n\x1a\n") and b"IEND" not in data[-64:]
-    cut_jpeg = data.startswith(b"\xff\xd8\xff") and b"\xff\xd9" not in data[-4096:]
-    if cut_png or cut_jpeg:
+    # Some decoders fill what is missing with grey, and say nothing that a program could hear.
+    if (data.startswith(_PNG) and b"IEND" not in data) or (data.startswith(_JPEG) and not _ends_jpeg(data)):
         raise ImageError(
             f"{path} is cut off.",
             why=f"it ends after {len(data):,} bytes, before the picture does",
             fix="copy it again from where it was recorded",
         )
     return data
+
+
+def _ends_jpeg(data: bytes) -> bool:
+    """Whether the end mark is there. Segments before the pixels are skipped: a preview among them has its own."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] == 0xFF:  # a fill byte
+            at += 1
+        elif data[at + 1] == 0xDA:  # the pixels begin; what follows the end mark, a film perhaps, does not matter
+            return data.find(b"\xff\xd9", at) > 0
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return False
 
 
 def _grey(image: NDArray[Any], path: Path) -> Grey:
@@ -100,10 +137,11 @@ def write_picture(path: Path, picture: NDArray[Any], *, bits: int = 8) -> None:
         most, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
         picture = np.clip(np.rint(picture * most), 0, most).astype(kind)
     ending = path.suffix.lower()
-    options = {".png": [cv2.IMWRITE_PNG_COMPRESSION, 1], ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 85]}.get(ending, [])
-    good, encoded = cv2.imencode(ending, picture, options)
-    if not good:
+    if ending not in ENDINGS:
         raise UsageError(f"{path} is no name for a picture.", fix=f"end it in {', '.join(ENDINGS)}")
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 85]
+    options = {".png": [cv2.IMWRITE_PNG_COMPRESSION, 1], ".jpg": quality, ".jpeg": quality}.get(ending, [])
+    _, encoded = cv2.imencode(ending, picture, options)
     with replacing(path) as temporary:
         temporary.write_bytes(encoded.tobytes())
 
@@ -117,19 +155,38 @@ def eight_bit(picture: Grey) -> NDArray[np.uint8]:
     return out
 
 
-def find_pictures(folder: Path, pattern: str = PATTERN) -> dict[str, dict[str, Path]]:
+def blank(picture: Grey) -> str:
+    """What a picture without anything in it is: "black", "white" or "uniformly grey"; empty where there is something.
+
+    The means of blocks of 8 x 8 pixels differ by no more than the noise from pixel to pixel makes them differ: that is
+    the root mean square of Immerkaer's operator (1996); the few edges of a small target hardly enlarge it.
+    """
+    cv2 = opencv()
+    height, width = picture.shape
+    laplacian = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+    noise = float(np.sqrt(np.mean(np.square(cv2.filter2D(picture, cv2.CV_32F, laplacian), dtype=np.float64))))
+    blocks = cv2.resize(picture, (-(-width // 8), -(-height // 8)), interpolation=cv2.INTER_AREA)
+    low, high = float(blocks.min()), float(blocks.max())
+    # The largest of n Gaussian numbers is near sqrt(2 ln n), and with +2 beyond it in one picture of thousands only.
+    widest = 2 * (np.sqrt(2 * np.log(blocks.size + 1)) + 2) * noise * np.sqrt(blocks.size / picture.size)
+    if high - low > max(widest, 1e-6):
+        return ""
+    return "black" if high < 0.03 else "white" if low > 0.97 else "uniformly grey"
+
+
+def find_pictures(folder: Path, pattern: str = PATTERN, cameras: Sequence[str] = ()) -> dict[str, dict[str, Path]]:
     """The files by camera and shot: {camera: {shot: path}}, both sorted as people count (2 before 10).
 
     pattern: the path below `folder` with {camera} and {shot}, without the ending: "{camera}/{shot}" (a folder per
-    camera), "{shot}_{camera}", ... UsageError for a pattern without both; ImageError where two files claim one place.
+    camera), "{shot}_{camera}", ... cameras: names to look for first, as in "cam_1_003" it is not clear where the camera
+    ends. Hidden files and folders are left out. UsageError for a pattern without both; ImageError where two files claim
+    one place.
     """
-    expression = _expression(pattern)
+    expression = _expression(pattern, cameras)
     if not folder.is_dir():
         raise ImageError(f"there is no folder {folder}.", fix="put the pictures of each camera into images/<camera>/")
     found: dict[str, dict[str, Path]] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() not in ENDINGS or not path.is_file() or path.name.startswith("."):
-            continue
+    for path in sorted(_files(folder, pattern.count("/"))):
         match = expression.fullmatch(path.relative_to(folder).with_suffix("").as_posix())
         if match is None:
             continue
@@ -151,17 +208,31 @@ def find_pictures(folder: Path, pattern: str = PATTERN) -> dict[str, dict[str, P
     return {camera: {shot: found[camera][shot] for shot in in_order(found[camera])} for camera in in_order(found)}
 
 
+def _files(folder: Path, depth: int) -> Iterator[Path]:
+    """The pictures so many folders down, behind links to folders on other disks too."""
+    for place, folders, names in os.walk(folder, followlinks=True):
+        here = Path(place)
+        if len(here.relative_to(folder).parts) < depth:
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            continue
+        folders.clear()
+        for name in names:
+            path = here / name
+            if path.suffix.lower() in ENDINGS and not name.startswith(".") and path.is_file():
+                yield path
+
+
 def in_order(names: Sequence[str] | dict[str, Any]) -> list[str]:
     """Names as people count: img2 before img10."""
 
-    def key(name: str) -> list[tuple[int, int, str]]:
-        parts = re.split(r"(\d+)", name)
-        return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+    def key(name: str) -> tuple[list[str | int], str]:
+        parts = re.split(r"(\d+)", name)  # text, digits, text, digits, ..., text
+        return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
     return sorted(names, key=key)
 
 
-def _expression(pattern: str) -> re.Pattern[str]:
+def _expression(pattern: str, cameras: Sequence[str]) -> re.Pattern[str]:
     for word in ("{camera}", "{shot}"):
         if pattern.count(word) != 1:
             raise UsageError(
@@ -169,5 +240,7 @@ def _expression(pattern: str) -> re.Pattern[str]:
                 why="a picture belongs to one camera and one shot",
                 fix='write for example "{camera}/{shot}" or "{shot}_{camera}"',
             )
-    text = re.escape(pattern).replace(r"\{camera\}", "(?P<camera>[^/]+?)").replace(r"\{shot\}", "(?P<shot>[^/]+)")
+    pattern = next((pattern.removesuffix(ending) for ending in ENDINGS if pattern.endswith(ending)), pattern)
+    camera = "|".join([*map(re.escape, sorted(cameras, key=len, reverse=True)), "[^/]+?"])
+    text = re.escape(pattern).replace(r"\{camera\}", f"(?P<camera>{camera})").replace(r"\{shot\}", "(?P<shot>[^/]+)")
     return re.compile(text)

@@ -45,12 +45,25 @@ _NO_SD = "leave the cell empty where no uncertainty is stated"
 
 def read_folder(path: Path) -> Dataset:
     """Read a dataset folder; every mistake is a DatasetError naming file, line, value and cure."""
-    toml = path / DESCRIPTION
-    name, unit, cameras, extra = description_from_toml(read_toml(toml), toml)
+    name, unit, cameras, extra = read_description(path)
     points = _read_points(path / POINTS) if (path / POINTS).exists() else None
     observations = _read_observations(path / VIEWS, cameras, points)
-    with naming(toml):
+    with naming(path / DESCRIPTION):
         return Dataset(name, unit, observations, points.known if points else None, extra)
+
+
+def read_description(path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
+    """What dataset.toml in the folder says: name, length unit, cameras, and its further entries."""
+    toml = path / DESCRIPTION
+    return description_from_toml(read_toml(toml), toml)
+
+
+def read_known(path: Path) -> tuple[list[str], KnownPositions] | None:
+    """The names and positions in the folder's points.csv, in its order; None where there is none."""
+    if not (path / POINTS).exists():
+        return None
+    points = _read_points(path / POINTS)
+    return points.names, points.known
 
 
 @dataclass(frozen=True)

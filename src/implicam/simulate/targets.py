@@ -15,7 +15,8 @@ from implicam.simulate.rigs import Rig
 class Target:
     """Points with their true positions (n, 3), in the rig's world frame and unit, and the shot each belongs to.
 
-    facing: (3,) the side a board shows, a unit vector in the world; None for a ball, which has no side.
+    facing: (3,) the side a board shows, a unit vector in the world; None for a ball, which has no side. board: rows and
+    columns of its inner corners, None for a ball.
     """
 
     name: str
@@ -23,6 +24,7 @@ class Target:
     shots: Names
     xyz: Floats
     facing: Floats | None = None
+    board: tuple[int, int] | None = None
 
 
 def ball_grid(rig: Rig, shape: tuple[int, int, int] = (5, 5, 7)) -> Target:
@@ -55,7 +57,8 @@ def moving_board(
     shots = [f"board{i + 1:02d}" for i in range(positions)]
     names = [f"{shot}-c{j + 1:03d}" for shot in shots for j in range(rows * columns)]
     pose = rig.volume.world_from_box
-    return Target("board", np.array(names), np.repeat(shots, rows * columns), pose.apply(box), -pose.rotation[:, 2])
+    facing = -pose.rotation[:, 2]
+    return Target("board", np.array(names), np.repeat(shots, rows * columns), pose.apply(box), facing, corners)
 
 
 def _balls(rig: Rig, name: str, parts: Floats) -> Target:

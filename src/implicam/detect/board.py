@@ -1,0 +1,253 @@
+"""A printed checkerboard: every corner with the same number in every camera and shot, or a reason why not.
+
+Corner 1 touches the board's black outermost corner square that is at the top left when the board stands with its
+`columns` running to the right; numbers run along the rows. The mirror image of a checkerboard is a checkerboard, too:
+corners are numbered as they lie on the printed side, and a picture that was mirrored afterwards is read wrongly.
+
+The seeds of `seeds.py` grow (`grid.py`) until nothing more of the board is seen; the paper's detector and OpenCV's at
+full size are asked where the saddle points alone did not give the whole board, and the grid with the most corners is
+kept. Then the grid is read (`numbering.py`). A grid that can be read in more than one way is refused, with all the
+ways in `Detected.others`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.detect.grid import Grid, grow, join
+from implicam.detect.model import Detected, View, nothing
+from implicam.detect.numbering import END, MORE, Numbering, numberings, sides
+from implicam.detect.seeds import from_libcbdetect, from_opencv, from_saddles, in_original, resized, saddles
+from implicam.errors import UsageError
+from implicam.images import Grey, opencv
+
+LARGEST_PICTURE = 2_500_000
+"""Pixels beyond which the search is done in a smaller picture; corners are always fitted in the original."""
+
+OTHERS = 12
+"""Readings that are kept of a board that is refused, at most."""
+
+ANOTHER = 12
+"""Corners of a second checkerboard that make it one."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A checkerboard with rows x columns inner corners, and squares of `square` millimetres.
+
+    rows + columns must be odd: a board whose half turn looks the same cannot be numbered.
+    """
+
+    rows: int = 8
+    columns: int = 11
+    square: float = 13.29
+
+    def __post_init__(self) -> None:
+        if min(self.rows, self.columns) < 3 or max(self.rows, self.columns) > 200:
+            raise UsageError(
+                f"a board of {self.rows} x {self.columns} inner corners cannot be found.",
+                why="rows and columns are those of the corners between squares, from 3 to 200",
+                fix="for example 8 x 11",
+            )
+        if not (np.isfinite(self.square) and self.square > 0):
+            raise UsageError(f"square = {self.square} mm; it must be positive.", fix="measure the edge of a square")
+        if (self.rows + self.columns) % 2 == 0:
+            raise UsageError(
+                f"a board of {self.rows} x {self.columns} inner corners looks the same upside down.",
+                why="half a turn gives black squares for black ones where rows + columns is even",
+                fix=f"use a ChArUco board, or another size, for example {self.rows} x {self.columns + 1}",
+            )
+
+    def options(self) -> dict[str, Any]:
+        """All that the results depend on."""
+        return {"target": "board", **asdict(self)}
+
+    def detect(self, picture: Grey, view: View) -> Detected:
+        """The corners of the board in one picture, or why they cannot be given."""
+        unfit = unusable(picture)
+        if unfit:
+            return nothing(unfit)
+        grids = self._grids(picture)
+        if not grids:
+            return nothing(
+                f"no checkerboard was found (looked for {self.rows} x {self.columns} inner corners). Show the board "
+                "whole and sharp, well lit and without glare, with squares at least 5 pixels wide."
+            )
+        return self._read(picture, grids, view)
+
+    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
+        """Nothing to add: a board that can be read in several ways stays refused."""
+        return dict(found)
+
+    def _grids(self, picture: Grey) -> list[Grid]:
+        """All checkerboards in the picture, the one with the most corners first."""
+        grids: list[Grid] = []
+        limit = max(self.rows, self.columns) + 3
+        for seed in self._seeds(picture, grids):
+            grid = grow(picture, seed, limit)
+            if grid is not None:
+                _enlist(grids, grid)
+        return self._together(picture, sorted(grids, key=lambda grid: -grid.count), limit)
+
+    def _together(self, picture: Grey, grids: list[Grid], limit: int) -> list[Grid]:
+        """The parts of a board that something covers, joined where that is certain."""
+        if not grids or self._whole(grids[0]):
+            return grids
+        first, rest = grids[0], []
+        for grid in grids[1:]:
+            both = join(picture, first, grid, (self.rows, self.columns), limit)
+            if both is None or both.count <= first.count:
+                rest.append(grid)
+            else:
+                first = both
+        return [first, *rest]
+
+    def _seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
+        """Seeds for as long as the grids found so far (the list grows meanwhile) do not hold a whole board."""
+        scale = min(1.0, 0.5 ** np.ceil(np.log2(max(picture.size / LARGEST_PICTURE, 1)) / 2))
+        yield from _saddle_seeds(picture, scale, grids)
+        if any(self._whole(grid) for grid in grids):
+            return
+        yield from _saddle_seeds(picture, scale / 2, grids)
+        for ask in (from_opencv, from_libcbdetect):
+            if any(self._whole(grid) for grid in grids):
+                return
+            yield from ask(picture, scale)
+
+    def _whole(self, grid: Grid) -> bool:
+        return grid.count == self.rows * self.columns
+
+    def _read(self, picture: Grey, grids: list[Grid], view: View) -> Detected:
+        """Number the largest grid that may be the board."""
+        ends = [sides(picture, grid) for grid in grids]
+        ways = [numberings(grid, end, self.rows, self.columns) for grid, end in zip(grids, ends, strict=True)]
+        fitting = [k for k in range(len(grids)) if ways[k]]
+        if not fitting:
+            return nothing(self._misfit(grids[0], ends[0]), outlines=(_outline(grids[0]),))
+        first = fitting[0]
+        grid, possible = grids[first], [self._named(grids[first], way, view) for way in ways[first]]
+        outline = (_outline(grid),)
+        if len(possible) > 1:
+            return nothing(
+                f"{grid.count} of the board's {self.rows * self.columns} corners are seen, and it is not certain "
+                f"which: they can be numbered in {len(possible)} ways. Show more of the board, with the white margin "
+                "after its outermost squares.",
+                outlines=outline,
+                others=tuple(possible[:OTHERS]),
+            )
+        for k in fitting[1:]:
+            if grids[k].count >= ANOTHER and not self._may_be_hidden_part(grid, ways[first][0], grids[k]):
+                return nothing(
+                    f"two checkerboards are in view, of {grid.count} and {grids[k].count} corners, and either may be "
+                    "the board. Take the other one away, or cover it.",
+                    outlines=(*outline, _outline(grids[k])),
+                )
+        return replace(possible[0], reason=self._missing(len(possible[0])), outlines=outline)
+
+    def _named(self, grid: Grid, way: Numbering, view: View) -> Detected:
+        """The corners under their names, in the order of their numbers."""
+        row, column = way.of((grid.rows, grid.columns))
+        there = grid.there
+        number = (row * self.columns + column)[there]
+        order = np.argsort(number)
+        uv, sd = grid.uv[there][order], grid.corners.sd[there.ravel()][order]
+        return Detected(tuple(corner_name(view.shot, int(j)) for j in number[order]), uv, sd)
+
+    def _may_be_hidden_part(self, grid: Grid, way: Numbering, other: Grid) -> bool:
+        """Whether another grid lies about where corners of the board are missing, so that it need be no other board."""
+        row, column = way.of((grid.rows, grid.columns))
+        known = np.column_stack([row[grid.there], column[grid.there]]).astype(np.float64)
+        h, _ = opencv().findHomography(grid.uv[grid.there].reshape(-1, 1, 2), known.reshape(-1, 1, 2), 0)
+        if h is None or self._whole(grid):
+            return False
+        place = np.hstack([other.uv[other.there], np.ones((other.count, 1))]) @ h.T
+        place = place[:, :2] / place[:, 2:]
+        return bool(((place > -1.5) & (place < np.array([self.rows, self.columns]) + 0.5)).all())
+
+    def _misfit(self, grid: Grid, ends: tuple[str, str, str, str]) -> str:
+        """Why no grid can be the board."""
+        size = f"{grid.rows} x {grid.columns}"
+        whole = all(end == END for end in ends)
+        exactly = "has" if whole else "has at least"
+        if sorted((grid.rows, grid.columns)) == sorted((self.rows, self.columns)):
+            return (
+                f"the checkerboard in view has {size} inner corners in sight, but goes on beyond them, or has its "
+                f"black and white squares exchanged. Give the size of the whole board instead of {self.rows} x "
+                f"{self.columns}."
+            )
+        more = " and more" if not whole and MORE in ends else ""
+        return (
+            f"the checkerboard in view {exactly} {size} inner corners{more}, which is no board of {self.rows} x "
+            f"{self.columns}. Give the size that the board has, or take this one out of the picture."
+        )
+
+    def _missing(self, found: int) -> str:
+        total = self.rows * self.columns
+        return "" if found == total else f"{total - found} of the board's {total} corners are hidden or not clear."
+
+
+def corner_name(shot: str, number: int) -> str:
+    """The name of a corner, number counted from 0: that of points.csv."""
+    return f"{shot}-c{number + 1:03d}"
+
+
+def unusable(picture: Grey) -> str:
+    """Why a picture cannot show anything; empty where it can."""
+    if picture.ndim != 2 or min(picture.shape, default=0) < 16:
+        return f"the picture is too small: {' x '.join(map(str, picture.shape[::-1]))} pixels."
+    if not np.isfinite(picture).all():
+        return "the picture holds values that are no numbers. Export it again."
+    low, high = np.quantile(picture[::3, ::3], (0.002, 0.998))
+    if high - low < 0.02:
+        what = "black" if high < 0.1 else "white" if low > 0.9 else "plain grey"
+        return f"the picture is {what}: nothing can be seen in it. Check lens cap, exposure and light."
+    return ""
+
+
+def _saddle_seeds(picture: Grey, scale: float, grids: list[Grid]) -> Iterator[Floats]:
+    """Seeds from the saddle points that no grid has yet, as long as each lets a grid grow."""
+    small = resized(picture, scale)
+    for seed in from_saddles(saddles(np.asarray(small, dtype=np.float32))):
+        original = in_original(seed, small, picture)
+        if not any(_inside(grid, original[1, 1]) for grid in grids):
+            yield original
+
+
+def _inside(grid: Grid, uv: Floats) -> bool:
+    """Whether a pixel is within a square or so of the grid's corners."""
+    return float(np.nanmin(np.linalg.norm(grid.uv - uv, axis=2))) < 0.8 * _step(grid)
+
+
+def _step(grid: Grid) -> float:
+    steps = [np.linalg.norm(np.diff(grid.uv, axis=axis), axis=2).ravel() for axis in (0, 1)]
+    return float(np.nanmax(np.concatenate(steps)))
+
+
+def _enlist(grids: list[Grid], grid: Grid) -> None:
+    """Add a grid to the list; of two that share corners, the one with more stays, then the one that fits better."""
+    for k, known in enumerate(grids):
+        if _shares(known, grid):
+            if (grid.count, -_rms_misfit(grid)) > (known.count, -_rms_misfit(known)):
+                grids[k] = grid
+            return
+    grids.append(grid)
+
+
+def _rms_misfit(grid: Grid) -> float:
+    return float(np.sqrt(np.nanmean(grid.corners.misfit**2)))
+
+
+def _shares(a: Grid, b: Grid) -> bool:
+    apart = np.linalg.norm(a.uv[a.there][:, None] - b.uv[b.there][None], axis=2)
+    return bool(apart.min() < 1.0)
+
+
+def _outline(grid: Grid) -> Floats:
+    """The grid's hull, closed, (k, 2) pixels."""
+    hull = opencv().convexHull(grid.uv[grid.there].astype(np.float32))[:, 0]
+    return np.asarray(np.vstack([hull, hull[:1]]), dtype=np.float64)

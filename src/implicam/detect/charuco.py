@@ -1,0 +1,222 @@
+"""A ChArUco board: a checkerboard whose white squares carry markers, so that any part of it tells which part it is.
+
+OpenCV reads the markers and says which corners they surround; the corners themselves are then fitted as those of a
+checkerboard are (`corners.py`), in a window that leaves the markers out, and those that the reader missed but whose
+neighbours it has are fitted as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Floats
+from implicam.detect.board import LARGEST_PICTURE, corner_name, unusable
+from implicam.detect.corners import Corners, fit_corners
+from implicam.detect.grid import ASTRAY, Places, places_from
+from implicam.detect.model import Detected, View, nothing
+from implicam.detect.seeds import in_original, resized
+from implicam.errors import UsageError, did_you_mean
+from implicam.images import Grey, eight_bit, opencv
+
+FEWEST = 6
+"""Corners from which their neighbourhood can be checked."""
+
+MISFIT = 0.35
+
+OFF = 0.3
+"""Squares that a marker may be from where its neighbours put it; more than a fifth beyond, and it is another board."""
+
+
+@dataclass(frozen=True)
+class Charuco:
+    """A ChArUco board of rows x columns SQUARES, edges of squares and markers in millimetres.
+
+    dictionary: OpenCV's name of the set of markers. legacy: printed with OpenCV before 4.6, and an even number of rows.
+    Corner 1 is the inner corner at the top left of the board as OpenCV draws it, and numbers run along the rows.
+    """
+
+    rows: int
+    columns: int
+    square: float
+    marker: float
+    dictionary: str = "DICT_5X5_100"
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        if min(self.rows, self.columns) < 3 or max(self.rows, self.columns) > 100:
+            raise UsageError(
+                f"a ChArUco board of {self.rows} x {self.columns} squares cannot be used.",
+                why="rows and columns count squares, from 3 to 100",
+                fix="for example 9 x 12",
+            )
+        if not 0 < self.marker < self.square < np.inf:
+            raise UsageError(
+                f"marker = {self.marker} mm and square = {self.square} mm do not go together.",
+                why="a marker lies inside of a square",
+                fix="measure the edges of both on the printed board",
+            )
+        known = [name for name in dir(opencv().aruco) if name.startswith("DICT_")]
+        if self.dictionary not in known:
+            raise UsageError(
+                f"there is no dictionary {self.dictionary!r}{did_you_mean(self.dictionary, known)}.",
+                fix="use the name that OpenCV has for it, for example DICT_5X5_100",
+            )
+        if self.rows * self.columns // 2 > len(self._dictionary().bytesList):
+            raise UsageError(
+                f"{self.dictionary} has too few markers for {self.rows} x {self.columns} squares.",
+                why=f"the board needs {self.rows * self.columns // 2}",
+                fix="use the dictionary that the board was printed with",
+            )
+
+    def options(self) -> dict[str, Any]:
+        """All that the results depend on."""
+        return {"target": "charuco", **asdict(self)}
+
+    def detect(self, picture: Grey, view: View) -> Detected:
+        """The corners of the board in one picture, or why they cannot be given."""
+        unfit = unusable(picture)
+        if unfit:
+            return nothing(unfit)
+        seen = self._seen(picture, 1.0)
+        if len(seen.ids) < self._total and picture.size <= LARGEST_PICTURE:
+            again = self._seen(picture, 2.0)  # small markers are read better when they are made larger
+            seen = again if len(again.ids) > len(seen.ids) else seen
+        if seen.reason:
+            return nothing(seen.reason)
+        corners, there = self._corners(picture, seen)
+        number = np.flatnonzero(there)
+        if len(number) < FEWEST:
+            return nothing(
+                f"{len(seen.ids)} markers of the board were read, and {len(number)} corners between them are clear: "
+                "too few. Show more of the board, sharper or nearer."
+            )
+        missing = self._total - len(number)
+        hull = opencv().convexHull(corners.uv[number].astype(np.float32))[:, 0].astype(np.float64)
+        return Detected(
+            tuple(corner_name(view.shot, int(j)) for j in number),
+            corners.uv[number],
+            corners.sd[number],
+            f"{missing} of the board's {self._total} corners are hidden or not clear." if missing else "",
+            (np.vstack([hull, hull[:1]]),),
+        )
+
+    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
+        """Nothing to add."""
+        return dict(found)
+
+    @property
+    def _total(self) -> int:
+        return (self.rows - 1) * (self.columns - 1)
+
+    def _dictionary(self) -> Any:
+        aruco = opencv().aruco
+        return aruco.getPredefinedDictionary(getattr(aruco, self.dictionary))
+
+    def _seen(self, picture: Grey, scale: float) -> _Seen:
+        """What OpenCV reads, and whether the markers lie as on this board."""
+        cv2 = opencv()
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._dictionary())
+        board.setLegacyPattern(self.legacy)
+        reader = cv2.aruco.CharucoDetector(board)
+        image = resized(eight_bit(picture), scale)
+        try:
+            corners, ids, outlines, names = reader.detectBoard(image)
+        except cv2.error as error:
+            return _nothing_seen(f"OpenCV could not read the ChArUco board: {error}")
+        if names is None or len(names) == 0:
+            return _nothing_seen(
+                f"no marker of {self.dictionary} was read. Show the board sharp and near (a marker needs 20 pixels), "
+                "and check that it was printed from this dictionary."
+            )
+        names = names.ravel()
+        middle = np.array([np.mean(outline.reshape(-1, 2), axis=0) for outline in outlines], dtype=np.float64)
+        if len(np.unique(names)) < len(names):
+            return _nothing_seen("the same marker is seen twice: two ChArUco boards are in view. Take one away.")
+        if not self._in_their_places(board, names, middle):
+            return _nothing_seen(
+                f"the markers do not lie as on a ChArUco board of {self.rows} x {self.columns} squares. Give the size "
+                "that the board has (rows x columns of squares), or legacy for one printed with OpenCV before 4.6."
+            )
+        if corners is None or ids is None or len(ids) == 0:
+            return _nothing_seen(f"{len(names)} markers were read, but no corner lies between two. Show more of it.")
+        uv = in_original(corners.reshape(-1, 2).astype(np.float64), image, picture)
+        return _Seen(ids.ravel().astype(np.intp), uv, "")
+
+    def _in_their_places(self, board: Any, names: NDArray[np.int32], middle: Floats) -> bool:
+        """Whether the markers' middles (n, 2) are where their neighbours say that this board has them."""
+        of = {int(name): np.mean(points, axis=0)[1::-1] for name, points in zip(board.getIds(), board.getObjPoints())}  # noqa: B905
+        known = np.array([name in of for name in names.tolist()])
+        if known.mean() < 0.8:
+            return False
+        if known.sum() < FEWEST:
+            return True
+        nodes = np.array([of[int(name)] for name in names[known]], dtype=np.float64) / self.square
+        places = places_from(nodes, middle[known], nodes)
+        off = _squares(middle[known] - places.uv, places)
+        return bool(np.mean(np.abs(off).max(axis=1) > OFF) < 0.2)
+
+    def _corners(self, picture: Grey, seen: _Seen) -> tuple[Corners, NDArray[np.bool_]]:
+        """All corners of the board, fitted; and (n,) which of them are clear."""
+        nodes = np.argwhere(np.ones((self.rows - 1, self.columns - 1), dtype=np.bool_)).astype(np.float64)
+        start = np.full((len(nodes), 2), np.nan)
+        start[seen.ids] = seen.uv
+        there = np.isfinite(start[:, 0])
+        corners = Corners(*(np.full((len(nodes), *more), np.nan) for more in ((2,), (2,), (), (), (), (), ())))
+        for _ in range(self.rows + self.columns):
+            before = there
+            if there.sum() < FEWEST:
+                break
+            places = places_from(nodes[there], start[there], nodes)
+            near = np.linalg.norm(nodes[:, None] - nodes[there], axis=2).min(axis=1) < 1.5
+            start = np.where(near[:, None] & ~there[:, None], places.uv, start)
+            corners = fit_corners(picture, start, places.right, places.down, bare=(1 - self.marker / self.square) / 2)
+            there = _sound(corners, nodes)
+            there &= _placed(corners, nodes, there)
+            start = np.where(there[:, None], corners.uv, np.nan)
+            if (there == before).all():
+                break
+        return corners, there
+
+
+class _Seen(NamedTuple):
+    """Numbers (n,) and pixels (n, 2) of the corners that OpenCV gives; or the reason why it gives none."""
+
+    ids: NDArray[np.intp]
+    uv: Floats
+    reason: str
+
+
+def _nothing_seen(reason: str) -> _Seen:
+    return _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), reason)
+
+
+def _sound(corners: Corners, nodes: Floats) -> NDArray[np.bool_]:
+    """Which corners (n,) look like corners: little left over, and bright and dark in turn as their neighbours."""
+    with np.errstate(invalid="ignore"):
+        good = (corners.misfit < MISFIT) & np.isfinite(corners.uv).all(axis=1)
+        signed = corners.height * (1 - 2 * (nodes.sum(axis=1) % 2))
+        if good.any():
+            middle = np.median(signed[good])
+            good &= signed * np.sign(middle) > 0.3 * abs(middle)
+    return np.asarray(good, dtype=np.bool_)
+
+
+def _placed(corners: Corners, nodes: Floats, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which corners (n,) are where those that are `there` say; their own say left out."""
+    if there.sum() < FEWEST:
+        return np.zeros_like(there)
+    places = places_from(nodes[there], corners.uv[there], nodes)
+    with np.errstate(invalid="ignore"):
+        off = np.abs(_squares(corners.uv - places.uv, places)).max(axis=1)
+    return np.asarray(off < ASTRAY / 2, dtype=np.bool_)
+
+
+def _squares(off: Floats, places: Places) -> Floats:
+    """Differences in pixels (n, 2) as parts of the steps right and down there."""
+    steps = np.stack([places.right, places.down], axis=2)
+    return np.asarray(np.einsum("nij,nj->ni", np.linalg.pinv(steps), off), dtype=np.float64)

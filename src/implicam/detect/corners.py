@@ -1,0 +1,210 @@
+"""Where the corners of a checkerboard are, to a few hundredths of a pixel, and how well that is known.
+
+A corner is where two straight edges cross. The picture around it is modelled as
+
+    grey = mean + height E(d1 / blur) E(d2 / blur),
+
+d1 and d2 the signed distances from the two edges, E(x) = erf(x / sqrt 2) an edge blurred by a Gaussian. Eight numbers
+are fitted to the pixels of a window by least squares: the crossing (u, v), the two directions, the blur, the mean, the
+height. For edges that are not square to each other the blurred corner is not quite a product; but the true picture and
+the model are both point-symmetric about the crossing, so the crossing is not biased by it, nor by a blur of another
+shape or by a response that is not linear.
+
+The covariance is the usual one of least squares, noise² (JᵀJ)⁻¹, with the noise from the residuals, so that shot noise
+and what the model does not describe count. All corners of a board are fitted side by side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from implicam.dataset import Floats
+from implicam.images import Grey
+
+Bools = NDArray[np.bool_]
+
+LARGEST = 9.0
+"""Pixels from the crossing to the window's rim at most: over more, edges are not straight behind a wide lens."""
+
+SMALLEST = 2.5
+"""Pixels to the rim at least: where squares are smaller, there is nothing to fit."""
+
+CLEAR = 1.6
+"""Pixels that the window stays away from the edges of the neighbouring corners, which are blurred too."""
+
+ROUNDS = 12
+
+FLOOR = 0.004
+"""Pixels that no standard uncertainty goes below: what curved edges and the sensor's pixels do to the model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """Corners as fitted, n of them. uv: (n, 2) pixels; sd: (n, 2) standard uncertainties.
+
+    mean, height: (n,) grey halfway, and from there to bright; the height is negative where the square between the two
+    steps given is dark. misfit: (n,) rms of the residuals as a part of the height. blur: (n,) pixels.
+    turned: (n,) radians, how far the edges are from the directions given.
+    Everything is NaN where there is no corner to be fitted, or too near to the rim of the picture.
+    """
+
+    uv: Floats
+    sd: Floats
+    mean: Floats
+    height: Floats
+    misfit: Floats
+    blur: Floats
+    turned: Floats
+
+    def __getitem__(self, rows: Bools | NDArray[np.intp]) -> Corners:
+        return Corners(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare: float = 1.0) -> Corners:
+    """Fit the corners near pixels uv (n, 2).
+
+    right, down: (n, 2) pixels from a corner to its neighbours, roughly. bare: how far from an edge, in squares, its
+    bright side is bare of print (1 on a checkerboard; on a ChArUco board markers begin earlier).
+    """
+    uv, right, down = (np.asarray(x, dtype=np.float64) for x in (uv, right, down))
+    out = Corners(*(np.full((len(uv), *more), np.nan) for more in ((2,), (2,), (), (), (), (), ())))
+    half = int(np.ceil(np.clip(0.9 * np.nanmax(_lengths(right, down), initial=SMALLEST), SMALLEST, LARGEST)))
+    with np.errstate(invalid="ignore"):
+        inside = np.isfinite(uv + right + down).all(axis=1)
+        inside &= ((uv >= half + 0.5) & (uv <= np.array(picture.shape)[::-1] - half - 1.5)).all(axis=1)
+    for rows in np.array_split(np.flatnonzero(inside), max(1, int(inside.sum()) // 256)):
+        if len(rows):
+            found = _Windows(picture, uv[rows], right[rows], down[rows], half, bare).fitted()
+            for name in out.__dataclass_fields__:
+                getattr(out, name)[rows] = getattr(found, name)
+    return out
+
+
+def _lengths(right: Floats, down: Floats) -> Floats:
+    return np.asarray(np.maximum(np.linalg.norm(right, axis=1), np.linalg.norm(down, axis=1)), dtype=np.float64)
+
+
+class _Windows:
+    """The pixels around n corners, and the fit of the model to them."""
+
+    def __init__(self, picture: Grey, uv: Floats, right: Floats, down: Floats, half: int, bare: float) -> None:
+        corner = np.rint(uv).astype(int)
+        step = np.arange(-half, half + 1)
+        dv, du = (x.ravel() for x in np.meshgrid(step, step, indexing="ij"))
+        self.offset = np.column_stack([du, dv]).astype(np.float64)
+        self.grey = picture[corner[:, 1, None] + dv, corner[:, 0, None] + du].astype(np.float64)
+        self.corner = corner.astype(np.float64)
+        self.steps = np.stack([right, down], axis=2)  # (n, 2, 2): pixels from squares
+        self.angle = np.arctan2(self.steps[:, 1], self.steps[:, 0])  # (n, 2): of the edges to the right and down
+        self.half, self.bare = half, bare
+        self.start = uv - corner
+
+    def fitted(self) -> Corners:
+        n = len(self.start)
+        parameters = np.hstack([self.start, self.angle, np.full((n, 1), np.log(0.8))])
+        weight = self._weight(parameters)
+        error, parameters, linear, jacobian = self._evaluated(parameters, weight)
+        damping = np.full(n, 1e-3)
+        for turn in range(ROUNDS):
+            if turn == 2:  # the window follows the corner, but not for ever: what moves does not converge
+                weight = self._weight(parameters)
+                error, parameters, linear, jacobian = self._evaluated(parameters, weight)
+            trial = self._bounded(parameters - self._step(linear[1], jacobian, weight, damping))
+            tried = self._evaluated(trial, weight)
+            better = tried[0] < error
+            damping = np.where(better, damping / 5, damping * 5)
+            pick = (better[:, None], better[:, None], better[:, None, None])
+            change = np.abs(trial - parameters)[:, :2].max(axis=1)
+            error = np.where(better, tried[0], error)
+            parameters = np.where(pick[0], trial, parameters)
+            jacobian = np.where(pick[2], tried[3], jacobian)
+            linear = (np.where(pick[0], tried[2][0], linear[0]), np.where(pick[1], tried[2][1], linear[1]))
+            if turn > 3 and np.all(change < 2e-4):
+                break
+        return self._result(parameters, linear, jacobian, weight)
+
+    def _weight(self, parameters: Floats) -> Floats:
+        """(n, pixels) 1 in the window, 0 outside; the window is point-symmetric about the corner, as the model is."""
+        d = self.offset - parameters[:, None, :2]
+        inverse = np.linalg.pinv(self.steps)
+        squares = np.abs(d @ inverse.swapaxes(1, 2))
+        slope = np.linalg.norm(inverse, axis=2)[:, None]  # squares per pixel
+        reach = np.maximum(1 - CLEAR * slope, 0.35)
+        inside = (squares < reach).all(axis=2) & (np.linalg.norm(d, axis=2) < self.half - 0.5)
+        if self.bare < 1:
+            bare = np.maximum(self.bare - CLEAR * slope, 1.5 * slope)
+            inside &= (squares < bare).any(axis=2)
+        return np.asarray(inside, dtype=np.float64)
+
+    def _evaluated(self, parameters: Floats, weight: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats], Floats]:
+        """Sum of squares (n,), the parameters, (mean and height (n, 2), residuals (n, pixels)), Jacobian.
+
+        Mean and height enter linearly and are solved for each time (variable projection, Golub & Pereyra 1973); the
+        Jacobian (n, pixels, 7) is that of the whole model: u, v, two angles, log blur, mean, height.
+        """
+        d = self.offset - parameters[:, None, :2]
+        cos, sin = np.cos(parameters[:, 2:4]), np.sin(parameters[:, 2:4])
+        blur = np.exp(parameters[:, 4])[:, None]
+        distance, shape, slope = [], [], []
+        for k in range(2):  # k = 0: the edge that runs to the right, and how far below it
+            x = (d[..., 1] * cos[:, k, None] - d[..., 0] * sin[:, k, None]) / blur
+            distance.append(x)
+            shape.append(erf(x / np.sqrt(2)))
+            slope.append(np.exp(-0.5 * x * x) * np.sqrt(2 / np.pi))
+        product = -shape[0] * shape[1]  # below the one edge and left of the other is not between the two steps
+        mean, height = _line(product, self.grey, weight)
+        residual = (mean[:, None] + height[:, None] * product - self.grey) * weight
+        jacobian = np.empty((*product.shape, 7))
+        a, b = -slope[0] * shape[1], -slope[1] * shape[0]
+        jacobian[..., 0] = (a * sin[:, 0, None] + b * sin[:, 1, None]) / blur
+        jacobian[..., 1] = -(a * cos[:, 0, None] + b * cos[:, 1, None]) / blur
+        for k, part in enumerate((a, b)):
+            jacobian[..., 2 + k] = -part * (d[..., 0] * cos[:, k, None] + d[..., 1] * sin[:, k, None]) / blur
+        jacobian[..., 4] = -(a * distance[0] + b * distance[1])
+        jacobian[..., :5] *= height[:, None, None]
+        jacobian[..., 5], jacobian[..., 6] = 1, product
+        return np.sum(residual**2, axis=1), parameters, (np.column_stack([mean, height]), residual), jacobian
+
+    def _step(self, residual: Floats, jacobian: Floats, weight: Floats, damping: Floats) -> Floats:
+        weighted = jacobian * weight[..., None]
+        normal = weighted.swapaxes(1, 2) @ jacobian
+        diagonal = np.einsum("nii->ni", normal)
+        diagonal += damping[:, None] * diagonal + 1e-9
+        gradient = np.einsum("npk,np->nk", weighted, residual)
+        step: Floats = np.linalg.solve(normal, gradient[..., None])[:, :5, 0]
+        return np.clip(step, -0.7, 0.7)
+
+    def _bounded(self, parameters: Floats) -> Floats:
+        parameters[:, :2] = self.start + np.clip(parameters[:, :2] - self.start, -self.half / 2, self.half / 2)
+        parameters[:, 4] = np.clip(parameters[:, 4], np.log(0.25), np.log(4.0))
+        return parameters
+
+    def _result(self, parameters: Floats, linear: tuple[Floats, Floats], jacobian: Floats, weight: Floats) -> Corners:
+        (mean, height), residual = linear[0].T, linear[1]
+        weighted = jacobian * weight[..., None]
+        normal = weighted.swapaxes(1, 2) @ jacobian
+        spare = weight.sum(axis=1) - 7
+        with np.errstate(invalid="ignore", divide="ignore"):
+            noise = np.where(spare > 5, np.sum(residual**2, axis=1) / spare, np.nan)
+            misfit = np.sqrt(noise) / np.abs(height)
+            scale = np.sqrt(np.einsum("nii->ni", normal)) + 1e-12
+            inverse = np.linalg.pinv(normal / (scale[:, :, None] * scale[:, None, :]), hermitian=True)
+            variance = np.einsum("nii->ni", inverse)[:, :2] / scale[:, :2] ** 2 * noise[:, None]
+        good = np.isfinite(variance).all(axis=1) & np.isfinite(misfit)
+        sd = np.sqrt(np.where(good[:, None], variance, np.nan) + FLOOR**2)
+        uv = np.where(good[:, None], self.corner + parameters[:, :2], np.nan)
+        turned = np.abs(np.sin(parameters[:, 2:4] - self.angle)).max(axis=1)
+        return Corners(uv, sd, mean, height, misfit, np.exp(parameters[:, 4]), turned)
+
+
+def _line(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Weighted straight lines y = a + b x, one a row: a (n,), b (n,)."""
+    total = np.maximum(weight.sum(axis=1), 1e-12)
+    mx, my = (weight * x).sum(axis=1) / total, (weight * y).sum(axis=1) / total
+    dx = (x - mx[:, None]) * weight
+    b = (dx * y).sum(axis=1) / np.maximum((dx * x).sum(axis=1), 1e-12)
+    return my - b * mx, b

@@ -1,0 +1,483 @@
+"""Dots at known positions on a target, as particle-tracking labs photograph it.
+
+A person labels six or more dots per camera, to a pixel or two. The labels give a first camera; it predicts where the
+other dots must be, those nearest to the labels best. Where the prediction is sure enough to tell a dot from the next
+one, the spot that is there gets the name; the camera is fitted again, until nothing changes. Dots that the others
+contradict are dropped.
+
+The camera is a projective one with a smooth departure from it (water, glass, a lens), as one Gaussian process: to first
+order in the eleven numbers of a camera matrix, pixel = f(theta, xyz) + g(xyz), so the covariance of two pixels is
+J S J^T + k, with J the derivatives of f, S a prior that knows no more than how large the picture is, and k a smooth
+kernel (Rasmussen & Williams, section 2.7). Flat targets, few labels and labels in one plane need no case of their own:
+what the dots seen do not fix is uncertain by what the prior allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from implicam.dataset import Floats, KnownPositions
+from implicam.dataset.folder import _read_points
+from implicam.dataset.tables import name_in, number, read_table
+from implicam.detect.blobs import find_spots, measure_spots, scale_shown
+from implicam.detect.model import Detected, View, nothing
+from implicam.errors import DatasetError, UsageError, did_you_mean
+from implicam.gp.kernels import Kernel
+from implicam.gp.linalg import cholesky, solve, solve_lower
+from implicam.images import Grey
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+Labels = Mapping[View, Mapping[str, tuple[float, float]]]
+
+FEWEST = 6
+"""Labels that a camera needs."""
+
+CLICK = 3.5
+"""Pixels from a label to the spot that is meant."""
+
+SURE = 2.0
+"""Standard deviations of a prediction that must stay within the way to the next dot."""
+
+PART = 0.4
+"""Of the distance to the next dot: farther from its prediction a spot may be that dot."""
+
+ASTRAY = 6.0
+"""A dot so many times farther from what the others predict than they are from theirs is none."""
+
+TOLERATED = 1.0
+"""Pixels from what the others predict that are no reason to drop a dot: targets are drilled by hand."""
+
+ROUNDS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Dots:
+    """Finds the dots of a target.
+
+    points: n names and `known`, where they are; labels: pixels (u, v) of dots by point name, for each camera and shot,
+    View(camera, "") for every shot of the camera. polarity: "bright" dots, "dark" ones, or what most labels show.
+    Where the layout has several shots (plates), a picture is searched for the points of its own.
+    """
+
+    points: tuple[str, ...]
+    known: KnownPositions
+    labels: Labels
+    polarity: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.polarity not in ("auto", "bright", "dark"):
+            raise UsageError(
+                f"there is no polarity {self.polarity!r}.",
+                fix='dots are "bright" or "dark"; "auto" looks at the labels',
+            )
+        for view, marks in self.labels.items():
+            for name in marks:
+                if name not in self.points:
+                    raise DatasetError(
+                        f"the labels of camera {view.camera!r} name the point {name!r}, which is not in the layout"
+                        f"{did_you_mean(name, self.points)}.",
+                        fix="correct the name, or add the point to the layout",
+                    )
+
+    @classmethod
+    def from_files(cls, layout: str | Path, labels: str | Path, *, polarity: str = "auto") -> Self:
+        """From a layout with the columns of points.csv, and labels with the columns point,camera,u,v and perhaps shot.
+
+        DatasetError names file, line and cure.
+        """
+        table = _read_points(Path(layout))
+        return cls(tuple(table.names), table.known, _read_labels(Path(labels), table.names), polarity)
+
+    def options(self) -> dict[str, Any]:
+        marks = [[*view, name, *uv] for view, named in self.labels.items() for name, uv in named.items()]
+        layout = {"points": list(self.points), "shots": self.known.shots.tolist(), "xyz": self.known.xyz.tolist()}
+        return {"target": "dots", "layout": layout, "labels": marks, "polarity": self.polarity}
+
+    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
+        return dict(found)
+
+    def detect(self, picture: Grey, view: View) -> Detected:
+        rows = self._rows(view)
+        if not len(rows):
+            shots = sorted(set(self.known.shots.tolist()))
+            return nothing(
+                f"the layout has no shot {view.shot!r}{did_you_mean(view.shot, shots)}; it has {_listed(shots)}: "
+                "name the picture after one of them, or correct the layout's column shot"
+            )
+        names = [self.points[row] for row in rows]
+        marks = self._marks(view, names)
+        if len(marks) < FEWEST:
+            return nothing(
+                f"{len(marks)} labelled dots for camera {view.camera!r} in shot {view.shot!r}, but it takes {FEWEST}: "
+                "label more dots, spread over the target and its depths"
+            )
+        search = _Search.begin(picture, names, self.known.xyz[rows], marks, self.polarity)
+        if isinstance(search, str):
+            return nothing(search)
+        search.grow()
+        return search.result()
+
+    def _rows(self, view: View) -> Ints:
+        shots = self.known.shots
+        if (shots == shots[0]).all():
+            return np.arange(len(shots))
+        return np.flatnonzero(shots == view.shot)
+
+    def _marks(self, view: View, names: Sequence[str]) -> dict[int, tuple[float, float]]:
+        marks = {**self.labels.get(View(view.camera, ""), {}), **self.labels.get(view, {})}
+        index = {name: i for i, name in enumerate(names)}
+        return {index[name]: uv for name, uv in marks.items() if name in index}
+
+
+def _read_labels(path: Path, points: Sequence[str]) -> dict[View, dict[str, tuple[float, float]]]:
+    header, rows = read_table(path, ("point", "camera", "u", "v"))
+    at = {column: header.index(column) for column in header}
+    index = set(points)
+    labels: dict[View, dict[str, tuple[float, float]]] = {}
+    for line, row in rows:
+        place = f"{path}, line {line}"
+        name, camera = (name_in(row[at[c]], c, place) for c in ("point", "camera"))
+        if name not in index:
+            raise DatasetError(
+                f"{place}: point {name!r} is not in the layout{did_you_mean(name, points)}.",
+                fix="correct the name, or add the point to the layout",
+            )
+        u, v = (number(row[at[c]], place, c, cure_nan="a label needs its pixel: remove the row") for c in "uv")
+        marks = labels.setdefault(View(camera, row[at["shot"]].strip() if "shot" in at else ""), {})
+        if name in marks:
+            raise DatasetError(f"{place}: point {name!r} of camera {camera!r} is labelled twice.", fix="remove one row")
+        marks[name] = (u, v)
+    if not labels:
+        raise DatasetError(f"{path} has a header and no rows.", fix=f"label {FEWEST} dots or more for each camera")
+    return labels
+
+
+class _Prediction(NamedTuple):
+    """Pixels (n, 2) and their standard uncertainties (n,)."""
+
+    uv: Floats
+    sd: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    """The Gaussian process of one camera, conditioned on dots seen (see the head of this file).
+
+    Everything is in normalised units: positions with mean 0 and rms 1 over the target, pixels in `scale`.
+    """
+
+    xyz: Floats
+    uv: Floats
+    sd: Floats
+    theta: Floats
+    prior: Floats  # (11, 11) covariance of theta
+    bend: float  # sd of the departure from a projective camera, in the units of uv
+    reach: float  # its correlation length, in the units of xyz
+    slack: float  # sd of where dots are, in the units of uv
+    L: Floats
+    alpha: Floats
+    evidence: float
+
+    @classmethod
+    def fit(cls, xyz: Floats, uv: Floats, sd: Floats) -> _Camera:
+        """With the most probable of a few departures; with few dots, one per cent of the target's size."""
+        first = cls.condition(xyz, uv, sd, _affine(xyz, uv), 0.01, 1.0, 0.001)
+        if len(xyz) < ENOUGH:
+            return first
+        some = np.random.default_rng(0).permutation(len(xyz))[:MOST]
+        trials = [
+            cls.condition(xyz[some], uv[some], sd[some], first.theta, bend, reach, slack, turns=1)
+            for bend in (0.001, 0.004, 0.016)
+            for reach in (0.7, 1.5)
+            for slack in (0.0002, 0.001, 0.004)
+        ]
+        best = max(trials, key=lambda trial: trial.evidence)
+        return cls.condition(xyz, uv, sd, first.theta, best.bend, best.reach, best.slack)
+
+    @classmethod
+    def condition(
+        cls,
+        xyz: Floats,
+        uv: Floats,
+        sd: Floats,
+        theta: Floats,
+        bend: float,
+        reach: float,
+        slack: float,
+        *,
+        turns: int = 5,
+    ) -> _Camera:
+        noise = np.repeat(sd**2 + slack**2, 2)
+        prior = _prior(theta)
+        for turn in range(turns):
+            image, J = _project(theta, xyz)
+            K = J @ prior @ J.T + np.kron(_smooth(bend, reach)(xyz, xyz), np.eye(2))
+            K[np.diag_indices_from(K)] += noise
+            L = cholesky(np.asfortranarray(K))
+            rest = (uv - image).ravel() + J @ theta
+            alpha = solve(L, rest)
+            if turn < turns - 1:
+                theta = prior @ (J.T @ alpha)
+        evidence = -0.5 * rest @ alpha - np.log(np.diag(L)).sum()
+        return cls(xyz, uv, sd, theta, prior, bend, reach, slack, L, alpha, float(evidence))
+
+    def predict(self, xyz: Floats) -> _Prediction:
+        image, J = _project(self.theta, xyz)
+        known = _project(self.theta, self.xyz)[1]
+        smooth = np.kron(_smooth(self.bend, self.reach)(self.xyz, xyz), np.eye(2))
+        K = known @ self.prior @ J.T + smooth
+        v = solve_lower(self.L, K)
+        prior = np.einsum("ij,jk,ik->i", J, self.prior, J) + self.bend**2
+        variance = np.maximum(prior - np.einsum("ij,ij->j", v, v), 0).reshape(-1, 2)
+        uv = image + (K.T @ self.alpha - J @ self.theta).reshape(-1, 2)
+        return _Prediction(uv, np.sqrt(variance.mean(axis=1) + self.slack**2))
+
+    def leave_one_out(self) -> _Prediction:
+        """What the other dots say of each (both of its pixel's coordinates left out)."""
+        n = len(self.xyz)
+        inverse = solve(self.L, np.eye(2 * n))
+        blocks = np.linalg.inv(inverse.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)])
+        uv = self.uv - np.einsum("nij,nj->ni", blocks, self.alpha.reshape(n, 2))
+        return _Prediction(uv, np.sqrt(np.einsum("nii->n", blocks) / 2))
+
+
+ENOUGH, MOST = 12, 120
+"""Dots from which the departure can be told, and so many of them as suffice for it."""
+
+AFFINE = np.array([1.5] * 3 + [5.0]) ** 2
+"""Prior variances of a row of the camera matrix, with pixels in units of the labels' size: all that is possible."""
+
+ALONG, ACROSS = 0.2, 0.06
+"""Prior sd of the perspective: how much the distance from the camera changes over the target, as a part of itself,
+along the line of sight; and across it, which is what an axis that does not meet the target does."""
+
+
+def _prior(theta: Floats) -> Floats:
+    """Prior covariance (11, 11) of the numbers of a camera; its line of sight is that of theta."""
+    sight = np.cross(theta[:3], theta[4:7])
+    sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
+    S = np.zeros((11, 11))
+    S[np.arange(8), np.arange(8)] = np.tile(AFFINE, 2)
+    S[8:, 8:] = (ALONG**2 - ACROSS**2) * np.outer(sight, sight) + ACROSS**2 * np.eye(3)
+    return S
+
+
+def _project(theta: Floats, xyz: Floats) -> tuple[Floats, Floats]:
+    """Pixels (n, 2), and their derivatives (2 n, 11), for points (n, 3)."""
+    n = len(xyz)
+    one = np.hstack([xyz, np.ones((n, 1))])
+    away = np.maximum(1 + xyz @ theta[8:], 0.1)[:, None]
+    uv = np.column_stack([one @ theta[:4], one @ theta[4:8]]) / away
+    J = np.zeros((n, 2, 11))
+    J[:, 0, :4] = J[:, 1, 4:8] = one / away
+    J[:, :, 8:] = -uv[..., None] * (xyz / away)[:, None]
+    return uv, J.reshape(2 * n, 11)
+
+
+def _smooth(bend: float, reach: float) -> Kernel:
+    return Kernel("squared-exponential", bend**2, np.full(3, reach))
+
+
+def _affine(xyz: Floats, uv: Floats) -> Floats:
+    one = np.hstack([xyz, np.ones((len(xyz), 1))])
+    normal = one.T @ one + 1e-6 * len(xyz) * np.eye(4)
+    return np.concatenate([*np.linalg.solve(normal, one.T @ uv).T, np.zeros(3)])
+
+
+class _Search:
+    """The search for the dots of one picture; `to` (n,) is the spot of each dot, -1 for none."""
+
+    def __init__(self, picture: Grey, sigma: float, names: Sequence[str], xyz: Floats) -> None:
+        self.picture, self.sigma, self.names = picture, sigma, names
+        middle = xyz.mean(axis=0)
+        self.xyz = (xyz - middle) / (np.sqrt(np.mean(np.sum((xyz - middle) ** 2, axis=1))) or 1.0)
+        self.rough, self.answer = find_spots(picture, sigma)
+        self.tree = cKDTree(self.rough.reshape(-1, 2)) if len(self.rough) else None
+        self.measured: dict[int, tuple[Floats, Floats, float]] = {}
+        self.to = np.full(len(xyz), -1)
+        self.labelled: list[int] = []
+        self.lost: list[int] = []
+        self.off: set[int] = set()
+
+    @classmethod
+    def begin(
+        cls, picture: Grey, names: Sequence[str], xyz: Floats, marks: Mapping[int, tuple[float, float]], polarity: str
+    ) -> _Search | str:
+        """With the labels' spots, or why there is no beginning."""
+        rows, uv = np.array(list(marks)), np.array(list(marks.values()))
+        picture = 1 - picture if polarity == "dark" else picture
+        largest = _largest(xyz, rows, uv)
+        sigma, answers = scale_shown(picture, uv, largest)
+        if polarity == "auto" and np.nansum(answers) < 0:
+            picture = 1 - picture
+        search = cls(picture, sigma, names, xyz)
+        search._label(rows, uv)
+        if len(search.labelled) < FEWEST:
+            return (
+                f"no dot where the labels {_listed([names[row] for row in search.lost])} are, and it takes {FEWEST} "
+                "labels that lie on dots: click within two pixels of dots that this picture shows, "
+                "and check that it is sharp and not turned"
+            )
+        return search
+
+    def _near(self, uv: Floats, within: float) -> list[int]:
+        """The spots near a pixel that are not much fainter than the brightest of them, as measured."""
+        found = [] if self.tree is None else self.tree.query_ball_point(uv, within + self.sigma)
+        self._measure(found)
+        found = [k for k in found if np.linalg.norm(self.measured[k][0] - uv) <= within]
+        least = FAINTER * max((self.answer[k] for k in found), default=0.0)
+        return [k for k in found if self.answer[k] >= least]
+
+    def _measure(self, spots: Sequence[int]) -> None:
+        new = [k for k in spots if k not in self.measured]
+        if not new:
+            return
+        found = measure_spots(self.picture, self.rough[new], self.sigma)
+        for i, k in enumerate(new):
+            self.measured[k] = (found.uv[i], found.sd[i], float(found.area[i]))
+
+    def _label(self, rows: Ints, uv: Floats) -> None:
+        for row, pixel in zip(rows, uv, strict=True):
+            near = self._near(pixel, max(CLICK, self.sigma * np.sqrt(2)))
+            near = [k for k in near if k not in self.to]
+            if near:
+                self.to[row] = max(near, key=lambda k: self.answer[k])
+                self.labelled.append(int(row))
+            else:
+                self.lost.append(int(row))
+
+    def grow(self) -> None:
+        """Match, fit, predict, until nothing changes."""
+        before: set[bytes] = set()
+        while len(before) < ROUNDS and self.to.tobytes() not in before:
+            before.add(self.to.tobytes())
+            self._fit()
+            self._drop()
+            self._add()
+        self._fit()
+
+    def _fit(self) -> None:
+        """Fit the camera to the matched dots, and predict all: those it is fitted to by the others."""
+        rows = np.flatnonzero(self.to >= 0)
+        uv = np.array([self.measured[k][0] for k in self.to[rows]])
+        sd = np.array([np.sqrt(np.mean(self.measured[k][1] ** 2)) for k in self.to[rows]])
+        middle, scale = _frame(self.xyz[rows], uv)
+        if len(rows) > MOST:
+            some = np.sort(np.random.default_rng(0).permutation(len(rows))[:MOST])
+            rows, uv, sd = rows[some], uv[some], sd[some]
+        camera = _Camera.fit(self.xyz[rows], (uv - middle) / scale, sd / scale)
+        predicted, by_others = camera.predict(self.xyz), camera.leave_one_out()
+        predicted.uv[rows], predicted.sd[rows] = by_others
+        self.uv, self.sd = middle + scale * predicted.uv, scale * predicted.sd
+        self.apart = cKDTree(self.uv).query(self.uv, k=2)[0][:, 1]
+        self.sure = SURE * self.sd < PART * self.apart
+
+    def _distance(self) -> Floats:
+        """(n,) pixels from what the others say of a dot to where it is; NaN where it is not matched."""
+        out = np.full(len(self.to), np.nan)
+        for row in np.flatnonzero(self.to >= 0):
+            out[row] = np.linalg.norm(self.measured[int(self.to[row])][0] - self.uv[row])
+        return out
+
+    def _drop(self) -> None:
+        """Forget the matches that the others contradict."""
+        distance = self._distance()
+        matched = self.to >= 0
+        if matched.sum() < ENOUGH:
+            return
+        usual = float(np.median(distance[matched]))
+        with np.errstate(invalid="ignore"):
+            far = distance > np.maximum(np.maximum(ASTRAY * usual, TOLERATED), 2 * SURE * self.sd)
+            far |= self.sure & (distance > PART * self.apart)
+        far &= distance >= 0.5 * np.nanmax(distance[far], initial=0.0)  # the worst first: they push others off
+        self.off |= set(np.flatnonzero(far).tolist())
+        self.to[far] = -1
+
+    def _add(self) -> None:
+        """Match the dots whose places are known well enough, each with the spot that is nearest to it and no other."""
+        pairs = []
+        taken = set(self.to[self.to >= 0].tolist())
+        for row in np.flatnonzero((self.to < 0) & self.sure & self._inside()):
+            within = min(PART * self.apart[row], 2 * SURE * self.sd[row] + TOLERATED)
+            for k in self._near(self.uv[row], within):
+                if k not in taken:
+                    pairs.append((float(np.linalg.norm(self.measured[k][0] - self.uv[row])), int(row), k))
+        for _, row, k in sorted(pairs):
+            if self.to[row] < 0 and k not in taken:
+                self.to[row] = k
+                taken.add(k)
+
+    def _inside(self) -> Bools:
+        height, width = self.picture.shape
+        return np.asarray(((self.uv > -0.5) & (self.uv < (width - 0.5, height - 0.5))).all(axis=1), dtype=np.bool_)
+
+    def result(self) -> Detected:
+        rows = np.flatnonzero(self.to >= 0)
+        kept = self.to[rows]
+        uv, sd = (np.array([self.measured[k][part] for k in kept]).reshape(-1, 2) for part in (0, 1))
+        odd = _odd_sizes(uv, np.array([self.measured[k][2] for k in kept]))
+        missing = {self.names[row]: self.uv[row].tolist() for row in np.flatnonzero((self.to < 0) & self._inside())}
+        return Detected(
+            tuple(self.names[row] for row in rows),
+            uv,
+            np.hypot(sd, odd[:, None]),
+            self._reason(),
+            notes={"labelled": [self.names[row] for row in self.labelled], "missing": missing, "scale": self.sigma},
+        )
+
+    def _reason(self) -> str:
+        gone = self.to < 0
+        inside = self._inside()
+        off = gone & inside & np.isin(np.arange(len(gone)), list(self.off))
+        unsure = gone & inside & ~self.sure & ~off
+        counts = {
+            "outside the picture": gone & ~inside,
+            "a spot is near, but not where the other dots say (is the layout right there?)": off,
+            "too far from the labels to be told from the next one (label a dot near them)": unsure,
+            "no spot where they must be (hidden, or too faint)": gone & inside & ~off & ~unsure,
+        }
+        parts = [f"{which.sum()} {text}" for text, which in counts.items() if which.any()]
+        return f"{gone.sum()} of {len(gone)} dots not found: {'; '.join(parts)}" if parts else ""
+
+
+FAINTER = 0.3
+"""Of the brightest spot near a prediction: fainter ones beside it are not meant."""
+
+
+def _frame(xyz: Floats, uv: Floats) -> tuple[Floats, float]:
+    """Where the middle of the target is in pixels, and pixels per unit, both roughly."""
+    spread = xyz - xyz.mean(axis=0)
+    scale = np.sqrt(np.sum((uv - uv.mean(axis=0)) ** 2) / max(float(np.sum(spread**2)), 1e-12))
+    return uv.mean(axis=0), float(scale)
+
+
+def _largest(xyz: Floats, rows: Ints, uv: Floats) -> float:
+    """The largest scale in pixels that dots can have: a quarter of the way from one to the next."""
+    pixels = (
+        (np.column_stack([xyz, np.ones(len(xyz))]))
+        @ np.linalg.pinv(np.column_stack([xyz[rows], np.ones(len(rows))]))
+        @ uv
+    )
+    return float(np.clip(np.median(cKDTree(pixels).query(pixels, k=2)[0][:, 1]) / 4, 1.5, 16.0))
+
+
+def _odd_sizes(uv: Floats, area: Floats) -> Floats:
+    """(n,) pixels that dots of other size than their neighbours' may be off: where a part f of a disc of radius R is
+    hidden or added at its rim, its centroid moves by up to f R, by half of that as a standard deviation."""
+    neighbours = cKDTree(uv).query(uv, k=min(9, len(uv)))[1]
+    ratio = np.log(area) - np.log(np.median(area[neighbours], axis=1))
+    usual = 1.4826 * float(np.median(np.abs(ratio)))
+    part = np.minimum(np.maximum(np.abs(ratio) - 2 * usual, 0), 1)
+    return np.asarray(0.5 * part * np.sqrt(area / np.pi), dtype=np.float64)
+
+
+def _listed(names: Sequence[str], most: int = 6) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,333 @@
+"""The edge of a disc to a hundredth of a pixel: a blurred step around an ellipse, fitted to the pixels along it.
+
+Near the edge a picture is `inner (1 - Phi(d / s)) + outer Phi(d / s)`: d the signed distance from an ellipse, s the blur,
+Phi the normal distribution; inner and outer vary slowly around the edge, for light is never even. All is found by
+Gauss-Newton at once, with a prior that says how uneven light may be, and the covariance of the centre follows from the
+noise that the pixels themselves show inside and outside. What does not look like a step (a highlight, a cable) is left
+out, sector by sector.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from implicam.dataset import Floats
+from implicam.images import Grey, opencv
+
+Bools = NDArray[np.bool_]
+
+SPOKES = 72
+"""Directions in which the edge is looked for first."""
+
+SECTORS = 24
+"""Parts of the edge that are judged, each as a whole."""
+
+ODD = 2.5
+"""A sector is left out where it fits so many times worse than usual."""
+
+GEOMETRY = 6
+"""Numbers of the edge: centre (2), shape (3), blur. Those of the light follow."""
+
+WAVES, SLOPES = 8, 5
+"""How finely the light may vary around the edge, and its slope away from the edge: a stem or a shadow is light, too."""
+
+LIGHT = 1 + 2 * WAVES + SLOPES
+
+UNEVEN, SLOPE = (0.05, 0.2), 0.1
+"""Prior sd of each wave of the light inside and outside, and of the slope per pixel, as parts of the step."""
+
+UNKNOWN = 0.01
+"""Standard deviation, in blurs, of what light that is not of this form does to the centre: rendered balls with shading and
+a soft shadow, without any noise, are off by 0.005 to 0.01 of the blur."""
+
+OUTWARD = 2.0
+"""Pixels beyond the blur that tell the light."""
+
+
+class Ellipse(NamedTuple):
+    """The points with |shape (p - centre)| = 1; shape (2, 2) symmetric, per pixel."""
+
+    centre: Floats
+    shape: Floats
+
+    @property
+    def axes(self) -> tuple[float, float]:
+        """Half the longer and half the shorter axis, pixels."""
+        inverse = 1 / np.linalg.svd(self.shape, compute_uv=False)
+        return float(inverse[1]), float(inverse[0])
+
+    @property
+    def radius(self) -> float:
+        """Of the circle with the same area."""
+        return float(1 / np.sqrt(abs(np.linalg.det(self.shape))))
+
+    def points(self, n: int = 64) -> Floats:
+        """(n, 2) points on it."""
+        angle = np.linspace(0, 2 * np.pi, n)
+        circle = np.column_stack([np.cos(angle), np.sin(angle)])
+        return np.asarray(self.centre + circle @ np.linalg.inv(self.shape).T, dtype=np.float64)
+
+
+class Edge(NamedTuple):
+    """A fitted edge: covariance (2, 2) of its centre; levels inside and outside, and the rms left over, in grey values;
+    blur in pixels; and `support`, the part of the edge that looks like one."""
+
+    ellipse: Ellipse
+    covariance: Floats
+    inner: float
+    outer: float
+    residual: float
+    blur: float
+    support: float
+
+
+def find_edge(picture: Grey, centre: Floats, radius: float) -> Edge | None:
+    """The edge of a disc, darker than what is around it, near `centre` (2,) with about this radius; None for none."""
+    start = _spokes(picture, centre, radius)
+    return None if start is None else fit_edge(picture, start)
+
+
+def _spokes(picture: Grey, centre: Floats, radius: float) -> Ellipse | None:
+    """An ellipse through the steepest rise along spokes from the centre, and again from the better centre."""
+    ellipse = None
+    for _ in range(3):
+        points = _steepest(picture, centre, radius)
+        ellipse = _robust_ellipse(points, centre, radius)
+        if ellipse is None or np.linalg.norm(ellipse.centre - centre) > radius:
+            return None
+        moved = np.linalg.norm(ellipse.centre - centre)
+        centre, radius = ellipse.centre, ellipse.radius
+        if moved < 0.5:
+            break
+    return ellipse
+
+
+def _steepest(picture: Grey, centre: Floats, radius: float) -> Floats:
+    """(SPOKES, 2) where the picture brightens most along each spoke, between half and 1.6 times the radius."""
+    step = max(0.25, radius / 40)
+    r = np.arange(0.45 * radius, 1.65 * radius + step, step)
+    angle = np.arange(SPOKES) * (2 * np.pi / SPOKES)
+    out = np.column_stack([np.cos(angle), np.sin(angle)])
+    at = (centre + r[None, :, None] * out[:, None, :]).astype(np.float32)
+    cv2 = opencv()
+    profile = cv2.remap(picture, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    window = max(1, round(0.5 / step))
+    rise = profile[:, 2 * window :] - profile[:, : -2 * window]
+    kernel = np.ones(2 * window + 1, np.float32) / (2 * window + 1)
+    rise = cv2.filter2D(rise, -1, kernel[None])
+    best = np.argmax(rise, axis=1)
+    return np.asarray(centre + (r[best + window])[:, None] * out, dtype=np.float64)
+
+
+def _robust_ellipse(points: Floats, centre: Floats, radius: float) -> Ellipse | None:
+    """The ellipse through most of the points: iteratively reweighted, quadratic form about the centre."""
+    p = (points - centre) / radius
+    basis = np.column_stack([p[:, 0] ** 2, 2 * p[:, 0] * p[:, 1], p[:, 1] ** 2, p])
+    pull = np.array([1.0, 0, 1, 0, 0])  # towards the circle we came from, gently
+    weight = np.ones(len(p))
+    for _ in range(8):
+        normal = (basis * weight[:, None]).T @ basis + 0.02 * len(p) * np.diag([1.0, 1, 1, 0.1, 0.1])
+        solved = np.linalg.solve(normal, basis.T @ weight + 0.02 * len(p) * pull)
+        form = np.array([[solved[0], solved[1]], [solved[1], solved[2]]])
+        if np.linalg.eigvalsh(form)[0] < 0.05:
+            return None
+        off = 0.5 * (basis @ solved - 1)  # about the distance, in radii
+        scale = max(1.48 * float(np.median(np.abs(off))), 0.01)
+        weight = np.maximum(1 - (off / (4 * scale)) ** 2, 0) ** 2
+    middle = -0.5 * np.linalg.solve(form, solved[3:])
+    form = form / (1 + middle @ form @ middle)
+    values, vectors = np.linalg.eigh(form)
+    return Ellipse(centre + radius * middle, vectors @ np.diag(np.sqrt(values)) @ vectors.T / radius)
+
+
+class _Band(NamedTuple):
+    """Pixels along the edge: where they are (n, 2), and their grey values (n,)."""
+
+    uv: Floats
+    grey: Floats
+
+
+class _Fit(NamedTuple):
+    """Where Gauss-Newton stands: the edge, its blur, the light (2 LIGHT,), and the noise (2,) inside and outside."""
+
+    ellipse: Ellipse
+    blur: float
+    light: Floats
+    noise: Floats
+
+
+def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
+    """The edge that fits the pixels best, from a start within a pixel or so; None where there is none."""
+    ellipse, kept = start, np.ones(SECTORS, dtype=np.bool_)
+    for _ in range(3):
+        band = _band(picture, ellipse, 3 * blur + OUTWARD)
+        if band is None:
+            return None
+        fit = _gauss_newton(band, ellipse, blur, kept[_sector(band.uv, ellipse)])
+        if fit is None:
+            return None
+        settled = 0.8 < fit.blur / blur < 1.25  # else the band was too narrow, or needlessly wide
+        ellipse, blur = fit.ellipse, fit.blur
+        worse = _sector_rms(band.grey - _model(band.uv, fit)[0], _sector(band.uv, ellipse))
+        again = worse <= ODD * max(float(np.median(worse)), 0.004)
+        if again.mean() < 0.4 or (settled and (again == kept).all()):
+            break
+        kept = again
+    return _judged(band, fit, kept)
+
+
+def _judged(band: _Band, fit: _Fit, kept: Bools) -> Edge | None:
+    """Levels and covariance of what was found."""
+    use = kept[_sector(band.uv, fit.ellipse)]
+    model, J, step = _model(band.uv[use], fit)
+    residual = band.grey[use] - model
+    if len(J) < 2 * J.shape[1]:
+        return None
+    JW = J / _variance(fit.noise, step)[:, None]
+    try:
+        covariance = np.linalg.inv(JW.T @ J + np.diag(_precision(fit)))
+    except np.linalg.LinAlgError:
+        return None
+    rms = float(np.sqrt(np.mean(residual**2)))
+    own = covariance[:2, :2] + (UNKNOWN * fit.blur) ** 2 * np.eye(2)
+    return Edge(fit.ellipse, own, float(fit.light[0]), float(fit.light[LIGHT]), rms, fit.blur, float(kept.mean()))
+
+
+def _band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:
+    """The pixels within `width` of the ellipse; None where it is not wholly in the picture."""
+    reach = ellipse.axes[0] + width + 1
+    low = np.floor(ellipse.centre - reach).astype(int)
+    high = np.ceil(ellipse.centre + reach).astype(int) + 1
+    height, columns = picture.shape
+    if (low < 0).any() or high[0] > columns or high[1] > height or not np.isfinite(reach) or reach > 2000:
+        return None
+    v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
+    uv = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
+    distance = _distance(uv, ellipse)[0]
+    near = (distance < width) & (distance > -min(width, 0.8 * ellipse.axes[1]))
+    grey = picture[low[1] : high[1], low[0] : high[0]].ravel()[near]
+    return _Band(uv[near], grey.astype(np.float64))
+
+
+def _distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
+    """Signed distance (n,) from the ellipse, right to first order near it, and its derivative (n, 5) by the centre and by
+    the shape's numbers (0, 0), (0, 1), (1, 1)."""
+    p = uv - ellipse.centre
+    q = p @ ellipse.shape
+    size = np.maximum(np.linalg.norm(q, axis=1), 1e-9)
+    slope = (q / size[:, None]) @ ellipse.shape
+    steep = np.linalg.norm(slope, axis=1)
+    unit = q / size[:, None]
+    by_shape = np.column_stack(
+        [unit[:, 0] * p[:, 0], unit[:, 0] * p[:, 1] + unit[:, 1] * p[:, 0], unit[:, 1] * p[:, 1]]
+    )
+    return (size - 1) / steep, np.column_stack([-slope, by_shape]) / steep[:, None]
+
+
+def _model(uv: Floats, fit: _Fit) -> tuple[Floats, Floats, Floats]:
+    """Grey values (n,), their derivative (n, GEOMETRY + 2 LIGHT), and how far outside each pixel is, 0 to 1."""
+    d, by_ellipse = _distance(uv, fit.ellipse)
+    around = _around(uv, fit.ellipse)
+    z = d / fit.blur
+    step, density = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
+    inner = np.column_stack([around, around[:, :SLOPES] * np.minimum(d, 0)[:, None]])
+    outer = np.column_stack([around, around[:, :SLOPES] * np.maximum(d, 0)[:, None]])
+    jump = outer @ fit.light[LIGHT:] - inner @ fit.light[:LIGHT]
+    J = np.empty((len(uv), GEOMETRY + 2 * LIGHT))
+    J[:, :5] = (jump * density / fit.blur)[:, None] * by_ellipse
+    J[:, 5] = -jump * density * z / fit.blur
+    J[:, GEOMETRY : GEOMETRY + LIGHT] = inner * (1 - step)[:, None]
+    J[:, GEOMETRY + LIGHT :] = outer * step[:, None]
+    return J[:, GEOMETRY:] @ fit.light, J, step
+
+
+def _around(uv: Floats, ellipse: Ellipse) -> Floats:
+    """(n, 1 + 2 WAVES) 1 and cos, sin of 1, 2, ... times the angle around the centre."""
+    q = (uv - ellipse.centre) @ ellipse.shape
+    turn = (q[:, 0] + 1j * q[:, 1]) / np.maximum(np.hypot(*q.T), 1e-9)
+    powers = np.multiply.accumulate(np.broadcast_to(turn[:, None], (len(q), WAVES)), axis=1)
+    return np.column_stack([np.ones(len(q)), np.stack([powers.real, powers.imag], axis=2).reshape(len(q), -1)])
+
+
+def _precision(fit: _Fit) -> Floats:
+    """(GEOMETRY + 2 LIGHT,) of the prior: the light is nearly even inside, less so outside, and never jumps."""
+    jump = abs(fit.light[LIGHT] - fit.light[0]) + 1e-3
+    wave = np.concatenate([[np.inf], np.full(2 * WAVES, 1.0)])
+    inner = np.concatenate([UNEVEN[0] * jump * wave, np.full(SLOPES, SLOPE * jump)])
+    outer = np.concatenate([UNEVEN[1] * jump * wave, np.full(SLOPES, SLOPE * jump)])
+    return np.concatenate([np.zeros(GEOMETRY), inner**-2, outer**-2])
+
+
+def _variance(noise: Floats, step: Floats) -> Floats:
+    return np.asarray(noise[0] ** 2 * (1 - step) + noise[1] ** 2 * step, dtype=np.float64)
+
+
+def _gauss_newton(band: _Band, start: Ellipse, blur: float, use: Bools) -> _Fit | None:
+    """The most probable edge and light, given the pixels to be used; None where it runs away."""
+    uv, grey = band.uv[use], band.grey[use]
+    outside = _distance(uv, start)[0] > 0
+    if outside.sum() < 2 * LIGHT or (~outside).sum() < 10:
+        return None
+    light = np.zeros(2 * LIGHT)
+    light[0], light[LIGHT] = np.median(grey[~outside]), np.median(grey[outside])
+    fit = _Fit(start, blur, light, np.full(2, 0.1 * abs(light[LIGHT] - light[0]) + 1e-3))
+    weight = np.ones(len(uv))
+    for iteration in range(15):
+        model, J, step = _model(uv, fit)
+        residual = grey - model
+        if iteration >= 2:  # a first fit knows what is odd
+            fit = fit._replace(noise=_noise(residual, step))
+            weight = np.maximum(1 - residual**2 / (25 * _variance(fit.noise, step)), 0) ** 2
+        JW = J * (weight / _variance(fit.noise, step))[:, None]
+        precision = _precision(fit)
+        pull = precision * np.concatenate([np.zeros(GEOMETRY), fit.light])
+        try:
+            change = np.linalg.solve(JW.T @ J + np.diag(precision), JW.T @ residual - pull)
+        except np.linalg.LinAlgError:
+            return None
+        fit = _moved(fit, change, start)
+        if not _sane(fit.ellipse, start):
+            return None
+        if iteration > 6 and np.abs(change[:2]).max() < 2e-4:
+            break
+    return fit
+
+
+def _moved(fit: _Fit, change: Floats, start: Ellipse) -> _Fit:
+    damp = min(1.0, 0.3 * start.radius / max(float(np.linalg.norm(change[:2])), 1e-9))
+    shape = fit.ellipse.shape + damp * np.array([[change[2], change[3]], [change[3], change[4]]])
+    blur = float(np.clip(fit.blur + damp * change[5], 0.6 * fit.blur, 1.6 * fit.blur))
+    blur = float(np.clip(blur, 0.3, 0.5 * start.radius))
+    ellipse = Ellipse(fit.ellipse.centre + damp * change[:2], shape)
+    return _Fit(ellipse, blur, fit.light + damp * change[GEOMETRY:], fit.noise)
+
+
+def _noise(residual: Floats, step: Floats) -> Floats:
+    """(2,) standard deviation inside and outside, bearing outliers; never less than the sensor's steps."""
+    sides = (residual[step < 0.5], residual[step >= 0.5])
+    taken = LIGHT + GEOMETRY / 2  # what the fit has explained away
+    return np.array(
+        [max(1.48 * float(np.median(np.abs(r))) * np.sqrt(len(r) / max(len(r) - taken, 1)), 1e-3) for r in sides]
+    )
+
+
+def _sane(ellipse: Ellipse, start: Ellipse) -> bool:
+    """Still an ellipse, near where it started."""
+    if not (np.isfinite(ellipse.centre).all() and np.linalg.eigvalsh(ellipse.shape)[0] > 0):
+        return False
+    near = float(np.linalg.norm(ellipse.centre - start.centre)) < 0.6 * start.radius
+    return near and 0.5 < ellipse.radius / start.radius < 2
+
+
+def _sector(uv: Floats, ellipse: Ellipse) -> NDArray[np.int64]:
+    p = uv - ellipse.centre
+    return np.floor((np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
+
+
+def _sector_rms(residual: Floats, sector: NDArray[np.int64]) -> Floats:
+    count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
+    return np.sqrt(np.bincount(sector, weights=residual**2, minlength=SECTORS) / count)

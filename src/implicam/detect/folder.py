@@ -1,0 +1,393 @@
+"""A detector over all pictures of a dataset: observations.csv, and in detections/ all that it takes to check them.
+
+    detections/journal.jsonl          what was found in each picture, kept as it comes (detect/journal.py)
+    detections/summary.csv            a row per picture: how many points, and why not more
+    detections/<camera>.jpg           all pictures of a camera on a sheet
+    detections/overlays/<camera>/     each picture with what was found
+    detections/written.toml           the SHA-256 of the observations.csv that detect wrote
+
+What is wrong with one picture is a note, and the rest goes on. What a person wrote is never overwritten.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import shutil
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations, folder_files
+from implicam.dataset.folder import DESCRIPTION, IMAGES, VIEWS, csv_text, read_description, read_known
+from implicam.dataset.model import check_name
+from implicam.dataset.tables import parse_toml
+from implicam.detect.journal import Entry, Looked, look_at_all
+from implicam.detect.model import Detector, View, nothing
+from implicam.detect.overlay import Result, draw
+from implicam.errors import DatasetError, ImageError, UsageError, did_you_mean
+from implicam.files import replacing, toml_text, write_text
+from implicam.images import PATTERN, find_pictures, in_order, one_thread_each
+from implicam.progress import Progress, silent
+
+DETECTIONS, JOURNAL, SUMMARY, WRITTEN = "detections", "journal.jsonl", "summary.csv", "written.toml"
+KEPT = "observations.before-detect"
+
+FIRST, MOST = 5, 20
+"""So many names in a sentence, then "and N more"; so many notes about pictures."""
+
+
+class Count(NamedTuple):
+    """How much was found in a camera's pictures: in how many of them anything, and how many points in all."""
+
+    camera: str
+    pictures: int
+    found: int
+    points: int
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionRun:
+    """What came of `detect_folder`.
+
+    data: the observations as written. cameras: a count each. reasons: why nothing, or not everything, was found, with
+    the number of pictures, the commonest first; those that differ in numbers only count as one. notes: sentences for
+    the person. resumed: pictures that an earlier run had looked at. seconds_per_picture: how long one core took to read
+    a picture and to look at it, NaN where none was new. sheets: the pictures to check by eye.
+    """
+
+    observations: Path
+    summary: Path
+    data: Dataset
+    results: tuple[Result, ...]
+    cameras: tuple[Count, ...]
+    reasons: tuple[tuple[str, int], ...]
+    notes: tuple[str, ...]
+    resumed: int
+    seconds_per_picture: float
+    sheets: tuple[Path, ...]
+
+
+def detect_folder(
+    dataset: Path,
+    detector: Detector,
+    *,
+    unit: str | None = None,
+    pictures: str = IMAGES,
+    pattern: str = PATTERN,
+    overlays: bool = True,
+    restart: bool = False,
+    progress: Progress = silent,
+) -> DetectionRun:
+    """Look for a target in all pictures of a dataset folder, and write its observations.csv.
+
+    pictures, pattern: where the pictures are, as `find_pictures` takes them, below `dataset`. Without dataset.toml one
+    is made, with lengths in `unit`. overlays: whether to draw pictures to check by eye. A run that was stopped goes on
+    where it was; `restart` forgets what it had found.
+
+    UsageError for options that do not go together, DatasetError for a damaged dataset.toml or points.csv, ImageError
+    where there are no pictures, or nothing was found in any of them.
+    """
+    rig = _Rig.of(Path(dataset), unit, Path(dataset) / pictures, pattern)
+    with one_thread_each():
+        looked = look_at_all(
+            rig.pictures, detector, rig.path / DETECTIONS / JOURNAL, restart=restart, progress=progress
+        )
+        rig = rig.with_sizes(looked.sizes)
+        results, notes = _settled(rig, detector, looked)
+        data, more = _gathered(rig, results)
+        folder = rig.path / DETECTIONS
+        write_text(folder / SUMMARY, _summary(rig, results))
+        if data is not None:
+            more += _written(rig, data)
+        sheets, undrawn = draw(folder, results, progress, redraw=restart) if overlays else ((), ())
+    if data is None:
+        raise _nothing_at_all(rig, results, sheets)
+    return DetectionRun(
+        rig.path / VIEWS,
+        folder / SUMMARY,
+        data,
+        tuple(results),
+        tuple(_counts(results)),
+        tuple(_reasons(results)),
+        (*rig.notes, *notes, *more, *undrawn),
+        looked.resumed,
+        looked.seconds,
+        sheets,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """A dataset folder before it has observations, and its pictures by camera and shot."""
+
+    path: Path
+    name: str
+    unit: str
+    cameras: tuple[Camera, ...]
+    extra: Mapping[str, Any]
+    known: tuple[list[str], KnownPositions] | None
+    pictures: Mapping[View, Path]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, path: Path, unit: str | None, pictures: Path, pattern: str) -> _Rig:
+        described = read_description(path) if (path / DESCRIPTION).exists() else None
+        found = find_pictures(pictures, pattern, [camera.name for camera in described[2]] if described else ())
+        name, said, cameras, extra = described or _made_up(path, unit, found)
+        if unit not in (None, said):
+            raise UsageError(
+                f"{path / DESCRIPTION} is in {said!r}, not in {unit!r}.", fix="leave out --unit, or correct the file"
+            )
+        usable, notes = _usable({camera.name for camera in cameras}, found, path)
+        return cls(path, name, said, cameras, extra, read_known(path), usable, tuple(notes))
+
+    def with_sizes(self, sizes: Mapping[str, tuple[int, int]]) -> _Rig:
+        """With the image sizes that dataset.toml does not state: those of most of the pictures."""
+        cameras = []
+        for camera in self.cameras:
+            width, height = sizes.get(camera.name, (None, None))
+            cameras.append(replace(camera, width=camera.width or width, height=camera.height or height))
+        return replace(self, cameras=tuple(cameras))
+
+    def relative(self, path: Path) -> str:
+        """A file's name as a note gives it."""
+        return Path(os.path.relpath(path, self.path)).as_posix()
+
+    def expected(self, view: View) -> int | None:
+        """How many known points belong to the shot; None where that is not known."""
+        if self.known is None:
+            return None
+        return int(np.count_nonzero(self.known[1].shots == view.shot)) or None
+
+
+def _made_up(
+    path: Path, unit: str | None, found: Mapping[str, Mapping[str, Path]]
+) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
+    """The description of a dataset that has none: its cameras are the folders of pictures."""
+    if unit is None:
+        raise UsageError(
+            f"{path} has no {DESCRIPTION}, so the length unit is not known.",
+            why=f"one is made from the folders of pictures, {_some(list(found))}, but no picture says the unit",
+            fix="add --unit mm (or another), or write dataset.toml yourself; see docs/formats.md",
+        )
+    return path.resolve().name, unit, tuple(Camera(name) for name in found), {}
+
+
+def _usable(
+    cameras: set[str], found: Mapping[str, Mapping[str, Path]], path: Path
+) -> tuple[dict[View, Path], list[str]]:
+    """The pictures of the rig's cameras with usable names, and what there is to say about the others."""
+    notes = [
+        f"the {len(shots)} pictures of {camera!r} are left out: {DESCRIPTION} has no such camera"
+        f"{did_you_mean(camera, cameras)}."
+        for camera, shots in found.items()
+        if camera not in cameras
+    ]
+    usable = {}
+    for camera in (camera for camera in found if camera in cameras):
+        for shot, file in found[camera].items():
+            try:
+                check_name(shot, "shot")
+                usable[View(camera, shot)] = file
+            except DatasetError as error:
+                notes.append(f"{str(file)!r} is left out: {error.what} {error.why[:1].upper()}{error.why[1:]}.")
+    if not usable:
+        raise ImageError(
+            f"none of the pictures in {path} belongs to a camera of {DESCRIPTION}.",
+            why=f"there are pictures of {_some(list(found))}, and the cameras are {_some(sorted(cameras))}",
+            fix=f"give the folders the cameras' names, or correct {DESCRIPTION}",
+        )
+    return usable, notes + _missing(cameras, usable)
+
+
+def _missing(cameras: Iterable[str], usable: Iterable[View]) -> list[str]:
+    """Which cameras, and which shots of a camera, have no picture."""
+    shots: dict[str, set[str]] = {camera: set() for camera in cameras}
+    for view in usable:
+        shots[view.camera].add(view.shot)
+    every = set.union(*shots.values())
+    notes = []
+    for camera in in_order(shots):
+        lacking = in_order(list(every - shots[camera]))
+        if lacking == in_order(list(every)):
+            notes.append(f"camera {camera!r} has no picture.")
+        elif lacking:
+            plural = "s" if len(lacking) > 1 else ""
+            notes.append(f"camera {camera!r} has no picture of the shot{plural} {_some(lacking)}, which others have.")
+    return notes
+
+
+def _settled(rig: _Rig, detector: Detector, looked: Looked) -> tuple[list[Result], list[str]]:
+    """The results in the order of the pictures, after the detector's second look; and a note per unusable picture."""
+    problems = dict(looked.problems)
+    cameras = {camera.name: camera for camera in rig.cameras}
+    for view, entry in looked.entries.items():
+        reason = _wrong_size(cameras[view.camera], entry)
+        if reason:
+            problems[view] = reason
+    found = {
+        view: looked.entries[view].found for view in rig.pictures if view in looked.entries and view not in problems
+    }
+    settled = detector.settle(found)
+    results = [
+        Result(view, path, nothing(problems[view]) if view in problems else settled[view], rig.expected(view))
+        for view, path in rig.pictures.items()
+    ]
+    return results, _unusable(rig, problems)
+
+
+def _unusable(rig: _Rig, problems: Mapping[View, str]) -> list[str]:
+    """A note for every problem, with the files that have it."""
+    files: dict[str, list[str]] = {}
+    for view, path in rig.pictures.items():
+        if view in problems:
+            files.setdefault(problems[view], []).append(rig.relative(path))
+    notes = [f"{_some(names)}: {problem}." for problem, names in files.items()]
+    if len(notes) <= MOST:
+        return notes
+    return [*notes[:MOST], f"{len(notes) - MOST} more such problems are named in {DETECTIONS}/{SUMMARY}."]
+
+
+def _wrong_size(camera: Camera, entry: Entry) -> str:
+    if camera.width in (None, entry.width) and camera.height in (None, entry.height):
+        return ""
+    turned = (camera.height, camera.width) == (entry.width, entry.height)
+    return (
+        f"its size is {entry.width} x {entry.height}, but camera {camera.name!r} has {camera.width} x {camera.height}"
+        f"{'; it may be rotated by a quarter turn' if turned else ''}"
+    )
+
+
+def _gathered(rig: _Rig, results: Sequence[Result]) -> tuple[Dataset | None, list[str]]:
+    """All that was found as a dataset, None where that is nothing; and notes about points that are left out."""
+    names = rig.known[0] if rig.known else list(_names(results))
+    rows = {name: i for i, name in enumerate(names)}
+    columns = {camera.name: k for k, camera in enumerate(rig.cameras)}
+    uv = np.full((len(rows), len(columns), 2), np.nan)
+    sd = uv.copy()
+    unknown: dict[str, None] = {}
+    twice: dict[str, None] = {}
+    for result in results:
+        k = columns[result.view.camera]
+        for j, name in enumerate(result.found.points):
+            i = rows.get(name)
+            if i is None:
+                unknown[name] = None
+            elif not np.isnan(uv[i, k, 0]):
+                twice[f"{name!r} ({result.view.camera}, {result.view.shot})"] = None
+            else:
+                uv[i, k], sd[i, k] = result.found.uv[j], result.found.sd[j]
+    notes = []
+    if unknown:
+        named = _some([f"{name!r}{did_you_mean(name, rows)}" for name in list(unknown)[:FIRST]], len(unknown))
+        notes.append(f"points without a known position in points.csv are left out: {named}.")
+    if twice:
+        notes.append(
+            f"found again by the same camera in another shot, where the first counts: {_some(list(twice))}. "
+            "A point that moves needs a name in each shot."
+        )
+    if np.isnan(uv).all():
+        return None, notes
+    observations = Observations(np.array(names, dtype=np.str_), rig.cameras, uv, sd)
+    return Dataset(rig.name, rig.unit, observations, rig.known[1] if rig.known else None, rig.extra), notes
+
+
+def _names(results: Iterable[Result]) -> dict[str, None]:
+    """The points found, shot by shot, within a shot as people count."""
+    shots: dict[str, dict[str, None]] = {}
+    for result in results:
+        shots.setdefault(result.view.shot, {}).update(dict.fromkeys(result.found.points))
+    return dict.fromkeys(name for shot in in_order(shots) for name in in_order(shots[shot]))
+
+
+def _written(rig: _Rig, data: Dataset) -> list[str]:
+    """Write observations.csv, and dataset.toml where there is none; what a person wrote is kept beside it."""
+    files = folder_files(data)
+    if not (rig.path / DESCRIPTION).exists():
+        write_text(rig.path / DESCRIPTION, files[DESCRIPTION])
+    target, record = rig.path / VIEWS, rig.path / DETECTIONS / WRITTEN
+    new, old = _sha256(files[VIEWS].encode()), _sha256(target.read_bytes()) if target.exists() else ""
+    notes = []
+    ours = [old] if old in (*_ours(record), new) else []
+    if old and not ours:
+        kept = _kept(target)
+        notes.append(f"the {VIEWS} that was there is kept as {kept.name}: detect had not written it.")
+    # Both sums first: killed between the two, the next run still knows which file is its own.
+    write_text(record, toml_text({"observations_sha256": [*ours, new]}))
+    write_text(target, files[VIEWS])
+    return notes
+
+
+def _ours(record: Path) -> list[str]:
+    """The SHA-256 of what detect wrote before."""
+    try:
+        sums = parse_toml(record.read_text(encoding="utf-8")).get("observations_sha256", [])
+    except (OSError, ValueError):
+        return []
+    return list(map(str, sums)) if isinstance(sums, list) else []
+
+
+def _kept(target: Path) -> Path:
+    """A copy under the first name that is free."""
+    free = (target.with_name(f"{KEPT}{f'-{n}' if n > 1 else ''}.csv") for n in range(1, 1 << 31))
+    kept = next(path for path in free if not path.exists())
+    with replacing(kept) as temporary:
+        shutil.copyfile(target, temporary)
+    return kept
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _summary(rig: _Rig, results: Iterable[Result]) -> str:
+    rows = [
+        (r.view.camera, r.view.shot, rig.relative(r.path), str(len(r.found)), str(r.expected or ""), r.found.reason)
+        for r in results
+    ]
+    return csv_text(("camera", "shot", "file", "found", "expected", "reason"), rows)
+
+
+def _counts(results: Sequence[Result]) -> Iterator[Count]:
+    for camera in dict.fromkeys(result.view.camera for result in results):
+        points = [len(result.found) for result in results if result.view.camera == camera]
+        yield Count(camera, len(points), sum(n > 0 for n in points), sum(points))
+
+
+def _reasons(results: Iterable[Result]) -> list[tuple[str, int]]:
+    """Reasons and how many pictures have them; those that differ in numbers only are one, told as the commonest."""
+    kinds: dict[str, Counter[str]] = {}
+    for result in results:
+        if result.found.reason:
+            kinds.setdefault(re.sub(r"\d+", "0", result.found.reason), Counter())[result.found.reason] += 1
+    told = [(texts.most_common(1)[0][0], texts.total()) for texts in kinds.values()]
+    return sorted(told, key=lambda item: -item[1])
+
+
+def _nothing_at_all(rig: _Rig, results: Sequence[Result], sheets: Sequence[Path]) -> ImageError:
+    found = list(_names(results))
+    look = f"look at {sheets[0]}, and check" if sheets else "check"
+    if found:
+        return ImageError(
+            f"none of the {len(found)} points found in the pictures of {rig.path} has a known position.",
+            why=f"points.csv names {_some(rig.known[0] if rig.known else [])}, and found were {_some(found)}",
+            fix="give pictures and points the same names, or move points.csv away to measure unknown points",
+        )
+    reasons = "; ".join(f"{count} x {text}" for text, count in _reasons(results)[:3])
+    return ImageError(
+        f"nothing was found in any of the {len(results)} pictures of {rig.path}, so {VIEWS} is not written.",
+        why=reasons or "the detector gave no reason",
+        fix=f"{look} the kind of target and its options",
+    )
+
+
+def _some(names: Sequence[str], total: int | None = None) -> str:
+    """The first few names, and how many more there are."""
+    more = (len(names) if total is None else total) - min(len(names), FIRST)
+    return ", ".join(names[:FIRST]) + (f" and {more} more" if more > 0 else "")

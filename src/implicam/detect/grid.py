@@ -1,0 +1,424 @@
+"""From a few corners of a checkerboard to all that can be seen: a grid that grows, and is checked.
+
+The node (i, j) of a grid is a corner, i counted along `down` and j along `right`, which are right-handed in the
+picture: a mirror image never arises. Where a node must be follows from a homography through its nearest known
+neighbours, itself left out; this places missing nodes, gives the directions of the edges to the fit of the corner, and
+finds the corners that are not where their neighbours say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Floats
+from implicam.detect.corners import Bools, Corners, fit_corners
+from implicam.images import Grey, opencv
+
+NEIGHBOURS = 16
+
+MISFIT = 0.35
+"""A corner whose residuals are a larger part of its height is none."""
+
+TURNED = 0.35
+"""Radians that an edge may be turned from where the neighbours put it: more, and the fit has found other edges."""
+
+QUADRANT = 0.3
+"""How far into a square its colour is looked at, in squares from the corner in both directions."""
+
+PLAIN = 0.35
+"""How far a square's grey must be on its side of the middle, as a part of the height, to have that colour."""
+
+FAINT = 0.3
+"""A corner whose height is a smaller part of the median is dropped."""
+
+ASTRAY = 0.25
+"""Squares that a corner may lie from where its neighbours put it, when it is first found."""
+
+GAP = 4
+"""Squares across which a grid is continued, where something stands before the board."""
+
+ASKEW = 0.4
+"""Squares that corners may lie from the plane of another part of their board: beyond, they are of another one."""
+
+THIN = 2
+"""An outermost row or column with fewer corners is dropped: one corner is no row."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Corners in rows and columns; `corners` holds rows * columns of them, NaN where there is a hole."""
+
+    rows: int
+    columns: int
+    corners: Corners
+
+    @property
+    def uv(self) -> Floats:
+        """(rows, columns, 2) pixels."""
+        return self.corners.uv.reshape(self.rows, self.columns, 2)
+
+    @property
+    def there(self) -> Bools:
+        """(rows, columns) where a corner was found."""
+        return np.isfinite(self.uv[..., 0])
+
+    @property
+    def count(self) -> int:
+        """How many corners were found."""
+        return int(self.there.sum())
+
+    @property
+    def polarity(self) -> float:
+        """+1 where the square right below and right of node (0, 0) is bright, -1 where it is dark."""
+        return float(np.sign(np.nansum(self._signed()))) or 1.0
+
+    def _signed(self) -> Floats:
+        i, j = np.indices((self.rows, self.columns))
+        return np.asarray(self.corners.height.reshape(i.shape) * (1 - 2 * ((i + j) % 2)), dtype=np.float64)
+
+    def kept(self, keep: Bools) -> Grid:
+        """The same grid with the corners where `keep` (rows, columns) is false taken out."""
+        gone = Corners(*(np.full_like(getattr(self.corners, n), np.nan) for n in Corners.__dataclass_fields__))
+        return replace(self, corners=_merged(gone, self.corners, keep.ravel()))
+
+    def turned(self, turns: int) -> Grid:
+        """The same corners, counted from another end: turned by quarter turns."""
+        index = np.rot90(np.arange(self.rows * self.columns).reshape(self.rows, self.columns), turns)
+        corners = self.corners[index.ravel()]
+        rows, columns = (self.rows, self.columns) if turns % 2 == 0 else (self.columns, self.rows)
+        return Grid(rows, columns, replace(corners, height=corners.height * (-1) ** turns))
+
+    def padded(self, by: int) -> Grid:
+        """With empty rows and columns all round."""
+        inner = np.zeros((self.rows + 2 * by, self.columns + 2 * by), dtype=np.bool_)
+        inner[by : by + self.rows, by : by + self.columns] = True
+        return Grid(inner.shape[0], inner.shape[1], _spread(self.corners, inner.ravel()))
+
+    def cropped(self) -> Grid:
+        """Without empty rows and columns at the rim."""
+        there = self.there
+        rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+        if len(rows) == 0:
+            return Grid(0, 0, self.corners[np.zeros(0, dtype=np.intp)])
+        index = np.arange(there.size).reshape(there.shape)
+        index = index[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        return Grid(index.shape[0], index.shape[1], self.corners[index.ravel()])
+
+    def places(self, nodes: Floats) -> Places:
+        """Where the nodes (n, 2), (i, j), whole numbers or not, must be, from their nearest known neighbours."""
+        known = np.argwhere(self.there).astype(np.float64)
+        return places_from(known, self.uv[self.there], nodes)
+
+
+class Places(NamedTuple):
+    """uv (n, 2) pixels, and there the steps right and down (n, 2) pixels per square."""
+
+    uv: Floats
+    right: Floats
+    down: Floats
+
+
+def grow(picture: Grey, seed: Floats, limit: int) -> Grid | None:
+    """The grid about corners found roughly, seed (rows, columns, 2), NaN for holes; None where it is no checkerboard.
+
+    limit: rows or columns beyond which it need not grow.
+    """
+    grid = _seeded(picture, seed)
+    return None if grid is None else _grown_from(picture, grid, limit)
+
+
+def join(picture: Grey, a: Grid, b: Grid, size: tuple[int, int], limit: int) -> Grid | None:
+    """One grid of two that are parts of one board, behind something that hides what is between; None if they are not.
+
+    The plane of each must put the corners of the other on whole numbers of squares, the colours must agree, and
+    together they must not be larger than a board of `size` (rows, columns), upright or lying.
+    """
+    for turns in range(4):
+        turned = b.turned(turns)
+        shift = _shift(a, turned)
+        if shift is None:
+            continue
+        again = _shift(turned, a)
+        if again is None or (shift != -again).any() or a.polarity != turned.polarity * (-1) ** int(shift.sum()):
+            return None
+        whole = _overlaid(a, turned, shift)
+        if whole is None or max(whole.there.shape) > max(size) or min(whole.there.shape) > min(size):
+            return None
+        return _grown_from(picture, whole, limit)
+    return None
+
+
+def _shift(a: Grid, b: Grid) -> NDArray[np.intp] | None:
+    """The node of `a` that node (0, 0) of `b` is, (2,), if all of b's are nodes of a's plane; else None."""
+    nodes = np.argwhere(a.there).astype(np.float64)
+    h, _ = opencv().findHomography(a.uv[a.there].reshape(-1, 1, 2), nodes.reshape(-1, 1, 2), 0)
+    if h is None:
+        return None
+    place = np.hstack([b.uv[b.there], np.ones((b.count, 1))]) @ h.T
+    away = place[:, :2] / place[:, 2:] - np.argwhere(b.there)
+    shift = np.rint(np.median(away, axis=0))
+    return shift.astype(np.intp) if np.abs(away - shift).max() < ASKEW else None
+
+
+def _overlaid(a: Grid, b: Grid, shift: NDArray[np.intp]) -> Grid | None:
+    """Both in one grid; None where both have a corner."""
+    low = np.minimum(shift, 0)
+    high = np.maximum(np.add(shift, (b.rows, b.columns)), (a.rows, a.columns))
+    rows, columns = (high - low).tolist()
+    boxes = []
+    for grid, at in ((a, -low), (b, shift - low)):
+        box = np.zeros((rows, columns), dtype=np.bool_)
+        box[at[0] : at[0] + grid.rows, at[1] : at[1] + grid.columns] = True
+        boxes.append(Grid(rows, columns, _spread(grid.corners, box.ravel())))
+    if (boxes[0].there & boxes[1].there).any():
+        return None
+    return Grid(rows, columns, _merged(boxes[0].corners, boxes[1].corners, boxes[1].there.ravel()))
+
+
+def _grown_from(picture: Grey, grid: Grid, limit: int) -> Grid | None:
+    reach = 1
+    while True:
+        larger = _extended(picture, grid, reach=reach, limit=limit)
+        if larger.count == grid.count and reach == GAP:
+            return _checked(grid)
+        reach = GAP if larger.count == grid.count else 1
+        grid = larger
+
+
+def _seeded(picture: Grey, seed: Floats) -> Grid | None:
+    rows, columns = seed.shape[:2]
+    if rows < 3 or columns < 3 or np.isfinite(seed[..., 0]).sum() < 9:
+        return None
+    if _handedness(seed) < 0:
+        seed = seed[:, ::-1]
+    empty = Corners(
+        seed.reshape(-1, 2), *(np.full((rows * columns, *more), np.nan) for more in ((2,), (), (), (), (), ()))
+    )
+    rough = Grid(rows, columns, empty)
+    nodes = np.argwhere(rough.there)
+    places = rough.places(nodes.astype(np.float64))
+    if not _checkered(picture, nodes, places._replace(uv=rough.uv[rough.there])):
+        return None
+    found = fit_corners(picture, rough.uv[rough.there], places.right, places.down)
+    good = _acceptable(found, nodes, places._replace(uv=rough.uv[rough.there]), None)
+    good &= _four_squares(picture, places._replace(uv=found.uv), found.mean, found.height)
+    grid = Grid(rows, columns, _spread(found, rough.there.ravel())).kept(_scattered(good, rough.there))
+    return grid.cropped() if grid.count >= 9 else None
+
+
+def _checkered(picture: Grey, nodes: NDArray[np.intp], places: Places) -> bool:
+    """Whether the four squares about most rough corners are bright and dark in turn; saves fitting most seeds."""
+    squares = _quadrants(picture, places)
+    crossed = (squares[0] + squares[3] - squares[1] - squares[2]) * (1 - 2 * (nodes.sum(axis=1) % 2))
+    apart = np.minimum(squares[0], squares[3]) > np.maximum(squares[1], squares[2])
+    apart |= np.maximum(squares[0], squares[3]) < np.minimum(squares[1], squares[2])
+    sign = np.sign(np.nanmedian(crossed)) if np.isfinite(crossed).any() else 0.0
+    return bool(np.mean(apart & (sign * crossed > 0)) > 0.6)
+
+
+def _handedness(uv: Floats) -> float:
+    right, down = np.diff(uv[:-1], axis=1), np.diff(uv[:, :-1], axis=0)
+    return float(np.nanmedian(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]))
+
+
+def _acceptable(found: Corners, nodes: NDArray[np.intp], places: Places, grid: Grid | None) -> Bools:
+    """Which of the corners fitted (n,) at nodes (n, 2) are corners of this checkerboard."""
+    with np.errstate(invalid="ignore"):
+        signed = found.height * (1 - 2 * (nodes.sum(axis=1) % 2))
+        sound = found.misfit < MISFIT
+        if grid is None:
+            usual = np.median(np.abs(found.height[sound])) if sound.any() else np.inf
+            polarity = np.sign(np.median(signed[sound])) if sound.any() else 1.0
+        else:
+            usual, polarity = np.nanmedian(np.abs(grid.corners.height)), grid.polarity
+        steps = np.stack([places.right, places.down], axis=2)
+        good = np.asarray(np.isfinite(np.hstack([places.right, places.down, found.uv])).all(axis=1), dtype=np.bool_)
+        steps[~good] = np.eye(2)
+        away = np.where(good[:, None], found.uv - places.uv, np.inf)
+        moved = np.asarray(np.linalg.solve(steps, away[..., None]), dtype=np.float64)[..., 0]
+        good &= (np.abs(moved) < ASTRAY).all(axis=1) & (found.turned < TURNED)
+        return np.asarray(good & sound & (polarity * signed > FAINT * usual), dtype=np.bool_)
+
+
+def _extended(picture: Grey, grid: Grid, *, reach: int, limit: int) -> Grid:
+    """The grid with the missing nodes up to `reach` squares from known ones that are found; across gaps (reach > 1)
+    only where two neighbours are found too."""
+    wide = grid.padded(reach)
+    there = wide.there
+    near = _grown(there, reach) & ~there
+    used_rows, used_columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    if len(used_rows) >= limit:
+        near[: used_rows[0]] = near[used_rows[-1] + 1 :] = False
+    if len(used_columns) >= limit:
+        near[:, : used_columns[0]] = near[:, used_columns[-1] + 1 :] = False
+    if not near.any():
+        return grid
+    nodes = np.argwhere(near)
+    places = wide.places(nodes.astype(np.float64))
+    plausible = _four_squares(picture, places, *_levels(wide, nodes))
+    near, nodes, places = _scattered(plausible, near), nodes[plausible], Places(*(x[plausible] for x in places))
+    if len(nodes) == 0:
+        return grid
+    found = fit_corners(picture, places.uv, places.right, places.down)
+    good = _scattered(_acceptable(found, nodes, places, wide), near)
+    if reach > 1:
+        good &= _neighbours(good) >= 2
+    corners = _merged(wide.corners, _spread(found, near.ravel()), good.ravel())
+    return Grid(wide.rows, wide.columns, corners).cropped()
+
+
+def _levels(grid: Grid, nodes: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Mean and height (n,) that corners at nodes (n, 2) should have: those of the nearest known corner."""
+    known = np.argwhere(grid.there)
+    nearest = np.argmin(np.linalg.norm(nodes[:, None] - known[None], axis=2), axis=1)
+    row = known[nearest] @ [grid.columns, 1]
+    sign = 1 - 2 * (nodes.sum(axis=1) % 2)
+    return grid.corners.mean[row], sign * grid.polarity * np.abs(grid.corners.height[row])
+
+
+def _four_squares(picture: Grey, places: Places, mean: Floats, height: Floats) -> Bools:
+    """(n,) whether the four squares about the places have the colours of a checkerboard."""
+    good = np.isfinite(height)
+    for sign, grey in zip((1, -1, -1, 1), _quadrants(picture, places), strict=True):
+        with np.errstate(invalid="ignore"):
+            good &= sign * (grey - mean) * np.sign(height) > PLAIN * np.abs(height)
+    return good
+
+
+def _quadrants(picture: Grey, places: Places) -> Floats:
+    """(4, n) grey in the squares up left, up right, down left, down right of the places."""
+    turns = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+    return np.stack([sample(picture, places.uv + QUADRANT * (j * places.right + i * places.down)) for i, j in turns])
+
+
+def sample(picture: Grey, uv: Floats) -> Floats:
+    """Grey at pixels (n, 2), bilinear; NaN outside the picture."""
+    size = np.array(picture.shape)[::-1]
+    with np.errstate(invalid="ignore"):
+        inside = ((uv >= 0) & (uv < size - 1)).all(axis=1)
+    out = np.full(len(uv), np.nan)
+    at = np.floor(uv[inside]).astype(int)
+    u, v = at.T
+    a, b = (uv[inside] - at).T
+    above = (1 - a) * picture[v, u] + a * picture[v, u + 1]
+    below = (1 - a) * picture[v + 1, u] + a * picture[v + 1, u + 1]
+    out[inside] = (1 - b) * above + b * below
+    return out
+
+
+def _grown(there: Bools, by: int) -> Bools:
+    for _ in range(by):
+        wide = np.pad(there, 1)
+        there = there | wide[2:, 1:-1] | wide[:-2, 1:-1] | wide[1:-1, 2:] | wide[1:-1, :-2]
+    return there
+
+
+def _neighbours(there: Bools) -> Floats:
+    wide = np.pad(there.astype(np.float64), 1)
+    return wide[2:, 1:-1] + wide[:-2, 1:-1] + wide[1:-1, 2:] + wide[1:-1, :-2]
+
+
+def _checked(grid: Grid) -> Grid | None:
+    """Without the corners that are not where their neighbours say, or that something else cuts into; None if few."""
+    for _ in range(4):
+        if grid.count < 9:
+            return None
+        nodes = np.argwhere(grid.there)
+        uv = grid.uv[grid.there]
+        off = np.linalg.norm(grid.places(nodes.astype(np.float64)).uv - uv, axis=1)
+        misfit = grid.corners.misfit.reshape(grid.there.shape)[grid.there]
+        inner = _neighbours(grid.there)[grid.there] >= 3  # the others are extrapolated, which is less certain
+        bound = np.where(inner, 5, 12) * (np.median(off[inner]) if inner.any() else np.median(off)) + 0.1
+        good = (off < bound) & (misfit < np.maximum(3 * np.median(misfit), 0.1))
+        there = _scattered(good, grid.there)
+        there &= _neighbours(there) >= 1
+        there = _without_thin_rims(there)
+        if there.sum() == grid.count:
+            return grid
+        grid = grid.kept(there).cropped()
+    return grid if grid.count >= 9 else None
+
+
+def _without_thin_rims(there: Bools) -> Bools:
+    there = there.copy()
+    changed = True
+    while changed and there.any():
+        changed = False
+        for lines in (there, there.T):
+            used = np.flatnonzero(lines.any(axis=1))
+            for k in {used[0], used[-1]} if len(used) else ():
+                if 0 < lines[k].sum() < THIN:
+                    lines[k] = False
+                    changed = True
+    return there
+
+
+def places_from(known: Floats, uv: Floats, nodes: Floats) -> Places:
+    """The homography through the nearest `NEIGHBOURS` known nodes, without the node itself, one for each node.
+
+    Linear, with its denominator 1 at the node; a little of the plane's perspective is taken away (a ridge) where the
+    neighbours do not fix it, so that three or four of them give an affine map.
+    """
+    nodes, pixels = nodes.astype(np.float64), uv
+    distance = np.linalg.norm(nodes[:, None] - known[None], axis=2)
+    distance[distance < 1e-6] = np.inf
+    n = min(NEIGHBOURS, len(known) - 1)
+    pick = np.argsort(distance, axis=1, kind="stable")[:, :n]
+    d = np.take_along_axis(distance, pick, axis=1)
+    weight = np.where(np.isfinite(d), 1 / d, 0)  # of the residual: squared in the normal equations
+    x = np.where(np.isfinite(d)[..., None], known[pick] - nodes[:, None], 0)
+    middle = pixels[pick].mean(axis=1)
+    scale = np.sqrt(np.mean((pixels[pick] - middle[:, None]) ** 2, axis=(1, 2))) + 1e-9
+    y = (pixels[pick] - middle[:, None]) / scale[:, None, None]
+    h = _homographies(x, y, weight)
+    at = h[:, [2, 5]]
+    right = h[:, [1, 4]] - at * h[:, 7:8]
+    down = h[:, [0, 3]] - at * h[:, 6:7]
+    s = scale[:, None]
+    return Places(middle + s * at, s * right, s * down)
+
+
+def _homographies(x: Floats, y: Floats, weight: Floats) -> Floats:
+    """(n, 8) of y = (h0 x0 + h1 x1 + h2, h3 x0 + h4 x1 + h5) / (1 + h6 x0 + h7 x1), from points (n, k, 2)."""
+    n, k = weight.shape
+    rows = np.zeros((n, 2 * k, 8))
+    for c in range(2):
+        part = rows[:, c::2]
+        part[..., 3 * c : 3 * c + 2], part[..., 3 * c + 2] = x, 1
+        part[..., 6:] = -y[..., c : c + 1] * x
+    w = np.repeat(weight, 2, axis=1)
+    rows *= w[..., None]
+    normal = rows.swapaxes(1, 2) @ rows
+    index = np.arange(8)
+    normal[:, index, index] += np.where(index < 6, 1e-12, 1e-7) * np.maximum(np.sum(w**2, axis=1), 1e-9)[:, None]
+    right = np.einsum("nki,nk->ni", rows, y.reshape(n, 2 * k) * w)
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
+
+
+def _scattered(values: Bools, where: Bools) -> Bools:
+    out = np.zeros_like(where)
+    out[where] = values
+    return out
+
+
+def _spread(corners: Corners, where: Bools) -> Corners:
+    """Corners (k,) put where `where` (n,) is true, NaN elsewhere."""
+    parts = []
+    for name in Corners.__dataclass_fields__:
+        values = getattr(corners, name)
+        out = np.full((len(where), *values.shape[1:]), np.nan)
+        out[where] = values
+        parts.append(out)
+    return Corners(*parts)
+
+
+def _merged(old: Corners, new: Corners, where: Bools) -> Corners:
+    parts = []
+    for name in Corners.__dataclass_fields__:
+        a, b = getattr(old, name), getattr(new, name)
+        parts.append(np.where(where[:, None] if a.ndim == 2 else where, b, a))
+    return Corners(*parts)

@@ -1,0 +1,273 @@
+"""A look at every picture, what was found kept as it comes: a run that is killed goes on where it stopped.
+
+One JSON line per picture, the later line wins. Each ends in a checksum, so that half a line, or a damaged one, is not
+there at all: the picture is looked at again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+import time
+import zlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from implicam.calibration_file import package_version
+from implicam.dataset.model import check_name
+from implicam.detect.model import Detected, Detector, View
+from implicam.errors import DatasetError, ImageError, ImplicamError, MissingExtraError
+from implicam.images import blank, read_picture
+from implicam.progress import Progress
+from implicam.threads import side_by_side
+
+_CHECK = b', "crc": '
+
+
+class Key(NamedTuple):
+    """What a result depends on: the picture, and the detector's options as `digest` gives them."""
+
+    camera: str
+    shot: str
+    file: str
+    size: int
+    mtime_ns: int
+    options: str
+
+    @classmethod
+    def of(cls, view: View, path: Path, options: str) -> Key:
+        """The key of a picture as its file is now."""
+        state = path.stat()
+        return cls(view.camera, view.shot, path.name, state.st_size, state.st_mtime_ns, options)
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """What a detector found in a picture of width x height pixels."""
+
+    width: int
+    height: int
+    found: Detected
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain values."""
+        return {"width": self.width, "height": self.height, "found": self.found.as_dict()}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Entry:
+        """The inverse of `as_dict`."""
+        return cls(int(table["width"]), int(table["height"]), Detected.from_dict(table["found"]))
+
+
+def digest(detector: Detector) -> str:
+    """One short text for a detector, all its options, and the version of implicam, which may find something else."""
+    text = json.dumps([package_version(), type(detector).__name__, detector.options()], sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+class Journal:
+    """The file, open for adding lines; several threads may add. ImplicamError where it cannot be written."""
+
+    def __init__(self, path: Path, *, restart: bool = False) -> None:
+        self._lock = threading.Lock()
+        self._path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if restart:
+                path.unlink(missing_ok=True)
+            self.entries = _read(path)
+            self._file = path.open("ab", buffering=0)
+            if not _ends_a_line(path):  # a kill may have left half a line: what comes next must not join it
+                self._file.write(b"\n")
+        except OSError as error:
+            raise self._unwritable(error) from error
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+    def add(self, key: Key, entry: Entry) -> Entry:
+        """Write a line; the entry as it will be read again. TypeError or ValueError for what JSON cannot hold."""
+        content = json.dumps({**key._asdict(), **entry.as_dict()}, default=_plain).encode()
+        line = content[:-1] + _CHECK + str(zlib.crc32(content)).encode() + b"}\n"
+        read = _entry(line)
+        if read is None:
+            raise ValueError("what was found cannot be written down")
+        try:
+            with self._lock:
+                if self._file.write(line) < len(line):
+                    raise OSError("the disk took only a part of a line")
+        except OSError as error:
+            raise self._unwritable(error) from error
+        return read[1]
+
+    def _unwritable(self, error: OSError) -> ImplicamError:
+        return ImplicamError(
+            f"cannot write {self._path}.",
+            why=str(error),
+            fix="check the permissions and the free space; what was found so far is kept",
+        )
+
+
+def _read(path: Path) -> dict[Key, Entry]:
+    """The whole lines of a journal."""
+    if not path.exists():
+        return {}
+    with path.open("rb") as file:
+        return dict(filter(None, map(_entry, file)))
+
+
+def _ends_a_line(path: Path) -> bool:
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        file.seek(max(0, size - 1))
+        return file.read(1) in (b"\n", b"")
+
+
+def _entry(line: bytes) -> tuple[Key, Entry] | None:
+    """A line's key and entry, or None where the line is not as it was written."""
+    content, mark, check = line.rpartition(_CHECK)
+    content += b"}"
+    if not mark or check != str(zlib.crc32(content)).encode() + b"}\n":
+        return None
+    try:
+        table = json.loads(content)
+        key, entry = Key(*(table[name] for name in Key._fields)), Entry.from_dict(table)
+        hash(key)
+        return key, entry
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
+        return None
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers and arrays, tuples' kin and files as JSON knows them."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"a value of type {type(value).__name__} has no form in JSON")
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What the detector found by itself, picture by picture, and the reasons why others could not be looked at."""
+
+    entries: Mapping[View, Entry]
+    problems: Mapping[View, str]
+    resumed: int
+    seconds: float
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """(width, height) of most of a camera's pictures."""
+        counts: dict[str, Counter[tuple[int, int]]] = {}
+        for view, entry in self.entries.items():
+            counts.setdefault(view.camera, Counter())[entry.width, entry.height] += 1
+        return {camera: max((n, size) for size, n in count.items())[1] for camera, count in counts.items()}
+
+
+def look_at_all(
+    pictures: Mapping[View, Path], detector: Detector, path: Path, *, restart: bool, progress: Progress
+) -> Looked:
+    """Detect in each picture that the journal at `path` does not know yet, on all cores.
+
+    A picture that cannot be used, and a detector that fails on one, are problems, and looked at again the next time.
+    """
+    options = digest(detector)
+    entries: dict[View, Entry] = {}
+    problems: dict[View, str] = {}
+    seconds: list[float] = []
+    total = len(pictures)
+    with Journal(path, restart=restart) as journal:
+
+        def work(item: tuple[View, Path]) -> None:
+            view, file = item
+            start = time.perf_counter()
+            try:
+                entries[view] = _look(file, view, detector, journal, options)
+            except ImageError as error:
+                problems[view] = sentence(error).replace(str(file), "the file")
+            seconds.append(time.perf_counter() - start)
+            progress("looking at pictures", resumed + len(seconds), total)
+
+        new = []
+        for view, file in pictures.items():
+            entry = _journalled(journal, view, file, options)
+            if entry is None:
+                new.append((view, file))
+            else:
+                entries[view] = entry
+        resumed = len(entries)
+        progress("looking at pictures", resumed, total)
+        side_by_side(work, new)
+    return Looked(entries, problems, resumed, float(np.mean(seconds)) if seconds else float("nan"))
+
+
+def _journalled(journal: Journal, view: View, path: Path, options: str) -> Entry | None:
+    try:
+        entry = journal.entries.get(Key.of(view, path, options))
+    except OSError:
+        return None  # reading it will say why
+    return None if entry is None or _fault(entry) else entry
+
+
+def _look(path: Path, view: View, detector: Detector, journal: Journal, options: str) -> Entry:
+    """Read a picture, detect, and write it down. ImageError for a picture, or a detector, that fails."""
+    try:
+        key = Key.of(view, path, options)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read", why=str(error)) from error
+    picture = read_picture(path)
+    height, width = picture.shape
+    empty = blank(picture)
+    if empty:
+        raise ImageError(
+            f"{path} is {empty}",
+            why="nothing in it stands out from the noise",
+            fix="check the lens cap and the exposure",
+        )
+    try:
+        entry = Entry(width, height, detector.detect(picture, view))
+        fault = _fault(entry)
+        if fault:
+            raise ValueError(fault)
+        return journal.add(key, entry)
+    except MissingExtraError:
+        raise
+    except ImplicamError as error:
+        raise ImageError(f"the detector failed: {sentence(error)}") from error
+    except Exception as error:
+        raise ImageError(f"the detector failed: {type(error).__name__}: {error}") from error
+
+
+def _fault(entry: Entry) -> str:
+    """What is impossible in a detector's answer; empty where nothing is."""
+    found, size = entry.found, np.array([entry.width, entry.height])
+    if not (found.uv.shape == found.sd.shape == (len(found), 2)):
+        return f"{len(found)} names, but pixels {found.uv.shape} and uncertainties {found.sd.shape}"
+    if not ((found.uv >= -1 - 0.01 * size.max()) & (found.uv <= size + 0.01 * size.max())).all():
+        return "a point outside the picture"
+    if ((found.sd <= 0) | np.isinf(found.sd)).any():
+        return "a standard uncertainty that is not greater than zero"
+    if len(set(found.points)) < len(found):
+        return "a point twice"
+    try:
+        for name in found.points:
+            check_name(name, "point")
+    except DatasetError as error:
+        return error.what
+    return ""
+
+
+def sentence(error: ImplicamError) -> str:
+    """An error's three lines in one."""
+    what = error.what.rstrip(".")
+    return what + (f" ({error.why.rstrip('.')})" if error.why else "") + (f"; {error.fix}" if error.fix else "")

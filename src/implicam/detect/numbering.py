@@ -1,0 +1,113 @@
+"""Which corner of the board each corner of a grid is: by the colours of the squares, and by where the board ends.
+
+A board has (rows + 1) x (columns + 1) squares; square (i, j) is black where i + j is even, and corner (r, c) is where
+the squares (r, c), (r, c + 1), (r + 1, c), (r + 1, c + 1) meet. Where rows + columns is odd, half a turn exchanges
+black and white, so a whole board can be read in one way only. Part of a board can be read in several; what leaves
+fewer is where its end is seen: after the last square of the pattern comes the white margin, not the next square.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.detect.grid import Grid, sample
+from implicam.images import Grey
+
+Ints = NDArray[np.intp]
+
+TOP, RIGHT, BOTTOM, LEFT = range(4)
+
+END, MORE, UNKNOWN = "end", "more", "unknown"
+
+WITHIN, BEYOND = 0.7, 1.3
+"""Squares outwards from a grid's outermost line where the last square, and what follows it, are looked at."""
+
+CLEARLY = 0.4
+"""How far a grey must be on one side of the middle, as a part of the height, to be called black or white."""
+
+
+class Numbering(NamedTuple):
+    """A way to read a grid: it is turned by `turns` quarter turns; its first row and column are `row` and `column`."""
+
+    turns: int
+    row: int
+    column: int
+
+    def of(self, shape: tuple[int, int]) -> tuple[Ints, Ints]:
+        """Row and column on the board, both of the grid's shape."""
+        i, j = np.indices(shape)
+        r, c = _turned(i, j, shape, self.turns)
+        return (r + self.row).astype(np.intp), (c + self.column).astype(np.intp)
+
+
+def sides(picture: Grey, grid: Grid) -> tuple[str, str, str, str]:
+    """What follows the grid's outermost squares at the top, right, bottom, left: `END` (white), `MORE` squares, or
+    `UNKNOWN`: covered, outside of the picture, or neither."""
+    top, right, bottom, left = (_side(picture, grid, side) for side in range(4))
+    return top, right, bottom, left
+
+
+def numberings(grid: Grid, ends: tuple[str, str, str, str], rows: int, columns: int) -> list[Numbering]:
+    """All the ways to read a grid as part of a board with so many inner corners; none where it cannot be one."""
+    found = []
+    for turns in range(4):
+        height, width = (grid.rows, grid.columns) if turns % 2 == 0 else (grid.columns, grid.rows)
+        for row in range(rows - height + 1):
+            for column in range(columns - width + 1):
+                touches = [row == 0, column + width == columns, row + height == rows, column == 0]
+                fits = all(
+                    ends[side] == UNKNOWN or touches[(side + turns) % 4] == (ends[side] == END) for side in range(4)
+                )
+                numbering = Numbering(turns, row, column)
+                if fits and _same_colours(grid, numbering):
+                    found.append(numbering)
+    return found
+
+
+def _same_colours(grid: Grid, numbering: Numbering) -> bool:
+    """Whether the square after node (0, 0) has the colour that this reading gives it."""
+    half = np.array(0.5)
+    r, c = _turned(half, half, (grid.rows, grid.columns), numbering.turns)
+    black = (np.floor(r) + numbering.row + np.floor(c) + numbering.column) % 2 == 0
+    return bool(black == (grid.polarity < 0))
+
+
+def _turned(i: NDArray[Any], j: NDArray[Any], shape: tuple[int, int], turns: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    rows, columns = shape
+    return [(i, j), (j, rows - 1 - i), (rows - 1 - i, columns - 1 - j), (columns - 1 - j, i)][turns]
+
+
+def _side(picture: Grey, grid: Grid, side: int) -> str:
+    along, out = np.array([[0.0, 1.0], [1.0, 0.0]])[[side % 2, 1 - side % 2]]
+    out = out if side in (BOTTOM, RIGHT) else -out
+    start = np.array([grid.rows - 1 if side == BOTTOM else 0, grid.columns - 1 if side == RIGHT else 0], np.float64)
+    length = grid.columns if side in (TOP, BOTTOM) else grid.rows
+    nodes = start + np.arange(length)[:, None] * along
+    i, j = nodes.astype(int).T
+    there = grid.there[i, j]
+    first = np.flatnonzero(there[:-1] & there[1:])
+    if len(first) < 4:
+        return UNKNOWN
+    middle = nodes[first] + along / 2
+    row = i[first] * grid.columns + j[first]
+    mean, height = grid.corners.mean[row], np.abs(grid.corners.height[row])
+    last, after = (
+        (sample(picture, grid.places(middle + depth * out).uv) - mean) / height for depth in (WITHIN, BEYOND)
+    )
+    cell = np.floor(middle + out / 2).sum(axis=1)
+    bright = grid.polarity * (1 - 2 * (cell % 2)) > 0
+    return _verdict(last, after, bright)
+
+
+def _verdict(last: NDArray[np.float64], after: NDArray[np.float64], bright: NDArray[np.bool_]) -> str:
+    """From the greys of the outermost squares and of what follows them, and which of the squares are to be bright."""
+    with np.errstate(invalid="ignore"):
+        dark_square = np.sum(~bright & (last < -CLEARLY) & (after > CLEARLY))
+        white_after = np.sum(bright & (last > CLEARLY) & (after > CLEARLY))
+        dark_after = np.sum(bright & (last > CLEARLY) & (after < -CLEARLY))
+    if dark_square >= 2 and white_after >= 2 and dark_after <= 0.2 * white_after:
+        return END
+    return MORE if dark_square >= 2 and dark_after >= 2 and white_after == 0 else UNKNOWN

@@ -1,0 +1,187 @@
+"""Where a checkerboard may be: grids of rough corners, from which `grid.grow` finds the board, or nothing.
+
+Three detectors: OpenCV's sector-based one (Duda & Frese 2018), the paper's, libCBDetect (after Geiger et al. 2012), and
+the saddle points of the picture with their eight neighbours, which needs no more than a ninth of a board to begin.
+A seed may be wrong: nothing is believed that the picture does not bear out afterwards.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Floats
+from implicam.detect.corners import Bools
+from implicam.images import Grey, eight_bit, opencv
+
+SMALLEST = 4
+"""Rows and columns of the smallest board that OpenCV is asked for; with three it sees boards in anything."""
+
+SADDLES = 800
+"""Saddle points that are looked at, the strongest first."""
+
+RANK, FAINT = 25, 0.2
+"""A saddle point is weak if it has less than this part of the strength of the one with this rank."""
+
+TRIES = 40
+"""Seeds from saddle points that are handed on, at most."""
+
+PATIENCE = 60.0
+"""Seconds that the paper's detector may take."""
+
+
+def from_opencv(picture: Grey, scale: float) -> list[Floats]:
+    """The board that `cv2.findChessboardCornersSB` sees in the picture shrunk or enlarged by `scale`."""
+    cv2 = opencv()
+    image = resized(eight_bit(picture), scale)
+    if min(image.shape) < 16:
+        return []
+    try:
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (SMALLEST, SMALLEST), cv2.CALIB_CB_LARGER)
+    except cv2.error:  # its own sub-pixel step fails near the picture's rim
+        return []
+    if not found or meta is None or corners.size != 2 * meta.size:
+        return []
+    return [in_original(corners.reshape(*meta.shape, 2).astype(np.float64), image, picture)]
+
+
+def resized(picture: NDArray[Any], scale: float) -> NDArray[Any]:
+    """The picture shrunk or enlarged."""
+    cv2 = opencv()
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    out: NDArray[Any] = picture if scale == 1 else cv2.resize(picture, None, fx=scale, fy=scale, interpolation=way)
+    return out
+
+
+def in_original(uv: Floats, small: NDArray[Any], picture: NDArray[Any]) -> Floats:
+    """Pixels (..., 2) of a picture that was resized, as pixels of the original."""
+    factor = np.array(picture.shape[::-1]) / np.array(small.shape[::-1])
+    return np.asarray((uv + 0.5) * factor - 0.5, dtype=np.float64)
+
+
+def from_libcbdetect(picture: Grey, scale: float) -> list[Floats]:
+    """The board that libCBDetect sees; none where it is not installed, or fails.
+
+    It runs in a process of its own: version 1.0.5 divides by zero where it finds no corner at all, in a black picture
+    for one, which takes the process down.
+    """
+    if importlib.util.find_spec("libCBDetect") is None:
+        return []
+    small = resized(picture, scale)
+    with tempfile.TemporaryDirectory(prefix="implicam-") as folder:
+        np.save(Path(folder) / "picture.npy", np.clip(small, 0, 1).astype(np.float64))
+        command = [sys.executable, "-c", _LIBCBDETECT, folder]
+        try:
+            subprocess.run(command, check=True, timeout=PATIENCE, capture_output=True, stdin=subprocess.DEVNULL)
+            grid: Floats = np.load(Path(folder) / "corners.npy")
+        except (subprocess.SubprocessError, OSError, ValueError):
+            return []
+    size = np.array(small.shape)[::-1]
+    grid[~((grid > 0) & (grid < size)).all(axis=2)] = np.nan  # holes in its board
+    return [in_original(grid, small, picture)]
+
+
+_LIBCBDETECT = """
+import sys
+import numpy as np
+from libCBDetect.Checkerboard import Checkerboard
+folder = sys.argv[1]
+picture = np.load(folder + "/picture.npy")
+board = Checkerboard()
+board.show_processing = board.show_debug_image = board.show_grow_processing = False
+board.array_norm_to_image(picture, *picture.shape)
+board.find_corners()
+board.find_board_from_corners()
+u, v = np.full(board.rows * board.cols, np.nan), np.full(board.rows * board.cols, np.nan)
+board.get_board_corners(u, v)
+np.save(folder + "/corners.npy", np.stack([u, v], axis=1).reshape(board.rows, board.cols, 2))
+"""
+
+
+class Saddles(NamedTuple):
+    """Saddle points of the grey values: uv (n, 2) pixels; edges (n, 2, 2) the unit directions in which it is flat, as
+    rows; bright (n, 2) the unit direction in which it rises. The strongest first."""
+
+    uv: Floats
+    edges: Floats
+    bright: Floats
+
+
+def saddles(picture: Grey, blur: float = 1.5) -> Saddles:
+    """The saddle points of the picture blurred a little, where its Hessian has a determinant much below zero."""
+    cv2 = opencv()
+    smooth = cv2.GaussianBlur(picture, (0, 0), blur)
+    uu, vv, uv = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
+    strength = np.sqrt(np.maximum(uv * uv - uu * vv, 0))
+    peak = (strength >= cv2.dilate(strength, np.ones((5, 5), np.uint8))) & (strength > 0)
+    peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = False, False, False, False
+    v, u = np.nonzero(peak)
+    strongest = np.argsort(-strength[v, u], kind="stable")[:SADDLES]
+    v, u = v[strongest], u[strongest]
+    if len(v):
+        clear = strength[v, u] > FAINT * strength[v, u][min(RANK, len(v) - 1)]
+        v, u = v[clear], u[clear]
+    hessian = np.stack([uu[v, u], uv[v, u], uv[v, u], vv[v, u]], axis=1).reshape(-1, 2, 2).astype(np.float64)
+    values, vectors = np.linalg.eigh(hessian)
+    low, high = np.sqrt(np.maximum(-values[:, :1], 0)), np.sqrt(np.maximum(values[:, 1:], 0))
+    # Flat where x0² low + x1² high = 0, along the two diagonals of the eigenvectors weighted by the other's root.
+    first, second = vectors[:, :, 0] * high, vectors[:, :, 1] * low
+    edges = np.stack([first + second, first - second], axis=1)
+    edges /= np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-12)
+    return Saddles(np.column_stack([u, v]).astype(np.float64), edges, vectors[:, :, 1])
+
+
+def from_saddles(points: Saddles) -> Iterator[Floats]:
+    """Three by three saddle points (3, 3, 2) that lie as corners of a board do, the strongest first; each point is
+    the middle of one at most."""
+    if len(points.uv) < 9:
+        return
+    given = 0
+    for k in range(len(points.uv)):
+        seed = _square_about(points, k)
+        if seed is not None:
+            yield seed
+            given += 1
+            if given == TRIES:
+                return
+
+
+def _square_about(points: Saddles, k: int) -> Floats | None:
+    away = points.uv - points.uv[k]
+    distance = np.linalg.norm(away, axis=1)
+    other = np.abs(points.bright @ points.bright[k]) < 0.75  # from corner to corner bright and dark squares change over
+    other &= distance > 0
+    a, b = points.edges[k]
+    arms = [_next_along(away, distance, other, direction) for direction in (a, -a, b, -b)]
+    if any(arm is None for arm in arms):
+        return None
+    ap, am, bp, bm = (points.uv[arm] for arm in arms if arm is not None)
+    middle = points.uv[k]
+    seed = np.array([[middle, middle, middle]] * 3)
+    seed[1, 2], seed[1, 0], seed[2, 1], seed[0, 1] = ap, am, bp, bm
+    steps = np.stack([(ap - am) / 2, (bp - bm) / 2])
+    size = np.linalg.norm(steps, axis=1).min()
+    if np.abs(np.cross(steps[0], steps[1])) < 0.2 * np.prod(np.linalg.norm(steps, axis=1)):
+        return None
+    for i, down in ((0, bm), (2, bp)):
+        for j, right in ((0, am), (2, ap)):
+            off = np.linalg.norm(points.uv - (down + right - middle), axis=1)
+            nearest = int(np.argmin(off))
+            if off[nearest] > 0.4 * size:
+                return None
+            seed[i, j] = points.uv[nearest]
+    return seed
+
+
+def _next_along(away: Floats, distance: Floats, other: Bools, direction: Floats) -> int | None:
+    """The nearest point in a direction, within 20 degrees."""
+    ahead = np.flatnonzero(other & (away @ direction > 0.94 * distance))
+    return int(ahead[np.argmin(distance[ahead])]) if len(ahead) else None

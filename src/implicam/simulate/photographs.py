@@ -1,0 +1,302 @@
+"""Photographs of a simulated rig: what each camera sees of a ball or a board through its true lens.
+
+Each camera has its lines of sight, pixel by pixel, and its background, both made once; a picture renders only the patch
+that the target covers, two by two rays a pixel, and then the optics and the sensor: blur, vignetting, noise, 8 bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
+
+from implicam.dataset import Floats
+from implicam.errors import UsageError
+from implicam.images import Grey, opencv, write_picture
+from implicam.progress import Progress, silent
+from implicam.simulate.camera import SimulatedCamera
+from implicam.simulate.clutter import background
+from implicam.simulate.noise import Bools, views
+from implicam.simulate.rigs import Rig
+from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, Thing
+from implicam.simulate.targets import Target
+from implicam.threads import side_by_side
+
+RAYS = 2
+"""Rays per pixel in each direction."""
+
+BALL_RADIUS_MM = 8.0
+
+
+@dataclass(frozen=True)
+class Optics:
+    """How the cameras see: standard deviations of noise (of full scale, at white) and blur (pixels).
+
+    vignetting: how much darker the corners are. uneven: how much the light changes across the volume. clutter: whether
+    there is anything behind the target, look-alikes among it. bits: of the sensor, 8 or 16.
+    """
+
+    noise: float = 0.01
+    blur: float = 0.7
+    vignetting: float = 0.3
+    uneven: float = 0.3
+    clutter: bool = True
+    bits: int = 8
+
+    def __post_init__(self) -> None:
+        for what in ("noise", "blur", "vignetting", "uneven"):
+            value = getattr(self, what)
+            if not 0 <= value < (20 if what == "blur" else 1):
+                raise UsageError(f"{what} = {value} is out of range.", fix=f"for example {what} = {0.3:g}")
+
+
+class Cover(NamedTuple):
+    """Something in front of the target, in pixels: a bar with round ends from `start` to `end` (2,), half `width` wide."""
+
+    start: Floats
+    end: Floats
+    width: float
+
+    def distance(self, uv: Floats) -> Floats:
+        """(...,) how far pixels (..., 2) are outside of it; negative inside."""
+        along = self.end - self.start
+        part = np.clip((uv - self.start) @ along / (along @ along), 0, 1)
+        return np.asarray(np.linalg.norm(uv - self.start - part[..., None] * along, axis=-1) - self.width, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Studio:
+    """A rig with a target before it, ready to take pictures; `seed` rules noise, background and what is covered.
+
+    covered: share of the pictures in which something stands before the target.
+    """
+
+    rig: Rig
+    target: Target
+    optics: Optics = Optics()
+    seed: int = 0
+    covered: float = 0.0
+    ball_radius_mm: float = BALL_RADIUS_MM
+
+    @cached_property
+    def shots(self) -> list[str]:
+        """The names of the shots, in the order of the target."""
+        return list(dict.fromkeys(self.target.shots.tolist()))
+
+    @cached_property
+    def true_pixels(self) -> tuple[Floats, Bools]:
+        """Pixels (n, cameras, 2) of the target's points, and (n, cameras) where they can be seen in the pictures."""
+        uv, visible = views(self.rig, self.target)
+        visible = visible.copy()
+        for c in range(len(self.rig.cameras)):
+            for s, shot in enumerate(self.shots):
+                cover = self._cover(c, s)
+                if cover is not None:
+                    rows = self.target.shots == shot
+                    visible[rows, c] &= cover.distance(uv[rows, c]) > 0
+        visible &= self._from_the_front()
+        return uv, visible
+
+    def picture(self, camera: int, shot: int) -> Grey:
+        """The photograph of shot number `shot` by camera number `camera`."""
+        return self._exposed(self._composed(camera, shot), camera, np.random.default_rng([self.seed, 7, camera, shot]))
+
+    def write(self, folder: Path, progress: Progress = silent, *, ending: str = ".png") -> int:
+        """Write all pictures to folder/<camera>/<shot>.png; how many."""
+        jobs = [(c, s) for s in range(len(self.shots)) for c in range(len(self.rig.cameras))]
+        done = 0
+        for c in range(len(self.rig.cameras)):
+            (folder / self.rig.cameras[c].name).mkdir(parents=True, exist_ok=True)
+            _ = self._looks[c]
+
+        def work(job: tuple[int, int]) -> None:
+            nonlocal done
+            c, s = job
+            path = folder / self.rig.cameras[c].name / f"{self.shots[s]}{ending}"
+            write_picture(path, self.picture(c, s), bits=self.optics.bits)
+            done += 1
+            progress("taking photographs", done, len(jobs))
+
+        progress("taking photographs", 0, len(jobs))
+        side_by_side(work, jobs)
+        return len(jobs)
+
+    def thing(self, shot: int) -> Thing:
+        """What stands there in a shot."""
+        xyz = self.target.xyz[self.target.shots == self.shots[shot]]
+        if self.target.board is None:
+            return Ball(xyz[0], self._towards_cameras, self.ball_radius_mm * self.rig.units_per_mm, self._light)
+        rows, columns = self.target.board
+        grid = xyz.reshape(rows, columns, 3)
+        right = (grid[0, -1] - grid[0, 0]) / (columns - 1)
+        down = (grid[-1, 0] - grid[0, 0]) / (rows - 1)
+        return Checkerboard(grid[0, 0], right, down, rows, columns, self._light)
+
+    @cached_property
+    def _looks(self) -> list[_Look]:
+        return side_by_side(
+            lambda c: _Look(self.rig.cameras[c], self.optics, np.random.default_rng([self.seed, 5, c])),
+            range(len(self.rig.cameras)),
+        )
+
+    @cached_property
+    def _towards_cameras(self) -> Floats:
+        if self.target.facing is not None:
+            return self.target.facing
+        middle = self.rig.volume.world_from_box.translation
+        mean = np.mean([camera.camera_from_world.centre for camera in self.rig.cameras], axis=0) - middle
+        return np.asarray(mean / np.linalg.norm(mean), dtype=np.float64)
+
+    @cached_property
+    def _light(self) -> Light:
+        rng = np.random.default_rng([self.seed, 6])
+        middle, size = self.rig.volume.world_from_box.translation, float(np.linalg.norm(self.rig.volume.size))
+        lamp = self._towards_cameras + 0.35 * rng.normal(size=3)
+        slope = rng.normal(size=3)
+        slope *= self.optics.uneven / (np.linalg.norm(slope) * size)
+        return Light(lamp / np.linalg.norm(lamp), slope, middle)
+
+    def _from_the_front(self) -> Bools:
+        """(n, cameras) where a ball is not behind its plate."""
+        if self.target.facing is not None:
+            return np.ones((len(self.target.xyz), len(self.rig.cameras)), dtype=np.bool_)
+        columns = []
+        for camera in self.rig.cameras:
+            towards = camera.camera_from_world.centre - self.target.xyz
+            columns.append(towards @ self._towards_cameras > 0.17 * np.linalg.norm(towards, axis=1))
+        return np.stack(columns, axis=1)
+
+    def _cover(self, camera: int, shot: int) -> Cover | None:
+        rng = np.random.default_rng([self.seed, 8, camera, shot])
+        if rng.random() >= self.covered:
+            return None
+        thing = self.thing(shot)
+        uv, _ = self.rig.cameras[camera].pixel_from_world(thing.reach())
+        middle = np.nanmean(uv, axis=0)
+        size = float(np.nanmax(np.linalg.norm(uv - middle, axis=1)))
+        angle = rng.uniform(0, np.pi)
+        along = size * np.array([np.cos(angle), np.sin(angle)])
+        if isinstance(thing, Ball):
+            (middle,), _ = self.rig.cameras[camera].pixel_from_world(thing.centre[None])
+            return Cover(middle - along, middle + along, 0.35 * size)
+        middle = middle + rng.normal(scale=0.25 * size, size=2)
+        return Cover(middle - along, middle + along, float(rng.uniform(0.1, 0.35)) * size)
+
+    def _composed(self, camera: int, shot: int) -> Grey:
+        look, thing = self._looks[camera], self.thing(shot)
+        picture = look.blurred.copy()
+        cover = self._cover(camera, shot)
+        box = self._box(camera, thing, cover)
+        if box is None:
+            return picture
+        top, bottom, left, right = box
+        window = slice(top, bottom), slice(left, right)
+        cv2 = opencv()
+        fine = ((right - left) * RAYS, (bottom - top) * RAYS)
+        ground = cv2.resize(look.sharp[window], fine, interpolation=cv2.INTER_LINEAR)
+        directions = cv2.resize(look.directions[window], fine, interpolation=cv2.INTER_LINEAR)
+        patch = thing.paint(Rays(look.camera.camera_from_world.centre, directions), ground)
+        if cover is not None:
+            patch = _covered(patch, cover, (left, top))
+        if self.optics.blur > 0:
+            patch = cv2.GaussianBlur(patch, (0, 0), self.optics.blur * RAYS)
+        small = cv2.resize(patch, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
+        inner = slice(_MARGIN, -_MARGIN)  # what the blur took from beyond the patch's edge is not wanted
+        picture[top + _MARGIN : bottom - _MARGIN, left + _MARGIN : right - _MARGIN] = small[inner, inner]
+        return _within(picture)
+
+    def _box(self, camera: int, thing: Thing, cover: Cover | None) -> tuple[int, int, int, int] | None:
+        """The patch of the padded picture that shows the target: top, bottom, left, right."""
+        view = self.rig.cameras[camera]
+        uv, _ = view.pixel_from_world(_densely(thing.reach()))
+        if cover is not None:
+            ends = np.stack([cover.start, cover.end])
+            uv = np.concatenate([uv, ends - cover.width, ends + cover.width])
+        uv = uv[np.isfinite(uv).all(axis=1)]
+        if len(uv) == 0:
+            return None
+        rim = 2 * _MARGIN
+        low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - rim, -PAD) + PAD
+        high = np.minimum(np.ceil(uv.max(axis=0)).astype(int) + rim, [view.width + PAD, view.height + PAD]) + PAD
+        if (high - low < 3 * _MARGIN).any():
+            return None
+        return int(low[1]), int(high[1]), int(low[0]), int(high[0])
+
+    def _exposed(self, picture: Grey, camera: int, rng: np.random.Generator) -> Grey:
+        """Vignetting, noise (half of it from the light itself), and the steps of the sensor's numbers."""
+        picture = picture * self._looks[camera].vignette
+        noise = rng.standard_normal(picture.shape, dtype=np.float32)
+        noise *= self.optics.noise * np.sqrt(0.5 + 0.5 * np.maximum(picture, 0))
+        picture += noise
+        steps = np.float32(2**self.optics.bits - 1)
+        return np.asarray(np.rint(np.clip(picture, 0, 1) * steps) / steps, np.float32)
+
+
+PAD = 16
+"""Pixels around the picture that are rendered too, so that a target may be cut by its edge."""
+
+_MARGIN = 4
+
+
+class _Look:
+    """What of a camera's pictures never changes: lines of sight, background (sharp and blurred), vignetting."""
+
+    def __init__(self, camera: SimulatedCamera, optics: Optics, rng: np.random.Generator) -> None:
+        cv2 = opencv()
+        cv2.setNumThreads(1)
+        self.camera = camera
+        self.directions = lines_of_sight(camera)
+        self.sharp = np.pad(background(camera.width, camera.height, rng, clutter=optics.clutter), PAD, mode="edge")
+        self.blurred = cv2.GaussianBlur(self.sharp, (0, 0), optics.blur) if optics.blur > 0 else self.sharp
+        v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+        middle = np.array([camera.width - 1, camera.height - 1]) / 2
+        radius = ((u - middle[0]) ** 2 + (v - middle[1]) ** 2) / np.sum(middle**2)
+        self.vignette = np.asarray(1 - optics.vignetting * radius, np.float32)
+
+
+def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
+    """(height + 2 PAD, width + 2 PAD, 3) the unit vector in the world that each pixel looks along.
+
+    Found every eighth pixel and interpolated by a bicubic spline, exact to far less than a thousandth of a pixel. Pixels
+    beyond the image circle of the lens look where its rim looks; nothing that the lens sees falls there.
+    """
+    size = np.array([camera.width, camera.height])
+    us, vs = (np.linspace(-PAD, n - 1 + PAD, (n + 2 * PAD) // 8 + 2) for n in size)
+    grid = np.stack(np.meshgrid(us, vs), axis=2).reshape(-1, 2)
+    straight = grid.copy()
+    for _ in range(6):  # the smooth error changes by less than a per cent from pixel to pixel
+        straight = grid - camera.error.at(straight)
+    rays, seen = camera.lens.ray_from_pixel(straight)
+    middle = np.array([camera.lens.cx, camera.lens.cy])
+    while not seen.all():
+        straight[~seen] = middle + 0.98 * (straight[~seen] - middle)
+        rays[~seen], seen[~seen] = camera.lens.ray_from_pixel(straight[~seen])
+    directions = (rays @ camera.camera_from_world.rotation).reshape(len(vs), len(us), 3)
+    u, v = np.arange(-PAD, size[0] + PAD), np.arange(-PAD, size[1] + PAD)
+    planes = [RectBivariateSpline(vs, us, directions[:, :, k])(v, u) for k in range(3)]
+    return np.stack(planes, axis=2).astype(np.float32)
+
+
+def _covered(patch: Grey, cover: Cover, corner: tuple[int, int]) -> Grey:
+    rows, columns = patch.shape
+    u = (np.arange(columns) + 0.5) / RAYS - 0.5 + corner[0] - PAD
+    v = (np.arange(rows) + 0.5) / RAYS - 0.5 + corner[1] - PAD
+    outside = cover.distance(np.stack(np.meshgrid(u, v), axis=2))
+    part = np.clip(0.5 - outside * RAYS, 0, 1)
+    return np.asarray(patch + part * (0.3 - patch), np.float32)
+
+
+def _densely(points: Floats) -> Floats:
+    """Points between all pairs of points too: the picture of a straight edge is not straight."""
+    steps = np.linspace(0, 1, 5)[:, None, None, None]
+    between = points[None, :, None] * steps + points[None, None, :] * (1 - steps)
+    return np.asarray(between.reshape(-1, 3), dtype=np.float64)
+
+
+def _within(padded: Grey) -> Grey:
+    return padded[PAD:-PAD, PAD:-PAD]

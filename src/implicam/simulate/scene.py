@@ -1,0 +1,210 @@
+"""What stands in front of the cameras: a ball on a tool before its white plate, or a printed checkerboard.
+
+An object paints itself into a patch of rays: its albedo where it covers them, and how much of each it covers. The edge
+of a thing is where a smooth function of the ray is zero; the function over its own slope is the distance from the edge in
+samples, so that edges are anti-aliased exactly where they are straight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Floats
+
+Patch = NDArray[np.float32]
+"""(rows, columns), one value per ray; or (rows, columns, 3), one vector."""
+
+
+class Rays(NamedTuple):
+    """Lines of sight: from `centre` (3,) along unit `directions` (rows, columns, 3), in the world frame."""
+
+    centre: Floats
+    directions: Patch
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """A lamp `towards` (3,) which a surface turns its face, and how the light falls off along `slope` (3,), per length."""
+
+    towards: Floats
+    slope: Floats
+    middle: Floats
+
+    def at(self, points: Patch) -> Patch:
+        """How bright it is at points (..., 3); 1 in the middle of the volume."""
+        return np.asarray(1 + (points - self.middle.astype(np.float32)) @ self.slope.astype(np.float32), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Ball:
+    """A dark ball on a stem before a white plate that faces `facing` (3,), a unit vector; the tool is behind it."""
+
+    centre: Floats
+    facing: Floats
+    radius: float
+    light: Light
+
+    GAP, PLATE, CORNER, STEM, TOOL, TOOL_LENGTH = 1.6, 5.0, 1.0, 0.22, 1.6, 9.0
+    """In radii: ball to plate, half the plate's edge, its rounding, the radii of stem and tool, the tool's length."""
+
+    def paint(self, rays: Rays, ground: Patch) -> Patch:
+        """The picture of it over what is behind."""
+        plate_at = self.centre - self.GAP * self.radius * self.facing
+        back = plate_at - self.TOOL_LENGTH * self.radius * self.facing
+        layers = [
+            (self._rod(rays, back, plate_at, self.TOOL * self.radius), np.float32(0.22)),
+            self._plate(rays, plate_at),
+            (self._rod(rays, plate_at, self.centre, self.STEM * self.radius), np.float32(0.4)),
+            self._sphere(rays),
+        ]
+        if (rays.centre - plate_at) @ self.facing < 0:  # seen from behind, the plate hides the ball
+            layers.reverse()
+        for cover, value in layers:
+            ground = ground + cover * (value - ground)
+        return ground
+
+    def reach(self) -> Floats:
+        """(n, 3) points that the picture of it lies between."""
+        a, b = _across(self.facing)
+        half = self.PLATE * self.radius
+        plate = self.centre - self.GAP * self.radius * self.facing
+        corners = [plate + half * (i * a + j * b) for i in (-1, 1) for j in (-1, 1)]
+        back = [c - self.TOOL_LENGTH * self.radius * self.facing for c in corners]
+        return np.array([*corners, *back, self.centre])
+
+    def _sphere(self, rays: Rays) -> tuple[Patch, Patch]:
+        towards = self.centre - rays.centre
+        distance = float(np.linalg.norm(towards))
+        axis = (towards / distance).astype(np.float32)
+        along = rays.directions @ axis
+        aside = _length(rays.directions - along[..., None] * axis)
+        cover = _cover(aside - np.float32(self.radius / distance))
+        depth = distance * along - np.sqrt(np.maximum(self.radius**2 - (distance * aside) ** 2, 0))
+        normal = (depth[..., None] * rays.directions - towards.astype(np.float32)) / np.float32(self.radius)
+        lamp = self.light.towards.astype(np.float32)
+        lambert = np.maximum(normal @ lamp, 0)
+        mirrored = 2 * lambert[..., None] * normal - lamp
+        shine = np.maximum(-_dot(mirrored, rays.directions), 0) ** 60
+        return cover, np.asarray(0.05 + 0.07 * lambert + 0.35 * shine, np.float32)
+
+    def _plate(self, rays: Rays, middle: Floats) -> tuple[Patch, Patch]:
+        a, b = _across(self.facing)
+        hit = _on_plane(rays, middle, self.facing)
+        x, y = (np.abs((hit - middle.astype(np.float32)) @ axis.astype(np.float32)) for axis in (a, b))
+        half, corner = self.PLATE * self.radius, self.CORNER * self.radius
+        qx, qy = x - np.float32(half - corner), y - np.float32(half - corner)
+        outside = np.hypot(np.maximum(qx, 0), np.maximum(qy, 0)) + np.minimum(np.maximum(qx, qy), 0)
+        cover = _cover(np.where(np.isnan(outside), np.inf, outside - np.float32(corner)))
+        lamp = self.light.towards
+        shadow_at = self.centre - lamp * ((self.centre - middle) @ self.facing) / max(float(lamp @ self.facing), 0.2)
+        from_shadow = _length(hit - shadow_at.astype(np.float32)) / np.float32(self.radius)
+        shade = 1 - 0.25 / (1 + np.exp(6 * (np.minimum(from_shadow, 9) - 1.1)))  # the ball's, soft: the lamp is large
+        return cover, np.nan_to_num(np.asarray(0.75 * shade * self.light.at(hit), np.float32))
+
+    def _rod(self, rays: Rays, start: Floats, end: Floats, radius: float) -> Patch:
+        """How much of each ray a rod with rounded ends covers."""
+        axis = (end - start).astype(np.float32)
+        towards = (start - rays.centre).astype(np.float32)
+        # The point of the rod nearest to a ray, as a part of its length: both lines' mutual perpendicular, clipped.
+        da, aa = rays.directions @ axis, np.float32(axis @ axis)
+        dt, at = rays.directions @ towards, np.float32(axis @ towards)
+        part = np.clip((da * dt - at) / np.maximum(aa - da * da, 1e-6 * aa), 0, 1)
+        nearest = towards + part[..., None] * axis
+        along = _dot(nearest, rays.directions)
+        aside = _length(nearest - along[..., None] * rays.directions)
+        return _cover((aside - np.float32(radius)) / np.maximum(along, np.float32(radius)))
+
+
+@dataclass(frozen=True, eq=False)
+class Checkerboard:
+    """A printed board: `corner` (3,) its inner corner 1, steps `right` and `down` (3,) from corner to corner.
+
+    rows, columns: of inner corners. The outermost square at corner 1 is black; a white margin of one square follows.
+    """
+
+    corner: Floats
+    right: Floats
+    down: Floats
+    rows: int
+    columns: int
+    light: Light
+
+    def paint(self, rays: Rays, ground: Patch) -> Patch:
+        """The picture of it over what is behind."""
+        facing = np.cross(self.down, self.right)
+        hit = _on_plane(rays, self.corner, facing / np.linalg.norm(facing))
+        offset = hit - self.corner.astype(np.float32)
+        x = offset @ (self.right / (self.right @ self.right)).astype(np.float32)
+        y = offset @ (self.down / (self.down @ self.down)).astype(np.float32)
+        cover = _inside(x, -2, self.columns + 1) * _inside(y, -2, self.rows + 1)
+        printed = _inside(x, -1, self.columns) * _inside(y, -1, self.rows)
+        black = 0.5 + 0.5 * _stripes(x) * _stripes(y)
+        albedo = 0.78 - 0.70 * black * printed
+        value = np.nan_to_num(np.asarray(albedo * self.light.at(hit), np.float32))
+        if (rays.centre - self.corner) @ facing < 0:
+            value = np.full_like(value, 0.3)  # its back
+        return ground + np.nan_to_num(cover) * (value - ground)
+
+    def reach(self) -> Floats:
+        """(4, 3) the corners of the sheet."""
+        ends = [(i, j) for i in (-2, self.columns + 1) for j in (-2, self.rows + 1)]
+        return np.array([self.corner + i * self.right + j * self.down for i, j in ends])
+
+
+Thing = Ball | Checkerboard
+
+
+def _across(normal: Floats) -> tuple[Floats, Floats]:
+    """Two unit vectors that span the plane across `normal`."""
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(normal, first)
+
+
+def _dot(a: Patch, b: Patch) -> Patch:
+    return np.asarray(np.einsum("ijk,ijk->ij", a, b), np.float32)
+
+
+def _length(vectors: Patch) -> Patch:
+    return np.sqrt(_dot(vectors, vectors))
+
+
+def _on_plane(rays: Rays, origin: Floats, normal: Floats) -> Patch:
+    """Where rays meet a plane; NaN where they do not, or from behind the eye."""
+    slope = rays.directions @ normal.astype(np.float32)
+    depth = np.float32((origin - rays.centre) @ normal) / np.where(np.abs(slope) > 1e-6, slope, np.nan)
+    depth = np.where(depth > 0, depth, np.nan)
+    return np.asarray(rays.centre.astype(np.float32) + depth[..., None] * rays.directions, np.float32)
+
+
+def _cover(field: Patch) -> Patch:
+    """How much of each sample lies where `field` is negative: half at zero, all half a sample inside."""
+    return np.asarray(np.clip(0.5 - _in_samples(field), 0, 1), np.float32)
+
+
+def _in_samples(field: Patch) -> Patch:
+    """A field over its slope per sample: the distance from where it is zero."""
+    with np.errstate(invalid="ignore"):
+        down, right = np.gradient(field)
+        slope = np.hypot(down, right)
+        return np.asarray(np.nan_to_num(field / np.maximum(slope, 1e-12), nan=1e9), np.float32)
+
+
+def _inside(x: Patch, low: float, high: float) -> Patch:
+    """How much of each sample lies between two lines."""
+    middle, half = np.float32((low + high) / 2), np.float32((high - low) / 2)
+    return _cover(np.abs(x - middle) - half)
+
+
+def _stripes(x: Patch) -> Patch:
+    """+1 between 0 and 1, -1 between 1 and 2, and so on: what changes sign at every whole number, anti-aliased."""
+    nearest = np.rint(x)
+    sign = 1 - 2 * (nearest % 2)
+    with np.errstate(invalid="ignore"):
+        slope = np.hypot(*np.gradient(x))
+        distance = np.clip(2 * (x - nearest) / np.maximum(slope, 1e-12), -1, 1)
+    return np.asarray(sign * distance, np.float32)
