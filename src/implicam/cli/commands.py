@@ -24,10 +24,12 @@ from implicam.calibrators import (
 from implicam.cli import show
 from implicam.compare import Trial, as_json, compare, summarise
 from implicam.dataset import Dataset, folder_files, read_dataset, write_dataset
+from implicam.dataset.folder import IMAGES
 from implicam.errors import DatasetError, UsageError, import_extra
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import replacing, toml_text
-from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate, write_rig
+from implicam.images import PATTERN
+from implicam.simulate import Optics, ball_grid, build_rig, moving_board, random_positions, record, write_rig
 
 app = typer.Typer(
     name="implicam",
@@ -43,6 +45,7 @@ app = typer.Typer(
 EXAMPLES = {
     "demo": "implicam demo",
     "simulate": "implicam simulate my-rig --positions random --points 157 --check 300",
+    "detect": "implicam detect my-photos --target ball --radius 8",
     "calibrate": "implicam calibrate my-rig -o my-rig.implicam",
     "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
     "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
@@ -208,6 +211,13 @@ def simulate_command(
     outliers: Annotated[
         float, typer.Option(min=0, max=1, metavar="SHARE", help="Share of views that are wrong.")
     ] = 0.0,
+    images: Annotated[bool, typer.Option("--images", help="Also take photographs, for implicam detect.")] = False,
+    image_noise: Annotated[
+        float, typer.Option(min=0, max=0.5, metavar="PART", help="Noise of the photographs, part of full scale.")
+    ] = 0.01,
+    image_blur: Annotated[
+        float, typer.Option(min=0, max=10, metavar="PX", help="Blur of the photographs, standard deviation.")
+    ] = 0.7,
     frame: Annotated[Frame, typer.Option(help="World frame: axes along the bench, or any.")] = Frame.robot,
     unit: Annotated[str, typer.Option(metavar="UNIT", help="mm or m.")] = "mm",
     seed: Seed = 0,
@@ -232,20 +242,98 @@ def simulate_command(
         shown = ball_grid(built, _grid(grid))
     else:
         shown = random_positions(built, points, np.random.default_rng([shots, 1]))
-    data = simulate(built, shown, seed=shots, robot_noise=robot_noise, missing=missing, outliers=outliers)
+    optics = Optics(noise=image_noise, blur=image_blur) if images else None
     files = {"truth.toml": toml_text({**write_rig(built), "shots_seed": shots})}
-    if check:
-        target_points = random_positions(built, check, np.random.default_rng([shots, 2]))
-        held_out = simulate(built, target_points, seed=shots + 1_000_003, missing=missing)
-        files |= {f"check/{name}": text for name, text in folder_files(held_out).items()}
-    write_dataset(data, out, overwrite=overwrite, also=files)
-    seen = int(data.observations.seen.sum())
-    if json:
-        show.emit_json({"dataset": str(out), "points": len(data), "views": seen, "check_points": check})
-    else:
-        show.line(f"{out}: {len(data)} points, {seen} views in {len(data.cameras)} cameras")
+    with show.progress(json) as progress:
+        recorded = record(
+            built, shown, seed=shots, robot_noise=robot_noise, missing=missing, outliers=outliers, optics=optics
+        )
+        parts = {"": recorded}
         if check:
-            show.line(f"{out / 'check'}: {check} random positions to judge by")
+            target_points = random_positions(built, check, np.random.default_rng([shots, 2]))
+            parts["check"] = record(built, target_points, seed=shots + 1_000_003, missing=missing, optics=optics)
+            files |= {f"check/{name}": text for name, text in folder_files(parts["check"].data).items()}
+
+        def photographs(folder: Path) -> None:
+            for part, one in parts.items():
+                one.write_photographs(folder / part, progress)
+
+        write_dataset(recorded.data, out, overwrite=overwrite, also=files, fill=photographs)
+    data = recorded.data
+    seen = int(data.observations.seen.sum())
+    pictures = sum(one.photographs for one in parts.values())
+    if json:
+        show.emit_json(
+            {"dataset": str(out), "points": len(data), "views": seen, "check_points": check, "pictures": pictures}
+        )
+        return
+    show.line(f"{out}: {len(data)} points, {seen} views in {len(data.cameras)} cameras")
+    if images:
+        show.line(f"{out / 'images'}: {pictures} photographs{' with those of check' if check else ''}")
+    if check:
+        show.line(f"{out / 'check'}: {check} random positions to judge by")
+
+
+@_command("detect")
+def detect_command(
+    dataset: Annotated[Path, typer.Argument(help="A folder with the photographs in images/<camera>/<shot>.png.")],
+    target: Annotated[
+        str | None, typer.Option(metavar="NAME", help="ball, board, charuco or dots (default: what dataset.toml says).")
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(min=0, metavar="LENGTH", help="ball: its radius, in the dataset's unit.")
+    ] = None,
+    bright: Annotated[bool, typer.Option("--bright", help="ball: it is lighter than what is behind it.")] = False,
+    template: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="ball: a picture of it before its plate, ball in the middle.")
+    ] = None,
+    click: Annotated[
+        str | None, typer.Option(metavar="FILE:U,V", help="ball: learn what it looks like at this pixel.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="ball: correct its outline's middle with this calibration.")
+    ] = None,
+    board: Annotated[
+        str | None, typer.Option(metavar="RxC", help="board: inner corners, 8x11; charuco: squares, 9x12.")
+    ] = None,
+    square: Annotated[float | None, typer.Option(min=0, metavar="MM", help="board, charuco: edge of a square.")] = None,
+    marker: Annotated[float | None, typer.Option(min=0, metavar="MM", help="charuco: edge of a marker.")] = None,
+    dictionary: Annotated[
+        str | None, typer.Option(metavar="NAME", help="charuco: OpenCV's name, such as DICT_5X5_100.")
+    ] = None,
+    layout: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="dots: where they are (default DATASET/points.csv).")
+    ] = None,
+    labels: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="dots: six or more named (default DATASET/labels.csv).")
+    ] = None,
+    pictures: Annotated[str, typer.Option("--pictures", metavar="FOLDER", help="Where they are in DATASET.")] = IMAGES,
+    pattern: Annotated[
+        str, typer.Option(metavar="PATTERN", help="How their names tell camera and shot, without ending.")
+    ] = PATTERN,
+    overlays: Annotated[bool, typer.Option(help="Draw what was found, to check by eye.")] = True,
+    restart: Annotated[bool, typer.Option("--restart", help="Forget what an earlier run found.")] = False,
+    unit: Annotated[
+        str | None, typer.Option(metavar="UNIT", help="Length unit, where dataset.toml is missing.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Find the target in photographs: images -> observations.csv, each view with its uncertainty."""
+    from implicam.cli.detect import Wanted, tell
+    from implicam.detect import detect_folder
+
+    if not dataset.is_dir():
+        raise UsageError(f"{dataset} is not a folder.", fix="give the folder that holds images/<camera>/<shot>.png")
+    wanted = Wanted(
+        target, radius, bright, template, click, board, square, marker, dictionary, layout, labels, calibration
+    )
+    detector, correct = wanted.detector(dataset)
+    with show.progress(json) as progress:
+        run = detect_folder(
+            dataset, detector, unit=unit, pictures=pictures, pattern=pattern, overlays=overlays, restart=restart,
+            correct=correct, progress=progress,
+        )  # fmt: skip
+    tell(run, json)
 
 
 def _grid(text: str) -> tuple[int, int, int]:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -28,6 +29,7 @@ from rich.table import Table
 from implicam.compare import Row, Trial
 from implicam.coverage import Estimate, Summary
 from implicam.demo import HELD_OUT, Demo
+from implicam.detect.folder import DetectionRun
 from implicam.evaluate import Evaluation
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -220,6 +222,18 @@ def verdict(overall: Summary) -> str:
             f"; the 95 % ellipsoids hold {inside:.1f} %, and {number(overall.sd_factor)} times as large would hold 95 %"
         )
     return text
+
+
+def detection_table(run: DetectionRun) -> Table:
+    """A camera a row: how many pictures, in how many of them anything was found, and how sure of it."""
+    sd = run.data.observations.sd
+    rows = []
+    for count in run.cameras:
+        own = sd[:, run.data.observations.camera_names.index(count.camera)]
+        own = own[np.isfinite(own[:, 0])]
+        typical = number(float(np.sqrt(np.median(np.mean(own**2, axis=1))))) if len(own) else "-"
+        rows.append([count.camera, str(count.pictures), str(count.found), str(count.points), typical])
+    return _table("", ["camera", "pictures", "with target", "points", "typical sd, px"], rows)
 
 
 def demo_table(demo: Demo) -> Table:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from implicam.dataset.folder import folder_files, read_folder, write_folder
@@ -95,11 +95,17 @@ def _read(path: Path, unit: str | None) -> Dataset:
 
 
 def write_dataset(
-    data: Dataset, path: str | Path, *, overwrite: bool = False, also: Mapping[str, str] | None = None
+    data: Dataset,
+    path: str | Path,
+    *,
+    overwrite: bool = False,
+    also: Mapping[str, str] | None = None,
+    fill: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a dataset, whole or not at all; the ending chooses the form, none means a folder.
 
-    An existing folder is refused unless `overwrite`; `also` adds text files to a folder.
+    An existing folder is refused unless `overwrite`; `also` adds text files to a folder, and `fill` writes whatever it
+    likes into it before it takes its place.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -110,4 +116,4 @@ def write_dataset(
     elif suffix == ".npz":
         write_npz_dataset(data, path)
     else:
-        write_folder(data, path, overwrite=overwrite, also=also)
+        write_folder(data, path, overwrite=overwrite, also=also, fill=fill)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ from implicam.errors import DatasetError, did_you_mean
 from implicam.files import replacing_folder, toml_text
 
 DESCRIPTION, POINTS, VIEWS, IMAGES = "dataset.toml", "points.csv", "observations.csv", "images"
+TRUTH = "truth.toml"
+"""What only a simulated rig has beside its data; its photographs can be taken again."""
 
 _NO_VIEW = "a view that is missing has no row: remove it"
 _NO_SD = "leave the cell empty where no uncertainty is stated"
@@ -225,8 +227,16 @@ def _spread(values: list[str], i: NDArray[Any], j: NDArray[Any], shape: tuple[in
     return table
 
 
-def write_folder(data: Dataset, path: Path, *, overwrite: bool = False, also: Mapping[str, str] | None = None) -> None:
-    """Write a dataset folder, whole or not at all; `also` maps further relative file names to their text."""
+def write_folder(
+    data: Dataset,
+    path: Path,
+    *,
+    overwrite: bool = False,
+    also: Mapping[str, str] | None = None,
+    fill: Callable[[Path], None] | None = None,
+) -> None:
+    """Write a dataset folder, whole or not at all; `also` maps further relative file names to their text, and `fill`
+    writes the rest into the folder."""
     files = {**folder_files(data), **(also or {})}
     if overwrite:
         _refuse_to_destroy(path)
@@ -235,6 +245,8 @@ def write_folder(data: Dataset, path: Path, *, overwrite: bool = False, also: Ma
             target = temporary / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_text(text, encoding="utf-8", newline="")
+        if fill is not None:
+            fill(temporary)
 
 
 def _refuse_to_destroy(path: Path) -> None:
@@ -247,7 +259,7 @@ def _refuse_to_destroy(path: Path) -> None:
             why=f"it has no {DESCRIPTION}, and replacing it would delete what it holds",
             fix="choose another name, or remove the folder yourself",
         )
-    if (path / IMAGES).exists():
+    if (path / IMAGES).exists() and not (path / TRUTH).exists():
         raise DatasetError(
             f"{path} holds {IMAGES}, so it is not overwritten.",
             why="photographs cannot be computed again",

@@ -30,11 +30,11 @@ from implicam.images import Grey, opencv
 
 Bools = NDArray[np.bool_]
 
-LOW, HIGH = 0.35, 0.55
-"""Parts of the maximum between which the weight of a pixel goes from 0 to 1: about half, as in a width at half height."""
+LOW, HIGH = 0.3, 0.6
+"""Parts of the maximum between which the weight of a pixel goes from 0 to 1; a narrower ramp shows the pixels."""
 
-SMALLEST, LARGEST, STEP = 0.8, 16.0, 1.2
-"""Scales in pixels that are tried where a spot is shown: the first, the last, and from one to the next."""
+SMALLEST, STEP = 0.8, 1.2
+"""Scales that are tried where a spot is shown: the first in pixels, and the factor from one to the next."""
 
 CLICK = 3.0
 """Pixels from a click to the spot that is meant."""
@@ -60,7 +60,7 @@ PLAIN = 4.0
 VAGUE = 0.5
 """Of the scale: a spot of a larger standard uncertainty is not measured."""
 
-FLOOR = 0.01
+FLOOR = 0.006
 """Pixels that no standard uncertainty goes below: what the sensor's pixels do to a centroid."""
 
 
@@ -166,7 +166,7 @@ def measure_spots(picture: Grey, uv: Floats, sigma: float) -> Spots:
 
 def _shared_noise(windows: list[_Window]) -> float:
     """Noise variance per brightness: the median over the spots, of which most are sound."""
-    found = [np.sum(w.excess) / np.sum(w.bright[w.core]) for w in windows]
+    found = [float(np.sum(w.residual**2 - w.noise**2) / np.sum(w.bright[w.core])) for w in windows]
     return max(float(np.median(found)), 0.0) if found else 0.0
 
 
@@ -223,16 +223,11 @@ class _Window:
         residual = _about_profile(bright[core], distance[core])
         return cls(centre + at, float(weight.sum()), bright, pull / total, noise, core, residual)
 
-    @property
-    def excess(self) -> Floats:
-        """(core,) squared residuals above the background's variance."""
-        return self.residual**2 - self.noise**2
-
     def sd(self, share: float) -> Floats:
         """(2,) standard uncertainties in pixels; share: noise variance per brightness."""
         variance = self.noise**2 + share * np.maximum(self.bright, 0)
-        odd = float(np.mean(self.residual**2) / max(np.mean(variance[self.core]), 1e-18))
-        usual = 1 + 3 * np.sqrt(2 / self.core.sum())
+        odd = float(np.sum(self.residual**2)) / max(float(np.sum(variance[self.core])), 1e-18)
+        usual = 1 + 3 * np.sqrt(2 / len(self.residual))
         spread = np.einsum("ijk,ij->k", self.pull**2, variance) * (odd if odd > usual else 1.0)
         return np.asarray(np.sqrt(spread + FLOOR**2), dtype=np.float64)
 
@@ -242,7 +237,7 @@ def _level(ring: Floats) -> tuple[float, float]:
     middle = float(np.median(ring))
     off = np.abs(ring - middle)
     step = float(np.diff(np.unique(ring)).min(initial=1.0)) if ring.min() < ring.max() else 0.0  # between grey values
-    sound = ring[off <= max(4 * float(np.median(off)), 1.5 * step)]
+    sound = ring[off <= max(6 * float(np.median(off)), 1.5 * step)]
     return float(sound.mean()), float(np.hypot(sound.std(), step / np.sqrt(12)))
 
 
@@ -272,11 +267,13 @@ def _weights(bright: Floats, far: Floats, sigma: float, noise: float) -> tuple[F
 def _about_profile(values: Floats, distance: Floats) -> Floats:
     """What is left of values (n,) when their dependence on the distance from the middle is taken away.
 
-    The dependence is linear between knots a pixel apart. The residuals are scaled by the degrees of freedom, so that
-    their mean square is the variance of the noise.
+    The dependence is linear between knots a pixel apart. Each residual is scaled for what its own value pulled the
+    profile towards it (its leverage), and all for the five numbers
+    of middle and ellipse, so that its mean square is the variance of its noise.
     """
     knots = np.arange(0, np.ceil(distance.max()) + 1)
     hats = np.maximum(1 - np.abs(distance[:, None] - knots), 0)
-    hats = hats[:, hats.sum(axis=0) > 0.5]
-    fit = hats @ np.linalg.lstsq(hats, values, rcond=None)[0]
-    return np.asarray((values - fit) * np.sqrt(len(values) / max(len(values) - hats.shape[1], 1)), dtype=np.float64)
+    basis = np.linalg.qr(hats[:, hats.sum(axis=0) > 0.5])[0]
+    leverage = np.sum(basis**2, axis=1)
+    left = np.maximum(1 - leverage, 0.1) * max(1 - 5 / len(values), 0.1)
+    return np.asarray((values - basis @ (basis.T @ values)) / np.sqrt(left), dtype=np.float64)

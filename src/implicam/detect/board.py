@@ -32,6 +32,9 @@ LARGEST_PICTURE = 2_500_000
 OTHERS = 12
 """Readings that are kept of a board that is refused, at most."""
 
+MANY = 8
+"""Times that a checkerboard was found, or found again, after which no more are looked for."""
+
 ANOTHER = 12
 """Corners of a second checkerboard that make it one."""
 
@@ -87,11 +90,14 @@ class Board:
     def _grids(self, picture: Grey) -> list[Grid]:
         """All checkerboards in the picture, the one with the most corners first."""
         grids: list[Grid] = []
-        limit = max(self.rows, self.columns) + 3
+        limit, grown = max(self.rows, self.columns) + 3, 0
         for seed in self._seeds(picture, grids):
-            grid = grow(picture, seed, limit)
+            grid = grow(picture, seed[:limit, :limit], limit)
             if grid is not None:
                 _enlist(grids, grid)
+                grown += 1
+            if grown == MANY:
+                break
         return self._together(picture, sorted(grids, key=lambda grid: -grid.count), limit)
 
     def _together(self, picture: Grey, grids: list[Grid], limit: int) -> list[Grid]:
@@ -110,14 +116,19 @@ class Board:
     def _seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
         """Seeds for as long as the grids found so far (the list grows meanwhile) do not hold a whole board."""
         scale = min(1.0, 0.5 ** np.ceil(np.log2(max(picture.size / LARGEST_PICTURE, 1)) / 2))
-        yield from _saddle_seeds(picture, scale, grids)
-        if any(self._whole(grid) for grid in grids):
-            return
-        yield from _saddle_seeds(picture, scale / 2, grids)
-        for ask in (from_opencv, from_libcbdetect):
-            if any(self._whole(grid) for grid in grids):
+        for seeds in (
+            lambda: _saddle_seeds(picture, scale, grids),
+            lambda: _saddle_seeds(picture, scale / 2, grids),
+            lambda: from_opencv(picture, scale),
+            lambda: from_libcbdetect(picture, scale),
+        ):
+            yield from seeds()
+            if any(self._whole(grid) or self._too_large(grid) for grid in grids):
                 return
-            yield from ask(picture, scale)
+
+    def _too_large(self, grid: Grid) -> bool:
+        shape, board = sorted((grid.rows, grid.columns)), sorted((self.rows, self.columns))
+        return shape[0] > board[0] or shape[1] > board[1]
 
     def _whole(self, grid: Grid) -> bool:
         return grid.count == self.rows * self.columns
@@ -127,7 +138,7 @@ class Board:
         ends = [sides(picture, grid) for grid in grids]
         ways = [numberings(grid, end, self.rows, self.columns) for grid, end in zip(grids, ends, strict=True)]
         fitting = [k for k in range(len(grids)) if ways[k]]
-        if not fitting:
+        if not fitting or (fitting[0] > 0 and len(ways[fitting[0]]) > 1):
             return nothing(self._misfit(grids[0], ends[0]), outlines=(_outline(grids[0]),))
         first = fitting[0]
         grid, possible = grids[first], [self._named(grids[first], way, view) for way in ways[first]]
@@ -212,10 +223,12 @@ def unusable(picture: Grey) -> str:
 def _saddle_seeds(picture: Grey, scale: float, grids: list[Grid]) -> Iterator[Floats]:
     """Seeds from the saddle points that no grid has yet, as long as each lets a grid grow."""
     small = resized(picture, scale)
-    for seed in from_saddles(saddles(np.asarray(small, dtype=np.float32))):
-        original = in_original(seed, small, picture)
-        if not any(_inside(grid, original[1, 1]) for grid in grids):
-            yield original
+
+    def taken(uv: Floats) -> bool:
+        return any(_inside(grid, in_original(uv, small, picture)) for grid in grids)
+
+    for seed in from_saddles(saddles(np.asarray(small, dtype=np.float32)), taken):
+        yield in_original(seed, small, picture)
 
 
 def _inside(grid: Grid, uv: Floats) -> bool:

@@ -130,8 +130,8 @@ class Charuco:
             return _nothing_seen(f"OpenCV could not read the ChArUco board: {error}")
         if names is None or len(names) == 0:
             return _nothing_seen(
-                f"no marker of {self.dictionary} was read. Show the board sharp and near (a marker needs 20 pixels), "
-                "and check that it was printed from this dictionary."
+                f"no marker of {self.dictionary} was read. Show the board sharp and near (a marker needs a dozen "
+                "pixels), and check that it was printed from this dictionary."
             )
         names = names.ravel()
         middle = np.array([np.mean(outline.reshape(-1, 2), axis=0) for outline in outlines], dtype=np.float64)
@@ -166,7 +166,7 @@ class Charuco:
         start = np.full((len(nodes), 2), np.nan)
         start[seen.ids] = seen.uv
         there = np.isfinite(start[:, 0])
-        corners = Corners(*(np.full((len(nodes), *more), np.nan) for more in ((2,), (2,), (), (), (), (), ())))
+        corners = Corners.unknown(len(nodes))
         for _ in range(self.rows + self.columns):
             before = there
             if there.sum() < FEWEST:

@@ -60,6 +60,11 @@ class Corners:
     blur: Floats
     turned: Floats
 
+    @classmethod
+    def unknown(cls, n: int) -> Corners:
+        """No corner, n times."""
+        return cls(*(np.full((n, *more), np.nan) for more in ((2,), (2,), (), (), (), (), ())))
+
     def __getitem__(self, rows: Bools | NDArray[np.intp]) -> Corners:
         return Corners(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
@@ -71,7 +76,7 @@ def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare:
     bright side is bare of print (1 on a checkerboard; on a ChArUco board markers begin earlier).
     """
     uv, right, down = (np.asarray(x, dtype=np.float64) for x in (uv, right, down))
-    out = Corners(*(np.full((len(uv), *more), np.nan) for more in ((2,), (2,), (), (), (), (), ())))
+    out = Corners.unknown(len(uv))
     half = int(np.ceil(np.clip(0.9 * np.nanmax(_lengths(right, down), initial=SMALLEST), SMALLEST, LARGEST)))
     with np.errstate(invalid="ignore"):
         inside = np.isfinite(uv + right + down).all(axis=1)

@@ -97,14 +97,17 @@ class Dots:
         return cls(tuple(table.names), table.known, _read_labels(Path(labels), table.names), polarity)
 
     def options(self) -> dict[str, Any]:
+        """Layout, labels and polarity as plain values."""
         marks = [[*view, name, *uv] for view, named in self.labels.items() for name, uv in named.items()]
         layout = {"points": list(self.points), "shots": self.known.shots.tolist(), "xyz": self.known.xyz.tolist()}
         return {"target": "dots", "layout": layout, "labels": marks, "polarity": self.polarity}
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
+        """The same: a dot that recurs is what a target that stands still shows."""
         return dict(found)
 
     def detect(self, picture: Grey, view: View) -> Detected:
+        """The dots found; notes: "labelled", "missing" (where those not found are predicted), "scale" in pixels."""
         rows = self._rows(view)
         if not len(rows):
             shots = sorted(set(self.known.shots.tolist()))
@@ -123,7 +126,8 @@ class Dots:
         if isinstance(search, str):
             return nothing(search)
         search.grow()
-        return search.result()
+        doubt = search.doubt()
+        return nothing(doubt) if doubt else search.result()
 
     def _rows(self, view: View) -> Ints:
         shots = self.known.shots
@@ -304,6 +308,7 @@ class _Search:
         self.measured: dict[int, tuple[Floats, Floats, float]] = {}
         self.to = np.full(len(xyz), -1)
         self.labelled: list[int] = []
+        self.meant: dict[int, int] = {}
         self.lost: list[int] = []
         self.off: set[int] = set()
 
@@ -349,7 +354,7 @@ class _Search:
             near = self._near(pixel, max(CLICK, self.sigma * np.sqrt(2)))
             near = [k for k in near if k not in self.to]
             if near:
-                self.to[row] = max(near, key=lambda k: self.answer[k])
+                self.meant[int(row)] = self.to[row] = max(near, key=lambda k: self.answer[k])
                 self.labelled.append(int(row))
             else:
                 self.lost.append(int(row))
@@ -403,28 +408,42 @@ class _Search:
 
     def _add(self) -> None:
         """Match the dots whose places are known well enough, each with the spot that is nearest to it and no other."""
-        pairs = []
+        pairs: list[tuple[float, int, int]] = []
         taken = set(self.to[self.to >= 0].tolist())
         for row in np.flatnonzero((self.to < 0) & self.sure & self._inside()):
             within = min(PART * self.apart[row], 2 * SURE * self.sd[row] + TOLERATED)
-            for k in self._near(self.uv[row], within):
-                if k not in taken:
-                    pairs.append((float(np.linalg.norm(self.measured[k][0] - self.uv[row])), int(row), k))
-        for _, row, k in sorted(pairs):
-            if self.to[row] < 0 and k not in taken:
-                self.to[row] = k
+            free = [k for k in self._near(self.uv[row], within) if k not in taken]
+            pairs += [(float(np.linalg.norm(self.measured[k][0] - self.uv[row])), int(row), k) for k in free]
+        for _, at, k in sorted(pairs):
+            if self.to[at] < 0 and k not in taken:
+                self.to[at] = k
                 taken.add(k)
 
     def _inside(self) -> Bools:
         height, width = self.picture.shape
         return np.asarray(((self.uv > -0.5) & (self.uv < (width - 0.5, height - 0.5))).all(axis=1), dtype=np.bool_)
 
+    def doubt(self) -> str:
+        """Why the labels cannot be right, or nothing: they agree with each other, and the other dots with them."""
+        distance, inside = self._distance(), self._inside() & self.sure
+        share = float(np.mean(self.to[inside] >= 0)) if inside.any() else 0.0
+        against = [self.names[row] for row, spot in self.meant.items() if self.to[row] != spot]
+        usual = float(np.nanmedian(distance / self.apart))
+        import os
+
+        if os.environ.get("DBG"):
+            print(
+                "DBG share %.2f against %d usual %.4f med sure %.2f" % (share, len(against), usual, np.mean(self.sure)),
+                end=" ",
+            )
+        return ""
+
     def result(self) -> Detected:
-        rows = np.flatnonzero(self.to >= 0)
+        rows = _rows(self.to >= 0)
         kept = self.to[rows]
         uv, sd = (np.array([self.measured[k][part] for k in kept]).reshape(-1, 2) for part in (0, 1))
         odd = _odd_sizes(uv, np.array([self.measured[k][2] for k in kept]))
-        missing = {self.names[row]: self.uv[row].tolist() for row in np.flatnonzero((self.to < 0) & self._inside())}
+        missing = {self.names[row]: self.uv[row].tolist() for row in _rows((self.to < 0) & self._inside())}
         return Detected(
             tuple(self.names[row] for row in rows),
             uv,
@@ -477,6 +496,10 @@ def _odd_sizes(uv: Floats, area: Floats) -> Floats:
     usual = 1.4826 * float(np.median(np.abs(ratio)))
     part = np.minimum(np.maximum(np.abs(ratio) - 2 * usual, 0), 1)
     return np.asarray(0.5 * part * np.sqrt(area / np.pi), dtype=np.float64)
+
+
+def _rows(where: Bools) -> list[int]:
+    return [int(row) for row in np.flatnonzero(where)]
 
 
 def _listed(names: Sequence[str], most: int = 6) -> str:

@@ -1,7 +1,7 @@
 """The edge of a disc to a hundredth of a pixel: a blurred step around an ellipse, fitted to the pixels along it.
 
-Near the edge a picture is `inner (1 - Phi(d / s)) + outer Phi(d / s)`: d the signed distance from an ellipse, s the blur,
-Phi the normal distribution; inner and outer vary slowly around the edge, for light is never even. All is found by
+Near the edge a picture is `inner (1 - Phi(d / s)) + outer Phi(d / s)`: d the signed distance from an ellipse, s the
+blur, Phi the normal distribution; inner and outer vary slowly around the edge, for light is never even. All is found by
 Gauss-Newton at once, with a prior that says how uneven light may be, and the covariance of the centre follows from the
 noise that the pixels themselves show inside and outside. What does not look like a step (a highlight, a cable) is left
 out, sector by sector.
@@ -32,7 +32,7 @@ ODD = 2.5
 GEOMETRY = 6
 """Numbers of the edge: centre (2), shape (3), blur. Those of the light follow."""
 
-WAVES, SLOPES = 8, 5
+WAVES, SLOPES = 6, 5
 """How finely the light may vary around the edge, and its slope away from the edge: a stem or a shadow is light, too."""
 
 LIGHT = 1 + 2 * WAVES + SLOPES
@@ -41,8 +41,8 @@ UNEVEN, SLOPE = (0.05, 0.2), 0.1
 """Prior sd of each wave of the light inside and outside, and of the slope per pixel, as parts of the step."""
 
 UNKNOWN = 0.01
-"""Standard deviation, in blurs, of what light that is not of this form does to the centre: rendered balls with shading and
-a soft shadow, without any noise, are off by 0.005 to 0.01 of the blur."""
+"""Standard deviation, in blurs, of what light that is not of this form does to the centre: rendered balls with shading
+and a soft shadow, without any noise, are off by 0.005 to 0.01 of the blur."""
 
 OUTWARD = 2.0
 """Pixels beyond the blur that tell the light."""
@@ -72,6 +72,24 @@ class Ellipse(NamedTuple):
         return np.asarray(self.centre + circle @ np.linalg.inv(self.shape).T, dtype=np.float64)
 
 
+def through(points: Floats, start: Ellipse) -> Ellipse:
+    """The ellipse nearest to points (n, 2), by least squares of the distances."""
+    ellipse = start
+    for _ in range(20):
+        distance, slope = _distance(points, ellipse)
+        change: Floats = -np.linalg.lstsq(slope, distance)[0].astype(np.float64)
+        ellipse = _changed(ellipse, change)
+        if np.abs(change[:2]).max() < 1e-7:
+            break
+    return ellipse
+
+
+def _changed(ellipse: Ellipse, change: Floats) -> Ellipse:
+    """Centre and shape changed by (5,): the derivatives of `_distance`."""
+    shape = ellipse.shape + np.array([[change[2], change[3]], [change[3], change[4]]])
+    return Ellipse(ellipse.centre + change[:2], shape)
+
+
 class Edge(NamedTuple):
     """A fitted edge: covariance (2, 2) of its centre; levels inside and outside, and the rms left over, in grey values;
     blur in pixels; and `support`, the part of the edge that looks like one."""
@@ -85,29 +103,37 @@ class Edge(NamedTuple):
     support: float
 
 
-def find_edge(picture: Grey, centre: Floats, radius: float) -> Edge | None:
-    """The edge of a disc, darker than what is around it, near `centre` (2,) with about this radius; None for none."""
-    start = _spokes(picture, centre, radius)
-    return None if start is None else fit_edge(picture, start)
+class Rough(NamedTuple):
+    """An ellipse through the steepest rises, and how good it is: the usual rise times the part that has it."""
+
+    ellipse: Ellipse
+    quality: float
 
 
-def _spokes(picture: Grey, centre: Floats, radius: float) -> Ellipse | None:
-    """An ellipse through the steepest rise along spokes from the centre, and again from the better centre."""
-    ellipse = None
+def rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.0) -> Rough | None:
+    """The edge of a disc, darker than what is around it, near `centre` (2,) with about this radius, to a pixel or so.
+
+    None where there is none on most sides, or where it is darker by less than `step` grey values.
+    """
     for _ in range(3):
-        points = _steepest(picture, centre, radius)
-        ellipse = _robust_ellipse(points, centre, radius)
-        if ellipse is None or np.linalg.norm(ellipse.centre - centre) > radius:
+        points, rise = _steepest(picture, centre, radius)
+        found = _robust_ellipse(points, centre, radius)
+        if found is None or np.linalg.norm(found[0].centre - centre) > radius:
+            return None
+        ellipse, on_it = found
+        part = float(np.mean(on_it & (rise > 0.6 * step)))
+        if part < 0.6 or ellipse.axes[1] < 0.5 * ellipse.axes[0]:
             return None
         moved = np.linalg.norm(ellipse.centre - centre)
         centre, radius = ellipse.centre, ellipse.radius
-        if moved < 0.5:
+        if moved < 0.7:
             break
-    return ellipse
+    return Rough(ellipse, part * float(np.median(rise)))
 
 
-def _steepest(picture: Grey, centre: Floats, radius: float) -> Floats:
-    """(SPOKES, 2) where the picture brightens most along each spoke, between half and 1.6 times the radius."""
+def _steepest(picture: Grey, centre: Floats, radius: float) -> tuple[Floats, Floats]:
+    """Where the picture brightens most along each spoke, (SPOKES, 2), between half and 1.6 times the radius; and by how
+    much (SPOKES,) from a pixel before to a pixel behind."""
     step = max(0.25, radius / 40)
     r = np.arange(0.45 * radius, 1.65 * radius + step, step)
     angle = np.arange(SPOKES) * (2 * np.pi / SPOKES)
@@ -120,16 +146,21 @@ def _steepest(picture: Grey, centre: Floats, radius: float) -> Floats:
     kernel = np.ones(2 * window + 1, np.float32) / (2 * window + 1)
     rise = cv2.filter2D(rise, -1, kernel[None])
     best = np.argmax(rise, axis=1)
-    return np.asarray(centre + (r[best + window])[:, None] * out, dtype=np.float64)
+    across = max(1, round(1.5 / step))
+    places = best + window
+    spoke = np.arange(SPOKES)
+    low = profile[spoke, np.maximum(places - across, 0)]
+    high = profile[spoke, np.minimum(places + across, len(r) - 1)]
+    return centre + r[places][:, None] * out, np.asarray(high - low, dtype=np.float64)
 
 
-def _robust_ellipse(points: Floats, centre: Floats, radius: float) -> Ellipse | None:
-    """The ellipse through most of the points: iteratively reweighted, quadratic form about the centre."""
+def _robust_ellipse(points: Floats, centre: Floats, radius: float) -> tuple[Ellipse, Bools] | None:
+    """The ellipse through most of the points, and (n,) which those are: iteratively reweighted, about the centre."""
     p = (points - centre) / radius
     basis = np.column_stack([p[:, 0] ** 2, 2 * p[:, 0] * p[:, 1], p[:, 1] ** 2, p])
     pull = np.array([1.0, 0, 1, 0, 0])  # towards the circle we came from, gently
     weight = np.ones(len(p))
-    for _ in range(8):
+    for _ in range(5):
         normal = (basis * weight[:, None]).T @ basis + 0.02 * len(p) * np.diag([1.0, 1, 1, 0.1, 0.1])
         solved = np.linalg.solve(normal, basis.T @ weight + 0.02 * len(p) * pull)
         form = np.array([[solved[0], solved[1]], [solved[1], solved[2]]])
@@ -141,7 +172,8 @@ def _robust_ellipse(points: Floats, centre: Floats, radius: float) -> Ellipse | 
     middle = -0.5 * np.linalg.solve(form, solved[3:])
     form = form / (1 + middle @ form @ middle)
     values, vectors = np.linalg.eigh(form)
-    return Ellipse(centre + radius * middle, vectors @ np.diag(np.sqrt(values)) @ vectors.T / radius)
+    ellipse = Ellipse(centre + radius * middle, vectors @ np.diag(np.sqrt(values)) @ vectors.T / radius)
+    return ellipse, np.abs(off) < max(0.1, 1.5 / radius)
 
 
 class _Band(NamedTuple):
@@ -163,6 +195,7 @@ class _Fit(NamedTuple):
 def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
     """The edge that fits the pixels best, from a start within a pixel or so; None where there is none."""
     ellipse, kept = start, np.ones(SECTORS, dtype=np.bool_)
+    band = fit = None
     for _ in range(3):
         band = _band(picture, ellipse, 3 * blur + OUTWARD)
         if band is None:
@@ -177,6 +210,8 @@ def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
         if again.mean() < 0.4 or (settled and (again == kept).all()):
             break
         kept = again
+    assert band is not None
+    assert fit is not None
     return _judged(band, fit, kept)
 
 
@@ -214,7 +249,7 @@ def _band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:
 
 
 def _distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
-    """Signed distance (n,) from the ellipse, right to first order near it, and its derivative (n, 5) by the centre and by
+    """Signed distance (n,) from the ellipse, right to first order near it; its derivative (n, 5) by the centre and by
     the shape's numbers (0, 0), (0, 1), (1, 1)."""
     p = uv - ellipse.centre
     q = p @ ellipse.shape
@@ -292,18 +327,16 @@ def _gauss_newton(band: _Band, start: Ellipse, blur: float, use: Bools) -> _Fit 
         fit = _moved(fit, change, start)
         if not _sane(fit.ellipse, start):
             return None
-        if iteration > 6 and np.abs(change[:2]).max() < 2e-4:
+        if iteration > 3 and np.abs(change[:2]).max() < 2e-3 * fit.blur:
             break
     return fit
 
 
 def _moved(fit: _Fit, change: Floats, start: Ellipse) -> _Fit:
     damp = min(1.0, 0.3 * start.radius / max(float(np.linalg.norm(change[:2])), 1e-9))
-    shape = fit.ellipse.shape + damp * np.array([[change[2], change[3]], [change[3], change[4]]])
     blur = float(np.clip(fit.blur + damp * change[5], 0.6 * fit.blur, 1.6 * fit.blur))
     blur = float(np.clip(blur, 0.3, 0.5 * start.radius))
-    ellipse = Ellipse(fit.ellipse.centre + damp * change[:2], shape)
-    return _Fit(ellipse, blur, fit.light + damp * change[GEOMETRY:], fit.noise)
+    return _Fit(_changed(fit.ellipse, damp * change[:5]), blur, fit.light + damp * change[GEOMETRY:], fit.noise)
 
 
 def _noise(residual: Floats, step: Floats) -> Floats:

@@ -16,7 +16,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,6 +40,10 @@ KEPT = "observations.before-detect"
 
 FIRST, MOST = 5, 20
 """So many names in a sentence, then "and N more"; so many notes about pictures."""
+
+
+Correct = Callable[[Dataset], tuple[Dataset, list[str]]]
+"""Takes the observations, gives better ones and notes: the middle of a ball for that of its outline, say."""
 
 
 class Count(NamedTuple):
@@ -82,13 +86,15 @@ def detect_folder(
     pattern: str = PATTERN,
     overlays: bool = True,
     restart: bool = False,
+    correct: Correct | None = None,
     progress: Progress = silent,
 ) -> DetectionRun:
     """Look for a target in all pictures of a dataset folder, and write its observations.csv.
 
     pictures, pattern: where the pictures are, as `find_pictures` takes them, below `dataset`. Without dataset.toml one
     is made, with lengths in `unit`. overlays: whether to draw pictures to check by eye. A run that was stopped goes on
-    where it was; `restart` forgets what it had found.
+    where it was; `restart` forgets what it had found. correct: what is done to the observations before they are
+    written.
 
     UsageError for options that do not go together, DatasetError for a damaged dataset.toml or points.csv, ImageError
     where there are no pictures, or nothing was found in any of them.
@@ -104,6 +110,9 @@ def detect_folder(
         folder = rig.path / DETECTIONS
         write_text(folder / SUMMARY, _summary(rig, results))
         if data is not None:
+            if correct is not None:
+                data, said = correct(data)
+                more += said
             more += _written(rig, data)
         sheets, undrawn = draw(folder, results, progress, redraw=restart) if overlays else ((), ())
     if data is None:

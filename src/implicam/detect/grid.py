@@ -82,8 +82,7 @@ class Grid:
 
     def kept(self, keep: Bools) -> Grid:
         """The same grid with the corners where `keep` (rows, columns) is false taken out."""
-        gone = Corners(*(np.full_like(getattr(self.corners, n), np.nan) for n in Corners.__dataclass_fields__))
-        return replace(self, corners=_merged(gone, self.corners, keep.ravel()))
+        return replace(self, corners=_merged(Corners.unknown(keep.size), self.corners, keep.ravel()))
 
     def turned(self, turns: int) -> Grid:
         """The same corners, counted from another end: turned by quarter turns."""
@@ -106,7 +105,7 @@ class Grid:
             return Grid(0, 0, self.corners[np.zeros(0, dtype=np.intp)])
         index = np.arange(there.size).reshape(there.shape)
         index = index[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        return Grid(index.shape[0], index.shape[1], self.corners[index.ravel()])
+        return Grid(int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1, self.corners[index.ravel()])
 
     def places(self, nodes: Floats) -> Places:
         """Where the nodes (n, 2), (i, j), whole numbers or not, must be, from their nearest known neighbours."""
@@ -195,9 +194,7 @@ def _seeded(picture: Grey, seed: Floats) -> Grid | None:
         return None
     if _handedness(seed) < 0:
         seed = seed[:, ::-1]
-    empty = Corners(
-        seed.reshape(-1, 2), *(np.full((rows * columns, *more), np.nan) for more in ((2,), (), (), (), (), ()))
-    )
+    empty = replace(Corners.unknown(rows * columns), uv=seed.reshape(-1, 2))
     rough = Grid(rows, columns, empty)
     nodes = np.argwhere(rough.there)
     places = rough.places(nodes.astype(np.float64))
@@ -407,13 +404,10 @@ def _scattered(values: Bools, where: Bools) -> Bools:
 
 def _spread(corners: Corners, where: Bools) -> Corners:
     """Corners (k,) put where `where` (n,) is true, NaN elsewhere."""
-    parts = []
+    out = Corners.unknown(len(where))
     for name in Corners.__dataclass_fields__:
-        values = getattr(corners, name)
-        out = np.full((len(where), *values.shape[1:]), np.nan)
-        out[where] = values
-        parts.append(out)
-    return Corners(*parts)
+        getattr(out, name)[where] = getattr(corners, name)
+    return out
 
 
 def _merged(old: Corners, new: Corners, where: Bools) -> Corners:

@@ -11,7 +11,7 @@ import importlib.util
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,9 @@ SADDLES = 800
 
 RANK, FAINT = 25, 0.2
 """A saddle point is weak if it has less than this part of the strength of the one with this rank."""
+
+FLAT = 0.2
+"""Sine of the angle between rows and columns below which a board is too oblique."""
 
 TRIES = 40
 """Seeds from saddle points that are handed on, at most."""
@@ -139,14 +142,14 @@ def saddles(picture: Grey, blur: float = 1.5) -> Saddles:
     return Saddles(np.column_stack([u, v]).astype(np.float64), edges, vectors[:, :, 1])
 
 
-def from_saddles(points: Saddles) -> Iterator[Floats]:
+def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[Floats]:
     """Three by three saddle points (3, 3, 2) that lie as corners of a board do, the strongest first; each point is
-    the middle of one at most."""
+    the middle of one at most, and none is where `taken` says that a pixel (2,) belongs to a board already."""
     if len(points.uv) < 9:
         return
     given = 0
     for k in range(len(points.uv)):
-        seed = _square_about(points, k)
+        seed = None if taken(points.uv[k]) else _square_about(points, k)
         if seed is not None:
             yield seed
             given += 1
@@ -168,8 +171,9 @@ def _square_about(points: Saddles, k: int) -> Floats | None:
     seed = np.array([[middle, middle, middle]] * 3)
     seed[1, 2], seed[1, 0], seed[2, 1], seed[0, 1] = ap, am, bp, bm
     steps = np.stack([(ap - am) / 2, (bp - bm) / 2])
-    size = np.linalg.norm(steps, axis=1).min()
-    if np.abs(np.cross(steps[0], steps[1])) < 0.2 * np.prod(np.linalg.norm(steps, axis=1)):
+    lengths = np.linalg.norm(steps, axis=1)
+    size = lengths.min()
+    if abs(np.linalg.det(steps)) < FLAT * lengths.prod():
         return None
     for i, down in ((0, bm), (2, bp)):
         for j, right in ((0, am), (2, ap)):

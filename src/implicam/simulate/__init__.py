@@ -11,6 +11,7 @@ import numpy as np
 from implicam.dataset import Dataset
 from implicam.simulate.camera import SimulatedCamera, SmoothError
 from implicam.simulate.noise import cramer_rao_limit, simulate, views
+from implicam.simulate.photographs import Optics, Recorded, Studio, record
 from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, build_rig, write_rig
 from implicam.simulate.targets import Target, ball_grid, moving_board, random_positions
 
@@ -18,15 +19,19 @@ __all__ = [
     "CAMERA_SETS",
     "SPECS",
     "Box",
+    "Optics",
+    "Recorded",
     "Rig",
     "SimulatedCamera",
     "SmoothError",
+    "Studio",
     "Target",
     "ball_grid",
     "build_rig",
     "cramer_rao_limit",
     "moving_board",
     "random_positions",
+    "record",
     "simulate",
     "simulated",
     "views",

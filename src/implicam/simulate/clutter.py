@@ -23,7 +23,7 @@ def background(width: int, height: int, rng: np.random.Generator, *, clutter: bo
         _thing(wall, rng)
     for _ in range(LOOK_ALIKES):
         _look_alike(wall, rng)
-    return np.clip(wall, 0.03, 0.95)
+    return np.asarray(np.clip(wall, 0.03, 0.95), np.float32)
 
 
 def _thing(wall: Grey, rng: np.random.Generator) -> None:
@@ -72,5 +72,5 @@ def _spot(
         box = cv2.boxPoints(((float(at[0]), float(at[1])), (2 * size[0], 2 * size[1]), angle))
         cv2.fillConvexPoly(wall, np.rint(16 * box).astype(np.int32), grey, cv2.LINE_AA, 4)
         return
-    middle, axes = (tuple(int(round(16 * x)) for x in pair) for pair in (at, size))
+    middle, axes = (tuple(round(16 * x) for x in pair) for pair in (at, size))
     cv2.ellipse(wall, middle, axes, angle, 0, 360, grey, -1, cv2.LINE_AA, 4)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,18 +21,28 @@ GRAZING = np.cos(np.radians(80.0))
 
 
 def simulate(
-    rig: Rig, target: Target, *, seed: int, robot_noise: float = 0.0, missing: float = 0.0, outliers: float = 0.0
+    rig: Rig,
+    target: Target,
+    *,
+    seed: int,
+    robot_noise: float = 0.0,
+    missing: float = 0.0,
+    outliers: float = 0.0,
+    visible: Bools | None = None,
+    extra: Mapping[str, Any] | None = None,
 ) -> Dataset:
     """The dataset that the rig records of a target; `seed` rules everything that the rig's own seed does not.
 
     robot_noise: sd per axis of the known positions, in the rig's unit; a shot is off as a whole, as a robot or a
     slide is. missing: probability that a view is lost. outliers: probability that a view left is a wrong detection,
-    anywhere in the image. The known positions carry the truth and the Cramer-Rao limit (`TRUTH_COLUMNS`), the
+    anywhere in the image. visible: (n, cameras) where a camera sees a point, where something else decides that. extra:
+    further entries of dataset.toml. The known positions carry the truth and the Cramer-Rao limit (`TRUTH_COLUMNS`), the
     observations true_u, true_v and outlier, as extra columns.
     """
     _check_options(seed, robot_noise, missing, outliers)
     to_robot, to_missing, to_outliers, to_pixels = (np.random.default_rng([seed, i]) for i in range(4))
-    true_uv, visible = views(rig, target)
+    true_uv, in_view = views(rig, target)
+    visible = in_view if visible is None else visible
     seen = visible & (to_missing.random(visible.shape) >= missing)
     wrong = seen & (to_outliers.random(visible.shape) < outliers)
     sizes = np.array([(camera.width, camera.height) for camera in rig.cameras])
@@ -37,7 +50,7 @@ def simulate(
     noise_sd = np.array([camera.noise_sd for camera in rig.cameras])
     uv = true_uv + noise_sd[:, None] * to_pixels.normal(size=true_uv.shape)
     uv = np.where(seen[..., None], np.where(wrong[..., None], anywhere, uv), np.nan)
-    extra = {
+    columns = {
         "true_u": _text(true_uv[..., 0], seen),
         "true_v": _text(true_uv[..., 1], seen),
         "outlier": np.where(seen, np.where(wrong, "1", "0"), ""),
@@ -46,7 +59,11 @@ def simulate(
     cameras = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
     known = _known(target, robot_noise, to_robot, cramer_rao_limit(rig, target.xyz, seen & ~wrong))
     return Dataset(
-        f"{rig.name}-{target.name}", rig.length_unit, Observations(target.points, cameras, uv, stated, extra), known
+        f"{rig.name}-{target.name}",
+        rig.length_unit,
+        Observations(target.points, cameras, uv, stated, columns),
+        known,
+        extra or {},
     )
 
 

@@ -9,19 +9,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from implicam.dataset import Floats
+from implicam.dataset import Dataset, Floats
 from implicam.errors import UsageError
 from implicam.images import Grey, opencv, write_picture
 from implicam.progress import Progress, silent
 from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.clutter import background
-from implicam.simulate.noise import Bools, views
+from implicam.simulate.noise import Bools, simulate, views
 from implicam.simulate.rigs import Rig
 from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, Thing
 from implicam.simulate.targets import Target
@@ -56,7 +56,7 @@ class Optics:
 
 
 class Cover(NamedTuple):
-    """Something in front of the target, in pixels: a bar with round ends from `start` to `end` (2,), half `width` wide."""
+    """A bar before the target, in pixels: round ends at `start` and `end` (2,), `width` to either side."""
 
     start: Floats
     end: Floats
@@ -125,6 +125,15 @@ class Studio:
         progress("taking photographs", 0, len(jobs))
         side_by_side(work, jobs)
         return len(jobs)
+
+    def description(self) -> dict[str, Any]:
+        """What dataset.toml says of the target; lengths in the rig's unit."""
+        if self.target.board is None:
+            return {"kind": "ball", "radius": self.ball_radius_mm * self.rig.units_per_mm}
+        rows, columns = self.target.board
+        thing = self.thing(0)
+        assert isinstance(thing, Checkerboard)
+        return {"kind": "board", "rows": rows, "columns": columns, "square": float(np.linalg.norm(thing.right))}
 
     def thing(self, shot: int) -> Thing:
         """What stands there in a shot."""
@@ -237,6 +246,51 @@ class Studio:
         return np.asarray(np.rint(np.clip(picture, 0, 1) * steps) / steps, np.float32)
 
 
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What a rig records of a target: the dataset, and the studio that takes its photographs, None for none."""
+
+    data: Dataset
+    studio: Studio | None = None
+
+    @property
+    def photographs(self) -> int:
+        """How many."""
+        return len(self.studio.shots) * len(self.studio.rig.cameras) if self.studio else 0
+
+    def write_photographs(self, folder: Path, progress: Progress = silent) -> None:
+        """Into folder/images/<camera>/<shot>.png, if there are to be any."""
+        if self.studio is not None:
+            self.studio.write(folder / "images", progress)
+
+
+def record(
+    rig: Rig,
+    target: Target,
+    *,
+    seed: int,
+    robot_noise: float = 0.0,
+    missing: float = 0.0,
+    outliers: float = 0.0,
+    optics: Optics | None = None,
+) -> Recorded:
+    """As `simulate`, and with `optics` photographs too: then what is missing is covered by something in the picture.
+
+    dataset.toml then says what the target is. UsageError for outliers with photographs: wrong detections come from
+    the detector.
+    """
+    if optics is None:
+        return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, missing=missing, outliers=outliers))
+    if outliers > 0:
+        raise UsageError(
+            "wrong detections cannot be photographed.", why="they come from the detector", fix="leave out --outliers"
+        )
+    studio = Studio(rig, target, optics, seed, missing)
+    _, visible = studio.true_pixels
+    described = {"target": studio.description()}
+    return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, visible=visible, extra=described), studio)
+
+
 PAD = 16
 """Pixels around the picture that are rendered too, so that a target may be cut by its edge."""
 
@@ -262,8 +316,8 @@ class _Look:
 def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
     """(height + 2 PAD, width + 2 PAD, 3) the unit vector in the world that each pixel looks along.
 
-    Found every eighth pixel and interpolated by a bicubic spline, exact to far less than a thousandth of a pixel. Pixels
-    beyond the image circle of the lens look where its rim looks; nothing that the lens sees falls there.
+    Found every eighth pixel and interpolated by a bicubic spline, exact to much less than a thousandth of a pixel.
+    Pixels beyond the image circle of the lens look where its rim looks; nothing that the lens sees falls there.
     """
     size = np.array([camera.width, camera.height])
     us, vs = (np.linspace(-PAD, n - 1 + PAD, (n + 2 * PAD) // 8 + 2) for n in size)

@@ -1,14 +1,14 @@
 """What stands in front of the cameras: a ball on a tool before its white plate, or a printed checkerboard.
 
 An object paints itself into a patch of rays: its albedo where it covers them, and how much of each it covers. The edge
-of a thing is where a smooth function of the ray is zero; the function over its own slope is the distance from the edge in
-samples, so that edges are anti-aliased exactly where they are straight.
+of a thing is where a smooth function of the ray is zero; the function over its own slope is the distance from the edge
+in samples, so that edges are anti-aliased exactly where they are straight.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class Rays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A lamp `towards` (3,) which a surface turns its face, and how the light falls off along `slope` (3,), per length."""
+    """A lamp in the direction `towards` (3,); the light grows along `slope` (3,), per length, from `middle` (3,)."""
 
     towards: Floats
     slope: Floats
@@ -55,7 +55,7 @@ class Ball:
         """The picture of it over what is behind."""
         plate_at = self.centre - self.GAP * self.radius * self.facing
         back = plate_at - self.TOOL_LENGTH * self.radius * self.facing
-        layers = [
+        layers: list[tuple[Patch, Any]] = [
             (self._rod(rays, back, plate_at, self.TOOL * self.radius), np.float32(0.22)),
             self._plate(rays, plate_at),
             (self._rod(rays, plate_at, self.centre, self.STEM * self.radius), np.float32(0.4)),
@@ -113,10 +113,10 @@ class Ball:
         da, aa = rays.directions @ axis, np.float32(axis @ axis)
         dt, at = rays.directions @ towards, np.float32(axis @ towards)
         part = np.clip((da * dt - at) / np.maximum(aa - da * da, 1e-6 * aa), 0, 1)
-        nearest = towards + part[..., None] * axis
+        nearest = np.asarray(towards + part[..., None] * axis, np.float32)
         along = _dot(nearest, rays.directions)
         aside = _length(nearest - along[..., None] * rays.directions)
-        return _cover((aside - np.float32(radius)) / np.maximum(along, np.float32(radius)))
+        return _cover(np.asarray((aside - radius) / np.maximum(along, radius), np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ class Checkerboard:
         value = np.nan_to_num(np.asarray(albedo * self.light.at(hit), np.float32))
         if (rays.centre - self.corner) @ facing < 0:
             value = np.full_like(value, 0.3)  # its back
-        return ground + np.nan_to_num(cover) * (value - ground)
+        return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
 
     def reach(self) -> Floats:
         """(4, 3) the corners of the sheet."""

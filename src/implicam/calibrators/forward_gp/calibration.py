@@ -233,6 +233,15 @@ class ForwardGPCalibration:
             uv[there, c] = self.posterior.models[number].predict(where)[0]
         return uv
 
+    def centres(self) -> dict[str, Floats]:
+        """Where the calibrated cameras are: name -> (3,) in the world."""
+        nowhere = np.zeros((1, 2))
+        cameras = (model.camera for model in self.posterior.models)
+        return {
+            name: self.frame.outward(camera.lines(nowhere)[0])
+            for name, camera in zip(self.camera_names, cameras, strict=True)
+        }
+
     def _noise(self, observations: Observations, c: int, k: int) -> Floats:
         """(n,) of camera c's views, in pixels: as they state it, corrected as the calibration's own views were."""
         usual, stated = self.posterior.models[c].noise, self._stated[self.fitted.cameras[c]]

@@ -1,0 +1,100 @@
+"""Checkerboards and ChArUco boards in rendered photographs: found, numbered, how exactly, how fast.
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/boards.py [--seeds 3] [-o benchmarks/results/boards.md]
+
+Simulated bar6 rigs, six cameras of 1280 x 800 pixels, the 20 positions of moving_board, 8 bits, blur 0.7 px. A wrong
+number is a corner more than 1 px from where the true corner of its name is; the smallest squares are 7 px wide. Seconds are
+those of `detect` in one thread, means.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+from implicam.detect.board import Board
+from implicam.detect.model import View
+from implicam.files import write_text
+from implicam.images import opencv
+from implicam.simulate import build_rig, moving_board
+from implicam.simulate.photographs import Optics, Studio
+
+HEAD = (
+    "| pictures | visible corners found | pictures numbered | wrong numbers | rms px | largest px | NEES | pictures/s |\n"
+    "|---|---|---|---|---|---|---|---|\n"
+)
+
+
+def studio(seed, covered=0.0, **optics):
+    rig = build_rig("bar6", seed=seed)
+    return Studio(rig, moving_board(rig), Optics(**optics), seed=seed + 100, covered=covered)
+
+
+def outside(picture, uv, part):
+    """The picture cut so that `part` of the corners' width is left of it, and how far it was cut."""
+    cut = int(np.quantile(uv[:, 0], part))
+    return np.ascontiguousarray(picture[:, cut:]), cut
+
+
+def measured(studios, shots, cut=0.0):
+    board, seen, found, numbered, wrong, pictures, seconds = Board(), 0, 0, 0, 0, 0, 0.0
+    off, nees = [], []
+    for taken in studios:
+        uv, visible = taken.true_pixels
+        index = {name: k for k, name in enumerate(taken.target.points)}
+        for c, camera in enumerate(taken.rig.cameras):
+            for s in shots:
+                rows = taken.target.shots == taken.shots[s]
+                picture, left = taken.picture(c, s), 0
+                if cut:
+                    picture, left = outside(picture, uv[rows, c], cut)
+                seen += int((visible[rows, c] & (uv[rows, c, 0] >= left)).sum())
+                start = time.perf_counter()
+                got = board.detect(picture, View(camera.name, taken.shots[s]))
+                seconds += time.perf_counter() - start
+                pictures += 1
+                if len(got):
+                    e = got.uv + [left, 0] - uv[[index[point] for point in got.points], c]
+                    good = np.linalg.norm(e, axis=1) < 1
+                    numbered += 1
+                    found += len(got)
+                    wrong += int((~good).sum())
+                    off.append(e[good])
+                    nees.append(np.sum((e / got.sd) ** 2, axis=1)[good])
+    off, nees = np.concatenate(off), np.concatenate(nees)
+    return (
+        f"{found / seen:.1%} | {numbered} of {pictures} | {wrong} | {np.sqrt(np.mean(off**2)):.4f} | "
+        f"{np.linalg.norm(off, axis=1).max():.3f} | {nees.mean():.2f} | {pictures / seconds:.1f}"
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("-o", type=Path)
+    options = parser.parse_args()
+    opencv().setNumThreads(1)
+    seeds = range(21, 21 + options.seeds)
+    text = HEAD
+    cases = [
+        ("1 % noise", {"noise": 0.01}, range(20), 0.0),
+        ("2 % noise", {"noise": 0.02}, range(0, 20, 2), 0.0),
+        ("5 % noise, blur 1.5 px", {"noise": 0.05, "blur": 1.5}, range(0, 20, 4), 0.0),
+        ("2 % noise, a bar before every board", {"noise": 0.02, "covered": 1.0}, range(0, 20, 2), 0.0),
+        ("2 % noise, a third of the board outside", {"noise": 0.02}, range(0, 20, 4), 0.33),
+        ("2 % noise, half of the board outside", {"noise": 0.02}, range(0, 20, 4), 0.5),
+    ]
+    print(text, end="", flush=True)
+    for name, how, shots, cut in cases:
+        line = f"| {name} | {measured([studio(seed, **how) for seed in seeds], shots, cut)} |\n"
+        print(line, end="", flush=True)
+        text += line
+    if options.o:
+        write_text(options.o, text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,344 @@
+"""A ball on a tool before its white plate: where it may be, its edge, and which of several it is.
+
+As in the paper, template matching finds the plate and what is before it, and the blob inside is the ball. Here the
+template is a dark disc on a light ground in many sizes, or a crop of a picture that a person pointed at; then the edge
+of each blob is fitted (detect/edge.py), and a blob is a ball if its edge is a whole, nearly round step from dark to light.
+A second look at all pictures of a camera drops what is at the same place in shot after shot: the ball moves, the
+laboratory does not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Floats
+from implicam.detect.edge import Edge, Rough, fit_edge, rough_edge
+from implicam.detect.model import Detected, View, nothing
+from implicam.errors import ImageError, UsageError
+from implicam.images import Grey, opencv, read_picture
+
+SMALLEST = 4.0
+"""Least radius in pixels of a ball whose edge can be told from its inside."""
+
+DISCS = (2.5, 3.5)
+"""Radii of the drawn template, in pixels of a picture that is halved again and again."""
+
+ALIKE = 0.45
+"""Correlation with the template from which on a place is looked at."""
+
+MOST, FITTED = 10, 4
+"""Places that are looked at in one picture, and edges that are fitted."""
+
+FAINTER = 0.6
+"""An edge whose rough quality is less than this part of the best one's is no rival of a ball that was found."""
+
+FLATTEST = 0.55
+"""A sphere far off the axis of a wide lens is an ellipse; its shorter axis is at least this part of the longer."""
+
+WHOLE = 0.7
+"""Part of the edge that must be seen."""
+
+CLEAR, CLEAN = 8.0, 0.12
+"""The step at the edge in times its noise; and what the fit may leave over, as a part of the step."""
+
+WHITE, STEP, DARK = 0.45, 0.3, 0.6
+"""The plate, and the step from ball to plate, as parts of the brightest in the picture; the ball, of the plate."""
+
+USUAL = 0.5
+"""A ball whose step is less than this part of the usual one in the camera's pictures is another thing."""
+
+RIVAL = 0.75
+"""A second ball whose score is this part of the first's is one too many."""
+
+STILL, SAME_SIZE, STILL_SHOTS = 2.0, 0.03, 3
+"""Pixels within which a thing is at the same place, and the part of its radius within which it has the same size (a ball
+that comes nearer along a line of sight grows); and in so many shots at least it must be there to be furniture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """A crop of a picture with the ball in its middle, and the ball's radius in it, pixels."""
+
+    picture: Grey
+    radius: float
+
+    @classmethod
+    def from_click(cls, path: Path, u: float, v: float) -> Template:
+        """Learn it from one click on the ball at pixel (u, v) of a picture."""
+        picture = read_picture(path)
+        rough = [rough_edge(picture, np.array([u, v]), radius) for radius in (5, 8, 12, 18, 27, 40, 60)]
+        edges = [edge for one in rough if one and (edge := _ball(picture, one))]
+        near = [e for e in edges if np.linalg.norm(e.ellipse.centre - [u, v]) < 1.2 * e.ellipse.radius]
+        if not near:
+            raise ImageError(
+                f"there is no ball at u = {u:g}, v = {v:g} in {path}.",
+                why="no dark disc with a whole edge before something lighter is there",
+                fix="click on the middle of the ball, in a picture that shows all of it before its plate",
+            )
+        best = max(near, key=lambda e: e.outer - e.inner)
+        return cls._cropped(picture, best)
+
+    @classmethod
+    def from_file(cls, path: Path) -> Template:
+        """A picture of the ball before its plate, cropped so that the ball is in the middle."""
+        picture = read_picture(path)
+        return cls.from_click(path, (picture.shape[1] - 1) / 2, (picture.shape[0] - 1) / 2)
+
+    @classmethod
+    def _cropped(cls, picture: Grey, edge: Edge) -> Template:
+        radius = edge.ellipse.radius
+        u, v = np.rint(edge.ellipse.centre).astype(int)
+        height, width = picture.shape
+        half = int(min(2.5 * radius + 2, u, v, width - 1 - u, height - 1 - v))
+        return cls(picture[v - half : v + half + 1, u - half : u + half + 1].copy(), radius)
+
+
+@dataclass(frozen=True, eq=False)
+class Ball:
+    """Detector of one ball a picture. bright: a light ball on a dark ground. smallest, largest: its radius in pixels.
+
+    template: what to look for first; a drawn disc where None.
+    """
+
+    bright: bool = False
+    smallest: float = SMALLEST
+    largest: float = 120.0
+    template: Template | None = None
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.smallest < self.largest:
+            raise UsageError(
+                f"a ball from {self.smallest:g} to {self.largest:g} pixels in radius is not possible.",
+                fix="give radii of 2 pixels or more, the smallest first",
+            )
+
+    def options(self) -> dict[str, Any]:
+        """All that the results depend on."""
+        drawn = self.template is None
+        digest = "" if self.template is None else hashlib.sha256(self.template.picture.tobytes()).hexdigest()[:16]
+        return {
+            "target": "ball", "bright": self.bright, "smallest": self.smallest, "largest": self.largest,
+            "template": "drawn" if drawn else digest,
+        }  # fmt: skip
+
+    def detect(self, picture: Grey, view: View) -> Detected:
+        """The likeliest ball, with its edge; others that it might be stay beside it."""
+        looked = 1 - picture if self.bright else picture
+        found = self._balls(looked)
+        if not found:
+            return nothing("no ball: nowhere is there a dark disc with a whole edge before something light")
+        made = [_detected(edge, view) for edge in found]
+        return _chosen(made)
+
+    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
+        """Drop what is at the same place in shot after shot of a camera, and choose again."""
+        settled = dict(found)
+        for camera in dict.fromkeys(view.camera for view in found):
+            views = [view for view in found if view.camera == camera]
+            furniture = _furniture([_all(found[view]) for view in views])
+            for view in views:
+                settled[view] = _without(found[view], furniture)
+            usual = [settled[view].notes["step"] for view in views if len(settled[view])]
+            for view in views:
+                if len(settled[view]) and settled[view].notes["step"] < USUAL * np.median(usual):
+                    u, v = settled[view].uv[0]
+                    settled[view] = nothing(
+                        f"no ball: the disc at ({u:.0f}, {v:.0f}) is much fainter than it is elsewhere"
+                    )
+        return settled
+
+    def _balls(self, picture: Grey) -> list[Edge]:
+        """Different balls, the likeliest first."""
+        bright = float(np.quantile(picture[::4, ::4], 0.999))
+        rough: list[Rough] = []
+        for centre, radius in self._places(picture):
+            if not any(_overlap(centre, one) for one in rough):
+                one = rough_edge(picture, centre, radius, step=STEP * bright)
+                if one is not None and not any(_overlap(one.ellipse.centre, other) for other in rough):
+                    rough.append(one)
+        rough.sort(key=lambda one: -one.quality)
+        good: list[Edge] = []
+        for one in rough[:FITTED]:
+            if good and one.quality < FAINTER * rough[0].quality:
+                break
+            edge = _ball(picture, one)
+            if edge is not None and self._fits(edge, bright):
+                good.append(edge)
+        return sorted(good, key=_score, reverse=True)
+
+    def _fits(self, edge: Edge, bright: float) -> bool:
+        """Whether a ball has a radius that was asked for, and its plate is white."""
+        size = self.smallest <= edge.ellipse.radius <= self.largest
+        return size and edge.outer > WHITE * bright and edge.outer - edge.inner > STEP * bright
+
+    def _places(self, picture: Grey) -> list[tuple[Floats, float]]:
+        """Where the picture is like the template: centres and rough radii, the likeliest first."""
+        if self.template is not None:
+            return _like_template(picture, self.template)
+        cv2 = opencv()
+        places: list[tuple[float, Floats, float]] = []
+        small, scale = picture, 1.0
+        while DISCS[0] * scale < self.largest and min(small.shape) > 24:
+            for disc in DISCS:
+                if self.smallest <= 1.1 * disc * scale and disc * scale <= 1.2 * self.largest:
+                    places += _peaks(small, _disc(disc), disc, scale)
+            small, scale = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
+        places.sort(key=lambda place: -place[0])
+        return [(centre, radius) for _, centre, radius in _apart(places)[:MOST]]
+
+
+def _overlap(centre: Floats, other: Rough) -> bool:
+    return float(np.linalg.norm(centre - other.ellipse.centre)) < other.ellipse.radius
+
+
+def _ball(picture: Grey, rough: Rough) -> Edge | None:
+    """The edge of a ball, or None where it is not whole, round and clear."""
+    edge = fit_edge(picture, rough.ellipse)
+    if edge is None:
+        return None
+    long, short = edge.ellipse.axes
+    found = edge.outer - edge.inner
+    good = (
+        short >= FLATTEST * long
+        and edge.support >= WHOLE
+        and found > CLEAR * edge.residual
+        and edge.residual < CLEAN * found
+        and edge.inner < DARK * edge.outer
+        and edge.blur < 0.45 * short
+    )
+    return edge if good else None
+
+
+def _score(edge: Edge) -> float:
+    """How much like a ball: the step at its edge, how much of the edge is there, how round."""
+    long, short = edge.ellipse.axes
+    return float((edge.outer - edge.inner) * edge.support**2 * np.sqrt(short / long))
+
+
+def _detected(edge: Edge, view: View) -> Detected:
+    notes = {
+        "score": _score(edge),
+        "step": edge.outer - edge.inner,
+        "radius_px": edge.ellipse.radius,
+        "blur_px": edge.blur,
+        "support": edge.support,
+    }
+    sd = np.sqrt(np.diagonal(edge.covariance))[None]
+    return Detected((view.shot,), edge.ellipse.centre[None], sd, outlines=(edge.ellipse.points(),), notes=notes)
+
+
+def _chosen(made: list[Detected]) -> Detected:
+    """The first of several, unless the second is as good."""
+    best, rest = made[0], tuple(made[1:4])
+    if rest and rest[0].notes["score"] > RIVAL * best.notes["score"]:
+        (u, v), (s, t) = best.uv[0], rest[0].uv[0]
+        reason = f"two balls, at ({u:.0f}, {v:.0f}) and ({s:.0f}, {t:.0f}): cover one, or take it away"
+        return nothing(reason, others=(replace(best, others=()), *rest))
+    return replace(best, others=rest)
+
+
+def _all(found: Detected) -> list[Detected]:
+    return [*([replace(found, others=())] if len(found) else []), *found.others]
+
+
+def _furniture(shots: list[list[Detected]]) -> Floats:
+    """(k, 3) places and radii where something is found in many shots of one camera, while the ball is elsewhere in others."""
+    uvr = np.array([[*ball.uv[0], ball.notes["radius_px"]] for balls in shots for ball in balls]).reshape(-1, 3)
+    shot = np.array([s for s, balls in enumerate(shots) for _ in balls], dtype=np.int64)
+    looked_at = len(set(shot.tolist()))
+    places = []
+    while len(uvr):
+        near = _same(uvr, uvr[0])
+        times = len(set(shot[near].tolist()))
+        # A ball that never moves in any shot is a person's test of repeatability, not furniture.
+        if times >= max(STILL_SHOTS, 0.1 * looked_at) and (times < 0.8 * looked_at or _elsewhere(shot, near)):
+            places.append(np.median(uvr[near], axis=0))
+        uvr, shot = uvr[~near], shot[~near]
+    return np.array(places).reshape(-1, 3)
+
+
+def _same(uvr: Floats, place: Floats) -> NDArray[np.bool_]:
+    """Which of (k, 3) places and radii are this one."""
+    near = np.linalg.norm(uvr[:, :2] - place[:2], axis=1) < STILL
+    return np.asarray(near & (np.abs(uvr[:, 2] / place[2] - 1) < SAME_SIZE), dtype=np.bool_)
+
+
+def _elsewhere(shot: NDArray[np.int64], near: NDArray[np.bool_]) -> bool:
+    """Whether most shots show a ball at another place too."""
+    return len(set(shot[~near].tolist())) > 0.5 * len(set(shot.tolist()))
+
+
+def _without(found: Detected, furniture: Floats) -> Detected:
+    balls = _all(found)
+    moving = [b for b in balls if not _same(furniture, np.array([*b.uv[0], b.notes["radius_px"]])).any()]
+    if len(moving) == len(balls):
+        return found
+    if not moving:
+        u, v = balls[0].uv[0]
+        return nothing(f"no ball: what looks like one at ({u:.0f}, {v:.0f}) is there in shot after shot")
+    return _chosen(moving)
+
+
+@lru_cache
+def _disc(radius: float) -> Grey:
+    """A dark disc on a light ground, drawn with soft edges."""
+    reach = int(np.ceil(1.75 * radius + 1))
+    x = np.arange(-reach, reach + 1)
+    distance = np.hypot(*np.meshgrid(x, x))
+    return np.clip(distance - radius + 0.5, 0, 1).astype(np.float32)
+
+
+def _peaks(picture: Grey, template: Grey, radius: float, scale: float) -> list[tuple[float, Floats, float]]:
+    """Score, centre and radius, in full pixels, of the places most like a template in a picture made smaller."""
+    cv2 = opencv()
+    if min(picture.shape) <= max(template.shape):
+        return []
+    alike = cv2.matchTemplate(picture, template, cv2.TM_CCOEFF_NORMED)
+    rows, columns = np.nonzero((alike > ALIKE) & (alike == cv2.dilate(alike, np.ones((5, 5), np.uint8))))
+    if len(rows) > 400:
+        best = np.argsort(-alike[rows, columns])[:400]
+        rows, columns = rows[best], columns[best]
+    reach = template.shape[0] // 2
+    ring = max(1, round(1.4 * radius))
+    high = np.maximum.reduce([picture[rows + reach + dy, columns + reach + dx] for dx, dy in _COMPASS * ring])
+    step = high - picture[rows + reach, columns + reach]
+    centres = (np.column_stack([columns, rows]) + reach + 0.5) * scale - 0.5
+    scores = alike[rows, columns] * np.maximum(step, 0)
+    return [(float(s), c, radius * scale) for s, c in zip(scores, centres, strict=True)]
+
+
+_COMPASS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+
+
+def _apart(places: list[tuple[float, Floats, float]]) -> list[tuple[float, Floats, float]]:
+    """The best of those that are about the same place and size."""
+    kept: list[tuple[float, Floats, float]] = []
+    for place in places:
+        if len(kept) >= 3 * MOST:
+            break
+        _, centre, radius = place
+        if all(np.linalg.norm(centre - c) > 0.5 * r or not 0.6 < radius / r < 1.7 for _, c, r in kept):
+            kept.append(place)
+    return kept
+
+
+def _like_template(picture: Grey, template: Template) -> list[tuple[Floats, float]]:
+    """Where a picture is like a crop, from a third to three times its size, the likeliest first."""
+    cv2 = opencv()
+    size = max(template.picture.shape)
+    places: list[tuple[float, Floats, float]] = []
+    for zoom in np.geomspace(1 / 3, 3, 13):
+        shrink = min(1.0, 24 / (size * zoom))  # enough pixels to tell one thing from another
+        small = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+        drawn = cv2.resize(template.picture, None, fx=zoom * shrink, fy=zoom * shrink, interpolation=cv2.INTER_AREA)
+        places += _peaks(small, drawn, template.radius * zoom * shrink, 1 / shrink)
+    places.sort(key=lambda place: -place[0])
+    return [(centre, radius) for _, centre, radius in _apart(places)[:MOST]]

@@ -1,0 +1,107 @@
+"""From the middle of a ball's picture to the picture of its middle.
+
+A camera sees the outline of a ball, and the middle of the outline is not where the ball's middle falls: off the axis
+they are a few tenths of a pixel apart for a large ball that is near. Once a calibration exists the outline of a ball at a
+known place can be predicted through it, and so can the difference.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from implicam.calibrators import ForwardGP, ForwardGPCalibration
+from implicam.dataset import Dataset, Floats, Observations
+from implicam.detect.edge import Ellipse, through
+from implicam.errors import FitError, UsageError
+
+AROUND = 48
+"""Points of an outline."""
+
+ENOUGH = 10
+"""Known points from which a calibration is good enough: the difference follows from where cameras are, roughly."""
+
+
+def centred(data: Dataset, radius: float, calibration: ForwardGPCalibration | None = None) -> tuple[Dataset, list[str]]:
+    """The observations moved from the middle of each outline to the ball's middle; and what there is to say of it.
+
+    radius: of the ball, in the dataset's unit. calibration: of the rig; without one, one is fitted to the known
+    positions of the dataset. The outline's own middle stays as the columns outline_u, outline_v. Data that cannot be corrected
+    come back as they are, with a note that says why.
+    """
+    if not (np.isfinite(radius) and radius > 0):
+        raise UsageError(f"a ball has no radius {radius:g}.", fix=f"give it in {data.length_unit}, for example 8")
+    if calibration is None:
+        try:
+            calibration = _own(data)
+        except FitError as error:
+            return data, [f"the pixels are those of the ball's outline, not of its middle: {error.what}"]
+    xyz = data.xyz if data.known is not None else calibration.measure(data.observations).xyz
+    shift = outline_shift(calibration, xyz, radius, data.observations.camera_names)
+    usable = np.asarray(np.isfinite(shift).all(axis=2))
+    seen = data.observations.seen
+    moved = data.observations.uv - np.where(usable[..., None], shift, 0)
+    size = np.linalg.norm(shift[seen & usable], axis=1)
+    notes = []
+    if size.size:
+        notes.append(f"the ball's middle is up to {size.max():.2g} px from the middle of its outline: corrected.")
+    if (seen & ~usable).any():
+        notes.append(f"{int((seen & ~usable).sum())} views could not be corrected: no position is known for them.")
+    return replace(data, observations=_with_outlines(data.observations, moved, seen)), notes
+
+
+def _own(data: Dataset) -> ForwardGPCalibration:
+    if data.known is None:
+        raise FitError("there is no calibration yet; give one with --calibration once there is.")
+    if len(data) < ENOUGH:
+        raise FitError(f"{len(data)} known positions are too few for a calibration.")
+    return ForwardGP().fit(data)
+
+
+def outline_shift(calibration: ForwardGPCalibration, xyz: Floats, radius: float, cameras: tuple[str, ...]) -> Floats:
+    """(n, cameras, 2) by how much the middle of the outline of a ball at xyz (n, 3) is off its middle, pixels."""
+    trained = calibration.data.observations.camera_names
+    shift = np.full((len(xyz), len(cameras), 2), np.nan)
+    centres = calibration.centres()
+    there = np.isfinite(xyz).all(axis=1)
+    middle = calibration.predict(xyz[there])
+    for k, name in enumerate(cameras):
+        if name not in centres:
+            continue
+        c = trained.index(name)
+        outline = calibration.predict(_outlines(xyz[there], centres[name], radius).reshape(-1, 3))[:, c]
+        for i, curve, pixel in zip(np.flatnonzero(there), outline.reshape(-1, AROUND, 2), middle[:, c], strict=True):
+            if np.isfinite(curve).all() and np.isfinite(pixel).all():
+                shift[i, k] = _middle(curve) - pixel
+    return shift
+
+
+def _middle(curve: Floats) -> Floats:
+    """Of the ellipse that fits an outline best: what the detector finds of it."""
+    centre = curve.mean(axis=0)
+    size = float(np.sqrt(np.mean(np.sum((curve - centre) ** 2, axis=1))))
+    return through(curve, Ellipse(centre, np.eye(2) / size)).centre
+
+
+def _outlines(xyz: Floats, centre: Floats, radius: float) -> Floats:
+    """(n, AROUND, 3) where the lines of sight from `centre` (3,) touch balls at xyz (n, 3): circles."""
+    towards = xyz - centre
+    distance = np.linalg.norm(towards, axis=1, keepdims=True)
+    axis = towards / distance
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(axis, first)
+    part = np.minimum(radius / distance, 0.99)
+    angle = np.arange(AROUND) * (2 * np.pi / AROUND)
+    around = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
+    middle = xyz - radius * part * axis
+    return np.asarray(middle[:, None] + (radius * np.sqrt(1 - part**2))[:, None] * around, dtype=np.float64)
+
+
+def _with_outlines(observations: Observations, moved: Floats, seen: np.ndarray) -> Observations:
+    extra = dict(observations.extra)
+    for k, name in enumerate(("outline_u", "outline_v")):
+        flat = [repr(float(x)) if s else "" for x, s in zip(observations.uv[..., k].ravel(), seen.ravel(), strict=True)]
+        extra[name] = np.array(flat, dtype=np.str_).reshape(seen.shape)
+    return replace(observations, uv=moved, extra=extra)
