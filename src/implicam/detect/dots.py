@@ -53,9 +53,13 @@ ASTRAY = 6.0
 """A dot so many times farther from what the others predict than they are from theirs is none."""
 
 TOLERATED = 1.0
-"""Pixels from what the others predict that are no reason to drop a dot: targets are drilled by hand."""
+"""Pixels, and times the scale of the dots, from what the others predict that are no reason to drop a dot: targets are
+drilled by hand, and a glint at its rim draws a dot's centroid there. Its uncertainty says so."""
 
-ROUNDS = 60
+SCATTER = 0.05
+"""Median distance of dots from what the others predict, as a part of the way to the next dot, that is no fit."""
+
+ROUNDS = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,6 +310,7 @@ class _Search:
         self.rough, self.answer = find_spots(picture, sigma)
         self.tree = cKDTree(self.rough.reshape(-1, 2)) if len(self.rough) else None
         self.measured: dict[int, tuple[Floats, Floats, float]] = {}
+        self.tolerated = max(TOLERATED, TOLERATED * sigma)
         self.to = np.full(len(xyz), -1)
         self.labelled: list[int] = []
         self.meant: dict[int, int] = {}
@@ -318,9 +323,16 @@ class _Search:
     ) -> _Search | str:
         """With the labels' spots, or why there is no beginning."""
         rows, uv = np.array(list(marks)), np.array(list(marks.values()))
+        inside = ((uv > -0.5) & (uv < np.array(picture.shape)[::-1] - 0.5)).all(axis=1)
+        outside = [names[row] for row in rows[~inside]]
+        rows, uv = rows[inside], uv[inside]
+        if len(rows) < FEWEST:
+            return (
+                f"the labels {_listed(outside)} lie outside the picture, which is {picture.shape[1]} x "
+                f"{picture.shape[0]} pixels: correct them, or check that this is the picture they belong to"
+            )
         picture = 1 - picture if polarity == "dark" else picture
-        largest = _largest(xyz, rows, uv)
-        sigma, answers = scale_shown(picture, uv, largest)
+        sigma, answers = scale_shown(picture, uv, _largest(xyz, rows, uv))
         if polarity == "auto" and np.nansum(answers) < 0:
             picture = 1 - picture
         search = cls(picture, sigma, names, xyz)
@@ -400,7 +412,7 @@ class _Search:
             return
         usual = float(np.median(distance[matched]))
         with np.errstate(invalid="ignore"):
-            far = distance > np.maximum(np.maximum(ASTRAY * usual, TOLERATED), 2 * SURE * self.sd)
+            far = distance > np.maximum(np.maximum(ASTRAY * usual, self.tolerated), 2 * SURE * self.sd)
             far |= self.sure & (distance > PART * self.apart)
         far &= distance >= 0.5 * np.nanmax(distance[far], initial=0.0)  # the worst first: they push others off
         self.off |= set(np.flatnonzero(far).tolist())
@@ -411,7 +423,7 @@ class _Search:
         pairs: list[tuple[float, int, int]] = []
         taken = set(self.to[self.to >= 0].tolist())
         for row in np.flatnonzero((self.to < 0) & self.sure & self._inside()):
-            within = min(PART * self.apart[row], 2 * SURE * self.sd[row] + TOLERATED)
+            within = min(PART * self.apart[row], 2 * SURE * self.sd[row] + self.tolerated)
             free = [k for k in self._near(self.uv[row], within) if k not in taken]
             pairs += [(float(np.linalg.norm(self.measured[k][0] - self.uv[row])), int(row), k) for k in free]
         for _, at, k in sorted(pairs):
@@ -419,24 +431,34 @@ class _Search:
                 self.to[at] = k
                 taken.add(k)
 
+    def _displaced(self) -> Floats:
+        """(n,) pixels that matched dots are off by, where that is far more than usual."""
+        distance = self._distance()
+        usual = float(np.nanmedian(distance))
+        with np.errstate(invalid="ignore"):
+            far = distance > np.maximum(ASTRAY * usual, 2 * SURE * self.sd)
+        return np.where(far, distance, 0.0)
+
     def _inside(self) -> Bools:
         height, width = self.picture.shape
         return np.asarray(((self.uv > -0.5) & (self.uv < (width - 0.5, height - 0.5))).all(axis=1), dtype=np.bool_)
 
     def doubt(self) -> str:
         """Why the labels cannot be right, or nothing: they agree with each other, and the other dots with them."""
-        distance, inside = self._distance(), self._inside() & self.sure
-        share = float(np.mean(self.to[inside] >= 0)) if inside.any() else 0.0
+        inside = self._inside()
+        sought = inside & self.sure
+        share = float(np.mean(self.to[sought] >= 0)) if sought.any() else 0.0
+        scatter = float(np.nanmedian(self._distance() / self.apart))
         against = [self.names[row] for row, spot in self.meant.items() if self.to[row] != spot]
-        usual = float(np.nanmedian(distance / self.apart))
-        import os
-
-        if os.environ.get("DBG"):
-            print(
-                "DBG share %.2f against %d usual %.4f med sure %.2f" % (share, len(against), usual, np.mean(self.sure)),
-                end=" ",
-            )
-        return ""
+        outvoted = share >= 0.95 and bool(self.sure[inside].all()) and 3 * len(against) <= len(self.meant)
+        if share >= 0.6 and scatter <= SCATTER and (not against or outvoted):
+            return ""
+        which = f", least of all {_listed(against)}" if against and len(against) < len(self.meant) else ""
+        return (
+            f"the labels do not fit the layout and the dots seen{which}: {(self.to[sought] >= 0).sum()} of "
+            f"{sought.sum()} dots were where they should be. Check that each label has the name of its dot and the "
+            "layout the right axes, and label a few more dots"
+        )
 
     def result(self) -> Detected:
         rows = _rows(self.to >= 0)
@@ -447,7 +469,7 @@ class _Search:
         return Detected(
             tuple(self.names[row] for row in rows),
             uv,
-            np.hypot(sd, odd[:, None]),
+            np.hypot(sd, np.hypot(odd, self._displaced()[rows])[:, None]),
             self._reason(),
             notes={"labelled": [self.names[row] for row in self.labelled], "missing": missing, "scale": self.sigma},
         )
@@ -464,7 +486,10 @@ class _Search:
             "no spot where they must be (hidden, or too faint)": gone & inside & ~off & ~unsure,
         }
         parts = [f"{which.sum()} {text}" for text, which in counts.items() if which.any()]
-        return f"{gone.sum()} of {len(gone)} dots not found: {'; '.join(parts)}" if parts else ""
+        said = [f"{gone.sum()} of {len(gone)} dots not found: {'; '.join(parts)}"] if parts else []
+        if self.lost:
+            said.append(f"no dot where the labels {_listed([self.names[row] for row in self.lost])} are: correct them")
+        return ". ".join(said)
 
 
 FAINTER = 0.3

@@ -16,6 +16,9 @@ from implicam.dataset import Dataset, Floats, Observations
 from implicam.detect.edge import Ellipse, through
 from implicam.errors import FitError, UsageError
 
+ALLOWED = 0.5
+"""Pixels that the middle of an outline may be off when a ball is placed for the first time."""
+
 AROUND = 48
 """Points of an outline."""
 
@@ -27,8 +30,8 @@ def centred(data: Dataset, radius: float, calibration: ForwardGPCalibration | No
     """The observations moved from the middle of each outline to the ball's middle; and what there is to say of it.
 
     radius: of the ball, in the dataset's unit. calibration: of the rig; without one, one is fitted to the known
-    positions of the dataset. The outline's own middle stays as the columns outline_u, outline_v. Data that cannot be corrected
-    come back as they are, with a note that says why.
+    positions of the dataset. The outline's own middle stays as the columns outline_u, outline_v. Data that cannot be
+    corrected come back as they are, with a note that says why.
     """
     if not (np.isfinite(radius) and radius > 0):
         raise UsageError(f"a ball has no radius {radius:g}.", fix=f"give it in {data.length_unit}, for example 8")
@@ -37,7 +40,7 @@ def centred(data: Dataset, radius: float, calibration: ForwardGPCalibration | No
             calibration = _own(data)
         except FitError as error:
             return data, [f"the pixels are those of the ball's outline, not of its middle: {error.what}"]
-    xyz = data.xyz if data.known is not None else calibration.measure(data.observations).xyz
+    xyz = data.xyz if data.known is not None else calibration.measure(_roughly(data.observations)).xyz
     shift = outline_shift(calibration, xyz, radius, data.observations.camera_names)
     usable = np.asarray(np.isfinite(shift).all(axis=2))
     seen = data.observations.seen
@@ -49,6 +52,12 @@ def centred(data: Dataset, radius: float, calibration: ForwardGPCalibration | No
     if (seen & ~usable).any():
         notes.append(f"{int((seen & ~usable).sum())} views could not be corrected: no position is known for them.")
     return replace(data, observations=_with_outlines(data.observations, moved, seen)), notes
+
+
+def _roughly(observations: Observations) -> Observations:
+    """The same, with error bars that allow for what is to be corrected: views must not contradict each other for it."""
+    own = np.where(observations.seen[..., None], np.nan_to_num(observations.sd), np.nan)
+    return replace(observations, sd=np.hypot(own, ALLOWED))
 
 
 def _own(data: Dataset) -> ForwardGPCalibration:

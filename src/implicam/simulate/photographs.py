@@ -71,9 +71,9 @@ class Cover(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Studio:
-    """A rig with a target before it, ready to take pictures; `seed` rules noise, background and what is covered.
+    """A rig with a target before it, ready to take pictures; `seed` rules noise and what is covered.
 
-    covered: share of the pictures in which something stands before the target.
+    Light and background are the rig's own, the same whatever the seed. covered: share of the pictures in which something stands before the target.
     """
 
     rig: Rig
@@ -149,7 +149,7 @@ class Studio:
     @cached_property
     def _looks(self) -> list[_Look]:
         return side_by_side(
-            lambda c: _Look(self.rig.cameras[c], self.optics, np.random.default_rng([self.seed, 5, c])),
+            lambda c: _Look(self.rig.cameras[c], self.optics, np.random.default_rng([self.rig.seed, 5, c])),
             range(len(self.rig.cameras)),
         )
 
@@ -163,7 +163,7 @@ class Studio:
 
     @cached_property
     def _light(self) -> Light:
-        rng = np.random.default_rng([self.seed, 6])
+        rng = np.random.default_rng([self.rig.seed, 6])
         middle, size = self.rig.volume.world_from_box.translation, float(np.linalg.norm(self.rig.volume.size))
         lamp = self._towards_cameras + 0.35 * rng.normal(size=3)
         slope = rng.normal(size=3)
