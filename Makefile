@@ -48,7 +48,7 @@ $(VENV)/bin/python:
 
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
 	@echo "Setting up (once) ..."
-	@$(PIP) --editable ".[report]"
+	@$(PIP) --editable ".[report,images]"
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python

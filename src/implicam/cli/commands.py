@@ -154,20 +154,26 @@ def demo_command(
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
-    """Simulate a rig, calibrate, measure, judge, report: both methods, in seconds."""
+    """Photograph a simulated rig, detect, calibrate, measure, judge, report: both methods, in about a minute."""
     from implicam.demo import run
 
     _must_be_folder(folder)
     with show.progress(json) as progress:
         made = run(folder, seed=seed, progress=progress)
     files = {key: str(getattr(made, key)) for key in ("dataset", "calibration", "measured", "report")}
+    files["photographs"] = str(made.photographs_seen)
     if json:
-        show.emit_json({"rows": [{"cameras": r.cameras, **asdict(r.trial)} for r in made.rows], **files})
+        counts = {"pictures": made.photographs, "found": made.found, "typical_sd_px": made.typical_sd}
+        show.emit_json({"rows": [{"cameras": r.cameras, **asdict(r.trial)} for r in made.rows], **counts, **files})
         return
+    show.line(
+        f"{made.photographs} photographs taken; the ball found in {made.found}, "
+        f"each to {show.number(made.typical_sd, 2)} px\n"
+    )
     show.table(show.demo_table(made))
     show.line(
-        "limit: the Cramer-Rao bound; with this pixel noise nobody does better on average, even with perfectly known "
-        "cameras"
+        "limit: the Cramer-Rao bound; with this noise of detection nobody does better on average, even with perfectly "
+        "known cameras"
     )
     for key, path in files.items():
         show.line(f"  {key:<12}{path}")

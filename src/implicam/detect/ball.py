@@ -2,8 +2,8 @@
 
 As in the paper, template matching finds the plate and what is before it, and the blob inside is the ball. Here the
 template is a dark disc on a light ground in many sizes, or a crop of a picture that a person pointed at; then the edge
-of each blob is fitted (detect/edge.py), and a blob is a ball if its edge is a whole, nearly round step from dark to light.
-A second look at all pictures of a camera drops what is at the same place in shot after shot: the ball moves, the
+of each blob is fitted (detect/edge.py), and a blob is a ball if its edge is a whole, nearly round step from dark to
+light. A second look at all pictures of a camera drops what is at the same place in shot after shot: the ball moves, the
 laboratory does not.
 """
 
@@ -59,8 +59,8 @@ RIVAL = 0.75
 """A second ball whose score is this part of the first's is one too many."""
 
 STILL, SAME_SIZE, STILL_SHOTS = 2.0, 0.03, 3
-"""Pixels within which a thing is at the same place, and the part of its radius within which it has the same size (a ball
-that comes nearer along a line of sight grows); and in so many shots at least it must be there to be furniture."""
+"""Pixels within which a thing is at the same place, and the part of its radius within which it has the same size (a
+ball that comes nearer along a line of sight grows); and in so many shots at least it must be there to be furniture."""
 
 
 @dataclass(frozen=True, eq=False)

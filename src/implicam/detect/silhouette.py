@@ -1,8 +1,8 @@
 """From the middle of a ball's picture to the picture of its middle.
 
 A camera sees the outline of a ball, and the middle of the outline is not where the ball's middle falls: off the axis
-they are a few tenths of a pixel apart for a large ball that is near. Once a calibration exists the outline of a ball at a
-known place can be predicted through it, and so can the difference.
+they are a few tenths of a pixel apart for a large ball that is near. Once a calibration exists the outline of a ball at
+a known place can be predicted through it, and so can the difference.
 """
 
 from __future__ import annotations
@@ -35,12 +35,13 @@ def centred(data: Dataset, radius: float, calibration: ForwardGPCalibration | No
     """
     if not (np.isfinite(radius) and radius > 0):
         raise UsageError(f"a ball has no radius {radius:g}.", fix=f"give it in {data.length_unit}, for example 8")
-    if calibration is None:
+    if calibration is not None:
+        xyz = calibration.measure(_roughly(data.observations)).xyz
+    else:
         try:
-            calibration = _own(data)
+            calibration, xyz = _own(data), data.xyz
         except FitError as error:
             return data, [f"the pixels are those of the ball's outline, not of its middle: {error.what}"]
-    xyz = data.xyz if data.known is not None else calibration.measure(_roughly(data.observations)).xyz
     shift = outline_shift(calibration, xyz, radius, data.observations.camera_names)
     usable = np.asarray(np.isfinite(shift).all(axis=2))
     seen = data.observations.seen

@@ -10,12 +10,13 @@ import numpy as np
 
 from implicam.dataset import Dataset
 from implicam.simulate.camera import SimulatedCamera, SmoothError
-from implicam.simulate.noise import cramer_rao_limit, simulate, views
-from implicam.simulate.photographs import Optics, Recorded, Studio, record
+from implicam.simulate.noise import cramer_rao_limit, simulate, views, with_limit
+from implicam.simulate.photographs import BALL_RADIUS_MM, Optics, Recorded, Studio, record
 from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, build_rig, write_rig
 from implicam.simulate.targets import Target, ball_grid, moving_board, random_positions
 
 __all__ = [
+    "BALL_RADIUS_MM",
     "CAMERA_SETS",
     "SPECS",
     "Box",
@@ -35,6 +36,7 @@ __all__ = [
     "simulate",
     "simulated",
     "views",
+    "with_limit",
     "write_rig",
 ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,19 +78,33 @@ def views(rig: Rig, target: Target) -> tuple[Floats, Bools]:
     return uv, visible
 
 
-def cramer_rao_limit(rig: Rig, xyz: Floats, used: Bools) -> Floats:
+def cramer_rao_limit(rig: Rig, xyz: Floats, used: Bools, sd: Floats | None = None) -> Floats:
     """(n, 3, 3) the covariance nobody can beat, with perfectly known cameras; NaN for fewer than two views.
 
-    The inverse of the Fisher information: the sum of J^T J / noise_sd^2 over the cameras used (n, cameras).
+    The inverse of the Fisher information: the sum of J^T J / sd^2 over the cameras used (n, cameras). sd: of the
+    pixels, (n, cameras, 2); that of each camera's noise where None.
     """
     information = np.zeros((len(xyz), 3, 3))
     for c, camera in enumerate(rig.cameras):
-        jacobian = camera.jacobian(xyz)[used[:, c]] / max(camera.noise_sd, 1e-12)
+        noise = np.full((len(xyz), 2), camera.noise_sd) if sd is None else sd[:, c]
+        jacobian = camera.jacobian(xyz)[used[:, c]] / np.maximum(noise[used[:, c]], 1e-12)[..., None]
         information[used[:, c]] += jacobian.transpose(0, 2, 1) @ jacobian
     limit = np.full_like(information, np.nan)
     enough = used.sum(axis=1) >= 2
     limit[enough] = np.linalg.inv(information[enough])
     return limit
+
+
+def with_limit(rig: Rig, data: Dataset) -> Dataset:
+    """A dataset of the rig's cameras with the Cramer-Rao limit that follows from the sd its own views state."""
+    truth = data.truth
+    if truth is None:
+        raise UsageError(f"dataset {data.name!r} has no simulated truth, so its limit is not known.")
+    observations = data.observations.with_cameras([camera.name for camera in rig.cameras])
+    limit = cramer_rao_limit(rig, truth.xyz, observations.seen, observations.sd)
+    known = data.positions
+    columns = {**known.extra, **_truth_columns(truth.xyz, limit)}
+    return replace(data, observations=observations, known=replace(known, extra=columns))
 
 
 def _faces(camera: SimulatedCamera, target: Target) -> Bools:
@@ -105,11 +120,14 @@ def _known(target: Target, robot_noise: float, rng: np.random.Generator, limit: 
     shots, shot_of_point = np.unique(target.shots, return_inverse=True)
     shift = robot_noise * rng.normal(size=(len(shots), 3))
     sd = np.full_like(target.xyz, robot_noise if robot_noise > 0 else np.nan)
+    return KnownPositions(target.shots, target.xyz + shift[shot_of_point], sd, _truth_columns(target.xyz, limit))
+
+
+def _truth_columns(xyz: Floats, limit: Floats) -> dict[str, Names]:
     off_diagonal = limit[:, [0, 0, 1], [1, 2, 2]]
-    table = np.hstack([target.xyz, np.sqrt(np.diagonal(limit, axis1=1, axis2=2)), off_diagonal])
+    table = np.hstack([xyz, np.sqrt(np.diagonal(limit, axis1=1, axis2=2)), off_diagonal])
     everywhere = np.ones(len(table), dtype=np.bool_)
-    extra = {key: _text(table[:, i], everywhere) for i, key in enumerate(TRUTH_COLUMNS)}
-    return KnownPositions(target.shots, target.xyz + shift[shot_of_point], sd, extra)
+    return {key: _text(table[:, i], everywhere) for i, key in enumerate(TRUTH_COLUMNS)}
 
 
 def _text(numbers: Floats, where: Bools) -> Names:

@@ -73,7 +73,8 @@ class Cover(NamedTuple):
 class Studio:
     """A rig with a target before it, ready to take pictures; `seed` rules noise and what is covered.
 
-    Light and background are the rig's own, the same whatever the seed. covered: share of the pictures in which something stands before the target.
+    Light and background are the rig's own, the same whatever the seed. covered: share of the pictures in which
+    something stands before the target.
     """
 
     rig: Rig
