@@ -82,7 +82,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated rig of two cameras with check points and a calibration, to be read only."""
     folder = tmp_path_factory.mktemp("made")
     simulated = "simulate rig --cameras 2R --positions random --points 40 --check 30 --seed 1"
-    for words in (f"{simulated}", "calibrate rig -o rig.implicam"):
+    photos = "simulate photos --images --cameras 2R --positions random --points 3"
+    for words in (f"{simulated}", "calibrate rig -o rig.implicam", photos):
         real(words, folder, check=True)
     return folder
 
@@ -109,6 +110,7 @@ def files(folder: Path) -> dict[str, bytes]:
 MAKES = {
     "demo": {"implicam-demo"},
     "simulate": {"my-rig"},
+    "detect": set(),
     "calibrate": {"my-rig.implicam"},
     "measure": {"measured.csv"},
     "evaluate": {"report.html"},
@@ -151,6 +153,7 @@ def test_the_version(cli: Cli) -> None:
 def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path) -> None:
     for module in ("plotly", "matplotlib"):
         pytest.importorskip(module)
+    real("simulate my-photos --images --cameras 2R --grid 3x2x2", tmp_path)
     for command, example in EXAMPLES.items():
         before = {path.name for path in tmp_path.iterdir()}
         name, *words = shlex.split(example)
@@ -173,13 +176,13 @@ def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path) -> None:
     assert (tmp_path / "report.html").read_text().rstrip().endswith("</html>")
     assert {path.name for path in (tmp_path / "implicam-demo").iterdir()} == {
         "dataset.toml", "points.csv", "observations.csv", "truth.toml", "check", "rig.implicam", "measured.csv",
-        "report.html",
+        "report.html", "images", "detections", "observations.before-detect.csv",
     }  # fmt: skip
 
 
 def check_readme(printed: str) -> None:
     """The table of the README is the one that the demo prints; numbers may differ in the last digits by machine."""
-    _, *table = printed.split("\n\nlimit:")[0].splitlines()  # without its title
+    _, *table = printed.split("\n\nlimit:")[0].split("\n\n", 1)[1].splitlines()  # without count and title
     text = Path(__file__, "../../README.md").resolve().read_text()
     shown = re.search(r"^```\n( +forward-gp .*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert shown
@@ -219,6 +222,7 @@ def json_commands(made: Path) -> dict[str, list[str]]:
     rig, check, file = str(made / "rig"), str(made / "rig" / "check"), str(made / "rig.implicam")
     return {
         "simulate": ["simulate", "out", "--missing", "0.3", "--positions", "random", "--points", "10", "--check", "5"],
+        "detect": ["detect", str(made / "photos"), "--no-overlays"],
         "calibrate": ["calibrate", rig, "-o", "out.implicam"],
         "measure": ["measure", file, check],
         "evaluate": ["evaluate", file, check],
@@ -239,12 +243,16 @@ def test_json_is_json_and_nothing_else(command: str, made: Path, cli: Cli) -> No
 
 def test_json_of_the_demo(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "SETS", {"2R": "2 cameras"})
+    monkeypatch.setattr(demo, "HELD_OUT", 8)
     ran = cli("demo", "--json", "--seed", "1")
     assert [(row["method"], row["known"]) for row in ran.json["rows"]] == [
-        (method, known) for known in (17, 35, 157) for method in ("forward-gp", "inverse-gp")
+        (method, known) for known in (17, 35) for method in ("forward-gp", "inverse-gp")
     ]
+    assert ran.json["pictures"] == 6 * (35 + 8)
+    assert 0.97 * ran.json["pictures"] <= ran.json["found"] <= ran.json["pictures"]
+    assert Path(ran.json["photographs"]).read_bytes().startswith(b"\xff\xd8")
     best = load_calibration(ran.json["calibration"])
-    assert (best.method, len(best.data)) == ("forward-gp", 157)
+    assert (best.method, len(best.data)) == ("forward-gp", 35)
     assert "forward-gp" in Path(ran.json["report"]).read_text()
     assert all(row["rmse"] > 0 for row in ran.json["rows"])
     assert Path(ran.json["report"]).is_file()
@@ -499,6 +507,8 @@ def test_a_mistake_of_ours_is_told_as_one(cli: Cli, monkeypatch: pytest.MonkeyPa
     ("plotly", "evaluate FILE CHECK --report r.html", "report"),
     ("plotly", "report FILE", "report"),
     ("plotly", "demo", "report"),
+    ("cv2", "demo", "images"),
+    ("cv2", "simulate photos --images --cameras 2R --positions random --points 2", "images"),
     ("matplotlib", "compare RIG -o figure.png", "report"),
     ("gpytorch", "compare RIG --methods inverse-gp:paper", "paper"),
     ("gpytorch", "calibrate RIG -o x.implicam --preset paper", "paper"),

@@ -1,4 +1,4 @@
-"""Everything once: photograph a simulated rig, detect, calibrate with few and more known points, measure, judge, report.
+"""Everything once: photograph a simulated rig, detect, calibrate with few and more points, measure, judge, report.
 
 Our method and the paper's, side by side on the same points.
 """

@@ -104,8 +104,10 @@ def tell(run: DetectionRun, json: bool) -> None:
     show.line(f"{run.observations}: {points} views of {len(run.data)} points in {len(run.cameras)} cameras")
     if run.sheets:
         show.line(f"look at {run.sheets[0]}{f' and {len(run.sheets) - 1} more' if len(run.sheets) > 1 else ''}")
-    show.notes([f"{times} picture{'s' * (times != 1)}: {reason}" for reason, times in run.reasons])
-    show.notes(run.notes)
+    named = "\n".join(run.notes)  # these name their files, and say the reason too
+    show.notes([f"{times} picture{'s' * (times != 1)}: {why}" for why, times in run.reasons if why not in named])
+    for text in run.notes:
+        show.note(text)
 
 
 def _said(dataset: Path) -> dict[str, Any]:

@@ -48,7 +48,7 @@ _NO_SD = "leave the cell empty where no uncertainty is stated"
 def read_folder(path: Path) -> Dataset:
     """Read a dataset folder; every mistake is a DatasetError naming file, line, value and cure."""
     name, unit, cameras, extra = read_description(path)
-    points = _read_points(path / POINTS) if (path / POINTS).exists() else None
+    points = read_points(path / POINTS) if (path / POINTS).exists() else None
     observations = _read_observations(path / VIEWS, cameras, points)
     with naming(path / DESCRIPTION):
         return Dataset(name, unit, observations, points.known if points else None, extra)
@@ -64,7 +64,7 @@ def read_known(path: Path) -> tuple[list[str], KnownPositions] | None:
     """The names and positions in the folder's points.csv, in its order; None where there is none."""
     if not (path / POINTS).exists():
         return None
-    points = _read_points(path / POINTS)
+    points = read_points(path / POINTS)
     return points.names, points.known
 
 
@@ -75,7 +75,7 @@ class _Points:
     known: KnownPositions
 
 
-def _read_points(path: Path) -> _Points:
+def read_points(path: Path) -> _Points:
     header, rows = read_table(path, POINT_COLUMNS)
     at = {column: header.index(column) for column in header}
     extra_columns = [c for c in header if c not in (*POINT_COLUMNS, *SD_POINT)]

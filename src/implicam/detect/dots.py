@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from implicam.dataset import Floats, KnownPositions
-from implicam.dataset.folder import _read_points
+from implicam.dataset.folder import read_points
 from implicam.dataset.tables import name_in, number, read_table
 from implicam.detect.blobs import find_spots, measure_spots, scale_shown
 from implicam.detect.model import Detected, View, nothing
@@ -97,7 +97,7 @@ class Dots:
 
         DatasetError names file, line and cure.
         """
-        table = _read_points(Path(layout))
+        table = read_points(Path(layout))
         return cls(tuple(table.names), table.known, _read_labels(Path(labels), table.names), polarity)
 
     def options(self) -> dict[str, Any]:

@@ -1,0 +1,244 @@
+"""Balls in rendered pictures: how well they are found, what is found where there is none, and what that is worth.
+
+    python benchmarks/ball.py [--rigs 3] [--shots 20] [--empty 1000] [--ends 4] [-o benchmarks/results/ball.md]
+
+First: `bar6` rigs (seeds 0, 1, ...), a random position a shot, 15 % of the pictures with something before the ball;
+errors are against the middle of the ball's true outline, and rms is per axis. NEES should be 2. *pictures / s*: one
+core, reading a PNG from disk and `Ball().detect`. A false ball is one more than 3 px off, or where none can be seen.
+
+Second: pictures in which the ball is covered, or no target at all is there, half of each.
+
+Third, end to end: pictures of 35 known positions -> detections -> corrected to the balls' middles -> forward-gp, which
+measures 60 others from their pictures. *limit* is the Cramer-Rao bound of the detections' stated sd. ± is the standard
+error over rigs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from implicam.calibrators import ForwardGP
+from implicam.dataset import Observations
+from implicam.detect.ball import Ball
+from implicam.detect.edge import Ellipse, through
+from implicam.detect.model import View
+from implicam.detect.silhouette import centred
+from implicam.files import write_text
+from implicam.images import one_thread_each, read_picture, write_picture
+from implicam.simulate import Optics, Studio, build_rig, random_positions, record
+
+LEVELS = ((0.01, 0.7), (0.02, 1.0), (0.05, 1.5))
+COVERED, FALSE, KNOWN, OTHERS = 0.15, 3.0, 35, 60
+
+
+def true_middle(camera, ball, n=90):
+    """The middle of the ellipse through where lines of sight touch the ball."""
+    towards = ball.centre - camera.camera_from_world.centre
+    distance = np.linalg.norm(towards)
+    axis = towards / distance
+    a = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    a /= np.linalg.norm(a)
+    sine = ball.radius / distance
+    t = np.linspace(0, 2 * np.pi, n, endpoint=False)[:, None]
+    around = ball.radius * np.sqrt(1 - sine**2) * (np.cos(t) * a + np.sin(t) * np.cross(axis, a))
+    pixels = camera.pixel_from_world(ball.centre - ball.radius * sine * axis + around)[0]
+    middle = pixels.mean(axis=0)
+    return through(pixels, Ellipse(middle, np.eye(2) / np.linalg.norm(pixels - middle, axis=1).mean())).centre
+
+
+def looked_at(studio, detector, render=None):
+    """{view: detected}, settled, and the seconds that reading and detecting took."""
+    found, seconds = {}, 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        for c, camera in enumerate(studio.rig.cameras):
+            for s, shot in enumerate(studio.shots):
+                write_picture(path, render(c, s) if render else studio.picture(c, s), bits=studio.optics.bits)
+                begin = time.process_time()
+                found[View(camera.name, shot)] = detector.detect(read_picture(path), View(camera.name, shot))
+                seconds += time.process_time() - begin
+    return detector.settle(found), seconds
+
+
+def judged(studio, found):
+    """Errors (k, 2) and sd (k, 2) of the balls found, how many can be seen, and how many are false."""
+    errors, sd, false = [], [], 0
+    visible = studio.true_pixels[1]
+    for c, camera in enumerate(studio.rig.cameras):
+        for s, shot in enumerate(studio.shots):
+            one = found[View(camera.name, shot)]
+            if not len(one):
+                continue
+            error = one.uv[0] - true_middle(camera, studio.thing(s))
+            if not visible[s, c] or np.linalg.norm(error) > FALSE:
+                false += 1
+                continue
+            errors.append(error)
+            sd.append(one.sd[0])
+    return np.reshape(errors, (-1, 2)), np.reshape(sd, (-1, 2)), int(visible.sum()), false
+
+
+def accuracy(noise, blur, rigs, shots):
+    errors, sd, pictures, visible, false, seconds = [], [], 0, 0, 0, 0.0
+    for seed in range(rigs):
+        rig = build_rig("bar6", seed=seed)
+        target = random_positions(rig, shots, np.random.default_rng([seed, 1]))
+        studio = Studio(rig, target, Optics(noise=noise, blur=blur), seed, COVERED)
+        found, took = looked_at(studio, Ball())
+        e, s, v, f = judged(studio, found)
+        errors.append(e)
+        sd.append(s)
+        pictures, visible, false, seconds = pictures + len(found), visible + v, false + f, seconds + took
+    e, s = np.concatenate(errors), np.concatenate(sd)
+    bias = " / ".join(f"{b:+.4f} ± {x:.4f}" for b, x in zip(e.mean(0), e.std(0) / np.sqrt(len(e)), strict=True))
+    nees = np.sum((e / s) ** 2, axis=1)
+    return (
+        f"| {noise:.0%}, {blur} px | {pictures} | {len(e)} of {visible} ({len(e) / visible:.1%}) | {false} | {bias} "
+        f"| {np.sqrt(np.mean(e**2)):.4f} | {nees.mean():.2f} ± {nees.std() / np.sqrt(len(e)):.2f} "
+        f"| {pictures / seconds:.0f} |"
+    )
+
+
+def empty(count, shots):
+    """False balls in `count` pictures in which none can be seen; before and after settling."""
+    first = settled = pictures = covers = seed = 0
+    seconds = 0.0
+    while pictures < count:
+        rig = build_rig("bar6", seed=100 + seed)
+        target = random_positions(rig, shots, np.random.default_rng([seed, 2]))
+        noise, blur = LEVELS[seed // 2 % len(LEVELS)]
+        studio = Studio(rig, target, Optics(noise=noise, blur=blur), seed, 1.0)
+        # A target far behind every camera leaves the background alone.
+        absent = replace(studio, target=replace(target, xyz=target.xyz - 1e5 * studio._towards_cameras), covered=0.0)
+        without = seed % 2 == 1
+        raw = _Counting()
+        found, took = looked_at(absent if without else studio, raw)
+        covers += 0 if without else len(found)
+        first, settled = first + raw.balls, settled + sum(len(one) > 0 for one in found.values())
+        pictures, seconds, seed = pictures + len(found), seconds + took, seed + 1
+    return f"| {covers} covered, {pictures - covers} absent | {first} | {settled} | {pictures / seconds:.0f} |"
+
+
+class _Counting:
+    """Ball(), and how many balls `detect` found before `settle`."""
+
+    def __init__(self):
+        self.balls = 0
+
+    def detect(self, picture, view):
+        found = Ball().detect(picture, view)
+        self.balls += len(found) > 0
+        return found
+
+    def settle(self, found):
+        return Ball().settle(found)
+
+
+def photographed(rig, target, seed, optics):
+    """The dataset with what was found in its pictures."""
+    recorded = record(rig, target, seed=seed, optics=optics)
+    found, _ = looked_at(recorded.studio, Ball())
+    old = recorded.data.observations
+    uv = np.full((len(target.xyz), len(rig.cameras), 2), np.nan)
+    sd = uv.copy()
+    for c, camera in enumerate(rig.cameras):
+        for s, shot in enumerate(recorded.studio.shots):
+            one = found[View(camera.name, shot)]
+            if len(one):
+                uv[s, c], sd[s, c] = one.uv[0], one.sd[0]
+    return replace(recorded.data, observations=Observations(old.points, old.cameras, uv, sd))
+
+
+def limit(rig, xyz, sd):
+    """(n, 3, 3) Cramer-Rao bound with known cameras and sd (n, cameras, 2); NaN for fewer than two views."""
+    information, used = np.zeros((len(xyz), 3, 3)), np.isfinite(sd).all(axis=2)
+    for c, camera in enumerate(rig.cameras):
+        rows = used[:, c]
+        scaled = camera.jacobian(xyz)[rows] / sd[rows, c][:, :, None]
+        information[rows] += scaled.transpose(0, 2, 1) @ scaled
+    out = np.full_like(information, np.nan)
+    enough = used.sum(axis=1) >= 2
+    out[enough] = np.linalg.inv(information[enough])
+    return out
+
+
+def end_to_end(noise, blur, rigs):
+    ratios, nees, covered, millimetres, measured = [], [], [], [], 0
+    for seed in range(rigs):
+        rig, optics = build_rig("bar6", seed=seed), Optics(noise=noise, blur=blur)
+        known, _ = centred(
+            photographed(rig, random_positions(rig, KNOWN, np.random.default_rng([seed, 3])), seed, optics), 8.0
+        )
+        others = photographed(rig, random_positions(rig, OTHERS, np.random.default_rng([seed, 4])), seed + 100, optics)
+        calibration = ForwardGP().fit(known)
+        moved, _ = centred(replace(others, known=None), 8.0, calibration)
+        m = calibration.measure(moved.observations)
+        bound = limit(rig, others.xyz, moved.observations.sd)
+        good = np.isfinite(m.xyz).all(axis=1) & np.isfinite(bound).all(axis=(1, 2))
+        error = (m.xyz - others.xyz)[good]
+        squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(m.cov[good]), error)
+        rmse = np.sqrt(np.mean(np.sum(error**2, axis=1)))
+        ratios.append(rmse / np.sqrt(np.mean(np.trace(bound[good], axis1=1, axis2=2))))
+        millimetres.append(rmse)
+        nees.append(squared.mean())
+        covered.append(np.mean(squared < 7.815))
+        measured += int(good.sum())
+    return (
+        f"| {noise:.0%}, {blur} px | {rigs} | {measured} of {rigs * OTHERS} | {_pm(ratios)} | {_pm(millimetres)} "
+        f"| {_pm(covered)} | {_pm(nees)} |"
+    )
+
+
+def _pm(values):
+    error = np.std(values, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return f"{np.mean(values):.3f} ± {error:.3f}"
+
+
+def table(args):
+    yield f"Balls in rendered pictures: `python benchmarks/ball.py {' '.join(sys.argv[1:])}`".replace(" `", " `", 1)
+    yield ""
+    yield "| noise, blur | pictures | found where visible | false | bias u / v, px | rms, px | NEES (2) | pictures / s |"
+    yield "|---|---|---|---|---|---|---|---|"
+    for noise, blur in LEVELS:
+        yield accuracy(noise, blur, args.rigs, args.shots)
+    yield ""
+    yield "Nothing to be found (all three levels of noise and blur in turn)."
+    yield ""
+    yield "| pictures | false, alone | false, after `settle` | pictures / s |"
+    yield "|---|---|---|---|"
+    yield empty(args.empty, args.shots)
+    yield ""
+    yield f"End to end: {KNOWN} known positions, forward-gp, {OTHERS} others measured."
+    yield ""
+    yield "| noise, blur | rigs | measured | rmse / limit | rmse, mm | 95 % ellipsoid | NEES (3) |"
+    yield "|---|---|---|---|---|---|---|"
+    for noise, blur in LEVELS:
+        yield end_to_end(noise, blur, args.ends)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rigs", type=int, default=3)
+    parser.add_argument("--shots", type=int, default=20)
+    parser.add_argument("--empty", type=int, default=1000)
+    parser.add_argument("--ends", type=int, default=4)
+    parser.add_argument("-o", "--output", type=Path)
+    args = parser.parse_args()
+    lines = []
+    with one_thread_each():
+        for line in table(args):
+            print(line, flush=True)
+            lines.append(line)
+    if args.output:
+        write_text(args.output, "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
