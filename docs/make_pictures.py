@@ -1,6 +1,7 @@
 """Draw the pictures of the docs from the demo: `python docs/make_pictures.py` (needs Chromium).
 
-Runs the demo in a temporary folder, opens its report in a real browser and photographs it.
+Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of its overlays, and
+one of a simulated board. The pictures of dots are drawn by `python benchmarks/dots.py ../shared/real --overlays docs/images`.
 """
 
 from __future__ import annotations
@@ -28,12 +29,21 @@ def photograph(report: Path) -> None:
         browser.close()
 
 
+def implicam(*words: str) -> None:
+    """Run a command."""
+    subprocess.run([sys.executable, "-m", "implicam", *words], check=True)
+
+
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        demo = Path(folder) / "demo"
-        subprocess.run([sys.executable, "-m", "implicam", "demo", str(demo)], check=True)
+        demo, board = Path(folder) / "demo", Path(folder) / "board"
+        implicam("demo", str(demo))
         photograph(demo / "report.html")
+        shutil.copy(demo / "detections" / "overlays" / "cam2" / "random003.jpg", IMAGES / "detect-ball.jpg")
+        implicam("simulate", str(board), "--images", "--target", "board", "--boards", "1", "--cameras", "cam5")
+        implicam("detect", str(board))
+        shutil.copy(board / "detections" / "overlays" / "cam5" / "board01.jpg", IMAGES / "detect-board.jpg")
 
 
 if __name__ == "__main__":

@@ -136,7 +136,8 @@ def test_bad_pictures_are_named_and_the_rest_goes_on(photos: Path, cli: Cli) -> 
     cut.write_bytes(cut.read_bytes()[:50_000])
     (images / "cam1" / "ball002.png").write_text("no picture")
     cv2.imwrite(str(images / "cam1" / "ball003.png"), np.zeros((1024, 1280), np.uint8))
-    cv2.imwrite(str(images / "cam2" / "ball004.png"), np.full((1280, 1024), 90, np.uint8))
+    turned = images / "cam2" / "ball004.png"
+    cv2.imwrite(str(turned), cv2.rotate(cv2.imread(str(turned)), cv2.ROTATE_90_CLOCKWISE))
     (images / "cam2" / "ball005.png").unlink()
     code, _, err = cli("detect", photos, "--no-overlays")
     assert code == 0

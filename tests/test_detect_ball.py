@@ -1,4 +1,4 @@
-"""A ball: the edge of drawn discs with a known centre, rendered pictures against the true outline, and what is no ball."""
+"""A ball: drawn discs with a known centre, rendered pictures against the true outline, and what is no ball."""
 
 from dataclasses import replace
 
@@ -71,36 +71,50 @@ def test_the_centre_of_a_drawn_disc_is_exact(radius, blur):
 @pytest.mark.parametrize(("long", "short", "angle"), [(14, 11, 0.4), (24, 15, -1.1), (40, 30, 2.0)])
 def test_the_centre_of_a_drawn_ellipse_is_exact(long, short, angle):
     centre = np.array([48.3, 51.85])
-    rough = rough_edge(drawn(100, centre, long, short, angle), np.round(centre) + [1, -1], 0.9 * long)
+    rough = rough_edge(drawn(100, centre, long, short, angle), np.round(centre) + np.array([1, -1]), 0.9 * long)
     edge = fit_edge(drawn(100, centre, long, short, angle), rough.ellipse)
     assert np.abs(edge.ellipse.centre - centre).max() < 0.002
     assert edge.ellipse.axes == (pytest.approx(long, abs=0.05), pytest.approx(short, abs=0.05))
 
 
-@pytest.mark.parametrize(("noise", "radius", "blur"), [(0.03, 8.0, 0.8), (0.06, 15.0, 1.5)])
-def test_stated_uncertainty_of_the_centre_is_true(noise, radius, blur):
+@pytest.mark.parametrize(
+    ("noise", "radius", "blur", "nees_of"),
+    # With much noise the light's own freedom is not used up, and the fit is a little better than it says.
+    [(0.03, 8.0, 0.8, (1.7, 2.3)), (0.06, 15.0, 1.5, (1.4, 2.3))],
+)
+def test_stated_uncertainty_of_the_centre_is_true(noise, radius, blur, nees_of):
     rng = np.random.default_rng(11)
     size, nees, errors = int(2 * radius + 20), [], []
-    for _ in range(400):
+    for _ in range(300):
         centre = size / 2 + rng.uniform(-0.5, 0.5, 2)
         picture = drawn(size, centre, radius, blur=blur)
         picture += rng.normal(scale=noise, size=picture.shape).astype(np.float32)
         edge = fit_edge(picture, start(centre + rng.uniform(-0.5, 0.5, 2), radius))
+        if edge is None:
+            continue
         error = edge.ellipse.centre - centre
         errors.append(error)
         nees.append(error @ np.linalg.solve(edge.covariance, error))
-    assert np.mean(nees) == pytest.approx(2, abs=0.3)  # the mean of 400 has a standard deviation of 0.1
+    assert len(nees) > 280
+    assert nees_of[0] < np.mean(nees) < nees_of[1]  # the mean of 300 has a standard deviation of 0.12
     mean, sd = np.mean(errors, axis=0), np.std(errors, axis=0) / np.sqrt(len(errors))
     assert (np.abs(mean) < 4 * sd).all()
 
 
-def test_a_disc_cut_by_the_border_has_no_edge():
-    picture = drawn(60, (30, 30), 12.0)
-    assert fit_edge(picture, start((30, 30), 12.0)) is not None
-    for window in (picture[:, 20:], picture[:, :40], picture[20:], picture[:40]):
-        left, top = (20 if window.shape[1] == 40 and np.shares_memory(window, picture[:1, 59:]) else 0), 0
-        top = 60 - window.shape[0] if window.shape[0] < 60 and window[-1, 0] == picture[-1, 0] else 0
-        assert fit_edge(np.ascontiguousarray(window), start((30 - left, 30 - top), 12.0)) is None
+@pytest.mark.parametrize(
+    ("top", "bottom", "left", "right"), [(0, 60, 20, 60), (0, 60, 0, 40), (20, 60, 0, 60), (0, 40, 0, 60)]
+)
+def test_a_disc_cut_by_the_border_has_no_edge(top, bottom, left, right):
+    centre = np.array([30.2, 29.9])
+    picture = drawn(60, centre, 12.0)
+    assert fit_edge(picture, start(centre, 12.0)) is not None
+    window = np.ascontiguousarray(picture[top:bottom, left:right])
+    assert fit_edge(window, start(centre - [left, top], 12.0)) is None
+
+
+def test_a_start_in_the_middle_of_a_pixel_is_like_any_other():
+    edge = fit_edge(drawn(60, (30.2, 29.9), 12.0), start((30, 30), 12.0))
+    assert edge.ellipse.centre == pytest.approx([30.2, 29.9], abs=0.002)
 
 
 def test_uneven_light_and_a_stem_do_not_pull_the_centre():
@@ -108,13 +122,13 @@ def test_uneven_light_and_a_stem_do_not_pull_the_centre():
     centre = np.array([40.3, 39.6])
     picture = drawn(80, centre, 14.0)
     light = (1 + 0.01 * (u - 40) - 0.006 * (v - 40)).astype(np.float32)  # 1 % a pixel: 28 % across the disc
-    uneven = fit_edge(picture * light, start((40, 40), 14.0))
-    assert np.abs(uneven.ellipse.centre - centre).max() < 0.03
+    uneven = fit_edge(picture * light, start((40.1, 39.9), 14.0))
+    assert np.abs(uneven.ellipse.centre - centre).max() < 0.002
     stem = np.where((np.abs(u - 40) < 3) & (v > 40), np.float32(0.4), picture)
     stem = np.where(np.hypot(u - centre[0], v - centre[1]) < 13, picture, stem).astype(np.float32)
-    edge = fit_edge(stem, start((40, 40), 14.0))
-    assert np.abs(edge.ellipse.centre - centre).max() < 0.03
-    assert edge.support < 1
+    edge = fit_edge(stem, start((40.1, 39.9), 14.0))
+    assert np.abs(edge.ellipse.centre - centre).max() < 0.005
+    assert 0.7 < edge.support < 1
 
 
 def test_no_edge_where_there_is_none():
@@ -127,7 +141,7 @@ def test_no_edge_where_there_is_none():
 
 
 def test_through_recovers_an_ellipse():
-    points = outline(31.0, 22.0, 0.7, 48) + [100.25, -7.5]
+    points = outline(31.0, 22.0, 0.7, 48) + np.array([100.25, -7.5])
     ellipse = through(points, start(points.mean(axis=0) + 1, 25.0))
     assert ellipse.centre == pytest.approx([100.25, -7.5], abs=1e-6)
     assert ellipse.axes == (pytest.approx(31, abs=1e-5), pytest.approx(22, abs=1e-5))
@@ -160,8 +174,8 @@ def true_outline(camera, ball):
     return through(pixels, start(middle, np.linalg.norm(pixels - middle, axis=1).mean()))
 
 
-def studio(seed, n, covered=0.0, **optics):
-    rig = build_rig("bar6", seed=seed)
+def studio(seed, n, covered=0.0, cameras=None, **optics):
+    rig = build_rig("bar6", seed=seed, cameras=cameras)
     return Studio(rig, random_positions(rig, n, np.random.default_rng(seed)), Optics(**optics), seed, covered)
 
 
@@ -185,7 +199,7 @@ def errors_of(made, detector):
     ("noise", "blur", "bias", "rms", "least"), [(0.01, 0.7, 0.02, 0.08, 0.95), (0.05, 1.5, 0.06, 0.2, 0.85)]
 )
 def test_rendered_balls_are_found_where_they_are(noise, blur, bias, rms, least):
-    parts = [errors_of(studio(seed, 4, noise=noise, blur=blur), Ball()) for seed in (0, 1)]
+    parts = [errors_of(studio(seed, 4, cameras="cam1,cam4", noise=noise, blur=blur), Ball()) for seed in (0, 1)]
     errors, sd = np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
     assert len(errors) >= least * sum(p[2] for p in parts)
     assert np.abs(errors.mean(axis=0)).max() < bias
@@ -196,8 +210,8 @@ def test_rendered_balls_are_found_where_they_are(noise, blur, bias, rms, least):
 
 @pytest.fixture(scope="module")
 def clean():
-    """Six cameras, three shots, 1 % noise."""
-    return studio(2, 3)
+    """Two cameras, three shots, 1 % noise."""
+    return studio(2, 3, cameras="cam1,cam2")
 
 
 @pytest.fixture(scope="module")
@@ -244,15 +258,24 @@ def test_no_ball_is_a_reason(picture, bright):
 
 
 def test_nothing_is_found_among_clutter():
-    covered = studio(4, 2, covered=1.0)
-    assert not covered.true_pixels[1].any()
-    found = {}
-    for c, camera in enumerate(covered.rig.cameras):
-        for s, shot in enumerate(covered.shots):
-            found[View(camera.name, shot)] = Ball().detect(covered.picture(c, s), View(camera.name, shot))
+    """Half of the balls are covered; each camera's background holds 14 look-alikes."""
+    rig = build_rig("bar6", seed=4, cameras="cam1,cam2")
+    made = Studio(rig, random_positions(rig, 12, np.random.default_rng(4)), Optics(), 4, 0.5)
+    visible, found = made.true_pixels[1], {}
+    for c, camera in enumerate(rig.cameras):
+        for s, shot in enumerate(made.shots):
+            found[View(camera.name, shot)] = Ball().detect(made.picture(c, s), View(camera.name, shot))
     settled = Ball().settle(found)
-    assert [view for view, one in settled.items() if len(one)] == []
-    assert all(one.reason for one in settled.values())
+    views = [(View(camera.name, shot), visible[s, c], c, s) for c, camera in enumerate(rig.cameras) for s, shot in
+             enumerate(made.shots)]  # fmt: skip
+    hidden = [settled[view] for view, seen, _, _ in views if not seen]
+    assert len(hidden) > 6
+    assert [one.uv.tolist() for one in hidden if len(one)] == []
+    assert all(one.reason for one in hidden)
+    assert any(len(found[view]) for view, seen, _, _ in views if not seen)  # else there was nothing to drop
+    for view, seen, c, s in views:
+        if seen:
+            assert settled[view].uv[0] == pytest.approx(made.true_pixels[0][s, c], abs=1)
 
 
 def test_what_is_stated_is_finite(seen):
@@ -345,11 +368,19 @@ def test_a_click_on_nothing_is_an_error(seen, tmp_path):
 
 def test_other_options_have_other_descriptions(seen):
     grey = seen[0]
-    templates = [Template(grey[:40, :40], 9.0), Template(grey[1:41, :40], 9.0), Template(grey[:40, :40], 12.0)]
+    templates = [Template(grey[:40, :40], 9.0), Template(grey[1:41, :40], 9.0)]
     detectors = [Ball(), Ball(bright=True), Ball(smallest=5), Ball(largest=80), *(Ball(template=t) for t in templates)]
     described = [repr(detector.options()) for detector in detectors]
     assert len(set(described)) == len(detectors)
     assert Ball().options() == Ball().options()
+
+
+def test_a_template_with_another_radius_or_shape_has_another_description():
+    grey = np.random.default_rng(0).uniform(size=(40, 40)).astype(np.float32)
+    one, *others = (
+        Ball(template=Template(*t)).options() for t in ((grey, 9.0), (grey, 12.0), (grey.reshape(32, 50), 9.0))
+    )
+    assert one not in others
 
 
 @pytest.mark.parametrize(("smallest", "largest"), [(1, 50), (10, 10), (20, 10), (np.nan, 50)])
@@ -390,28 +421,41 @@ def test_eight_and_sixteen_bits_agree(seen, tmp_path):
 
 @pytest.fixture(scope="module")
 def calibrated():
-    """A rig, its 40 known balls, and the calibration of them."""
+    """A rig, its 60 known balls, and the calibration of them."""
     rig = build_rig("bar6", seed=3, cameras="2R2W", noise=0.05)
-    data = simulate(rig, random_positions(rig, 40, np.random.default_rng(3)), seed=3)
+    data = simulate(rig, random_positions(rig, 60, np.random.default_rng(3)), seed=3)
     return rig, data, ForwardGP().fit(data)
 
 
 def true_shift(rig, xyz, radius):
-    made = Studio(rig, replace(random_positions(rig, len(xyz), np.random.default_rng(0)), xyz=xyz), ball_radius_mm=radius)
+    made = Studio(
+        rig, replace(random_positions(rig, len(xyz), np.random.default_rng(0)), xyz=xyz), ball_radius_mm=radius
+    )
     pairs = [[true_outline(camera, made.thing(s)).centre for camera in rig.cameras] for s in range(len(xyz))]
     return np.array(pairs) - made.true_pixels[0]
 
 
-def test_the_outline_is_off_by_what_is_predicted(calibrated):
-    rig, data, calibration = calibrated
+@pytest.mark.parametrize(("lens_error", "most"), [(0.0, 0.005), (0.5, 0.012)])
+def test_the_outline_is_off_by_what_is_predicted(lens_error, most):
+    """To 0.005 px; with an error no lens model has, a little worse where an outline reaches beyond what is known."""
+    rig = build_rig("bar6", seed=3, cameras="2R2W", noise=0.05, lens_error=lens_error)
+    data = simulate(rig, random_positions(rig, 150, np.random.default_rng(3)), seed=3)
+    calibration = ForwardGP().fit(data)
     xyz = random_positions(rig, 12, np.random.default_rng(9)).xyz
     true = true_shift(rig, xyz, 8.0)
-    found = outline_shift(calibration, xyz, 8.0, data.observations.camera_names)
-    assert np.abs(true).max() > 0.05  # there is something to predict
-    assert np.abs(found - true).max() < 0.005
-    assert np.isnan(outline_shift(calibration, xyz, 8.0, ("cam2", "unheard-of"))[:, 1]).all()
-    hole = outline_shift(calibration, np.full((1, 3), np.nan), 8.0, data.observations.camera_names)
-    assert np.isnan(hole).all()
+    off = np.abs(outline_shift(calibration, xyz, 8.0, data.observations.camera_names) - true)
+    assert np.abs(true).max() > 0.2  # there is something to predict
+    assert np.quantile(off, 0.95) < 0.005
+    assert off.max() < most
+
+
+def test_where_nothing_can_be_predicted_there_is_no_number(calibrated):
+    _, data, calibration = calibrated
+    shift = outline_shift(calibration, data.xyz[:3], 8.0, ("cam2", "unheard-of"))
+    assert np.isfinite(shift[:, 0]).all()
+    assert np.isnan(shift[:, 1]).all()
+    nowhere = outline_shift(calibration, np.full((1, 3), np.nan), 8.0, data.observations.camera_names)
+    assert np.isnan(nowhere).all()
 
 
 def test_observations_are_moved_to_the_middle(calibrated):
@@ -421,7 +465,7 @@ def test_observations_are_moved_to_the_middle(calibrated):
     for given, target in ((None, outlines), (calibration, outlines), (calibration, replace(outlines, known=None))):
         moved, notes = centred(target, 8.0, given)
         seen = data.observations.seen
-        assert np.abs(moved.observations.uv - data.observations.uv)[seen].max() < 0.01
+        assert np.abs(moved.observations.uv - data.observations.uv)[seen].max() < 0.02  # of up to 0.2 px
         assert any("corrected" in note for note in notes)
         for k, name in enumerate(("outline_u", "outline_v")):
             column = moved.observations.extra[name]

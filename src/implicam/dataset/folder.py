@@ -76,6 +76,7 @@ class _Points:
 
 
 def read_points(path: Path) -> _Points:
+    """The table points.csv: names, and known positions in their order."""
     header, rows = read_table(path, POINT_COLUMNS)
     at = {column: header.index(column) for column in header}
     extra_columns = [c for c in header if c not in (*POINT_COLUMNS, *SD_POINT)]

@@ -40,7 +40,7 @@ MOST, FITTED = 10, 4
 FAINTER = 0.6
 """An edge whose rough quality is less than this part of the best one's is no rival of a ball that was found."""
 
-FLATTEST = 0.55
+FLATTEST = 0.65
 """A sphere far off the axis of a wide lens is an ellipse; its shorter axis is at least this part of the longer."""
 
 WHOLE = 0.7
@@ -49,11 +49,12 @@ WHOLE = 0.7
 CLEAR, CLEAN = 8.0, 0.12
 """The step at the edge in times its noise; and what the fit may leave over, as a part of the step."""
 
-WHITE, STEP, DARK = 0.45, 0.3, 0.6
+WHITE, STEP, DARK = 0.5, 0.38, 0.5
 """The plate, and the step from ball to plate, as parts of the brightest in the picture; the ball, of the plate."""
 
-USUAL = 0.5
-"""A ball whose step is less than this part of the usual one in the camera's pictures is another thing."""
+USUAL, MANY = 0.6, 5
+"""A ball whose step is less than this part of the usual one in the camera's pictures, or, where they show fewer than so
+many balls, in those of all cameras, is another thing."""
 
 RIVAL = 0.75
 """A second ball whose score is this part of the first's is one too many."""
@@ -69,6 +70,12 @@ class Template:
 
     picture: Grey
     radius: float
+
+    @property
+    def digest(self) -> str:
+        """Another for every other template."""
+        content = repr((self.picture.shape, self.radius)).encode() + self.picture.tobytes()
+        return hashlib.sha256(content).hexdigest()[:16]
 
     @classmethod
     def from_click(cls, path: Path, u: float, v: float) -> Template:
@@ -122,11 +129,9 @@ class Ball:
 
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
-        drawn = self.template is None
-        digest = "" if self.template is None else hashlib.sha256(self.template.picture.tobytes()).hexdigest()[:16]
         return {
             "target": "ball", "bright": self.bright, "smallest": self.smallest, "largest": self.largest,
-            "template": "drawn" if drawn else digest,
+            "template": "drawn" if self.template is None else self.template.digest,
         }  # fmt: skip
 
     def detect(self, picture: Grey, view: View) -> Detected:
@@ -140,20 +145,16 @@ class Ball:
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
         """Drop what is at the same place in shot after shot of a camera, and choose again."""
-        settled = dict(found)
-        for camera in dict.fromkeys(view.camera for view in found):
-            views = [view for view in found if view.camera == camera]
-            furniture = _furniture([_all(found[view]) for view in views])
-            for view in views:
-                settled[view] = _without(found[view], furniture)
-            usual = [settled[view].notes["step"] for view in views if len(settled[view])]
-            for view in views:
-                if len(settled[view]) and settled[view].notes["step"] < USUAL * np.median(usual):
-                    u, v = settled[view].uv[0]
-                    settled[view] = nothing(
-                        f"no ball: the disc at ({u:.0f}, {v:.0f}) is much fainter than it is elsewhere"
-                    )
-        return settled
+        cameras = dict.fromkeys(view.camera for view in found)
+        views = {camera: [view for view in found if view.camera == camera] for camera in cameras}
+        moving: dict[View, Detected] = {}
+        for own in views.values():
+            furniture = _furniture([_all(found[view]) for view in own])
+            moving |= {view: _without(found[view], furniture) for view in own}
+        steps = {camera: [moving[v].notes["step"] for v in own if len(moving[v])] for camera, own in views.items()}
+        every = [step for own in steps.values() for step in own]
+        usual = {camera: np.median(own if len(own) >= MANY else every) for camera, own in steps.items() if every}
+        return {view: _if_usual(moving[view], usual.get(view.camera, 0.0)) for view in found}
 
     def _balls(self, picture: Grey) -> list[Edge]:
         """Different balls, the likeliest first."""
@@ -285,6 +286,13 @@ def _without(found: Detected, furniture: Floats) -> Detected:
         u, v = balls[0].uv[0]
         return nothing(f"no ball: what looks like one at ({u:.0f}, {v:.0f}) is there in shot after shot")
     return _chosen(moving)
+
+
+def _if_usual(found: Detected, usual: float) -> Detected:
+    if not len(found) or found.notes["step"] >= USUAL * usual:
+        return found
+    u, v = found.uv[0]
+    return nothing(f"no ball: the disc at ({u:.0f}, {v:.0f}) is much fainter than it is elsewhere")
 
 
 @lru_cache

@@ -122,7 +122,7 @@ def rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.
             return None
         ellipse, on_it = found
         part = float(np.mean(on_it & (rise > 0.6 * step)))
-        if part < 0.6 or ellipse.axes[1] < 0.5 * ellipse.axes[0]:
+        if part < 0.6 or ellipse.axes[1] < 0.55 * ellipse.axes[0]:
             return None
         moved = np.linalg.norm(ellipse.centre - centre)
         centre, radius = ellipse.centre, ellipse.radius
@@ -255,7 +255,7 @@ def _distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
     q = p @ ellipse.shape
     size = np.maximum(np.linalg.norm(q, axis=1), 1e-9)
     slope = (q / size[:, None]) @ ellipse.shape
-    steep = np.linalg.norm(slope, axis=1)
+    steep = np.maximum(np.linalg.norm(slope, axis=1), 1e-9)
     unit = q / size[:, None]
     by_shape = np.column_stack(
         [unit[:, 0] * p[:, 0], unit[:, 0] * p[:, 1] + unit[:, 1] * p[:, 0], unit[:, 1] * p[:, 1]]

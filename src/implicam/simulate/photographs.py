@@ -203,7 +203,7 @@ class Studio:
         cover = self._cover(camera, shot)
         box = self._box(camera, thing, cover)
         if box is None:
-            return picture
+            return _within(picture)
         top, bottom, left, right = box
         window = slice(top, bottom), slice(left, right)
         cv2 = opencv()
