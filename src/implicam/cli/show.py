@@ -245,9 +245,7 @@ def demo_table(demo: Demo) -> Table:
     headings = ["cameras", "points"]
     for name in methods:
         headings += [f"{name}\nrmse {demo.unit}", "rmse/\nlimit", "95 %\ncoverage"]
-    shown = _table(
-        f"A simulated rig, photographed and judged at {HELD_OUT} random positions it has not seen", headings, []
-    )
+    shown = _table(f"A simulated rig, judged at {HELD_OUT} photographed positions it has not seen", headings, [])
     for (cameras, known), trials in lines.items():
         cells: list[str] = []
         for t in trials:
