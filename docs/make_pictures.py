@@ -1,7 +1,7 @@
-"""Draw the pictures of the docs from the demo: `python docs/make_pictures.py` (needs Chromium).
+"""Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium).
 
-Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of its overlays, and
-one of a simulated board. The pictures of dots are drawn by `python benchmarks/dots.py ../shared/real --overlays docs/images`.
+Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of the demo's
+overlays, and one of a simulated board. Dots: `python benchmarks/dots.py ../shared/real --overlays docs/images`.
 """
 
 from __future__ import annotations
