@@ -193,7 +193,7 @@ class Ball:
                     places += _peaks(small, _disc(disc), disc, scale)
             small, scale = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
         places.sort(key=lambda place: -place[0])
-        return [(centre, radius) for _, centre, radius in _apart(places)[:MOST]]
+        return [(centre, radius) for _, centre, radius in _apart(places)]
 
 
 def _overlap(centre: Floats, other: Rough) -> bool:
@@ -330,7 +330,7 @@ def _apart(places: list[tuple[float, Floats, float]]) -> list[tuple[float, Float
     """The best of those that are about the same place and size."""
     kept: list[tuple[float, Floats, float]] = []
     for place in places:
-        if len(kept) >= 3 * MOST:
+        if len(kept) >= MOST:
             break
         _, centre, radius = place
         if all(np.linalg.norm(centre - c) > 0.5 * r or not 0.6 < radius / r < 1.7 for _, c, r in kept):
@@ -349,4 +349,4 @@ def _like_template(picture: Grey, template: Template) -> list[tuple[Floats, floa
         drawn = cv2.resize(template.picture, None, fx=zoom * shrink, fy=zoom * shrink, interpolation=cv2.INTER_AREA)
         places += _peaks(small, drawn, template.radius * zoom * shrink, 1 / shrink)
     places.sort(key=lambda place: -place[0])
-    return [(centre, radius) for _, centre, radius in _apart(places)[:MOST]]
+    return [(centre, radius) for _, centre, radius in _apart(places)]

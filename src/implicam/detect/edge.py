@@ -117,6 +117,8 @@ def rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.
     """
     for _ in range(3):
         points, rise = _steepest(picture, centre, radius)
+        if np.mean(rise > 0.6 * step) < 0.6:  # no ellipse can be better than that
+            return None
         found = _robust_ellipse(points, centre, radius)
         if found is None or np.linalg.norm(found[0].centre - centre) > radius:
             return None
