@@ -7,7 +7,8 @@ polynomial has turned back and would put it on top of another point.
 
 To add a lens:
   1. write a frozen dataclass whose fields are its parameters, in OpenCV's order and names if it has any;
-  2. give it `pixel_from_camera_point`, `jacobian` and `ray_from_pixel`, with the contracts of `BrownConrady`;
+  2. give it `pixel_from_camera_point`, `jacobian`, `parameter_jacobian` and `ray_from_pixel`, with the contracts of
+     `BrownConrady`;
   3. add it to `Lens` below;
   4. add it to `LENSES` in tests/test_cameras.py, where one contract test runs over every lens.
 """
@@ -62,6 +63,22 @@ class BrownConrady:
         focal = np.array([self.fx, self.fy])
         jacobian: Floats = focal[:, None] * (self._distort_slope(xy) @ plane)
         return jacobian
+
+    def parameter_jacobian(self, points: Floats) -> Floats:
+        """(n, 2, 9) derivative of the pixels with respect to fx, fy, cx, cy, k1, k2, p1, p2, k3; NaN for no pixel."""
+        xy, _ = self._plane_from_point(points)
+        x, y = xy.T
+        r2 = x * x + y * y
+        distorted = self._distort(xy)
+        out = np.zeros((len(xy), 2, 9))
+        out[:, 0, 0], out[:, 1, 1] = distorted.T
+        out[:, 0, 2] = out[:, 1, 3] = np.where(np.isnan(x), np.nan, 1.0)
+        focal = np.array([self.fx, self.fy])
+        for column, power in ((4, 1), (5, 2), (8, 3)):
+            out[:, :, column] = focal * xy * (r2**power)[:, None]
+        out[:, :, 6] = focal * np.column_stack([2 * x * y, r2 + 2 * y * y])
+        out[:, :, 7] = focal * np.column_stack([r2 + 2 * x * x, 2 * x * y])
+        return out
 
     def ray_from_pixel(self, uv: Floats) -> tuple[Floats, Bools]:
         """Unit rays (n, 3) in the camera frame of pixels (n, 2); and (n,) where they exist, else NaN."""

@@ -279,7 +279,7 @@ class _Candidate(NamedTuple):
 
 def _best_lens(xyz: Floats, offset: Floats, keep: Bools, *, every: int = 1) -> tuple[_Candidate, Floats]:
     """The pose for the lens that fits the points kept best, and the errors (n,) of all points in pixels."""
-    focal, pinhole, rays = _candidate_rays(offset, every)
+    focal, pinhole, rays = candidate_rays(offset, every)
     rotations, translations, determined = _resect_many(xyz[keep], rays[:, keep])
     if not determined.any():
         raise _undetermined()
@@ -293,8 +293,9 @@ def _best_lens(xyz: Floats, offset: Floats, keep: Bools, *, every: int = 1) -> t
     return _Candidate(pose, float(focal[best]), bool(pinhole[best])), errors[best]
 
 
-def _candidate_rays(offset: Floats, every: int = 1) -> tuple[Floats, Bools, Floats]:
-    """Focal lengths (k,) in pixels, pinhole or not (k,), and unit rays (k, n, 3) of pixels (n, 2) off the middle."""
+def candidate_rays(offset: Floats, every: int = 1) -> tuple[Floats, Bools, Floats]:
+    """A ladder of lenses: focal lengths (k,) in pixels, pinhole or equidistant (k,), and the unit rays (k, n, 3) that
+    pixels (n, 2) off the middle then look along; every: only one rung in so many."""
     radius = np.linalg.norm(offset, axis=1)
     outermost = float(radius.max()) or 1.0
     widest = np.geomspace(0.03, 2.5, 40)[::every]  # radians at the outermost point

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from implicam import calibration_file
+from implicam.calibrators.explicit import Explicit, ExplicitCalibration
 from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
 from implicam.calibrators.protocol import Calibration, Calibrator, Rejected, Unused
@@ -15,11 +16,12 @@ from implicam.errors import CalibrationFileError, UsageError, did_you_mean
 METHODS: dict[str, tuple[type[Any], type[Any]]] = {
     ForwardGP.method: (ForwardGP, ForwardGPCalibration),
     InverseGP.method: (InverseGP, InverseGPCalibration),
+    Explicit.method: (Explicit, ExplicitCalibration),
 }
 """Method name -> (calibrator, calibration)."""
 
 DEFAULT_METHOD = ForwardGP.method
-COMING = ("mlp", "explicit")
+COMING = ("mlp",)
 
 
 def calibrator(method: str, **options: Any) -> Calibrator:
@@ -59,6 +61,8 @@ __all__ = [
     "METHODS",
     "Calibration",
     "Calibrator",
+    "Explicit",
+    "ExplicitCalibration",
     "ForwardGP",
     "ForwardGPCalibration",
     "InverseGP",

@@ -7,7 +7,8 @@ To add a method: 1. write `calibrators/<method>.py` with the two classes; 2. add
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
@@ -155,6 +156,19 @@ def require_two_values(xyz: NDArray[np.float64], method: str) -> None:
                 why=f"{method} learns {axis} from examples, and has seen one value only",
                 fix=f"add points with other {axis}, for example a second position of the board",
             )
+
+
+@contextmanager
+def solvable() -> Iterator[None]:
+    """Turn equations of a fit without a solution into a FitError."""
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise FitError(
+            "the known points do not fix the rig: the equations have no solution.",
+            why=str(error),
+            fix="add known points elsewhere in the volume, and look for wrong ones (implicam info DATASET)",
+        ) from error
 
 
 def finite_column(arrays: Arrays, name: str, shape: tuple[int, ...], *, positive: bool = False) -> NDArray[np.float64]:

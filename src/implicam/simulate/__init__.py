@@ -10,10 +10,10 @@ import numpy as np
 
 from implicam.dataset import Dataset
 from implicam.simulate.camera import SimulatedCamera, SmoothError
-from implicam.simulate.noise import cramer_rao_limit, simulate, views, with_limit
+from implicam.simulate.noise import cramer_rao_limit, each_and_pairs, simulate, simulate_boards, views, with_limit
 from implicam.simulate.photographs import BALL_RADIUS_MM, Optics, Recorded, Studio, record
 from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, build_rig, write_rig
-from implicam.simulate.targets import Target, ball_grid, moving_board, random_positions
+from implicam.simulate.targets import Target, ball_grid, held_boards, moving_board, random_positions
 
 __all__ = [
     "BALL_RADIUS_MM",
@@ -30,10 +30,13 @@ __all__ = [
     "ball_grid",
     "build_rig",
     "cramer_rao_limit",
+    "each_and_pairs",
+    "held_boards",
     "moving_board",
     "random_positions",
     "record",
     "simulate",
+    "simulate_boards",
     "simulated",
     "views",
     "with_limit",

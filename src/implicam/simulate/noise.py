@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from implicam.dataset import TRUTH_COLUMNS, Camera, Dataset, Floats, KnownPositi
 from implicam.errors import UsageError
 from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.rigs import Rig
-from implicam.simulate.targets import Target
+from implicam.simulate.targets import Target, held_boards
 
 Bools = NDArray[np.bool_]
 
@@ -68,6 +69,37 @@ def simulate(
     )
 
 
+def simulate_boards(
+    rig: Rig,
+    groups: Sequence[Sequence[str]],
+    *,
+    seed: int,
+    missing: float = 0.0,
+    outliers: float = 0.0,
+    corners: tuple[int, int] = (8, 11),
+    square: float = 13.29,
+) -> Dataset:
+    """Corners of a board held by hand, once for each group of cameras (`held_boards`), at positions nobody knows.
+
+    square: in mm. missing, outliers: as for `simulate`.
+    """
+    rng = np.random.default_rng([seed, 9])
+    target, takes = held_boards(rig, groups, rng, corners=corners, square=square)
+    visible = takes & views(rig, target)[1]
+    kind = {"kind": "board", "rows": corners[0], "columns": corners[1], "square": square * rig.units_per_mm}
+    data = simulate(rig, target, seed=seed, missing=missing, outliers=outliers, visible=visible, extra={"target": kind})
+    return replace(data, known=None)
+
+
+def each_and_pairs(rig: Rig, each: int, pairs: int) -> list[tuple[str, ...]]:
+    """The paper's budget: `each` pictures by every camera alone, and `pairs` by every two neighbours on the bar."""
+    along = rig.volume.world_from_box.rotation[:, 0]
+    order = sorted(rig.cameras, key=lambda camera: float(camera.camera_from_world.centre @ along))
+    alone = [(camera.name,) for camera in rig.cameras for _ in range(each)]
+    together = [(a.name, b.name) for a, b in pairwise(order) for _ in range(pairs)]
+    return [*alone, *together]
+
+
 def views(rig: Rig, target: Target) -> tuple[Floats, Bools]:
     """The true pixels (n, cameras, 2), and (n, cameras) where the camera sees the point."""
     pairs = [camera.pixel_from_world(target.xyz) for camera in rig.cameras]
@@ -111,7 +143,7 @@ def _faces(camera: SimulatedCamera, target: Target) -> Bools:
     if target.facing is None:
         return np.ones(len(target.xyz), dtype=np.bool_)
     to_camera = camera.camera_from_world.centre - target.xyz
-    cos = to_camera @ target.facing / np.linalg.norm(to_camera, axis=1)
+    cos = np.sum(to_camera * target.facing, axis=1) / np.linalg.norm(to_camera, axis=1)
     return np.asarray(cos > GRAZING, dtype=np.bool_)
 
 

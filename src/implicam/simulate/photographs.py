@@ -157,7 +157,8 @@ class Studio:
     @cached_property
     def _towards_cameras(self) -> Floats:
         if self.target.facing is not None:
-            return self.target.facing
+            mean = np.atleast_2d(self.target.facing).mean(axis=0)
+            return np.asarray(mean / np.linalg.norm(mean), dtype=np.float64)
         middle = self.rig.volume.world_from_box.translation
         mean = np.mean([camera.camera_from_world.centre for camera in self.rig.cameras], axis=0) - middle
         return np.asarray(mean / np.linalg.norm(mean), dtype=np.float64)

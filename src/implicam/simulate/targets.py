@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from implicam.dataset import Floats, Names
 from implicam.errors import UsageError
+from implicam.geometry import look_at, rotation_from_vector
+from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.rigs import Rig
 
 
@@ -15,8 +19,8 @@ from implicam.simulate.rigs import Rig
 class Target:
     """Points with their true positions (n, 3), in the rig's world frame and unit, and the shot each belongs to.
 
-    facing: (3,) the side a board shows, a unit vector in the world; None for a ball, which has no side. board: rows and
-    columns of its inner corners, None for a ball.
+    facing: (3,) or (n, 3) the side a board shows, a unit vector in the world; None for a ball, which has none. board:
+    rows and columns of its inner corners, None for a ball.
     """
 
     name: str
@@ -59,6 +63,71 @@ def moving_board(
     pose = rig.volume.world_from_box
     facing = -pose.rotation[:, 2]
     return Target("board", np.array(names), np.repeat(shots, rows * columns), pose.apply(box), facing, corners)
+
+
+def held_boards(
+    rig: Rig,
+    groups: Sequence[Sequence[str]],
+    rng: np.random.Generator,
+    *,
+    corners: tuple[int, int] = (8, 11),
+    square: float = 13.29,
+) -> tuple[Target, NDArray[np.bool_]]:
+    """A board held by hand, once for each group of cameras, so that all of the group see all of it; and (n, cameras)
+    which cameras take a picture: those of the group.
+
+    Tilted up to 50 degrees, as far away as lets its diagonal span 0.25 to 0.8 of the image's width. UsageError where no
+    pose is found that a group sees together.
+    """
+    _check_counts(corners=corners)
+    y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in corners), indexing="ij")
+    flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * square * rig.units_per_mm
+    names = [camera.name for camera in rig.cameras]
+    positions, facing, takes = [], [], np.zeros((len(groups) * len(flat), len(names)), dtype=np.bool_)
+    for g, group in enumerate(groups):
+        xyz, towards = _held(flat, [rig.cameras[names.index(name)] for name in group], rng)
+        positions.append(xyz)
+        facing.append(np.broadcast_to(towards, xyz.shape))
+        takes[g * len(flat) : (g + 1) * len(flat), [names.index(name) for name in group]] = True
+    shots = np.repeat([f"held{g + 1:03d}" for g in range(len(groups))], len(flat))
+    points = np.array([f"{shot}-c{i % len(flat) + 1:03d}" for i, shot in enumerate(shots)])
+    return Target("boards", points, shots, np.concatenate(positions), np.concatenate(facing), corners), takes
+
+
+TRIES = 4000
+
+
+def _held(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Corners (k, 3) of a board that all the cameras see, and the side (3,) it shows."""
+    middle = np.mean([camera.camera_from_world.centre for camera in cameras], axis=0)
+    diagonal = float(np.linalg.norm(np.ptp(flat, axis=0)))
+    for _ in range(TRIES):
+        camera = cameras[int(rng.integers(len(cameras)))]
+        pixel = rng.uniform(0.05, 0.95, size=2) * [camera.width - 1, camera.height - 1]
+        rays, valid = camera.lens.ray_from_pixel(pixel[None])
+        if not valid[0]:
+            continue
+        reach = camera.lens.fx * diagonal / (rng.uniform(0.25, 0.8) * camera.width)
+        centre = camera.camera_from_world.centre + reach * (rays[0] @ camera.camera_from_world.rotation)
+        turn = rng.normal(size=3) * [1.0, 1.0, 0.4]  # tilted more than turned in its own plane
+        turn *= np.radians(rng.uniform(0, 50)) / np.linalg.norm(turn)
+        # a board's x runs to the right and y down as seen from its front: its z looks away from the cameras
+        frame = look_at(middle, centre, -cameras[0].camera_from_world.rotation[1]).rotation.T @ rotation_from_vector(
+            turn
+        )
+        xyz, towards = flat @ frame.T + centre, -frame[:, 2]
+        if all(_sees(each, xyz, towards) for each in cameras):
+            return xyz, towards
+    raise UsageError(
+        f"no place was found where {', '.join(c.name for c in cameras)} see a whole board together.",
+        fix="choose cameras that look at the same place, or a smaller board",
+    )
+
+
+def _sees(camera: SimulatedCamera, xyz: Floats, towards: Floats) -> bool:
+    to_camera = camera.camera_from_world.centre - xyz
+    cos = to_camera @ towards / np.linalg.norm(to_camera, axis=1)
+    return bool((cos > 0.3).all() and camera.pixel_from_world(xyz)[1].all())
 
 
 def _balls(rig: Rig, name: str, parts: Floats) -> Target:

@@ -5,6 +5,7 @@ The order of docs/method.md, section "Fit".
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -82,30 +83,12 @@ class FittedRig:
 def fit_rig(problem: Problem, progress: Progress) -> FittedRig:
     """Fit every camera that can be fitted."""
     progress("fitting", 0, 3)
-    started, blind = _start(problem)
+    started, blind = start_rig(problem, lambda c, points, uv: start_camera(points, uv, problem.images[c], problem.lens))
     cameras = tuple(started)
-    if len(cameras) < 2:
-        raise FitError(
-            f"{len(cameras)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
-            why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
-            fix="show the cameras more known points, in the whole volume",
-        )
     seen = tuple(problem.sightings[c] for c in cameras)
     images = tuple(problem.images[c] for c in cameras)
     kept = tuple(started[c].kept for c in cameras)
-    models = tuple(
-        CameraModel(
-            started[c].camera,
-            started[c].camera,
-            started[c].prior,
-            image,
-            empty_field(np.ones(2), np.zeros((1, 3)), 1.0),
-            0.0,
-            1.0,
-            np.zeros((1, 2)),
-        )
-        for c, image in zip(cameras, images, strict=True)
-    )
+    models = tuple(without_field(started[c], image) for c, image in zip(cameras, images, strict=True))
     progress("fitting", 1, 3)
     stated = problem.stated[list(cameras)]
     rounds = ROUNDS_WITH_SHOTS if problem.errors is not None and problem.errors.estimated else ROUNDS
@@ -114,7 +97,7 @@ def fit_rig(problem: Problem, progress: Progress) -> FittedRig:
         state = _round(problem, state, seen, images, stated)
         judged = state.kept
         if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
-            judged = _judged_all(state.posterior, problem.points, seen, state.kept)
+            judged = judged_all(state.posterior, problem.points, seen, state.kept)
         if state.settled and all((j == k).all() for j, k in zip(judged, state.kept, strict=True)):
             break
         progress("fitting", 2, 3)
@@ -164,11 +147,24 @@ def _round(
     return _Round(hyper, posterior.models, posterior, kept, following, label_sd, settled, errors)
 
 
-def _start(problem: Problem) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+def without_field(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
+    """A camera model that is nothing but the camera; noise in pixels."""
+    field = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
+    return CameraModel(started.camera, started.camera, started.prior, image, field, 0.0, noise, np.zeros((1, 2)))
+
+
+def start_rig(
+    problem: Problem, start: Callable[[int, Floats, Floats], Started]
+) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    """Each camera that `start` can place from its number, known points (n, 3) and pixels, and why it cannot the others.
+
+    FitError where fewer than two can be placed.
+    """
+
     def one(c: int) -> Started | FitError:
         seen = problem.sightings[c]
         try:
-            started = start_camera(problem.points[seen.rows], seen.uv, problem.images[c], problem.lens)
+            started = start(c, problem.points[seen.rows], seen.uv)
             _check_start(started, problem.points[seen.rows], seen.uv, problem)
             return started
         except FitError as error:
@@ -180,6 +176,12 @@ def _start(problem: Problem) -> tuple[dict[int, Started], list[tuple[int, str]]]
             blind.append((c, found.what))
         else:
             started[c] = found
+    if len(started) < 2:
+        raise FitError(
+            f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
+            why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
+            fix="show the cameras more known points, in the whole volume",
+        )
     return started, blind
 
 
@@ -248,12 +250,18 @@ def _conditioned(
     hyper: Hyperparameters,
     errors: ShotErrors | None,
 ) -> Posterior:
+    """The posterior with fields laid out anew."""
+    return settle(_sized(problem, models, used, hyper), problem.points, used, errors)
+
+
+def settle(
+    models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...], errors: ShotErrors | None
+) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
-    models = _sized(problem, models, used, hyper)
     for _ in range(4):
-        posterior = condition(models, problem.points, used, errors)
+        posterior = condition(models, points, used, errors)
         models = tuple(
-            _in_front(before, after, step, problem.points[seen.rows])
+            _in_front(before, after, step, points[seen.rows])
             for before, after, step, seen in zip(models, posterior.models, posterior.steps, used, strict=True)
         )
         if all(_small(step, posterior.root(c)) for c, step in enumerate(posterior.steps)):
@@ -357,9 +365,11 @@ def left_out(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept
     return residual, inside * (sd**2)[:, None, None] + extra + rows.rest[:, None, None] * np.eye(2)
 
 
-def _judged_all(
+def judged_all(
     posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
 ) -> tuple[Bools, ...]:
+    """Per camera, the views to use next: not those that contradict the others."""
+
     def one(c: int) -> Bools:
         return _judged(squared_distances(posterior, c, points, seen[c], kept[c]), kept[c])
 

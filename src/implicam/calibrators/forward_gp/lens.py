@@ -6,13 +6,13 @@ Both see points (n, 3) of the working frame (world, centred and scaled; calibrat
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.cameras import KannalaBrandt
+from implicam.cameras import BrownConrady, KannalaBrandt, Lens
 from implicam.geometry import Pose, camera_centre, rotation_from_vector
 
 Floats = NDArray[np.float64]
@@ -25,6 +25,12 @@ BENT = np.array([0.15, 0.1, 0.05, 0.02])
 
 BENT_AT_EDGE = np.array([0.15, 0.1, 0.07, 0.05])
 """... and of what each term may do at the edge of the image, as a part of the radius: it tames fisheyes."""
+
+DISTORTED, DISTORTED_AT_EDGE = np.array([0.5, 0.5, 0.3]), np.array([0.4, 0.3, 0.15])
+"""The same of k1, k2, k3 of a Brown-Conrady lens, about none, and of each term at the edge of the image."""
+
+DECENTRED = 0.005
+"""Prior sd of p1 and p2."""
 
 ASPECT = 0.002
 """Prior sd of log(fy / fx): pixels are square."""
@@ -66,13 +72,17 @@ class Prior(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CentralCamera:
-    """A Kannala-Brandt lens and its place, eq. (2). A step is (8 lens parameters, rotation vector, translation)."""
+    """A lens and its place, eq. (2). A step is (lens parameters, rotation vector, translation)."""
 
-    lens: KannalaBrandt
+    lens: Lens
     pose: Pose  # camera_from_world
 
     kind: ClassVar[str] = "central"
-    size: ClassVar[int] = 14
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns: those of the lens, and six of the pose."""
+        return len(fields(self.lens)) + 6
 
     def view(self, points: Floats) -> View:
         """Everything at once, of points (n, 3)."""
@@ -81,9 +91,9 @@ class CentralCamera:
         uv, _ = self.lens.pixel_from_camera_point(there)
         slope = self.lens.jacobian(there)
         by_parameters = np.empty((len(points), 2, self.size))
-        by_parameters[:, :, :8] = self.lens.parameter_jacobian(there)
-        by_parameters[:, :, 8:11] = np.cross(turned[:, None, :], slope)  # slope . (omega x turned)
-        by_parameters[:, :, 11:] = slope
+        by_parameters[:, :, :-6] = self.lens.parameter_jacobian(there)
+        by_parameters[:, :, -6:-3] = np.cross(turned[:, None, :], slope)  # slope . (omega x turned)
+        by_parameters[:, :, -3:] = slope
         squared = np.sum(there**2, axis=1)
         return View(
             uv,
@@ -104,8 +114,8 @@ class CentralCamera:
 
     @property
     def parameters(self) -> Floats:
-        """(14,) what the prior is about; the pose has no prior and is zero here."""
-        return np.concatenate([astuple(self.lens), np.zeros(6)])
+        """(size,) what the prior is about; the pose has no prior and is zero here."""
+        return np.concatenate([lens_parameters(self.lens), np.zeros(6)])
 
     @property
     def sane(self) -> bool:
@@ -113,10 +123,10 @@ class CentralCamera:
         return self.lens.fx > 0 and self.lens.fy > 0
 
     def moved(self, step: Floats) -> CentralCamera:
-        """The camera with its parameters changed by (14,)."""
-        lens = KannalaBrandt(*(np.array(astuple(self.lens)) + step[:8]).tolist())
-        turn = rotation_from_vector(step[8:11])
-        return CentralCamera(lens, Pose(turn @ self.pose.rotation, self.pose.translation + step[11:]))
+        """The camera with its parameters changed by (size,)."""
+        lens = type(self.lens)(*(lens_parameters(self.lens) + step[:-6]).tolist())
+        turn = rotation_from_vector(step[-6:-3])
+        return CentralCamera(lens, Pose(turn @ self.pose.rotation, self.pose.translation + step[-3:]))
 
     def prior(self, image: Image, widest: float) -> Prior:
         """Eq. (3), for a lens that is used up to `widest` radians off its axis."""
@@ -125,22 +135,35 @@ class CentralCamera:
         precision[:2, :2] = aspect * np.array([[1, -1], [-1, 1]])
         mean[2:4] = image.centre
         precision[2, 2] = precision[3, 3] = 1 / (CENTRE * 2 * image.half) ** 2
-        own = np.minimum(BENT, BENT_AT_EDGE / widest ** np.array([2, 4, 6, 8]))
-        mean[4:8] = 0.5 * TANGENT
-        precision[4:8, 4:8] = np.linalg.inv(np.diag(own**2) + 0.25 * np.outer(TANGENT, TANGENT))
+        if isinstance(self.lens, KannalaBrandt):
+            own = np.minimum(BENT, BENT_AT_EDGE / widest ** np.array([2, 4, 6, 8]))
+            mean[4:8] = 0.5 * TANGENT
+            precision[4:8, 4:8] = np.linalg.inv(np.diag(own**2) + 0.25 * np.outer(TANGENT, TANGENT))
+        else:
+            radial = np.minimum(DISTORTED, DISTORTED_AT_EDGE / np.tan(min(widest, 1.5)) ** np.array([2, 4, 6]))
+            sd = np.array([radial[0], radial[1], DECENTRED, DECENTRED, radial[2]])
+            precision[range(4, 9), range(4, 9)] = 1 / sd**2
         return Prior(mean, precision)
 
     def as_array(self) -> Floats:
-        """(20,) lens, rotation and translation."""
-        return np.concatenate([astuple(self.lens), self.pose.rotation.ravel(), self.pose.translation])
+        """Lens parameters, rotation and translation: (20,) of Kannala-Brandt, (21,) of Brown-Conrady."""
+        return np.concatenate([lens_parameters(self.lens), self.pose.rotation.ravel(), self.pose.translation])
 
     @classmethod
     def from_array(cls, array: Floats) -> CentralCamera:
-        """The inverse of `as_array`."""
-        rotation = array[8:17].reshape(3, 3)
+        """The inverse of `as_array`; ValueError for what is none."""
+        lens = {20: KannalaBrandt, 21: BrownConrady}.get(len(array))
+        if lens is None:
+            raise ValueError(f"{len(array)} numbers are no camera")
+        rotation = array[-12:-3].reshape(3, 3)
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
             raise ValueError("a camera's rotation is not one")
-        return cls(KannalaBrandt(*array[:8].tolist()), Pose(rotation, array[17:]))
+        return cls(lens(*array[:-12].tolist()), Pose(rotation, array[-3:]))
+
+
+def lens_parameters(lens: Lens) -> Floats:
+    """The parameters of a lens, in the order of its fields."""
+    return np.array([getattr(lens, field.name) for field in fields(lens)])
 
 
 @dataclass(frozen=True, eq=False)

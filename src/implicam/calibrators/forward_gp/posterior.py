@@ -229,7 +229,7 @@ def _independent(models: tuple[CameraModel, ...], normals: list[_Normal]) -> Pos
     """Known positions are exact: every camera on its own, eq. (13)."""
     value, means, roots = 0.0, [], []
     for normal in normals:
-        root, mean, log_determinant = _solve(normal.A, normal.b)
+        root, mean, log_determinant = solve_normal(normal.A, normal.b)
         value += 0.5 * (float(normal.b @ mean) - log_determinant - normal.squares - normal.logs)
         means.append(mean)
         roots.append(root)
@@ -257,10 +257,10 @@ def _tied(
         block = kept or meeting(*each)
         squares, logs = block.eliminate(A, b)
         value += squares - logs
-    joint, mean, log_determinant = _solve(A, b)
+    joint, mean, log_determinant = solve_normal(A, b)
     value += float(b @ mean) - log_determinant
     means = np.split(mean, ends[:-1])
-    alone = tuple(_solve(normal.A, normal.b)[0] for normal in normals)
+    alone = tuple(solve_normal(normal.A, normal.b)[0] for normal in normals)
     found = np.concatenate([(kept or meeting(*each)).unknowns(mean) for each in parts])
     displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
     unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
@@ -421,7 +421,7 @@ def _meet(model: CameraModel, points: Floats, seen: Sightings, errors: ShotError
     return total
 
 
-def _solve(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
+def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
     """Root of the covariance, mean and log determinant; scaled first, since lens parameters differ by many orders of
     magnitude."""
     if not np.isfinite(A).all():

@@ -101,12 +101,12 @@ def _model(lens: str, arrays: Arrays, number: int, sizes: Floats, lengthscale: F
     m = len(arrays[f"{number}/inducing"])
     inducing = finite_column(arrays, f"{number}/inducing", (m, 3))
     weights = finite_column(arrays, f"{number}/weights", (m, 2))
-    size = kind.size + 2 * m
+    size = camera.size + 2 * m
     alone = finite_column(arrays, f"{number}/root", (size, size))
     signal, noise, *centre, half = sizes.tolist()
     if not (signal > 0 and noise > 0 and half > 0):
         raise ValueError("signal, noise and image size must be positive")
-    none = Prior(np.zeros(kind.size), np.zeros((kind.size, kind.size)))  # only a fit needs it
+    none = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))  # only a fit needs it
     field = LowRank(field_kernel(lengthscale), inducing)
     return CameraModel(camera, ruler, none, Image(np.array(centre), half), field, signal, noise, weights), alone
 

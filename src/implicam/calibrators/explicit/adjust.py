@@ -1,0 +1,297 @@
+"""Bundle adjustment: lenses and poses of all cameras and the poses of all boards, from all views of corners at once.
+
+Levenberg-Marquardt on robust residuals. A view joins one camera and one board, so the Jacobian is sparse in blocks: the
+normal equations have a block for each camera (A), one for each board (D) and one for each pair that met (B). The boards
+are eliminated by the Schur complement A - B D^-1 B^T; work grows linearly with the number of boards. Triggs et al.
+2000, "Bundle Adjustment: A Modern Synthesis", sections 4.3 and 6.1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.explicit.boards import BoardView
+from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Prior
+from implicam.calibrators.forward_gp.posterior import solve_normal
+from implicam.geometry import Bools, Pose, rotation_from_vector
+from implicam.progress import Progress, silent
+
+ROBUST = 3.0
+"""Residuals, in standard deviations, beyond which a view counts less: Cauchy's loss."""
+
+LOST = 1e4
+"""Squared residual of a corner that the lens has no pixel for."""
+
+ITERATIONS = 60
+
+CONVERGED = 1e-8
+"""Relative change of the sum of squares in one step."""
+
+BARELY = 1e-9
+"""Keeps a board of which nothing is left solvable; one corner counts a million million times as much."""
+
+
+class Placed(NamedTuple):
+    """Poses rig_from_board of all boards: rotations (b, 3, 3), translations (b, 3)."""
+
+    rotation: Floats
+    translation: Floats
+
+    @classmethod
+    def of(cls, poses: Sequence[Pose]) -> Placed:
+        """From single poses."""
+        return cls(np.array([p.rotation for p in poses]), np.array([p.translation for p in poses]))
+
+    def pose(self, k: int) -> Pose:
+        """That of board number k."""
+        return Pose(self.rotation[k], self.translation[k])
+
+
+class Stack(NamedTuple):
+    """All that one camera saw, n corners: xyz (n, 3) on their boards, uv (n, 2), relative (n,) noise, board (n,)
+    numbers, and the rows of each view."""
+
+    xyz: Floats
+    uv: Floats
+    relative: Floats
+    board: NDArray[np.int64]
+    sections: tuple[tuple[int, slice], ...]
+
+    @classmethod
+    def of(cls, views: Sequence[BoardView]) -> Stack:
+        """From the views of one camera."""
+        ends = np.cumsum([0, *(len(view.rows) for view in views)]).tolist()
+        sections = tuple((view.board, slice(a, b)) for view, a, b in zip(views, ends[:-1], ends[1:], strict=True))
+        xyz = np.concatenate([np.zeros((0, 3)), *(view.xyz for view in views)])
+        uv = np.concatenate([np.zeros((0, 2)), *(view.uv for view in views)])
+        relative = np.concatenate([np.zeros(0), *(view.relative for view in views)])
+        board = np.repeat([view.board for view in views], [len(view.rows) for view in views]).astype(np.int64)
+        return cls(xyz, uv, relative, board, sections)
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Views of boards, and the same stacked for each of `count` cameras."""
+
+    each: tuple[BoardView, ...]
+    count: int
+
+    @cached_property
+    def stacks(self) -> tuple[Stack, ...]:
+        """All that each camera saw."""
+        return tuple(Stack.of([view for view in self.each if view.camera == c]) for c in range(self.count))
+
+    def select(self, keep: Sequence[Bools]) -> Views:
+        """Per camera, some of its corners: masks as its stack."""
+        return Views(tuple(view.select(keep[c][rows]) for c, view, rows in self.in_stacks()), self.count)
+
+    def in_stacks(self) -> Iterator[tuple[int, BoardView, slice]]:
+        """Camera number, view, and its rows in the camera's stack."""
+        for c, stack in enumerate(self.stacks):
+            own = (view for view in self.each if view.camera == c)
+            for view, (_, rows) in zip(own, stack.sections, strict=True):
+                yield c, view, rows
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """cameras and their poses in the rig's frame, which is that of the first camera; boards: rig_from_board of each;
+    noise: (C,) in pixels; held: the cameras are known, and only the boards move."""
+
+    cameras: tuple[CentralCamera, ...]
+    priors: tuple[Prior, ...]
+    boards: Placed
+    views: Views
+    noise: Floats
+    held: bool = False
+
+    @property
+    def starts(self) -> list[int]:
+        """Where each camera's unknowns start, and where they end."""
+        return [0, *map(int, np.cumsum([camera.size for camera in self.cameras]))]
+
+    @property
+    def free(self) -> Bools:
+        """(P,) which of the cameras' unknowns are free."""
+        free = np.full(self.starts[-1], not self.held, dtype=np.bool_)
+        free[self.cameras[0].size - 6 : self.cameras[0].size] = False
+        return free
+
+    def corners(self, c: int) -> Floats:
+        """(n, 3) in the rig's frame, of the boards that camera number c saw."""
+        stack = self.views.stacks[c]
+        turned = np.einsum("nij,nj->ni", self.boards.rotation[stack.board], stack.xyz)
+        return np.asarray(turned + self.boards.translation[stack.board], dtype=np.float64)
+
+    def residuals(self, c: int) -> Floats:
+        """(n, 2) pixels of camera number c, seen minus predicted; NaN where the lens has none."""
+        return self.views.stacks[c].uv - self.cameras[c].pixel(self.corners(c))
+
+    def lengths(self, c: int) -> Floats:
+        """(n,) of the residuals of camera number c, in its usual pixels; infinite where the lens has none."""
+        error = np.linalg.norm(self.residuals(c), axis=1) / self.views.stacks[c].relative
+        return np.where(np.isfinite(error), error, np.inf)
+
+    def moved(self, step: Floats, boards: Floats) -> Bundle:
+        """With cameras changed by (P,) and boards by (boards, 6)."""
+        parts = np.split(step, self.starts[1:-1])
+        cameras = self.cameras
+        if not self.held:
+            cameras = tuple(camera.moved(part) for camera, part in zip(self.cameras, parts, strict=True))
+        turned = rotation_from_vector(boards[:, :3]) @ self.boards.rotation
+        return replace(self, cameras=cameras, boards=Placed(turned, self.boards.translation + boards[:, 3:]))
+
+
+class Adjusted(NamedTuple):
+    """bundle: where it ends; root (q, P) with root^T root the covariance of the cameras' unknowns; converged."""
+
+    bundle: Bundle
+    root: Floats
+    converged: bool
+
+
+def adjust(
+    bundle: Bundle, *, robust: bool = True, progress: Progress = silent, iterations: int = ITERATIONS
+) -> Adjusted:
+    """The bundle with the least robust (or plain) sum of squares, from where it starts."""
+    cost, damping, converged = _cost(bundle, robust), 1e-3, False
+    normal = _Normal.of(bundle, robust)
+    for number in range(iterations):
+        progress("adjusting the bundle", number, iterations)
+        previous = cost
+        while damping < 1e10:
+            candidate = bundle.moved(*normal.step(damping))
+            now = _cost(candidate, robust)
+            if now < cost:
+                bundle, cost, damping = candidate, now, max(damping / 10, 1e-14)
+                normal = _Normal.of(bundle, robust)
+                break
+            damping *= 10
+        if cost > previous * (1 - CONVERGED):
+            converged = True
+            break
+    progress("adjusting the bundle", iterations, iterations)
+    return Adjusted(bundle, normal.root(), converged)
+
+
+def _cost(bundle: Bundle, robust: bool) -> float:
+    if not all(camera.sane for camera in bundle.cameras):
+        return float("inf")
+    total = 0.0
+    for c, (camera, prior) in enumerate(zip(bundle.cameras, bundle.priors, strict=True)):
+        off = prior.mean - camera.parameters
+        squares = _squares(bundle, c)
+        total += float(off @ prior.precision @ off)
+        total += float(np.sum(ROBUST**2 * np.log1p(squares / ROBUST**2) if robust else squares))
+    return total
+
+
+def _squares(bundle: Bundle, c: int) -> Floats:
+    """(n,) squared residuals of a camera in standard deviations."""
+    squares = (bundle.lengths(c) / bundle.noise[c]) ** 2
+    return np.where(np.isfinite(squares), squares, LOST)
+
+
+class _Normal(NamedTuple):
+    """The normal equations: A (P, P), a (P,) of the cameras; D (b, 6, 6), d (b, 6) of the boards; B (b, P, 6)."""
+
+    A: Floats
+    a: Floats
+    D: Floats
+    d: Floats
+    B: Floats
+    free: Bools
+
+    @classmethod
+    def of(cls, bundle: Bundle, robust: bool) -> _Normal:
+        starts, n = bundle.starts, len(bundle.boards.translation)
+        P = starts[-1]
+        A, a = np.zeros((P, P)), np.zeros(P)
+        D, d, B = np.tile(BARELY * np.eye(6), (n, 1, 1)), np.zeros((n, 6)), np.zeros((n, P, 6))
+        for c, (camera, prior) in enumerate(zip(bundle.cameras, bundle.priors, strict=True)):
+            own = slice(starts[c], starts[c + 1])
+            r, J, K = _whitened(bundle, c, robust)
+            flat = J.reshape(-1, camera.size)
+            A[own, own] += prior.precision + flat.T @ flat
+            a[own] += prior.precision @ (prior.mean - camera.parameters) + flat.T @ r.ravel()
+            for k, rows in bundle.views.stacks[c].sections:
+                Kk, Jk = K[rows].reshape(-1, 6), J[rows].reshape(-1, camera.size)
+                D[k] += Kk.T @ Kk
+                d[k] += Kk.T @ r[rows].ravel()
+                B[k, own] += Jk.T @ Kk
+        return cls(A, a, D, d, B, bundle.free)
+
+    def step(self, damping: float) -> tuple[Floats, Floats]:
+        """Of the cameras (P,) and the boards (b, 6); damping as a part of the diagonal (Marquardt)."""
+        diagonal = np.arange(6)
+        D = self.D.copy()
+        D[:, diagonal, diagonal] *= 1 + damping
+        S, s = self._reduced(self.A + damping * np.diag(np.diag(self.A)), D)
+        cameras = np.zeros(len(self.a))
+        scale = 1 / np.sqrt(np.diag(S))
+        cameras[self.free] = scale * np.linalg.solve(S * scale[:, None] * scale, scale * s)
+        boards = np.linalg.solve(D, (self.d - np.einsum("bpk,p->bk", self.B, cameras))[..., None])[..., 0]
+        return cameras, boards
+
+    def root(self) -> Floats:
+        """(q, P) root of the covariance of the cameras' unknowns, the boards integrated out; zero where fixed."""
+        if not self.free.any():
+            return np.zeros((0, len(self.a)))
+        found, _, _ = solve_normal(*self._reduced(self.A, self.D))
+        root = np.zeros((len(found), len(self.a)))
+        root[:, self.free] = found
+        return root
+
+    def _reduced(self, A: Floats, D: Floats) -> tuple[Floats, Floats]:
+        """The Schur complement and its right-hand side, for the unknowns that are free."""
+        B = self.B[:, self.free]
+        pulled = np.linalg.solve(D, np.concatenate([B.swapaxes(1, 2), self.d[..., None]], axis=2))  # (b, 6, P + 1)
+        flat = B.swapaxes(0, 1).reshape(B.shape[1], len(B) * 6)
+        S = A[np.ix_(self.free, self.free)] - flat @ pulled[:, :, :-1].reshape(len(B) * 6, B.shape[1])
+        s = self.a[self.free] - flat @ pulled[:, :, -1].reshape(-1)
+        return 0.5 * (S + S.T), s
+
+
+def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Floats]:
+    """Of a camera: residuals (n, 2) and their slopes by it (n, 2, p) and by the board (n, 2, 6), in standard
+    deviations, weighted; zero where the lens has no pixel."""
+    camera, stack = bundle.cameras[c], bundle.views.stacks[c]
+    turned = np.einsum("nij,nj->ni", bundle.boards.rotation[stack.board], stack.xyz)
+    seen = camera.view(turned + bundle.boards.translation[stack.board])
+    weight = 1 / (bundle.noise[c] * stack.relative)
+    if robust:  # iteratively reweighted: Cauchy's weight
+        squares = np.sum((stack.uv - seen.uv) ** 2, axis=1) * weight**2
+        weight = weight / np.sqrt(1 + squares / ROBUST**2)
+    there = np.isfinite(seen.uv).all(axis=1) & np.isfinite(seen.by_parameters).all(axis=(1, 2))
+    weight = np.where(there, weight, 0)[:, None]
+    by_board = np.concatenate([np.cross(turned[:, None, :], seen.by_point), seen.by_point], axis=2)
+    blocks = (stack.uv - seen.uv, seen.by_parameters, by_board)
+    if not there.all():
+        blocks = (np.nan_to_num(blocks[0]), np.nan_to_num(blocks[1]), np.nan_to_num(blocks[2]))
+    return blocks[0] * weight, blocks[1] * weight[..., None], blocks[2] * weight[..., None]
+
+
+def spreads(bundle: Bundle) -> Floats:
+    """(C,) the usual residual of each camera in pixels per coordinate, whatever a few wrong corners say."""
+    rayleigh = 1.1774  # the median length of a residual with sd 1 in u and in v
+    return np.array([np.median(bundle.lengths(c)) / rayleigh for c in range(len(bundle.cameras))])
+
+
+def adjust_in_steps(bundle: Bundle, half: Floats, *, progress: Progress = silent) -> Adjusted:
+    """Adjusted with the residuals' own size as the noise, which shrinks: far from the answer nothing is an outlier.
+
+    half: (C,) half the longer side of each image, pixels.
+    """
+    for _ in range(4):
+        noise = np.minimum(np.maximum(spreads(bundle), 1e-5 * half), half)
+        found = adjust(replace(bundle, noise=noise), progress=progress)
+        bundle = found.bundle
+        if np.allclose(noise, np.maximum(spreads(bundle), 1e-5 * half), rtol=0.05):
+            break
+    return found

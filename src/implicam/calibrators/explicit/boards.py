@@ -1,0 +1,170 @@
+"""Flat boards at places nobody knows: what each camera saw of each board, and where the corners are on the board."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.lens import Image
+from implicam.calibrators.forward_gp.problem import image_of, relative_noise, stated_noise
+from implicam.dataset import Camera, Dataset, Floats, Names
+from implicam.errors import FitError
+
+FEWEST_CORNERS = 12
+"""Corners of one picture; with fewer it says little more than that there is a board."""
+
+FEWEST_BOARDS = 3
+"""Pictures that a camera needs: Zhang's method takes three planes for a lens."""
+
+CORNER = re.compile(r"(?P<shot>.+)-c(?P<number>[0-9]+)")
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """What camera number `camera` saw of board number `board`: corners (k, 3) on the board (z = 0), their pixels
+    (k, 2), the noise of each over the camera's usual one (k,), and their rows (k,) in the dataset."""
+
+    camera: int
+    board: int
+    xyz: Floats
+    uv: Floats
+    relative: Floats
+    rows: NDArray[np.int64]
+
+    def select(self, keep: NDArray[np.bool_]) -> BoardView:
+        """Some of the corners."""
+        return replace(self, xyz=self.xyz[keep], uv=self.uv[keep], relative=self.relative[keep], rows=self.rows[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class Boards:
+    """All views of all boards. shots: (n,) of each row of the dataset; images: of each camera, where its pixels are
+    measured from; stated: (C,) its noise."""
+
+    cameras: tuple[Camera, ...]
+    shots: Names
+    views: tuple[BoardView, ...]
+    images: tuple[Image, ...]
+    stated: Floats
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names."""
+        return tuple(camera.name for camera in self.cameras)
+
+    def of_camera(self, c: int) -> tuple[BoardView, ...]:
+        """The views of camera number c."""
+        return tuple(view for view in self.views if view.camera == c)
+
+
+def boards_of(data: Dataset) -> Boards:
+    """The boards of a dataset: corners as [target] in dataset.toml lays them out, or as its known positions do.
+
+    FitError where neither says where the corners are on the board.
+    """
+    shots, flat = _laid_out(data)
+    names, number = np.unique(shots, return_inverse=True)
+    observations = data.observations
+    stated = stated_noise(observations)
+    relative = relative_noise(observations, stated)
+    views = []
+    for c in range(len(observations.cameras)):
+        for board in range(len(names)):
+            rows = np.flatnonzero(observations.seen[:, c] & (number == board))
+            if len(rows) >= FEWEST_CORNERS and _spread(flat[rows]):
+                xyz = np.column_stack([flat[rows], np.zeros(len(rows))])
+                views.append(BoardView(c, board, xyz, observations.uv[rows, c], relative[rows, c], rows))
+    images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
+    return Boards(observations.cameras, shots, tuple(views), images, stated)
+
+
+def has_boards(data: Dataset) -> bool:
+    """Whether a dataset says that it shows a board whose corners can be laid out."""
+    target = data.extra.get("target")
+    return isinstance(target, Mapping) and target.get("kind") in ("board", "charuco")
+
+
+def _laid_out(data: Dataset) -> tuple[Names, Floats]:
+    """(n,) the shot of each corner, and (n, 2) where it is on the board."""
+    if has_boards(data):
+        return _by_target(data, data.extra["target"])
+    if data.known is None:
+        raise FitError(
+            f"nothing says where the corners of {data.name!r} are on the board.",
+            why="dataset.toml has no [target], and there is no points.csv",
+            fix='write into dataset.toml: [target] kind = "board", rows = 8, columns = 11, square = 13.29',
+        )
+    return data.shots, _by_positions(data)
+
+
+def _by_target(data: Dataset, target: Mapping[str, Any]) -> tuple[Names, Floats]:
+    try:
+        rows, columns, square = int(target["rows"]), int(target["columns"]), float(target["square"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise FitError(
+            f"[target] of {data.name!r} does not describe a board: {error}.",
+            fix='dataset.toml needs [target] kind = "board" with rows, columns (of inner corners) and square',
+        ) from error
+    if target["kind"] == "charuco":  # it counts squares; its corners are those between them
+        rows, columns = rows - 1, columns - 1
+    found = [CORNER.fullmatch(str(point)) for point in data.points]
+    wrong = [str(point) for point, match in zip(data.points, found, strict=True) if match is None]
+    numbers = np.array([int(match["number"]) - 1 if match else 0 for match in found], dtype=np.int64)
+    if wrong or not ((numbers >= 0) & (numbers < rows * columns)).all():
+        name = wrong[0] if wrong else str(data.points[np.argmax((numbers < 0) | (numbers >= rows * columns))])
+        raise FitError(
+            f"point {name!r} is no corner of a board of {rows} x {columns} inner corners.",
+            fix="name corners as implicam detect does: board01-c001, counted along the rows",
+        )
+    shots = np.array([match["shot"] if match else "" for match in found], dtype=np.str_)
+    return shots, np.asarray(np.column_stack([numbers % columns, numbers // columns]) * square, dtype=np.float64)
+
+
+def _by_positions(data: Dataset) -> Floats:
+    """(n, 2) known positions of each shot, in the plane of the shot."""
+    flat = np.zeros((len(data), 2))
+    for shot in np.unique(data.shots):
+        rows = data.shots == shot
+        centred = data.xyz[rows] - data.xyz[rows].mean(axis=0)
+        _, extents, axes = np.linalg.svd(centred, full_matrices=False)
+        if len(centred) < FEWEST_CORNERS or extents[2] > 1e-3 * extents[0]:
+            raise FitError(
+                f"the points of shot {str(shot)!r} are no flat board.",
+                why=f"it has {len(centred)} points; a board has {FEWEST_CORNERS} or more, on one plane",
+                fix="give pictures of a board with --boards, and balls as the dataset itself",
+            )
+        if np.linalg.det(np.vstack([axes[:2], np.cross(axes[0], axes[1])])) < 0:
+            axes[1] = -axes[1]
+        flat[rows] = centred @ axes[:2].T
+    return flat
+
+
+def _spread(flat: Floats) -> bool:
+    extents = np.linalg.svd(flat - flat.mean(axis=0), compute_uv=False)
+    return bool(extents[1] > 0.05 * extents[0])
+
+
+def usable_cameras(boards: Boards) -> tuple[list[int], list[tuple[int, str]]]:
+    """Numbers of the cameras that saw enough boards; number and reason of the others."""
+    counts = [len(boards.of_camera(c)) for c in range(len(boards.cameras))]
+    good = [c for c, count in enumerate(counts) if count >= FEWEST_BOARDS]
+    poor = [
+        (
+            c,
+            f"it saw {count} of the {FEWEST_BOARDS} boards that it takes, each with {FEWEST_CORNERS} corners or more",
+        )
+        for c, count in enumerate(counts)
+        if count < FEWEST_BOARDS
+    ]
+    return good, poor
+
+
+def renumbered(views: Sequence[BoardView]) -> tuple[tuple[BoardView, ...], list[int]]:
+    """The views with boards counted from 0, and which boards these are."""
+    boards = sorted({view.board for view in views})
+    return tuple(replace(view, board=boards.index(view.board)) for view in views), boards

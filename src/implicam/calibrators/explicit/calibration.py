@@ -1,0 +1,164 @@
+"""explicit: the classical calibration, a lens model and a pose for every camera; triangulation by maximum likelihood.
+
+From known points: resection of every camera, then refinement. From pictures of a board, the paper's way: Zhang's method
+for each camera, pairs, bundle adjustment of the whole rig, and rigid alignment to the known points. Covariances come
+from the normal equations and go into every position that is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam import calibration_file
+from implicam.calibrators.explicit import saved
+from implicam.calibrators.explicit.align import MATCHING
+from implicam.calibrators.explicit.boards import boards_of, has_boards
+from implicam.calibrators.explicit.fitted import Fitted, fit_to_boards, fit_to_boards_alone, fit_to_points
+from implicam.calibrators.explicit.lenses import AUTO, FAMILIES
+from implicam.calibrators.explicit.network import Network, calibrate_network
+from implicam.calibrators.forward_gp.rig_map import RigMap
+from implicam.calibrators.protocol import Arrays, Rejected, Unused, solvable
+from implicam.dataset import Dataset, Floats, Observations
+from implicam.errors import UsageError, did_you_mean
+from implicam.measurement import Measurement
+from implicam.progress import Progress, silent
+from implicam.threads import blas_threads
+
+
+@dataclass(frozen=True)
+class Explicit:
+    """The classical method. lens: `auto`, the model that predicts held-out views best, or `brown-conrady`, or
+    `kannala-brandt`, for all cameras.
+
+    boards: pictures of a board, the corners found in them; without, the known points are what it is fitted to. align:
+    how a calibration from boards is brought into the world: `points`, by the names of the known points, or `icp`, by
+    the closest ones as in the paper. seed is there because every method has one; nothing is left to chance.
+    """
+
+    lens: str = AUTO
+    align: str = MATCHING[0]
+    seed: int = 0
+    boards: Dataset | None = None
+
+    method: ClassVar[str] = "explicit"
+
+    def __post_init__(self) -> None:
+        for what, value, known in (("lens", self.lens, (AUTO, *FAMILIES)), ("align", self.align, MATCHING)):
+            if value not in known:
+                raise UsageError(
+                    f"explicit has no {what} {value!r}{did_you_mean(value, known)}.",
+                    fix=f"choose one of {', '.join(known)}",
+                )
+
+    def fit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
+        """Fit to the known points; or to the boards, and then to the known points.
+
+        A dataset of boards at places nobody knows is calibrated in the frame of its first camera; its boards then have
+        the positions that the adjustment gives them.
+        """
+        with solvable(), blas_threads(1):
+            if self.boards is None and data.known is None and has_boards(data):
+                data, fitted = fit_to_boards_alone(data, self.lens, progress)
+            elif self.boards is None:
+                fitted = fit_to_points(data, self.lens, progress)
+            else:
+                fitted = fit_to_boards(data, self._network(data, progress), self.boards, self.align)
+        return ExplicitCalibration(self, data, fitted)
+
+    def _network(self, data: Dataset, progress: Progress) -> Network:
+        """The rig from the boards: the same for all known points, so it is adjusted once."""
+        if data.observations.camera_names not in self._networks:
+            assert self.boards is not None
+            names = [name for name in data.observations.camera_names if name in self.boards.observations.camera_names]
+            boards = boards_of(self.boards.with_cameras(names)) if names else boards_of(self.boards)
+            self._networks[data.observations.camera_names] = calibrate_network(boards, self.lens, progress)
+        return self._networks[data.observations.camera_names]
+
+    @cached_property
+    def _networks(self) -> dict[tuple[str, ...], Network]:
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class ExplicitCalibration:
+    """Cameras with lens models and poses, and the covariance of all of it."""
+
+    calibrator: Explicit
+    data: Dataset
+    fitted: Fitted
+
+    method: ClassVar[str] = "explicit"
+
+    @cached_property
+    def map(self) -> RigMap:
+        """The cameras, and how they measure."""
+        fitted = self.fitted
+        return RigMap(fitted.trained, self.data.length_unit, fitted.frame, fitted.cameras, fitted.posterior)
+
+    def measure(self, observations: Observations) -> Measurement:
+        """Measure each point with the views it has, two or more: maximum likelihood."""
+        return self.map.measure(observations)
+
+    def predict(self, xyz: Floats) -> Floats:
+        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
+        return self.map.predict(xyz)
+
+    def centres(self) -> dict[str, Floats]:
+        """Where the calibrated cameras are: name -> (3,) in the world."""
+        return self.map.centres()
+
+    @property
+    def unused(self) -> tuple[Unused, ...]:
+        """The known points of which no view is used."""
+        return self.fitted.unused
+
+    @property
+    def rejected(self) -> tuple[Rejected, ...]:
+        """The views not used because they contradict the others, the farthest first."""
+        return self.fitted.rejected
+
+    def refit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
+        """The same method with the same options, and the same boards, on other known points."""
+        return self.calibrator.fit(data, progress)
+
+    def notes(self) -> list[str]:
+        """What the user should know before trusting this calibration; empty where all is well."""
+        return list(self.fitted.notes)
+
+    def residuals(self) -> dict[str, Any]:
+        """Leave-one-out errors per axis in the dataset's unit; per camera the lens model and the noise in pixels."""
+        fitted = self.fitted
+        axes, names = "xyz", self.map.camera_names
+        return {
+            "points_used": len(self.data) - len(self.unused),
+            "points_unused": len(self.unused),
+            "views_rejected": len(self.rejected),
+            "leave_one_out_rms": dict(zip(axes, map(float, np.sqrt(np.mean(fitted.errors**2, axis=0))), strict=True)),
+            "leave_one_out_mean_sd": dict(zip(axes, map(float, np.mean(fitted.sds, axis=0)), strict=True)),
+            "noise_px": dict(zip(names, (float(model.noise) for model in fitted.posterior.models), strict=True)),
+            "lens": dict(zip(names, (choice.lens for choice in fitted.choices), strict=True)),
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write a `.implicam` file that carries everything, the known points and the boards included."""
+        calibration_file.save(self, path)
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """The options; and per camera lens, pose and covariance, in the working frame."""
+        options = {"lens": self.calibrator.lens, "align": self.calibrator.align, "seed": self.calibrator.seed}
+        table, arrays = saved.state(self.fitted, self.calibrator.boards)
+        return {**options, **table}, arrays
+
+    @classmethod
+    def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ExplicitCalibration:
+        """Restore a calibration; nothing is computed again."""
+        fitted, boards = saved.restored(data, table, arrays)
+        calibrator = Explicit(str(table["lens"]), str(table["align"]), int(table["seed"]), boards)
+        return cls(calibrator, data, fitted)

@@ -1,0 +1,123 @@
+"""The classical calibration from known points: every camera resected, then refined.
+
+Where known positions are exact, the cameras do not depend on each other; where an error of theirs is declared, all
+cameras see the same error and are refined together. The equations are those of forward-gp without its field
+(docs/method.md, eqs. (13) to (15)); the noise is what the residuals say, per camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from implicam.calibrators.explicit.lenses import Choice, start_with_lens
+from implicam.calibrators.forward_gp.evidence import Hyperparameters
+from implicam.calibrators.forward_gp.fit import (
+    Bools,
+    FittedRig,
+    Problem,
+    judged_all,
+    settle,
+    start_rig,
+    without_field,
+)
+from implicam.calibrators.forward_gp.lens import Floats
+from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, spread
+from implicam.calibrators.forward_gp.start import Started
+from implicam.progress import Progress
+
+ROUNDS = 8
+
+AS_IF = 2.0
+"""The stated noise counts like so many residuals; so does the noise of all cameras together where none is stated."""
+
+
+def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[FittedRig, dict[int, Choice]]:
+    """Fit every camera that can be fitted; and the lens model that each got, by its number."""
+    progress("fitting", 0, 3)
+    choices: dict[int, Choice] = {}
+
+    def start(c: int, points: Floats, uv: Floats) -> Started:
+        started, choices[c] = start_with_lens(points, uv, problem.images[c], family)
+        return started
+
+    started, blind = start_rig(problem, start)
+    cameras = tuple(started)
+    progress("fitting", 1, 3)
+    seen = tuple(problem.sightings[c] for c in cameras)
+    kept = tuple(started[c].kept for c in cameras)
+    stated = problem.stated[list(cameras)]
+    models = tuple(without_field(started[c], problem.images[c]) for c in cameras)
+    models = with_noise(models, _first_noise(problem, models, seen, kept))
+    for number in range(ROUNDS):
+        used = tuple(
+            s.select(k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1))
+            for s, k, m in zip(seen, kept, models, strict=True)
+        )
+        posterior = settle(models, problem.points, used, problem.errors)
+        noise = _noise(problem, posterior, used, stated)
+        close = np.allclose(noise, [m.noise for m in models], rtol=0.01)
+        models = with_noise(posterior.models, noise)
+        judged = judged_all(replace(posterior, models=models), problem.points, seen, kept)
+        if close and all((a == b).all() for a, b in zip(judged, kept, strict=True)):
+            break
+        if number < ROUNDS - 1:
+            kept = judged
+        progress("fitting", 2, 3)
+    posterior = settle(
+        models, problem.points, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)), problem.errors
+    )
+    progress("fitting", 3, 3)
+    hyper = Hyperparameters(np.ones(2), np.zeros(len(cameras)), noise)
+    fitted = FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
+    return fitted, {c: choices[c] for c in cameras}
+
+
+def with_noise(models: Sequence[CameraModel], noise: Floats) -> tuple[CameraModel, ...]:
+    """The cameras with noise (C,) in pixels."""
+    return tuple(replace(m, noise=float(sd)) for m, sd in zip(models, noise, strict=True))
+
+
+def _first_noise(
+    problem: Problem, models: Sequence[CameraModel], seen: Sequence[Sightings], kept: Sequence[Bools]
+) -> Floats:
+    """(C,) from the residuals of the start, never nothing."""
+    noise = []
+    for m, s, k in zip(models, seen, kept, strict=True):
+        error = (s.uv - m.camera.pixel(problem.points[s.rows]))[k] / s.relative[k, None]
+        noise.append(max(float(np.sqrt(np.nanmean(error**2))), 1e-5 * m.image.half))
+    return np.array(noise)
+
+
+def _noise(problem: Problem, posterior: Posterior, used: tuple[Sightings, ...], stated: Floats) -> Floats:
+    """(C,) the noise of each camera in pixels: the residuals' sum of squares over the degrees of freedom left."""
+    if problem.errors is not None:
+        return _noise_beside_errors(problem, posterior, used, stated)
+    squares, freedom = np.zeros(len(used)), np.zeros(len(used))
+    for c, seen in enumerate(used):
+        model = posterior.models[c]
+        rows = model.rows(problem.points[seen.rows])
+        squares[c] = np.sum(((seen.uv - rows.mean) / seen.relative[:, None]) ** 2)
+        reach = spread(rows, posterior.alone[c]) / (model.noise * seen.relative)[:, None, None]
+        freedom[c] = max(2 * len(seen.rows) - float(np.sum(reach**2)), 0.0)
+    told = np.isfinite(stated)
+    together = float(np.sum(squares) / max(np.sum(freedom), 1e-3))
+    believed = np.where(told, np.nan_to_num(stated) ** 2, together)
+    floor = np.array([1e-6 * model.image.half for model in posterior.models])
+    return np.asarray(np.maximum(np.sqrt((squares + AS_IF * believed) / (freedom + AS_IF)), floor), dtype=np.float64)
+
+
+def _noise_beside_errors(problem: Problem, posterior: Posterior, used: tuple[Sightings, ...], stated: Floats) -> Floats:
+    """(C,) where known positions have errors of their own: one factor for all cameras, the most probable one."""
+    now = np.array([model.noise for model in posterior.models])
+    base = np.where(np.isfinite(stated), stated, now)
+
+    def loss(log_factor: float) -> float:
+        models = with_noise(posterior.models, base * np.exp(log_factor))
+        return -settle(models, problem.points, used, problem.errors).evidence + 0.5 * AS_IF * log_factor**2
+
+    found = minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded", options={"xatol": 0.02})
+    return np.asarray(base * np.exp(found.x), dtype=np.float64)

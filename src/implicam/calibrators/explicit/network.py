@@ -1,0 +1,247 @@
+"""The whole rig from boards: every camera alone, pairs of cameras that saw the same board, then all of them at once.
+
+The rig's frame is that of the first camera that is calibrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
+from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
+from implicam.calibrators.explicit.lenses import Choice, angles
+from implicam.calibrators.explicit.zhang import OneCamera, calibrate_camera
+from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image
+from implicam.dataset import Names
+from implicam.errors import FitError
+from implicam.geometry import Pose
+from implicam.progress import Progress, silent
+from implicam.threads import side_by_side
+
+FAR = 5.0
+"""Standard deviations off, beyond which a corner is wrong: one in 270,000 of good ones."""
+
+AS_IF = 2.0
+"""The stated noise counts like so many residuals."""
+
+TOLERABLE = 0.02
+"""Usual residual of a camera in the whole rig, in half the longer side of its image, beyond which there is no fit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """cameras: numbers of those calibrated, as in bundle; blind: number and reason of the others; root: of the
+    covariance of the cameras' unknowns; wrong: corners not used (row, camera number, pixels off); images: of those
+    calibrated; shots: (n,) of each row of the dataset."""
+
+    cameras: tuple[int, ...]
+    blind: tuple[tuple[int, str], ...]
+    choices: Mapping[int, Choice]
+    bundle: Bundle
+    root: Floats
+    wrong: tuple[tuple[int, int, float], ...]
+    images: tuple[Image, ...]
+    shots: Names
+
+
+def calibrate_network(boards: Boards, family: str, progress: Progress = silent) -> Network:
+    """FitError where fewer than two cameras can be calibrated and joined."""
+    singles, choices, blind = _singles(boards, family, progress)
+    poses, alone = _joined(boards, singles)
+    blind += alone
+    cameras = tuple(sorted(poses))
+    if len(cameras) < 2:
+        raise FitError(
+            f"{len(cameras)} of {len(boards.cameras)} cameras can be calibrated together; a position takes two.",
+            why="; ".join(f"{boards.names[c]}: {why}" for c, why in blind),
+            fix="show every camera the board in ten places or more, and in half of them to two cameras at once",
+        )
+    half = np.array([boards.images[c].half for c in cameras])
+    bundle = _bundle(boards, singles, poses, cameras)
+    found = adjust_in_steps(bundle, half, progress=progress)
+    _check(boards, cameras, found, half)
+    found, wrong = _refined(boards, cameras, found, progress)
+    return Network(
+        cameras,
+        tuple(sorted(blind)),
+        {c: choices[c] for c in cameras},
+        found.bundle,
+        found.root,
+        tuple(wrong),
+        tuple(boards.images[c] for c in cameras),
+        boards.shots,
+    )
+
+
+def _singles(
+    boards: Boards, family: str, progress: Progress
+) -> tuple[dict[int, OneCamera], dict[int, Choice], list[tuple[int, str]]]:
+    usable, blind = usable_cameras(boards)
+    done = 0
+
+    def one(c: int) -> tuple[OneCamera, Choice] | FitError:
+        nonlocal done
+        try:
+            return calibrate_camera(boards.of_camera(c), boards.images[c], family)
+        except FitError as error:
+            return error
+        except np.linalg.LinAlgError as error:
+            return FitError(f"its boards do not fix a lens: {error}.")
+        finally:
+            done += 1
+            progress("calibrating each camera", done, len(usable))
+
+    singles, choices = {}, {}
+    for c, found in zip(usable, side_by_side(one, usable), strict=True):
+        if isinstance(found, FitError):
+            blind.append((c, found.what))
+        else:
+            singles[c], choices[c] = found
+    return singles, choices, blind
+
+
+def _joined(boards: Boards, singles: Mapping[int, OneCamera]) -> tuple[dict[int, Pose], list[tuple[int, str]]]:
+    """first_from_camera of the cameras that can be joined by boards that two of them saw, over the pairs that share the
+    most; and why not the others."""
+    seen = {c: dict(zip((v.board for v in boards.of_camera(c)), boards.of_camera(c), strict=True)) for c in singles}
+    placed = {c: _placed(boards, c, singles[c]) for c in singles}
+    shared = {
+        (a, b): sum(len(seen[a][k].rows) + len(seen[b][k].rows) for k in seen[a].keys() & seen[b].keys())
+        for a, b in combinations(singles, 2)
+    }
+    groups = _trees(list(singles), shared)
+    best = max(groups, key=lambda group: (len(group[0]), -min(group[0])), default=([], []))
+    poses: dict[int, Pose] = {}
+    for a, b in best[1]:  # in an order in which one of the two is placed already
+        if not poses:
+            poses[a] = Pose(np.eye(3), np.zeros(3))
+        known, new = (a, b) if a in poses else (b, a)
+        poses[new] = poses[known] @ _relative(seen, placed, singles, known, new)
+    if poses:
+        first = poses[min(poses)].inverse()
+        poses = {c: first @ pose for c, pose in poses.items()}
+    others = [c for c in singles if c not in poses]
+    return poses, [(c, "it saw no board at the same time as the others") for c in others]
+
+
+def _placed(boards: Boards, c: int, single: OneCamera) -> dict[int, Pose]:
+    """camera_from_board of each board that a camera saw."""
+    _, numbers = renumbered(boards.of_camera(c))
+    return {k: single.boards.pose(i) for i, k in enumerate(numbers)}
+
+
+def _trees(cameras: list[int], shared: Mapping[tuple[int, int], int]) -> list[tuple[list[int], list[tuple[int, int]]]]:
+    """Groups of cameras that shared boards join, each with its tree of the strongest pairs (Prim 1957), in order."""
+    groups, left = [], list(cameras)
+    while left:
+        group, tree = [left.pop(0)], list[tuple[int, int]]()
+        while True:
+            pairs = [p for p, n in shared.items() if n > 0 and ((p[0] in group) != (p[1] in group))]
+            if not pairs:
+                break
+            pair = max(pairs, key=lambda p: shared[p])
+            new = pair[1] if pair[0] in group else pair[0]
+            group.append(new)
+            left.remove(new)
+            tree.append(pair)
+        groups.append((group, tree))
+    return groups
+
+
+def _relative(
+    seen: Mapping[int, Mapping[int, BoardView]],
+    placed: Mapping[int, Mapping[int, Pose]],
+    singles: Mapping[int, OneCamera],
+    a: int,
+    b: int,
+) -> Pose:
+    """a_from_b: of what each shared board says, that which explains the others best."""
+    common = sorted(seen[a].keys() & seen[b].keys())
+    candidates = [placed[a][k] @ placed[b][k].inverse() for k in common]
+
+    def error(pose: Pose) -> float:
+        off = []
+        for k in common:
+            for camera, view, there in (
+                (singles[a].camera, seen[a][k], pose @ placed[b][k]),
+                (singles[b].camera, seen[b][k], pose.inverse() @ placed[a][k]),
+            ):
+                length = np.linalg.norm(camera.pixel(there.apply(view.xyz)) - view.uv, axis=1)
+                off.append(float(np.median(np.nan_to_num(length, nan=1e4))))
+        return float(np.median(off))
+
+    return min(candidates, key=error)
+
+
+def _bundle(
+    boards: Boards, singles: Mapping[int, OneCamera], poses: Mapping[int, Pose], cameras: tuple[int, ...]
+) -> Bundle:
+    number = {c: i for i, c in enumerate(cameras)}
+    views, kept = renumbered([replace(v, camera=number[v.camera]) for v in boards.views if v.camera in number])
+    placed = {c: _placed(boards, c, singles[c]) for c in cameras}
+    rig_from_board = []
+    for k in kept:
+        by = [c for c in cameras if k in placed[c]]
+        best = max(by, key=lambda c: next(len(v.rows) for v in boards.of_camera(c) if v.board == k))
+        rig_from_board.append(poses[best] @ placed[best][k])
+    there = tuple(CentralCamera(singles[c].camera.lens, poses[c].inverse()) for c in cameras)
+    priors = []
+    for c, camera in zip(cameras, there, strict=True):
+        own = np.concatenate([rig_from_board[v.board].apply(v.xyz) for v in views if v.camera == number[c]])
+        priors.append(camera.prior(boards.images[c], min(float(np.quantile(angles(camera, own), 0.98)), 3.0)))
+    noise = np.array([singles[c].noise for c in cameras])
+    return Bundle(there, tuple(priors), Placed.of(rig_from_board), Views(views, len(cameras)), noise)
+
+
+def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floats) -> None:
+    usual = spreads(found.bundle)
+    worst = int(np.argmax(usual / half))
+    if usual[worst] < TOLERABLE * half[worst]:
+        return
+    raise FitError(
+        f"the cameras contradict each other: {boards.names[cameras[worst]]} is left {usual[worst]:.3g} px off.",
+        why="alone it fits its boards; with the others it does not",
+        fix="check that its pictures are of the same instants and that no camera moved; or leave it out with "
+        f"--without {boards.names[cameras[worst]]}",
+    )
+
+
+def _refined(
+    boards: Boards, cameras: tuple[int, ...], found: Adjusted, progress: Progress
+) -> tuple[Adjusted, list[tuple[int, int, float]]]:
+    """Without the corners that are wrong, by plain least squares, with the noise that the residuals show."""
+    everything, stated = found.bundle.views, boards.stated[list(cameras)]
+    bundle = replace(found.bundle, noise=np.maximum(spreads(found.bundle), 1e-6))
+    for _ in range(3):
+        bundle = replace(bundle, views=everything)
+        kept = [bundle.lengths(c) <= FAR * bundle.noise[c] for c in range(len(cameras))]
+        found = adjust(replace(bundle, views=everything.select(kept)), robust=False, progress=progress)
+        noise = _noise(found.bundle, stated)
+        settled = np.allclose(noise, bundle.noise, rtol=0.02)
+        bundle = replace(found.bundle, noise=noise)
+        if settled:
+            break
+    wrong = []
+    off = [np.linalg.norm(replace(bundle, views=everything).residuals(c), axis=1) for c in range(len(cameras))]
+    for c, view, rows in everything.in_stacks():
+        bad = np.flatnonzero(~kept[c][rows])
+        wrong += [(int(view.rows[i]), cameras[c], float(off[c][rows][i])) for i in bad]
+    return adjust(bundle, robust=False), wrong
+
+
+def _noise(bundle: Bundle, stated: Floats) -> Floats:
+    """(C,) the residuals' sum of squares over the degrees of freedom left: a board's pose is shared by who saw it."""
+    squares, freedom = np.zeros(len(bundle.cameras)), np.array([-float(camera.size) for camera in bundle.cameras])
+    stacks = bundle.views.stacks
+    corners = np.sum([np.bincount(s.board, minlength=len(bundle.boards.translation)) for s in stacks], axis=0)
+    for c, stack in enumerate(stacks):
+        squares[c] = np.nansum((bundle.residuals(c) / stack.relative[:, None]) ** 2)
+        freedom[c] += float(np.sum(2 - 6 / corners[stack.board]))
+    own = np.sqrt(squares / np.maximum(freedom, 1.0))
+    told = np.isfinite(stated)
+    mixed = np.sqrt((squares + AS_IF * np.nan_to_num(stated) ** 2) / (np.maximum(freedom, 1.0) + AS_IF))
+    return np.asarray(np.maximum(np.where(told, mixed, own), 1e-6), dtype=np.float64)

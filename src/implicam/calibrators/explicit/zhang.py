@@ -1,0 +1,138 @@
+"""One camera from pictures of a flat board at unknown places: Zhang's method, for any lens.
+
+Zhang 2000, "A flexible new technique for camera calibration", takes pixels of a pinhole. Here a ladder of lenses
+(geometry.candidate_rays) turns pixels into rays first: board -> ray is a homography for the right lens, whatever the
+lens, and the wrong ones fit worse. The best rung starts a bundle adjustment of lens and board poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
+from implicam.calibrators.explicit.boards import BoardView, renumbered
+from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
+from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, Image
+from implicam.cameras import KannalaBrandt
+from implicam.errors import FitError
+from implicam.geometry import Bools, Pose, candidate_rays
+
+FEW = 30
+"""Boards that the lens is looked for with; the adjustment has them all."""
+
+TOLERABLE = 0.03
+"""Median error of a start, in half the longer side of the image, beyond which it is none."""
+
+FOLDS = 3
+
+
+class OneCamera(NamedTuple):
+    """A camera at the origin of its own frame, camera_from_board of its boards, and its noise in pixels."""
+
+    camera: CentralCamera
+    boards: Placed
+    noise: float
+
+
+def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> tuple[OneCamera, Choice]:
+    """From the views of one camera, and the lens model it got. FitError where the boards do not fix a lens."""
+    own, _ = renumbered([replace(view, camera=0) for view in views])
+    first = _adjusted(*_start(own, image), Views(own, 1), image)
+    left = float(spreads(first.bundle)[0])
+    if not left < TOLERABLE * image.half:
+        raise FitError(
+            f"no lens explains the corners of its {len(own)} boards: the best of all fits leaves {left:.3g} px.",
+            fix="look at the overlays of its pictures (detections/), and take out those with wrong corners",
+        )
+
+    def perspective() -> Adjusted:
+        camera = as_brown_conrady(first.bundle.cameras[0], first.bundle.corners(0))
+        return _adjusted(camera, first.bundle.boards, first.bundle.views, image)
+
+    candidates: dict[str, Callable[[], Adjusted]] = {"kannala-brandt": lambda: first, "brown-conrady": perspective}
+    found, choice = chosen(family, candidates, _held_out)
+    return OneCamera(found.bundle.cameras[0], found.bundle.boards, float(spreads(found.bundle)[0])), choice
+
+
+def _start(views: Sequence[BoardView], image: Image) -> tuple[CentralCamera, Placed]:
+    """The rung of the ladder that fits the boards best, and the poses camera_from_board that go with it."""
+    offsets = [view.uv - image.centre for view in views]
+    outermost = max(float(np.linalg.norm(offset, axis=1).max()) for offset in offsets)
+
+    def ladder(offset: Floats) -> tuple[Floats, Bools, Floats]:
+        focal, pinhole, rays = candidate_rays(np.vstack([offset, [outermost, 0.0]]))  # the same rungs for each board
+        return focal, pinhole, rays[:, :-1]
+
+    total: Floats | float = 0.0
+    for i in sorted(range(len(views)), key=lambda i: -len(views[i].rows))[:FEW]:
+        focal, pinhole, rays = ladder(offsets[i])
+        _, errors = planar_poses(views[i].xyz[:, :2], rays, focal)
+        total = total + np.sum(np.minimum(errors, 3 * np.median(errors, axis=1, keepdims=True)) ** 2, axis=1)
+    best = int(np.argmin(total))
+    k = TANGENT if pinhole[best] else np.zeros(4)
+    lens = KannalaBrandt(float(focal[best]), float(focal[best]), *image.centre.tolist(), *k.tolist())
+    one = slice(best, best + 1)
+    poses = [
+        planar_poses(view.xyz[:, :2], ladder(offset)[2][one], focal[one])[0][0]
+        for view, offset in zip(views, offsets, strict=True)
+    ]
+    return CentralCamera(lens, Pose(np.eye(3), np.zeros(3))), Placed.of(poses)
+
+
+def planar_poses(flat: Floats, rays: Floats, focal: Floats) -> tuple[list[Pose], Floats]:
+    """camera_from_board for each of k lenses, from points (n, 2) on the board and their unit rays (k, n, 3); and errors
+    (k, n) in pixels of focal lengths (k,). The homography board -> ray, made rigid (Zhang 2000, appendix C)."""
+    middle = flat.mean(axis=0)
+    scale = float(np.sqrt(np.mean((flat - middle) ** 2)))
+    points = np.column_stack([(flat - middle) / scale, np.ones(len(flat))])
+    # ray x (H p) = 0: the sum of (I - ray ray^T) (x) p p^T has vec(H) in its null space
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    outer = (points[:, :, None] * points[:, None, :]).reshape(len(flat), 9)
+    normal = (across.reshape(len(rays), len(flat), 9).swapaxes(1, 2) @ outer).reshape(-1, 3, 3, 3, 3)
+    H = np.linalg.eigh(normal.swapaxes(2, 3).reshape(-1, 9, 9))[1][:, :, 0].reshape(-1, 3, 3)
+    front = np.median(np.einsum("kij,nj,kni->kn", H, points, rays, optimize=True), axis=1)
+    size = 0.5 * (np.linalg.norm(H[:, :, 0], axis=1) + np.linalg.norm(H[:, :, 1], axis=1))
+    H = H * (np.where(front < 0, -1.0, 1.0) / np.maximum(size, 1e-12))[:, None, None]
+    u, _, vt = np.linalg.svd(np.stack([H[:, :, 0], H[:, :, 1], np.cross(H[:, :, 0], H[:, :, 1])], axis=2))
+    u[:, :, 2] *= np.sign(np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    rotations = u @ vt
+    translations = H[:, :, 2] * scale - rotations[:, :, :2] @ middle
+    there = flat @ rotations[:, :, :2].swapaxes(1, 2) + translations[:, None]
+    along = np.sum(there * rays, axis=2)
+    aside = np.sqrt(np.maximum(np.sum(there**2, axis=2) - along**2, 0))
+    errors = focal[:, None] * np.arctan2(aside, along)
+    return [Pose(r, t) for r, t in zip(rotations, translations, strict=True)], np.asarray(errors, dtype=np.float64)
+
+
+def _adjusted(camera: CentralCamera, boards: Placed, views: Views, image: Image) -> Adjusted:
+    """Lens and poses of the boards, refined."""
+    bundle = Bundle((camera,), (camera.prior(image, 1.0),), boards, views, np.ones(1))
+    widest = float(np.quantile(angles(camera, bundle.corners(0)), 0.98))
+    return adjust_in_steps(replace(bundle, priors=(camera.prior(image, min(widest, 3.0)),)), np.array([image.half]))
+
+
+def _held_out(adjusted: Adjusted) -> Floats:
+    """(n,) squared errors of corners: a third of the boards held out in turn, the lens from the others, and a pose from
+    every second corner."""
+    bundle = adjusted.bundle
+    views, count = bundle.views.each, len(bundle.boards.translation)
+    fold = np.random.default_rng(0).permutation(np.arange(count) % min(FOLDS, count))
+    errors = []
+    for k in range(min(FOLDS, count)):
+        train, boards = renumbered([view for view in views if fold[view.board] != k])
+        kept = Placed(bundle.boards.rotation[boards], bundle.boards.translation[boards])
+        camera = adjust(replace(bundle, views=Views(train, 1), boards=kept), iterations=15).bundle.cameras[0]
+        errors.append(_of_placed_boards(replace(bundle, cameras=(camera,)), [v for v in views if fold[v.board] == k]))
+    return clipped(np.concatenate(errors)) ** 2
+
+
+def _of_placed_boards(bundle: Bundle, views: Sequence[BoardView]) -> Floats:
+    """(n,) errors in pixels of every second corner of the boards, which are placed by the others for a known lens."""
+    odd = [view.select(np.arange(len(view.rows)) % 2 == 1) for view in views]
+    even = [view.select(np.arange(len(view.rows)) % 2 == 0) for view in views]
+    placed = adjust(replace(bundle, views=Views(tuple(odd), 1), held=True), iterations=15).bundle
+    return replace(placed, views=Views(tuple(even), 1)).lengths(0)

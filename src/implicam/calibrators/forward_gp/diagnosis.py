@@ -1,0 +1,143 @@
+"""How a fit agrees with its own known points: views not used, leave-one-out errors, what is to be noted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.fit import FittedRig, left_out
+from implicam.calibrators.forward_gp.posterior import Sightings
+from implicam.calibrators.forward_gp.problem import Frame, sightings_of, stated_noise
+from implicam.calibrators.protocol import Rejected, Unused
+from implicam.dataset import Dataset, Floats
+
+NAMED = 5
+"""Things that a note names one by one; of more it gives the number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """Of a fitted rig and the data it was fitted from."""
+
+    data: Dataset
+    frame: Frame
+    fitted: FittedRig
+
+    @cached_property
+    def rejected(self) -> tuple[Rejected, ...]:
+        """The views not used because they contradict the others, the farthest first."""
+        names, found = self.data.observations.camera_names, []
+        for number, c in enumerate(self.fitted.cameras):
+            kept = self.fitted.kept[number]
+            if kept.all():
+                continue
+            seen = self._sightings[c]
+            residual, _ = left_out(self.fitted.posterior, number, self._points, seen, kept)
+            for row in np.flatnonzero(~kept):
+                point = str(self.data.points[seen.rows[row]])
+                found.append(Rejected(point, names[c], float(np.linalg.norm(residual[row]))))
+        return tuple(sorted(found, key=lambda view: -np.nan_to_num(view.residual, nan=np.inf)))
+
+    @property
+    def unused(self) -> tuple[Unused, ...]:
+        """The known points of which no view is used."""
+        used = self._used.any(axis=1)
+        seen = self.data.observations.seen
+        calibrated = seen[:, list(self.fitted.cameras)].any(axis=1)
+        reasons = np.where(
+            calibrated,
+            "all its views contradict the others",
+            np.where(seen.any(axis=1), "no calibrated camera saw it", "no camera saw it"),
+        )
+        return tuple(Unused(str(self.data.points[i]), str(reasons[i])) for i in np.flatnonzero(~used))
+
+    @cached_property
+    def leave_one_out(self) -> tuple[Floats, Floats]:
+        """Errors and sds (n, 3) of the known points, each measured without its own views, to first order."""
+        n = len(self.data)
+        posterior = self.fitted.posterior
+        H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        views = np.zeros(n)
+        for number, c in enumerate(self.fitted.cameras):
+            seen, kept = self._sightings[c], self.fitted.kept[number]
+            residual, spread = left_out(posterior, number, self._points, seen, kept)
+            rows = seen.rows[kept]
+            where = self._points[rows]
+            if posterior.displacement is not None:
+                where = where + posterior.displacement[rows]
+            _, D = posterior.models[number].predict(where)
+            WD = np.linalg.inv(spread[kept]) @ D
+            H[rows] += D.swapaxes(1, 2) @ WD
+            g[rows] += np.einsum("nij,ni->nj", WD, residual[kept])
+            views[rows] += 1
+        good = (views >= 2) & (np.linalg.cond(H) < 1e12)
+        cov = np.linalg.inv(H[good])
+        error = np.einsum("nij,nj->ni", cov, g[good])
+        return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
+
+    def residuals(self) -> dict[str, Any]:
+        """Leave-one-out errors per axis in the dataset's unit, and per camera the noise in pixels."""
+        errors, sds = self.leave_one_out
+        axes, models = "xyz", self.fitted.posterior.models
+        names = (self.data.observations.camera_names[c] for c in self.fitted.cameras)
+        return {
+            "points_used": len(self.data) - len(self.unused),
+            "points_unused": len(self.unused),
+            "views_rejected": len(self.rejected),
+            "leave_one_out_rms": dict(zip(axes, map(float, np.sqrt(np.mean(errors**2, axis=0))), strict=True)),
+            "leave_one_out_mean_sd": dict(zip(axes, map(float, np.mean(sds, axis=0)), strict=True)),
+            "noise_px": dict(zip(names, (float(model.noise) for model in models), strict=True)),
+        }
+
+    def notes(self) -> list[str]:
+        """Cameras that could not be calibrated, and views that contradict the others."""
+        names = self.data.observations.camera_names
+        blind = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in self.fitted.blind]
+        return [*blind, *self._rejected_notes()]
+
+    def noise_notes(self) -> list[str]:
+        """Cameras whose noise is not what the observations state."""
+        notes = []
+        stated = stated_noise(self.data.observations)
+        for number, c in enumerate(self.fitted.cameras):
+            found = self.fitted.posterior.models[number].noise
+            if np.isfinite(stated[c]) and not 0.5 < found / stated[c] < 2:
+                name = self.data.observations.camera_names[c]
+                notes.append(f"{name}: the noise is {found:.2g} px, and the observations state {stated[c]:.2g} px.")
+        return notes
+
+    def _rejected_notes(self) -> list[str]:
+        if not self.rejected:
+            return []
+        n, total = len(self.rejected), int(sum(len(kept) for kept in self.fitted.kept))
+        named = ", ".join(
+            f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in self.rejected[:NAMED]
+        )
+        more = f" and {n - NAMED} more" if n > NAMED else ""
+        notes = [f"{n} of {total} views contradict the others and are not used: {named}{more}."]
+        seen = np.stack([self.data.observations.seen[:, c] for c in self.fitted.cameras], axis=1)
+        wrong = (seen.sum(axis=1) >= 2) & ((seen & ~self._used).sum(axis=1) > 0.5 * seen.sum(axis=1))
+        if wrong.any():
+            points = ", ".join(map(str, self.data.points[wrong][:NAMED]))
+            notes.append(f"Most views of {points} are among them: look at the known position rather than the images.")
+        return notes
+
+    @cached_property
+    def _points(self) -> Floats:
+        return self.frame.inward(self.data.xyz)
+
+    @cached_property
+    def _sightings(self) -> tuple[Sightings, ...]:
+        return sightings_of(self.data.observations, stated_noise(self.data.observations))
+
+    @cached_property
+    def _used(self) -> NDArray[np.bool_]:
+        """(n, calibrated cameras) the views used."""
+        used = np.zeros((len(self.data), len(self.fitted.cameras)), dtype=np.bool_)
+        for number, c in enumerate(self.fitted.cameras):
+            used[self._sightings[c].rows, number] = self.fitted.kept[number]
+        return used

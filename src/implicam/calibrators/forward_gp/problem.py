@@ -1,0 +1,124 @@
+"""What a fit of forward models starts from: the working frame, what each camera saw, how known points may be off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.fit import Problem
+from implicam.calibrators.forward_gp.lens import Image
+from implicam.calibrators.forward_gp.posterior import ShotErrors, Sightings
+from implicam.calibrators.forward_gp.shots import Shots
+from implicam.calibrators.forward_gp.start import FEWEST
+from implicam.calibrators.protocol import require_points, require_volume
+from implicam.dataset import Dataset, Floats, Observations
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The working frame: world positions about their mean, in their overall standard deviation."""
+
+    offset: Floats
+    scale: float
+
+    @classmethod
+    def of(cls, data: Dataset, method: str) -> Frame:
+        """FitError, which names the method, where the points do not fill a volume."""
+        seen = data.observations.seen.any(axis=1)
+        _ = data.positions  # a clear error where there are none
+        counts = data.observations.seen.sum(axis=0)
+        why = ", ".join(f"{n} sees {k}" for n, k in zip(data.observations.camera_names, counts, strict=True))
+        require_points(int(seen.sum()), FEWEST, method, why)
+        xyz = data.xyz[seen]
+        require_volume(xyz, method)
+        offset = xyz.mean(axis=0)
+        return cls(offset, float(np.sqrt(np.mean((xyz - offset) ** 2))))
+
+    @classmethod
+    def from_array(cls, array: Floats) -> Frame:
+        """The inverse of `as_array`; ValueError for what is none."""
+        if array[3] <= 0:
+            raise ValueError("the scale of the frame must be positive")
+        return cls(array[:3], float(array[3]))
+
+    def as_array(self) -> Floats:
+        """(4,) offset and scale."""
+        return np.append(self.offset, self.scale)
+
+    def inward(self, xyz: Floats) -> Floats:
+        """World to working frame."""
+        return (xyz - self.offset) / self.scale
+
+    def outward(self, points: Floats) -> Floats:
+        """Working frame to world."""
+        return points * self.scale + self.offset
+
+
+def problem_of(lens: str, data: Dataset, frame: Frame, *, shots_off: bool = True) -> Problem:
+    """The problem of known points, in the working frame; shots_off: estimate how shots are off as a whole."""
+    observations, points = data.observations, frame.inward(data.xyz)
+    stated = stated_noise(observations)
+    images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
+    shots = _shots(data, points) if shots_off else None
+    errors = shots.errors(points) if shots is not None else _declared(data, frame)
+    sightings = sightings_of(observations, stated)
+    return Problem(points, observations.camera_names, sightings, images, stated, errors, lens)
+
+
+def sightings_of(observations: Observations, stated: Floats) -> tuple[Sightings, ...]:
+    """What each camera saw, all of it."""
+    relative = relative_noise(observations, stated)
+    seen = (np.flatnonzero(there) for there in observations.seen.T)
+    return tuple(Sightings(rows, observations.uv[rows, c], relative[rows, c]) for c, rows in enumerate(seen))
+
+
+def image_of(observations: Observations, c: int) -> Image:
+    """Where the pixels of camera number c are measured from."""
+    camera = observations.cameras[c]
+    if camera.width is not None and camera.height is not None:
+        return Image(np.array([camera.width - 1, camera.height - 1]) / 2, max(camera.width, camera.height) / 2)
+    uv = observations.uv[observations.seen[:, c], c]  # not told: what is seen must do
+    if not len(uv):
+        return Image(np.zeros(2), 1.0)
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    return Image((low + high) / 2, float(max((high - low).max() / 2, 1.0)))
+
+
+def stated_noise(observations: Observations) -> Floats:
+    """(C,) the usual stated noise of each camera in pixels, NaN where none is stated."""
+    size = view_noise(observations)
+    known = np.isfinite(size) & observations.seen
+    return np.array([np.median(size[known[:, c], c]) if known[:, c].any() else np.nan for c in range(size.shape[1])])
+
+
+def relative_noise(observations: Observations, stated: Floats) -> Floats:
+    """(n, C) the stated noise of each view over the camera's usual one; 1 where it is not stated."""
+    relative = view_noise(observations) / stated
+    return np.where(np.isfinite(relative) & (relative > 0), relative, 1.0)
+
+
+def view_noise(observations: Observations) -> Floats:
+    """(n, C) the stated noise of u and v together, in pixels; NaN where none is stated."""
+    return np.asarray(np.sqrt(np.mean(observations.sd**2, axis=2)), dtype=np.float64)
+
+
+def _declares(data: Dataset) -> bool:
+    return bool((data.positions.sd > 0).any())
+
+
+def _shots(data: Dataset, points: Floats) -> Shots | None:
+    """Shots whose errors are to be estimated: many points each, and nothing declared."""
+    return None if _declares(data) else Shots.of(points, data.shots)
+
+
+def _declared(data: Dataset, frame: Frame) -> ShotErrors | None:
+    """A shot is off as a whole by its declared sd: a robot or a slide puts all its points there together."""
+    if not _declares(data):
+        return None
+    _, shot = np.unique(data.shots, return_inverse=True)
+    sd = np.nan_to_num(data.positions.sd) / frame.scale
+    count = np.bincount(shot)
+    of_shot = np.stack([np.sqrt(np.bincount(shot, weights=sd[:, k] ** 2) / count) for k in range(3)], axis=1)
+    basis = np.broadcast_to(np.eye(3), (len(data), 3, 3))
+    return ShotErrors(shot.astype(np.int64), basis, of_shot, np.full(3, -1))

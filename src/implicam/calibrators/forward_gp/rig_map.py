@@ -1,0 +1,117 @@
+"""Cameras that predict pixels from positions, with their covariance: how they measure, whatever fitted them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.locate import Labels, Located, locate
+from implicam.calibrators.forward_gp.posterior import Posterior
+from implicam.calibrators.forward_gp.problem import Frame, stated_noise, view_noise
+from implicam.calibrators.protocol import same_cameras
+from implicam.dataset import Floats, Names, Observations
+from implicam.measurement import Measurement
+
+
+@dataclass(frozen=True, eq=False)
+class RigMap:
+    """trained: what the cameras saw when they were fitted, all cameras; cameras: numbers of those that could be, in
+    the order of posterior.models; posterior: in the working frame; labels: how known positions are off, if they are."""
+
+    trained: Observations
+    length_unit: str
+    frame: Frame
+    cameras: tuple[int, ...]
+    posterior: Posterior
+    labels: Labels | None = None
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The cameras that are calibrated."""
+        return tuple(self.trained.camera_names[c] for c in self.cameras)
+
+    def measure(self, observations: Observations) -> Measurement:
+        """Measure each point with the views it has, two or more."""
+        known = [name for name in self.trained.camera_names if name in observations.camera_names]
+        trained = self.trained.with_cameras(known) if known else self.trained
+        observations = same_cameras(trained, observations)
+        uv, noise = self.views(observations)
+        found = locate(self.posterior, uv, noise, self.labels)
+        seen = np.asarray(np.isfinite(uv).all(axis=2))
+        return Measurement(
+            observations.points,
+            self.frame.outward(found.xyz),
+            found.cov * self.frame.scale**2,
+            seen.sum(axis=1) - found.left_out.sum(axis=1),
+            found.p,
+            self._reasons(observations, seen, found),
+            self.length_unit,
+        )
+
+    def views(self, observations: Observations) -> tuple[Floats, Floats]:
+        """Pixels (n, C, 2) of the calibrated cameras, NaN where not seen, and the noise (n, C) of each view, pixels."""
+        n, C = len(observations), len(self.camera_names)
+        uv, noise = np.full((n, C, 2), np.nan), np.ones((n, C))
+        for c, name in enumerate(self.camera_names):
+            if name in observations.camera_names:
+                k = observations.camera_names.index(name)
+                uv[:, c] = observations.uv[:, k]
+                noise[:, c] = self._noise(observations, c, k)
+        return uv, noise
+
+    def predict(self, xyz: Floats) -> Floats:
+        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
+        points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        uv = np.full((len(points), len(self.trained.cameras), 2), np.nan)
+        there = np.isfinite(points).all(axis=1)
+        where = points[there]
+        if self.labels is not None:
+            known, _ = self.labels.shots.labels(where, self.labels.sd)
+            where = where + known @ self.labels.unknowns.mean
+        for number, c in enumerate(self.cameras):
+            uv[there, c] = self.posterior.models[number].predict(where)[0]
+        return uv
+
+    def centres(self) -> dict[str, Floats]:
+        """Where the calibrated cameras are: name -> (3,) in the world."""
+        nowhere = np.zeros((1, 2))
+        cameras = (model.camera for model in self.posterior.models)
+        return {
+            name: self.frame.outward(camera.lines(nowhere)[0])
+            for name, camera in zip(self.camera_names, cameras, strict=True)
+        }
+
+    def _noise(self, observations: Observations, c: int, k: int) -> Floats:
+        """(n,) of camera c's views, in pixels: as they state it, corrected as the calibration's own views were."""
+        usual, stated = self.posterior.models[c].noise, self._stated[self.cameras[c]]
+        given = view_noise(observations)[:, k]
+        corrected = given * (usual / stated) if np.isfinite(stated) else given
+        return np.where(np.isfinite(given) & (given > 0), corrected, usual)
+
+    @cached_property
+    def _stated(self) -> Floats:
+        return stated_noise(self.trained)
+
+    def _reasons(self, observations: Observations, seen: NDArray[np.bool_], found: Located) -> Names:
+        every = observations.seen.sum(axis=1)
+        usable = seen.sum(axis=1)
+        reasons = []
+        for i in range(len(seen)):
+            if np.isfinite(found.xyz[i, 0]):
+                away = " and ".join(self.camera_names[c] for c in np.flatnonzero(found.left_out[i]))
+                reasons.append(f"measured without {away}, whose view contradicts the others" if away else "")
+            elif every[i] == 0:
+                reasons.append("no camera saw it")
+            elif usable[i] == 0:
+                reasons.append("no calibrated camera saw it")
+            elif usable[i] == 1:
+                only = self.camera_names[int(np.argmax(seen[i]))]
+                reasons.append(f"only {only} saw it; a position takes two cameras")
+            elif np.isfinite(found.p[i]):
+                reasons.append("its views contradict each other: a wrong match in one of them")
+            else:
+                reasons.append("no position explains its views: a wrong match, or a place that a camera cannot see")
+        return np.array(reasons, dtype=np.str_)
