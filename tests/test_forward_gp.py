@@ -36,7 +36,7 @@ from implicam.calibrators.forward_gp.posterior import (
 )
 from implicam.calibrators.forward_gp.shots import SMOOTH, Shots
 from implicam.calibrators.forward_gp.start import start_camera
-from implicam.cameras import KannalaBrandt
+from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, join
 from implicam.errors import FitError, UsageError
 from implicam.geometry import Pose, look_at
@@ -60,6 +60,10 @@ CAMERAS: dict[str, tuple[AnyCamera, float]] = {
     "telephoto": (CentralCamera(KannalaBrandt(9000.0, 9010.0, 645.0, 390.0, *TANGENT), POSE), 4.0),
     "normal": (CentralCamera(KannalaBrandt(900.0, 903.0, 630.0, 405.0, 0.25, 0.1, 0.04, 0.01), POSE), 35.0),
     "fisheye": (CentralCamera(KannalaBrandt(330.0, 329.0, 642.0, 402.0, -0.02, 0.004, -1e-3, 1e-4), POSE), 105.0),
+    "perspective": (
+        CentralCamera(BrownConrady(900.0, 903.0, 630.0, 405.0, -0.1, 0.02, 4e-4, -3e-4, 0.001), POSE),
+        35.0,
+    ),
     "projective": (
         ProjectiveCamera(
             np.array([[900.0, 3.0, 640.0], [0.0, 905.0, 400.0], [0.0, 0.0, 1.0]])
@@ -102,8 +106,8 @@ def numeric(f: Callable[[np.ndarray], np.ndarray], steps: np.ndarray) -> np.ndar
 def test_derivatives_by_parameters(name: str) -> None:
     camera, points = CAMERAS[name][0], seen_points(name)
     if isinstance(camera, CentralCamera):
-        bent = 1.0 if name == "telephoto" else 1e-4  # k1 ... k4, in which pixels are linear
-        steps = np.array([*np.full(4, 1e-2), *np.full(4, bent), *np.full(6, 1e-5)])
+        bent = 1.0 if name == "telephoto" else 1e-4  # distortion, in which pixels are linear
+        steps = np.array([*np.full(4, 1e-2), *np.full(camera.size - 10, bent), *np.full(6, 1e-5)])
     else:
         steps = 1e-5 * np.maximum(np.abs(camera.P), 0.1).ravel()
     expected = numeric(lambda step: camera.moved(step).pixel(points), steps)

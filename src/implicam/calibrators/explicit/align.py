@@ -44,23 +44,23 @@ def align(
 ) -> Alignment:
     """models: cameras in the rig's frame. uv (n, C, 2) and noise (n, C): their views of the known points xyz (n, 3),
     whose declared sd is (n, 3); measured: these points in the rig's frame. FitError where they do not fix a motion."""
-    used = np.asarray(measured.measured.copy(), dtype=np.bool_)
+    there = np.asarray(measured.measured, dtype=np.bool_)
+    used = there
     if used.sum() < 3:
         raise FitError(
             f"{used.sum()} known points can be measured with the boards' calibration; it takes three to align it.",
             fix="add known points that two cameras see, or leave out points.csv to measure in the first camera's frame",
         )
     point, M = _sensitivities(models, uv, noise, measured.xyz, used)
-    for _ in range(5):
+    for _ in range(8):
         pose = _matched(measured.xyz, xyz, used, how)
-        pose, Q, G, W, residual = _weighted(pose, measured, xyz, sd, used)
+        pose, Q, G, W, residual = _weighted(pose, measured, xyz, sd, used, there)
         distance = np.einsum("ni,nij,nj->n", residual, W, residual)
-        good = used & (distance <= max(FAR, float(np.quantile(distance[used], 0.9))))
+        good = there & (distance <= max(FAR, float(np.quantile(distance[used], 0.9))))
         if good.sum() < 3 or (good == used).all():
             break
         used = good
     GtW = G.swapaxes(1, 2) @ W
-    GtW[~used] = 0
     declared = np.nan_to_num(sd)[:, :, None] ** 2 * np.eye(3)
     declared = pose.rotation @ declared @ pose.rotation.T
     own = Q @ np.einsum("nai,nij,nbj->ab", GtW[used], (point + declared)[used], GtW[used]) @ Q.T
@@ -90,23 +90,23 @@ def icp(known: Floats, measured: Floats, start: Pose) -> Pose:
 
 
 def _weighted(
-    pose: Pose, measured: Measurement, xyz: Floats, sd: Floats, used: Bools
+    pose: Pose, measured: Measurement, xyz: Floats, sd: Floats, used: Bools, there: Bools
 ) -> tuple[Pose, Floats, Floats, Floats, Floats]:
     """The most probable motion, by Gauss-Newton: it, the inverse Q (6, 6) of the normal matrix, and for all points G
     (n, 3, 6), weights W (n, 3, 3) and residuals (n, 3) in the rig's frame; zero where not measured."""
     n = len(xyz)
-    cov = np.where(used[:, None, None], measured.cov, np.eye(3))
+    cov = np.where(there[:, None, None], measured.cov, np.eye(3))
     for _ in range(4):
         declared = pose.rotation @ (np.nan_to_num(sd)[:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
-        W = np.where(used[:, None, None], np.linalg.inv(cov + declared), 0)
+        W = np.where(there[:, None, None], np.linalg.inv(cov + declared), 0)
         turned = xyz @ pose.rotation.T
         G = np.concatenate([-_cross(turned), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
-        residual = np.where(used[:, None], measured.xyz - turned - pose.translation, 0)
+        residual = np.where(there[:, None], measured.xyz - turned - pose.translation, 0)
         GtW = G.swapaxes(1, 2) @ W
-        Q = np.linalg.inv(np.einsum("nai,nib->ab", GtW, G))
-        step = Q @ np.einsum("nai,ni->a", GtW, residual)
+        Q = np.linalg.inv(np.einsum("nai,nib->ab", GtW[used], G[used]))
+        step = Q @ np.einsum("nai,ni->a", GtW[used], residual[used])
         pose = Pose(rotation_from_vector(step[:3]) @ pose.rotation, pose.translation + step[3:])
-    residual = np.where(used[:, None], measured.xyz - pose.apply(xyz), 0)
+    residual = np.where(there[:, None], measured.xyz - pose.apply(xyz), 0)
     return pose, Q, G, W, residual
 
 

@@ -8,7 +8,7 @@ from the normal equations and go into every position that is measured.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,7 +20,13 @@ from implicam import calibration_file
 from implicam.calibrators.explicit import saved
 from implicam.calibrators.explicit.align import MATCHING
 from implicam.calibrators.explicit.boards import boards_of, has_boards
-from implicam.calibrators.explicit.fitted import Fitted, fit_to_boards, fit_to_boards_alone, fit_to_points
+from implicam.calibrators.explicit.fitted import (
+    Fitted,
+    by_cameras_of,
+    fit_to_boards,
+    fit_to_boards_alone,
+    fit_to_points,
+)
 from implicam.calibrators.explicit.lenses import AUTO, FAMILIES
 from implicam.calibrators.explicit.network import Network, calibrate_network
 from implicam.calibrators.forward_gp.rig_map import RigMap
@@ -76,8 +82,7 @@ class Explicit:
         """The rig from the boards: the same for all known points, so it is adjusted once."""
         if data.observations.camera_names not in self._networks:
             assert self.boards is not None
-            names = [name for name in data.observations.camera_names if name in self.boards.observations.camera_names]
-            boards = boards_of(self.boards.with_cameras(names)) if names else boards_of(self.boards)
+            boards = boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)))
             self._networks[data.observations.camera_names] = calibrate_network(boards, self.lens, progress)
         return self._networks[data.observations.camera_names]
 

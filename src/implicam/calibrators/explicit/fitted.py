@@ -64,7 +64,7 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
 
 def fit_to_boards(data: Dataset, network: Network, boards: Dataset, how: str) -> Fitted:
     """Cameras from boards, brought into the world by the known points."""
-    trained = _trained(boards, data)
+    trained = by_cameras_of(data, boards)
     known, bundle = data.positions, network.bundle
     in_rig = RigMap(
         trained, data.length_unit, _UNIT, network.cameras, _posterior(network, bundle.cameras, network.root)
@@ -123,10 +123,10 @@ def _frame(xyz: Floats) -> Frame:
     return Frame(offset, float(np.sqrt(np.mean((xyz - offset) ** 2))) or 1.0)
 
 
-def _trained(boards: Dataset, data: Dataset) -> Observations:
-    """The boards' observations by the cameras of the data; an error where sizes differ or no camera is the same."""
+def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
+    """The boards' observations by the cameras of the data; an error where sizes differ, or no two are the same."""
     names = [name for name in data.observations.camera_names if name in boards.observations.camera_names]
-    trained = boards.observations.with_cameras(names) if names else boards.observations
+    trained = boards.observations.with_cameras(names) if len(names) > 1 else boards.observations
     same_cameras(trained, data.observations)
     return trained
 

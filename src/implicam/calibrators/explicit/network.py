@@ -18,7 +18,7 @@ from implicam.calibrators.explicit.zhang import OneCamera, calibrate_camera
 from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image
 from implicam.dataset import Names
 from implicam.errors import FitError
-from implicam.geometry import Pose
+from implicam.geometry import Bools, Pose
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
 
@@ -202,12 +202,7 @@ def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floa
     worst = int(np.argmax(usual / half))
     if usual[worst] < TOLERABLE * half[worst]:
         return
-    raise FitError(
-        f"the cameras contradict each other: {boards.names[cameras[worst]]} is left {usual[worst]:.3g} px off.",
-        why="alone it fits its boards; with the others it does not",
-        fix="check that its pictures are of the same instants and that no camera moved; or leave it out with "
-        f"--without {boards.names[cameras[worst]]}",
-    )
+    raise _contradiction(boards, cameras[worst], f"its corners are left {usual[worst]:.3g} px off")
 
 
 def _refined(
@@ -225,12 +220,40 @@ def _refined(
         bundle = replace(found.bundle, noise=noise)
         if settled:
             break
+    _check_shared(boards, cameras, everything, kept)
     wrong = []
     off = [np.linalg.norm(replace(bundle, views=everything).residuals(c), axis=1) for c in range(len(cameras))]
     for c, view, rows in everything.in_stacks():
         bad = np.flatnonzero(~kept[c][rows])
         wrong += [(int(view.rows[i]), cameras[c], float(off[c][rows][i])) for i in bad]
     return adjust(bundle, robust=False), wrong
+
+
+def _check_shared(boards: Boards, cameras: tuple[int, ...], views: Views, kept: list[Bools]) -> None:
+    """FitError where a camera's corners do not fit on boards that another camera saw too, though alone they do."""
+    seen = np.bincount([view.board for view in views.each])
+    total, lost = np.zeros(len(cameras)), np.zeros(len(cameras))
+    for c, view, rows in views.in_stacks():
+        if seen[view.board] > 1:
+            total[c] += len(view.rows)
+            lost[c] += np.sum(~kept[c][rows])
+    share = lost / np.maximum(total, 1)
+    worst = int(np.argmax(share))
+    if share[worst] > 0.3:
+        raise _contradiction(
+            boards,
+            cameras[worst],
+            f"{100 * share[worst]:.0f} % of its corners do not fit where another camera saw them too",
+        )
+
+
+def _contradiction(boards: Boards, c: int, how: str) -> FitError:
+    name = boards.names[c]
+    return FitError(
+        f"the cameras contradict each other: {name}: {how}.",
+        why="alone it fits its boards; with the others it does not",
+        fix=f"see that its pictures are of the same instants and that no camera moved; or use --without {name}",
+    )
 
 
 def _noise(bundle: Bundle, stated: Floats) -> Floats:

@@ -55,6 +55,9 @@ def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[F
     own = {name.removeprefix(BOARDS): array for name, array in arrays.items() if name.startswith(BOARDS)}
     boards = dataset_from_arrays(own, Path("boards")) if own else None
     trained = _trained(data, boards)
+    unknown = set(map(str, table["calibrated"])) - set(trained.camera_names)
+    if unknown:
+        raise ValueError(f"there is no camera {', '.join(sorted(unknown))}")
     cameras = tuple(trained.camera_names.index(str(name)) for name in table["calibrated"])
     if len(set(cameras)) != len(cameras) or len(cameras) < 2:
         raise ValueError("a rig has two calibrated cameras or more, each once")

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
-from implicam.calibrators.explicit.boards import BoardView, renumbered
+from implicam.calibrators.explicit.boards import FEWEST_CORNERS, BoardView, renumbered
 from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
-from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, Image
+from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, Image, Prior
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
-from implicam.geometry import Bools, Pose, candidate_rays
+from implicam.geometry import Bools, Pose, candidate_rays, rotation_from_vector
 
 FEW = 30
 """Boards that the lens is looked for with; the adjustment has them all."""
@@ -28,6 +28,12 @@ TOLERABLE = 0.03
 """Median error of a start, in half the longer side of the image, beyond which it is none."""
 
 FOLDS = 3
+
+STUCK = 4.0
+"""Median error of a board, in the camera's usual residual, beyond which its pose is looked for again."""
+
+SUBSETS = 40
+"""Random sets of eight corners; with a fifth of the corners wrong, seven of them are clean."""
 
 
 class OneCamera(NamedTuple):
@@ -42,6 +48,9 @@ def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> t
     """From the views of one camera, and the lens model it got. FitError where the boards do not fix a lens."""
     own, _ = renumbered([replace(view, camera=0) for view in views])
     first = _adjusted(*_start(own, image), Views(own, 1), image)
+    better = placed_again(first.bundle)
+    if better is not None:
+        first = _adjusted(better.cameras[0], better.boards, better.views, image)
     left = float(spreads(first.bundle)[0])
     if not left < TOLERABLE * image.half:
         raise FitError(
@@ -75,9 +84,8 @@ def _start(views: Sequence[BoardView], image: Image) -> tuple[CentralCamera, Pla
     best = int(np.argmin(total))
     k = TANGENT if pinhole[best] else np.zeros(4)
     lens = KannalaBrandt(float(focal[best]), float(focal[best]), *image.centre.tolist(), *k.tolist())
-    one = slice(best, best + 1)
     poses = [
-        planar_poses(view.xyz[:, :2], ladder(offset)[2][one], focal[one])[0][0]
+        _trimmed_pose(view.xyz[:, :2], ladder(offset)[2][best], float(focal[best]))
         for view, offset in zip(views, offsets, strict=True)
     ]
     return CentralCamera(lens, Pose(np.eye(3), np.zeros(3))), Placed.of(poses)
@@ -106,6 +114,76 @@ def planar_poses(flat: Floats, rays: Floats, focal: Floats) -> tuple[list[Pose],
     aside = np.sqrt(np.maximum(np.sum(there**2, axis=2) - along**2, 0))
     errors = focal[:, None] * np.arctan2(aside, along)
     return [Pose(r, t) for r, t in zip(rotations, translations, strict=True)], np.asarray(errors, dtype=np.float64)
+
+
+def _trimmed_pose(flat: Floats, rays: Floats, focal: float) -> Pose:
+    """camera_from_board from rays (n, 3) of one lens, some of which may be wrong: those far off are left out."""
+    keep, lens = np.ones(len(flat), dtype=np.bool_), np.array([focal])
+    for _ in range(3):
+        poses, _ = planar_poses(flat[keep], rays[None, keep], lens)
+        there = poses[0].apply(np.column_stack([flat, np.zeros(len(flat))]))
+        off = np.arccos(np.clip(np.sum(there * rays, axis=1) / np.linalg.norm(there, axis=1), -1, 1))
+        inside = off <= 3 * np.median(off)
+        if inside.sum() < FEWEST_CORNERS or (inside == keep).all():
+            break
+        keep = inside
+    return poses[0]
+
+
+def placed_again(bundle: Bundle) -> Bundle | None:
+    """The bundle of one camera with boards placed anew that are stuck in a wrong pose: wrong corners led them there, or
+    it is the mirrored pose that a small board has as well. None where there is none."""
+    lengths, usual = bundle.lengths(0), float(spreads(bundle)[0])
+    rotation, translation, changed = bundle.boards.rotation.copy(), bundle.boards.translation.copy(), False
+    for (k, rows), view in zip(bundle.views.stacks[0].sections, bundle.views.each, strict=True):
+        now = float(np.median(lengths[rows]))
+        if now <= STUCK * usual:
+            continue
+        pose, error = _best_pose(bundle.cameras[0], view, bundle.boards.pose(k), float(bundle.noise[0]))
+        if error < 0.5 * now:
+            rotation[k], translation[k], changed = pose.rotation, pose.translation, True
+    return replace(bundle, boards=Placed(rotation, translation)) if changed else None
+
+
+def _best_pose(camera: CentralCamera, view: BoardView, now: Pose, noise: float) -> tuple[Pose, float]:
+    """Of poses from random corners (RANSAC) and the present one, and the mirrored ones of both, refined: that with the
+    least median error, and the error in pixels."""
+    rng = np.random.default_rng(0)
+    rays, valid = camera.lens.ray_from_pixel(view.uv)
+    good = np.flatnonzero(valid)
+    found = [now]
+    for _ in range(SUBSETS if len(good) >= 8 else 0):
+        some = rng.choice(good, 8, replace=False)
+        found.append(planar_poses(view.xyz[some, :2], rays[None, some], np.ones(1))[0][0])
+
+    def error(pose: Pose) -> float:
+        off = np.linalg.norm(camera.pixel(pose.apply(view.xyz)) - view.uv, axis=1)
+        return float(np.median(np.nan_to_num(off, nan=np.inf)))
+
+    best = min(found, key=error)
+    only = Views((replace(view, camera=0, board=0),), 1)
+    prior = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))
+    refined = []
+    for start in (best, _mirrored(best, view.xyz.mean(axis=0))):
+        bundle = Bundle((camera,), (prior,), Placed.of([start]), only, np.array([noise]), held=True)
+        refined.append(adjust(bundle).bundle.boards.pose(0))
+    best = min(refined, key=error)
+    return best, error(best)
+
+
+def _mirrored(pose: Pose, middle: Floats) -> Pose:
+    """The pose whose tilt is the other way about the line of sight, about the board's middle."""
+    centre = pose.apply(middle)
+    sight = centre / np.linalg.norm(centre)
+    normal = pose.rotation[:, 2]
+    other = 2 * (normal @ sight) * sight - normal  # half a turn about the line of sight
+    axis = np.cross(normal, other)
+    size = np.linalg.norm(axis)
+    if size < 1e-9:
+        return pose
+    turn = rotation_from_vector(axis / size * np.arctan2(size, normal @ other))
+    rotation = turn @ pose.rotation
+    return Pose(rotation, centre - rotation @ middle)
 
 
 def _adjusted(camera: CentralCamera, boards: Placed, views: Views, image: Image) -> Adjusted:

@@ -1,0 +1,129 @@
+"""`aniposelib` and `pose2sim`: the same TOML, with two readings.
+
+    [cam_0]
+    name, size = [width, height], matrix = 3 x 3, distortions, rotation = rvec, translation, fisheye = true (or absent)
+
+                aniposelib                                   pose2sim
+    tables      cam_0, cam_1, ...                            the camera's name
+    lens        k1, k2, p1, p2, k3, or a fisheye's k1 ... k4 k1, k2, p1, p2
+    lengths     of the board; the rig's own are written      metres
+    [metadata]  adjusted, error; ours keeps length_unit      adjusted, error
+
+Rotation and translation are camera_from_world; pixels are OpenCV's. Pose2Sim reads no `fisheye`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+from implicam.cameras import KannalaBrandt, Lens
+from implicam.dataset.tables import naming, parse_toml
+from implicam.errors import DatasetError
+from implicam.exchange.checks import (
+    MAX_CAMERAS,
+    as_table,
+    entry,
+    image_size,
+    lens_from_matrix,
+    numbers,
+    read_text,
+    shown,
+    text_entry,
+)
+from implicam.exchange.fits import four_coefficients
+from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
+from implicam.files import toml_text, write_text
+from implicam.geometry import Pose, rotation_from_vector, vector_from_rotation
+
+NOT_CAMERAS = ("metadata", "capture_volume", "charuco", "checkerboard")
+"""Tables that Pose2Sim and others leave out when they look for cameras."""
+
+
+def write_aniposelib(rig: Rig, path: Path) -> list[str]:
+    """Write in the rig's own unit; everything is kept."""
+    width = len(str(len(rig.cameras) - 1))  # aniposelib sorts the tables as text
+    tables = {f"cam_{i:0{width}}": _table(camera, camera.lens) for i, camera in enumerate(rig.cameras)}
+    metadata = {"adjusted": False, "error": 0.0, "length_unit": rig.length_unit}
+    write_text(path, toml_text({**tables, "metadata": metadata}))
+    return []
+
+
+def write_pose2sim(rig: Rig, path: Path) -> list[str]:
+    """Write in metres; a lens with more than k1, k2, p1, p2 is refitted, and the cost is in the notes."""
+    metres, notes, tables = rig.in_unit("m"), [], {}
+    if rig.length_unit != "m":
+        notes.append(f"Lengths are in metres; the rig's unit was {rig.length_unit}.")
+    for camera in metres.cameras:
+        if camera.name in NOT_CAMERAS:
+            raise DatasetError(f"Pose2Sim takes {camera.name!r} for something else than a camera.", fix="rename it")
+        lens, cost = four_coefficients(camera)
+        if cost:
+            notes.append(f"Camera {camera.name!r}: Pose2Sim has k1, k2, p1, p2 only; fitted again with these: {cost}.")
+        table = _table(camera, lens)
+        sides = [float(side) for side in camera.size]  # as Pose2Sim writes them
+        tables[camera.name] = {**table, "size": sides, "distortions": table["distortions"][:4], "fisheye": False}
+    write_text(path, toml_text({**tables, "metadata": {"adjusted": False, "error": 0.0}}))
+    return notes
+
+
+def _table(camera: ExplicitCamera, lens: Lens) -> dict[str, Any]:
+    pose = camera.camera_from_world
+    numbers = {
+        "matrix": [[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]],
+        "distortions": [float(k) for k in astuple(lens)[4:]],
+        "rotation": vector_from_rotation(pose.rotation).tolist(),
+        "translation": pose.translation.tolist(),
+    }
+    fisheye = {"fisheye": True} if isinstance(lens, KannalaBrandt) else {}
+    return {"name": camera.name, "size": list(camera.size), **numbers, **fisheye}
+
+
+def read_aniposelib(path: Path) -> Rig:
+    """Read a file of aniposelib or Anipose; its unit is known only where implicam wrote it."""
+    table = read_toml(path)
+    metadata = as_table(table.get("metadata", {}), f"{path}: metadata")
+    return _rig(table, path, text_entry(metadata.get("length_unit", UNKNOWN), f"{path}: metadata.length_unit"))
+
+
+def read_pose2sim(path: Path) -> Rig:
+    """Read a Calib.toml of Pose2Sim: metres."""
+    return _rig(read_toml(path), path, "m")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file."""
+    try:
+        return parse_toml(read_text(path))
+    except ValueError as error:
+        raise DatasetError(
+            f"{path}: not valid TOML: {str(error)[:200]}.", fix="the file may be cut off: export it again"
+        ) from None
+
+
+def camera_tables(table: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The tables that are cameras."""
+    return {key: value for key, value in table.items() if isinstance(value, dict) and key not in NOT_CAMERAS}
+
+
+def _rig(table: dict[str, Any], path: Path, unit: str) -> Rig:
+    cameras = camera_tables(table)
+    if not 0 < len(cameras) <= MAX_CAMERAS:
+        raise DatasetError(f"{path}: it has {len(cameras)} tables of cameras.", fix="each camera is a table, [cam_0]")
+    with naming(str(path)):
+        return Rig(tuple(_camera(key, value, f"{path}: [{key}]") for key, value in cameras.items()), unit)
+
+
+def _camera(key: str, table: dict[str, Any], place: str) -> ExplicitCamera:
+    def array(name: str, *shape: int) -> Any:
+        return numbers(entry(table, name, place), shape, f"{place} {name}")
+
+    fisheye = table.get("fisheye", False)
+    if not isinstance(fisheye, bool):
+        raise DatasetError(f"{place}: fisheye = {shown(fisheye)} must be true or false.", fix="correct the value")
+    matrix = array("matrix", 3, 3)
+    lens = lens_from_matrix(matrix, array("distortions", -1).tolist(), fisheye=fisheye, place=place)
+    width, height = image_size(entry(table, "size", place), f"{place} size")
+    pose = Pose(rotation_from_vector(array("rotation", 3)), array("translation", 3))
+    return ExplicitCamera(text_entry(table.get("name", key), f"{place} name"), width, height, lens, pose)

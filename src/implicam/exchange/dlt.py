@@ -1,0 +1,139 @@
+"""`dlt`: the eleven coefficients of the direct linear transformation, as DLTdv and easyWand keep them.
+
+A CSV without header: eleven rows L1 ... L11, one column a camera, so that
+
+    u = (L1 x + L2 y + L3 z + L4) / (L9 x + L10 y + L11 z + 1),   v = (L5 x + ... + L8) / (the same)
+
+(Abdel-Aziz & Karara 1971). The file knows no names, no image sizes, no unit and not where its pixels begin, so all that
+stands beside it, in NAME.csv.toml. Pixels are those of MATLAB: (1, 1) is the centre of the first pixel, which is the
+top-left one (`image_origin = "upper-left"`; written) or, in older files of DLTdv and easyWand, the bottom-left one with
+v upwards (`"lower-left"`). DLTdv 8 has a function, dlt_invert, that turns the one into the other.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from implicam.cameras import Floats
+from implicam.dataset.model import Camera
+from implicam.dataset.tables import naming
+from implicam.errors import DatasetError
+from implicam.exchange.anipose import read_toml
+from implicam.exchange.checks import as_list, as_table, entry, numbers, read_text, shown, text_entry, whole
+from implicam.exchange.fits import Cost, nearest_matrix, pinhole_from_matrix
+from implicam.exchange.model import ExplicitCamera, Rig
+from implicam.files import toml_text, write_text
+
+ORIGINS = ("upper-left", "lower-left")
+COEFFICIENTS = 11
+
+
+def write(rig: Rig, path: Path, points: Floats | None = None) -> list[str]:
+    """Write coefficients and their description, in the rig's own unit; what a lens costs is in the notes.
+
+    A pinhole is exact. A lens with distortion is replaced by the nearest transformation: over the whole image, or over
+    points (n, 3) of the world, for which the centre of projection may move too.
+    """
+    columns, notes = [], []
+    for camera in rig.cameras:
+        column, cost = coefficients(camera, points)
+        columns.append(column)
+        if cost:
+            where = "over the image" if points is None else "at the given points"
+            notes.append(f"Camera {camera.name!r}: DLT has no lens distortion; the nearest is off {where}: {cost}.")
+    tables = [{"name": c.name, "width": c.size[0], "height": c.size[1]} for c in rig.cameras]
+    head = {"length_unit": rig.length_unit, "image_origin": "upper-left", "cameras": tables}
+    write_text(_description(path), toml_text(head))
+    write_text(path, "".join(",".join(map(repr, row)) + "\n" for row in np.column_stack(columns).tolist()))
+    return notes
+
+
+def coefficients(camera: ExplicitCamera, points: Floats | None = None) -> tuple[Floats, Cost | None]:
+    """L1 ... L11 for pixels from the upper left, and what the format costs; None where nothing (a pinhole)."""
+    p, cost = nearest_matrix(camera, points)
+    p = np.linalg.inv(_ours_from_dlt("upper-left", camera.size[1])) @ p
+    if abs(p[2, 3]) < 1e-9 * np.abs(p[2]).max():
+        raise DatasetError(
+            f"camera {camera.name!r} cannot be written with eleven coefficients.",
+            why="the origin of the world lies beside the camera, in the plane through its centre: L12 would be zero",
+            fix="choose an origin in front of the cameras",
+        )
+    return (p / p[2, 3]).ravel()[:COEFFICIENTS], cost
+
+
+def read(path: Path) -> Rig:
+    """Read coefficients and the description beside them; a skew, which no camera has, is left out and noted."""
+    columns = _columns(path)
+    unit, origin, tables = _described(path, len(columns))
+    cameras, notes = [], []
+    for i, (table, column) in enumerate(zip(tables, columns, strict=True), 1):
+        camera, cost = _camera(table, column, origin, f"{path}, column {i}")
+        cameras.append(camera)
+        if cost:
+            notes.append(f"Camera {camera.name!r}: its axes were not at right angles; made so, pixels move: {cost}.")
+    if all(camera.camera_from_world.translation[2] < 0 for camera in cameras):
+        notes.append(f"Every camera looks away from the world's origin. Is image_origin {origin!r} right?")
+    with naming(str(path)):
+        return Rig(tuple(cameras), unit, tuple(notes))
+
+
+def _described(path: Path, columns: int) -> tuple[str, str, list[dict[str, Any]]]:
+    """The unit, where the pixels begin, and a table for each column, from the description beside the coefficients."""
+    beside = _description(path)
+    if not beside.is_file():
+        raise DatasetError(
+            f"{path} says nothing of names, image sizes, unit and origin of the pixels.",
+            why=f"they are read from {beside.name}, which does not exist",
+            fix=f'write {beside.name} with length_unit = "mm", image_origin = "lower-left" (v upwards: older '
+            'DLTdv and easyWand) or "upper-left", and for each column [[cameras]] with name, width and height',
+        )
+    head, place = read_toml(beside), str(beside)
+    unit = text_entry(entry(head, "length_unit", place), f"{place}: length_unit")
+    origin = entry(head, "image_origin", place)
+    if origin not in ORIGINS:
+        raise DatasetError(f"{place}: image_origin = {shown(origin)}.", fix=f"write one of {', '.join(ORIGINS)}")
+    tables = as_list(entry(head, "cameras", place), f"{place}: cameras")
+    if len(tables) != columns:
+        raise DatasetError(
+            f"{path} has {columns} columns, and {beside.name} names {len(tables)} cameras.",
+            fix="name each column, in their order",
+        )
+    return unit, origin, [as_table(table, f"{place}: cameras[{i}]") for i, table in enumerate(tables)]
+
+
+def _camera(table: dict[str, Any], column: Floats, origin: str, place: str) -> tuple[ExplicitCamera, Cost | None]:
+    name = text_entry(entry(table, "name", place), f"{place}: name")
+    width, height = (whole(entry(table, key, place), f"{place}: {key}") for key in ("width", "height"))
+    p = np.append(column, 1.0).reshape(3, 4)
+    with naming(place):
+        Camera(name, width, height)  # refuses a size that is none
+        return pinhole_from_matrix(name, (width, height), _ours_from_dlt(origin, height) @ p, place)
+
+
+def _ours_from_dlt(origin: str, height: int) -> Floats:
+    """The map (3, 3) from the file's homogeneous pixels to ours."""
+    if origin == "upper-left":
+        return np.array([[1.0, 0, -1], [0, 1, -1], [0, 0, 1]])
+    return np.array([[1.0, 0, -1], [0, -1, height], [0, 0, 1]])
+
+
+def _columns(path: Path) -> list[Floats]:
+    """The columns (11,) of the file; a header is refused."""
+    rows = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
+    if len(rows) != COEFFICIENTS:
+        raise DatasetError(
+            f"{path} has {len(rows)} rows; DLT coefficients are {COEFFICIENTS} rows, one column a camera.",
+            why="it is turned on its side" if rows and len(rows[0]) == COEFFICIENTS else "",
+            fix="give a CSV without header, L1 to L11 from top to bottom",
+        )
+    values = [
+        numbers([cell.strip() for cell in row], (len(rows[0]),), f"{path}, row {i}") for i, row in enumerate(rows, 1)
+    ]
+    return list(np.array(values).T)
+
+
+def _description(path: Path) -> Path:
+    return path.with_name(path.name + ".toml")

@@ -1,0 +1,103 @@
+"""The values that all formats share: cameras with explicit lenses and poses, and the rig they make.
+
+Pixels (0, 0) at the centre of the top-left pixel, camera frame x right, y down, z forward, as everywhere here; each
+format's own conventions are converted in its own file.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import astuple, dataclass, replace
+
+import numpy as np
+
+from implicam.cameras import Bools, BrownConrady, Floats, Lens
+from implicam.dataset.model import _METRES as METRES
+from implicam.dataset.model import Camera
+from implicam.errors import DatasetError, did_you_mean
+from implicam.geometry import Pose
+
+UNKNOWN = "unknown"
+"""The length unit of a rig whose file does not say it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExplicitCamera:
+    """A camera with a lens model and a place. width, height: in pixels, None where not known."""
+
+    name: str
+    width: int | None
+    height: int | None
+    lens: Lens
+    camera_from_world: Pose
+
+    def __post_init__(self) -> None:
+        Camera(self.name, self.width, self.height)  # refuses what could not be a camera of a dataset
+        pose = (self.camera_from_world.rotation, self.camera_from_world.translation)
+        if not np.isfinite([*astuple(self.lens), *np.concatenate(pose, axis=None)]).all():
+            raise DatasetError(f"camera {self.name!r} has a number that is not finite.", fix="correct the value")
+        if not (self.lens.fx > 0 and self.lens.fy > 0):
+            raise DatasetError(
+                f"camera {self.name!r} has focal lengths {self.lens.fx:g}, {self.lens.fy:g}.",
+                why="they are in pixels and greater than zero; a mirrored picture has no lens here",
+                fix="correct the values",
+            )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels; DatasetError where they are not known."""
+        if self.width is None or self.height is None:
+            raise DatasetError(
+                f"the image size of camera {self.name!r} is not known, and the format needs it.",
+                fix="give width and height",
+            )
+        return self.width, self.height
+
+    def pixel_from_world(self, xyz: Floats) -> tuple[Floats, Bools]:
+        """Pixels (n, 2) of points (n, 3) in the rig's unit; and (n,) where they exist, else NaN."""
+        return self.lens.pixel_from_camera_point(self.camera_from_world.apply(xyz))
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras in one world frame.
+
+    notes: what the reader of a file should know, each a sentence; none where all is well.
+    """
+
+    cameras: tuple[ExplicitCamera, ...]
+    length_unit: str
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.cameras:
+            raise DatasetError("the rig has no camera.", fix="keep at least one")
+        for name, times in Counter(camera.name for camera in self.cameras).items():
+            if times > 1:
+                raise DatasetError(f"camera {name!r} is there {times} times.", fix="give each a name of its own")
+
+    def in_unit(self, unit: str) -> Rig:
+        """The same rig with lengths in another unit; DatasetError where one of the two is not known."""
+        if unit == self.length_unit:
+            return self
+        scale = metres_per(self.length_unit) / metres_per(unit)
+        poses = [camera.camera_from_world for camera in self.cameras]
+        moved = [Pose(pose.rotation, pose.translation * scale) for pose in poses]
+        cameras = [replace(c, camera_from_world=pose) for c, pose in zip(self.cameras, moved, strict=True)]
+        return replace(self, cameras=tuple(cameras), length_unit=unit)
+
+
+def metres_per(unit: str) -> float:
+    """How long a length unit is in metres."""
+    if unit not in METRES:
+        raise DatasetError(
+            f"the length unit of the rig is {unit!r}, which has no known size{did_you_mean(unit, METRES)}.",
+            why="the other format wants metres, or another unit was asked for",
+            fix=f"state the unit of the cameras: one of {', '.join(METRES)}",
+        )
+    return METRES[unit]
+
+
+def has_distortion(lens: Lens) -> bool:
+    """Whether a lens is anything but a pinhole."""
+    return not isinstance(lens, BrownConrady) or any(astuple(lens)[4:])

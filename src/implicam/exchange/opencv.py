@@ -1,0 +1,127 @@
+"""`opencv`: one YAML file that cv2.FileStorage reads, with the keys of OpenCV's own calibration programs.
+
+    cameras:
+       -
+          name, image_width, image_height
+          camera_matrix             3 x 3
+          distortion_coefficients   k1, k2, p1, p2, k3; of a fisheye k1, k2, k3, k4
+          fisheye_model             1 for cv2.fisheye, else 0
+          R, T                      camera_from_world: x_camera = R x_world + T
+    length_unit: m
+
+OpenCV itself has no unit; its multi-camera functions want metres, so metres are written. Read are also files with
+`rvec`, `tvec` in place of R, T, and the file of one camera that OpenCV's calibration program writes, which has no pose.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from implicam.cameras import Floats, KannalaBrandt
+from implicam.dataset.tables import naming
+from implicam.errors import DatasetError
+from implicam.exchange.checks import (
+    MAX_CAMERAS,
+    as_list,
+    as_table,
+    entry,
+    lens_from_matrix,
+    numbers,
+    read_yaml,
+    rotation_matrix,
+    shown,
+    text_entry,
+    whole,
+)
+from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
+from implicam.files import write_text
+from implicam.geometry import Pose, rotation_from_vector
+
+
+def write(rig: Rig, path: Path) -> list[str]:
+    """Write the rig in metres; nothing is lost but the unit."""
+    cameras = "".join(_camera_text(camera) for camera in rig.in_unit("m").cameras)
+    write_text(path, f'%YAML:1.0\n---\nlength_unit: "m"\ncameras:\n{cameras}')
+    return [] if rig.length_unit == "m" else [f"Lengths are in metres; the rig's unit was {rig.length_unit}."]
+
+
+def _camera_text(camera: ExplicitCamera) -> str:
+    lens, pose = camera.lens, camera.camera_from_world
+    width, height = camera.size
+    lines = [
+        f"name: {json.dumps(camera.name, ensure_ascii=False)}",
+        f"image_width: {width}",
+        f"image_height: {height}",
+        f"fisheye_model: {int(isinstance(lens, KannalaBrandt))}",
+        *_matrix("camera_matrix", np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])),
+        *_matrix("distortion_coefficients", np.array(astuple(lens)[4:])[:, None]),
+        *_matrix("R", pose.rotation),
+        *_matrix("T", pose.translation[:, None]),
+    ]
+    return "   -\n" + "".join(f"      {line}\n" for line in lines)
+
+
+def _matrix(name: str, values: Floats) -> list[str]:
+    rows, columns = values.shape
+    data = ", ".join(repr(float(x)) for x in values.ravel())
+    return [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
+
+
+def read(path: Path) -> Rig:
+    """Read a rig; see the head of this file. DatasetError names file, key and cure."""
+    table = read_yaml(path)
+    place = str(path)
+    unit = text_entry(table.get("length_unit", UNKNOWN), f"{place}: length_unit")
+    if "cameras" not in table:
+        posed = {"R", "rvec"} & set(table)
+        notes = () if posed else ("The file has no pose: the world is the camera's own frame.",)
+        return Rig((_camera({"name": path.stem, **table}, place),), unit, notes)
+    places = [f"{place}: cameras[{i}]" for i in range(MAX_CAMERAS)]
+    listed = zip(as_list(table["cameras"], f"{place}: cameras"), places, strict=False)
+    cameras = tuple(_camera(as_table(camera, where), where) for camera, where in listed)
+    with naming(place):
+        return Rig(cameras, unit)
+
+
+def _camera(table: dict[str, Any], place: str) -> ExplicitCamera:
+    name = text_entry(entry(table, "name", place), f"{place}: name")
+    place = f"{place} ({shown(name)})"
+    k = _array(entry(table, "camera_matrix", place), f"{place}: camera_matrix", (3, 3))
+    given = _array(entry(table, "distortion_coefficients", place), f"{place}: distortion_coefficients", (-1,))
+    fisheye = whole(table.get("fisheye_model", 0), f"{place}: fisheye_model") != 0
+    lens = lens_from_matrix(k, given.tolist(), fisheye=fisheye, place=place)
+    sizes = [table[key] for key in ("image_width", "image_height") if key in table]
+    width, height = [whole(size, f"{place}: image size") for size in sizes] if len(sizes) == 2 else (None, None)
+    with naming(place):
+        return ExplicitCamera(name, width, height, lens, _pose(table, place))
+
+
+def _pose(table: dict[str, Any], place: str) -> Pose:
+    if "R" in table or "T" in table:
+        r = _array(entry(table, "R", place), f"{place}: R", (3, 3))
+        return Pose(rotation_matrix(r, f"{place}: R"), _array(entry(table, "T", place), f"{place}: T", (3,)))
+    if "rvec" in table or "tvec" in table:
+        rotation = rotation_from_vector(_array(entry(table, "rvec", place), f"{place}: rvec", (3,)))
+        return Pose(rotation, _array(entry(table, "tvec", place), f"{place}: tvec", (3,)))
+    return Pose(np.eye(3), np.zeros(3))
+
+
+def _array(value: object, place: str, shape: tuple[int, ...]) -> Floats:
+    """An OpenCV matrix as an array; a vector may be a row, a column, one-dimensional (OpenCV 5) or a plain list."""
+    if isinstance(value, list):
+        return numbers(value, shape, place)
+    matrix = as_table(value, place)
+    keys = ("rows", "cols")
+    given = entry(matrix, "sizes", place) if "sizes" in matrix else [entry(matrix, key, place) for key in keys]
+    sizes = tuple(int(size) for size in numbers(given, (-1,), f"{place} size"))
+    if len(shape) == 2 and sizes != shape:
+        raise DatasetError(
+            f"{place} has the size {shown(sizes)}; it must be {' x '.join(map(str, shape))}.", fix="correct the value"
+        )
+    count = shape if len(shape) == 1 else (shape[0] * shape[1],)
+    return numbers(entry(matrix, "data", place), count, f"{place}.data").reshape(shape)
