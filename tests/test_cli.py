@@ -83,7 +83,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     simulated = "simulate rig --cameras 2R --positions random --points 40 --check 30 --seed 1"
     photos = "simulate photos --images --cameras 2R --positions random --points 3"
-    for words in (f"{simulated}", "calibrate rig -o rig.implicam", photos):
+    cameras = "export rig.implicam --to aniposelib -o cameras.toml"
+    for words in (f"{simulated}", "calibrate rig -o rig.implicam", photos, cameras):
         real(words, folder, check=True)
     return folder
 
@@ -117,6 +118,8 @@ MAKES = {
     "compare": {"compare.png"},
     "report": {"report.html"},
     "convert": {"my-rig.csv", "my-rig.csv.toml"},
+    "export": {"cameras.toml"},
+    "import": {"cameras.implicam"},
     "info": set(),
 }
 
@@ -229,6 +232,8 @@ def json_commands(made: Path) -> dict[str, list[str]]:
         "compare": ["compare", rig, "--methods", "inverse-gp,inverse-gp:matern-5/2", "--train", "3,20", "--seeds", "1"],
         "report": ["report", file, check],
         "convert": ["convert", rig, "out.npz"],
+        "export": ["export", file, "--to", "colmap", "-o", "model"],
+        "import": ["import", str(made / "cameras.toml"), "-o", "cameras.implicam"],
         "info": ["info", file],
     }
 

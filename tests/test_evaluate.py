@@ -1,4 +1,4 @@
-"""Nothing is judged by what it has learned; methods are compared on the same splits; threads keep order."""
+"""Nothing is judged by what it has learned; threads keep order."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import pytest
 
 from implicam import demo
 from implicam.calibrators import Calibration, ForwardGP, InverseGP
-from implicam.compare import NUMBERS, Trial, as_json, compare, summarise
 from implicam.dataset import Dataset, KnownPositions, Observations, join
-from implicam.errors import DatasetError, FitError, NumericalError, UsageError
+from implicam.errors import DatasetError, FitError, UsageError
 from implicam.evaluate import cross_validate, evaluate, leave_out_shots
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -299,148 +298,6 @@ def test_what_cannot_be_held_out_is_refused() -> None:
         leave_out_shots(InverseGP().fit, data.select(data.shots == "board01"))
     with pytest.raises(FitError, match="4 usable known points"):
         cross_validate(InverseGP().fit, sets()[0].select(np.arange(6)), 3)
-
-
-# compare
-
-
-@dataclass
-class Fails:
-    """A method that cannot do it."""
-
-    error: Exception
-    method: str = "fails"
-
-    def fit(self, data: Dataset, progress: Progress = silent) -> Calibration:
-        raise self.error
-
-
-@dataclass
-class Watches:
-    """inverse-gp, remembering what it was trained on."""
-
-    seen: list[list[str]] = field(default_factory=list)
-    method: str = "watches"
-
-    def fit(self, data: Dataset, progress: Progress = silent) -> Calibration:
-        self.seen.append([str(name) for name in data.points])
-        return InverseGP().fit(data)
-
-
-def test_all_methods_see_the_same_splits() -> None:
-    data, a, b = sets()[0], Watches(), Watches()
-    steps: list[tuple[str, int, int]] = []
-    trials = compare(data, {"a": a, "b": b}, [20, 40], seeds=3, progress=lambda *step: steps.append(step))
-    assert a.seen == b.seen
-    assert [len(names) for names in a.seen] == [20] * 3 + [40] * 3
-    assert len({tuple(names) for names in a.seen}) == 6
-    assert [(t.method, t.known, t.seed) for t in trials[:3]] == [("a", 20, 0), ("b", 20, 0), ("a", 20, 1)]
-    for first, second in zip(trials[::2], trials[1::2], strict=True):
-        assert first.rmse == second.rmse
-        assert first.held_out == len(data) - first.known
-        assert first.unmeasured == 0
-        assert first.limit > 0
-        assert first.fit_seconds > 0
-    assert steps[0] == ("comparing", 0, 12)
-    assert steps[-1] == ("comparing", 12, 12)
-
-
-def test_a_comparison_is_an_evaluation() -> None:
-    data = sets()[0]
-    (trial,) = compare(data, {"gp": InverseGP()}, [40], seeds=1)
-    train, rest = data.split(40, seed=0)
-    overall = evaluate(InverseGP().fit(train), rest).coverage.overall
-    assert (trial.rmse, trial.median, trial.nees) == (overall.rmse, overall.median_error, overall.nees.value)
-    assert trial.limit == pytest.approx(np.sqrt(np.mean(np.trace(rest.truth.limit, axis1=1, axis2=2))))
-    assert trial.coverage_95 == overall.level(0.95).pooled.value
-    assert trial.ellipsoid_95 == overall.level(0.95).ellipsoid.value
-
-
-def test_a_check_dataset_is_what_all_are_judged_by() -> None:
-    known, others = sets()
-    trials = compare(known, {"gp": InverseGP()}, [40, len(known)], seeds=2, check=others)
-    assert [t.held_out for t in trials] == [len(others)] * 3
-    assert [t.known for t in trials] == [40, 40, len(known)]  # all points can be drawn in one way only
-    all_of_it = evaluate(fitted(), others).coverage.overall.rmse
-    assert trials[2].rmse == all_of_it
-
-
-@pytest.mark.parametrize("error", [FitError("too few points"), NumericalError("not positive definite")])
-def test_a_failure_is_reported_and_the_others_go_on(error: Exception) -> None:
-    trials = compare(sets()[0], {"fails": Fails(error), "gp": InverseGP()}, [20], seeds=2)
-    rows = {row.method: row for row in summarise(trials)}
-    assert rows["fails"].failures == (error.args[0],)
-    assert rows["fails"].seeds == 0
-    assert np.isnan(list(rows["fails"].mean.values())).all()
-    assert rows["gp"].failures == ()
-    assert rows["gp"].seeds == 2
-    assert rows["gp"].mean["rmse"] > 0
-
-
-def test_a_mistake_in_a_method_is_not_hidden_as_a_failure() -> None:
-    with pytest.raises(ZeroDivisionError):
-        compare(sets()[0], {"fails": Fails(ZeroDivisionError())}, [20], seeds=1)
-
-
-def test_what_cannot_be_compared_is_refused() -> None:
-    data = sets()[0]
-    gp = {"gp": InverseGP()}
-    with pytest.raises(UsageError, match=f"{len(data)} of {len(data)} points leave none"):
-        compare(data, gp, [10, len(data)])
-    for methods, sizes, seeds in (({}, [10], 1), (gp, [], 1), (gp, [10], 0)):
-        with pytest.raises(UsageError, match="at least one method, one number of points and one seed"):
-            compare(data, methods, sizes, seeds=seeds)
-    for size in (0, -3):
-        with pytest.raises(DatasetError, match="cannot split"):
-            compare(data, gp, [size], seeds=1)
-    with pytest.raises(DatasetError, match="cannot split"):
-        compare(data, gp, [len(data) + 1], seeds=1, check=sets()[1])
-    with pytest.raises(DatasetError, match="is in m"):
-        compare(data, gp, [20], seeds=1, check=replace(sets()[1], length_unit="m"))
-
-
-def test_the_same_number_twice_is_one_row() -> None:
-    trials = compare(sets()[0], {"gp": InverseGP()}, [20, 30, 20], seeds=2)
-    assert [(row.known, row.seeds) for row in summarise(trials)] == [(20, 2), (30, 2)]
-
-
-def test_points_that_were_not_measured_are_counted() -> None:
-    data = sets()[0]
-    uv = data.observations.uv.copy()
-    uv[::4, 1] = np.nan
-    trials = compare(with_uv(data, uv), {"gp": InverseGP()}, [40], seeds=2)
-    (row,) = summarise(trials)
-    assert all(0 < t.unmeasured < t.held_out for t in trials)
-    assert row.mean["measured"] == pytest.approx(np.mean([1 - t.unmeasured / t.held_out for t in trials]))
-
-
-def test_summaries_are_means_and_standard_errors() -> None:
-    def trial(method: str, known: int, seed: int, rmse: float, **more: Any) -> Trial:
-        return Trial(method, known, seed, rmse=rmse, limit=2.0, held_out=10, **more)
-
-    trials = [
-        trial("a", 10, 0, 1.0, unmeasured=5),
-        trial("b", 10, 0, 7.0),
-        trial("a", 10, 1, 2.0),
-        Trial("b", 10, 1, failure="no"),
-        trial("a", 10, 2, 6.0),
-        Trial("b", 10, 2, failure="no"),
-        trial("a", 20, 0, 9.0),
-    ]
-    a, b, more = summarise(trials)
-    assert [(r.method, r.known, r.seeds) for r in (a, b, more)] == [("a", 10, 3), ("b", 10, 1), ("a", 20, 1)]
-    assert a.mean["rmse"] == pytest.approx(3.0)
-    assert a.standard_error["rmse"] == pytest.approx(np.std([1, 2, 6], ddof=1) / np.sqrt(3))
-    assert a.mean["rmse_over_limit"] == pytest.approx(1.5)
-    assert a.mean["measured"] == pytest.approx((0.5 + 1 + 1) / 3)
-    assert b.mean["rmse"] == 7.0
-    assert np.isnan(b.standard_error["rmse"])
-    assert b.failures == ("no",)
-    assert set(a.mean) == set(NUMBERS)
-    assert summarise([]) == []
-    plain = as_json(trials)
-    assert len(plain["trials"]) == 7
-    assert len(plain["rows"]) == 3
 
 
 # demo

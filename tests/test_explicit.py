@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from implicam.calibrators import load_calibration
-from implicam.calibrators.explicit import Explicit, ExplicitCalibration
+from implicam.calibrators import ForwardGP, InverseGP, load_calibration
+from implicam.calibrators.explicit import Explicit, ExplicitCalibration, calibration_of, rig_of
 from implicam.calibrators.explicit.adjust import Bundle, Placed, Views, _Normal, adjust, spreads
 from implicam.calibrators.explicit.align import icp
 from implicam.calibrators.explicit.boards import Boards, BoardView, boards_of
@@ -26,6 +26,8 @@ from implicam.coverage import assess
 from implicam.dataset import Dataset, KnownPositions, Observations, arrays_from_dataset
 from implicam.errors import CalibrationFileError, DatasetError, FitError, UsageError
 from implicam.evaluate import evaluate
+from implicam.exchange import UNKNOWN, ExplicitCamera
+from implicam.exchange import Rig as ExchangeRig
 from implicam.geometry import Pose, candidate_rays, rotation_from_vector
 from implicam.simulate import (
     Rig,
@@ -437,7 +439,7 @@ def test_corners_that_are_wrong_are_listed() -> None:
         listed[row[view.point], names.index(view.camera)] = True
     assert (listed & wrong).sum() > 0.98 * wrong.sum()
     assert (listed & ~wrong).sum() < 0.003 * data.observations.seen.sum()
-    assert any("corners contradict the others" in note for note in calibration.notes())
+    assert any("far from where the others predict" in note for note in calibration.notes())
 
 
 # into the world
@@ -539,7 +541,7 @@ def test_the_layout_may_come_from_known_positions() -> None:
     boards = simulate(rig, moving_board(rig, positions=3), seed=1)
     assert boards_of(boards).views
     tilted = simulate_boards(rig, each_and_pairs(rig, 8, 4), seed=3)
-    target, _ = held_boards(rig, each_and_pairs(rig, 8, 4), np.random.default_rng([3, 9]))
+    target = held_boards(rig, each_and_pairs(rig, 8, 4), np.random.default_rng([3, 9]))
     known = KnownPositions(target.shots, target.xyz, np.full(target.xyz.shape, np.nan))
     by_positions = replace(tilted, known=known, extra={})
     a, b = boards_of(tilted), boards_of(by_positions)
@@ -708,6 +710,79 @@ def test_nothing_in_common_is_a_clear_error() -> None:
     with pytest.raises(FitError, match="0 of 2 cameras can be calibrated together") as caught:
         Explicit(boards=alone).fit(points(rig, 20, 1))
     assert "two cameras at once" in caught.value.fix
+
+
+# for and from other programs
+
+
+def test_exported_cameras_see_what_the_calibration_predicts() -> None:
+    rig, _ = pair()
+    xyz = points(rig, 50, 6).truth.xyz
+    for calibration in (from_boards(), Explicit().fit(points(rig, 40, 5))):
+        exported, notes = rig_of(calibration)
+        assert notes == []
+        assert exported.length_unit == "mm"
+        expected = calibration.predict(xyz)
+        for c, camera in enumerate(exported.cameras):
+            uv, valid = camera.pixel_from_world(xyz)
+            np.testing.assert_allclose(uv[valid], expected[valid, c], atol=1e-6)
+
+
+def test_a_forward_gp_is_exported_with_what_it_costs() -> None:
+    rig = build_rig("bar6", seed=2, lens_error=0.5, cameras="2R")
+    calibration = ForwardGP().fit(points(rig, 150, 5))
+    exported, notes = rig_of(calibration)
+    assert len(notes) == 2
+    assert "a lens model cannot hold all that forward-gp has learned" in notes[0]
+    xyz = points(rig, 200, 6).truth.xyz
+    for c, camera in enumerate(exported.cameras):
+        off = np.linalg.norm(camera.pixel_from_world(xyz)[0] - calibration.predict(xyz)[:, c], axis=1)
+        told = float(notes[c].split(": ")[2].split(" px")[0])
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(told, rel=0.35)  # 2000 places of the box against 200 others
+    exact = build_rig("bar6", seed=2, lens_error=0.0, cameras="cam1,cam4")
+    exported, _ = rig_of(ForwardGP().fit(points(exact, 150, 5)))
+    truth = exact.cameras[0].camera_from_world
+    np.testing.assert_allclose(exported.cameras[0].camera_from_world.centre, truth.centre, atol=1.0)
+
+
+def test_methods_without_cameras_say_so() -> None:
+    rig = build_rig("bar6", seed=2, cameras="2R")
+    with pytest.raises(UsageError, match="inverse-gp has no cameras"):
+        rig_of(InverseGP().fit(points(rig, 30, 5)))
+    with pytest.raises(UsageError, match="--lens none has no lens models"):
+        rig_of(ForwardGP(lens="none").fit(points(rig, 60, 5)))
+
+
+def test_imported_cameras_measure_with_the_noise_of_the_pixels(tmp_path: Path) -> None:
+    """Perfectly known cameras: what they measure is as far off as the Cramer-Rao limit, and so are the error bars."""
+    rig = build_rig("bar6", seed=2, lens_error=0.0, frame="random", cameras="2R2W")
+    cameras = tuple(ExplicitCamera(c.name, c.width, c.height, c.lens, c.camera_from_world) for c in rig.cameras)
+    calibration = calibration_of(ExchangeRig(cameras, "mm"), "cameras", 0.3)
+    calibration.save(tmp_path / "cameras.implicam")
+    loaded = load_calibration(tmp_path / "cameras.implicam")
+    others = points(rig, 300, 6)
+    measured = loaded.measure(others.observations)
+    np.testing.assert_array_equal(measured.cov, calibration.measure(others.observations).cov)
+    whole = measured.reason == ""  # all views of these are used
+    assert whole.mean() > 0.98
+    np.testing.assert_allclose(measured.cov[whole], others.truth.limit[whole], rtol=0.02, atol=2e-5)
+    error = measured.xyz - others.truth.xyz
+    squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(measured.cov), error)
+    assert np.mean(squares) == pytest.approx(3, abs=3 * np.sqrt(6 / 300))
+    assert "calibrated elsewhere" in loaded.notes()[0]
+    assert evaluate(loaded, others).coverage.overall.n == 300
+    unstated = replace(others.observations, sd=np.full(others.observations.uv.shape, np.nan))
+    np.testing.assert_allclose(loaded.measure(unstated).sd[whole], 1.5 * measured.sd[whole], rtol=0.02)
+
+
+def test_cameras_that_cannot_measure_are_refused() -> None:
+    lens = BrownConrady(900.0, 900.0, 640.0, 400.0)
+    one = ExplicitCamera("a", 1280, 800, lens, Pose(np.eye(3), np.zeros(3)))
+    other = replace(one, name="b", camera_from_world=Pose(np.eye(3), np.array([100.0, 0.0, 0.0])))
+    with pytest.raises(UsageError, match="there is one camera"):
+        calibration_of(ExchangeRig((one,), "mm"), "x", 0.3)
+    with pytest.raises(UsageError, match="does not say what its lengths are in"):
+        calibration_of(ExchangeRig((one, other), UNKNOWN), "x", 0.3)
 
 
 def test_evaluate_takes_it_like_any_other() -> None:

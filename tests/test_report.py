@@ -14,7 +14,7 @@ import pytest
 
 from implicam.coverage import assess, tercile_labels
 from implicam.errors import MissingExtraError, UsageError
-from implicam.figures import compare_figure, error_against_sd, reliability, scene
+from implicam.figures import error_against_sd, reliability, scene
 from implicam.figures.style import number
 from implicam.measurement import Measurement
 from implicam.report import ReportData, page, write_report
@@ -271,26 +271,6 @@ def test_error_against_sd_leaves_out_what_a_log_axis_cannot_show():
     assert list(figure.data[0].y) == [0.1, 2]
     assert len(figure.data) == 4
     assert len(error_against_sd(np.zeros(2), np.zeros(2), names=["a", "b"], unit="m").data) == 1
-
-
-def test_compare_figure_shows_median_and_range(tmp_path: Path):
-    table = [
-        {"method": method, "known": known, "seed": seed, "rmse": base * (1 + seed) / known, "coverage_95": cover,
-         "limit": 0.1}
-        for method, base, cover in (("forward-gp", 10, 0.95), ("mlp", 50, None))
-        for known in (20, 50) for seed in (0, 1, 2)
-    ]  # fmt: skip
-    figure = compare_figure(table, unit="mm")
-    left, right = figure.axes
-    assert [container.get_label() for container in left.containers] == ["forward-gp", "mlp"]
-    assert list(left.containers[0].lines[0].get_ydata()) == pytest.approx([1.0, 0.4])
-    bars = left.containers[0].lines[2][0].get_segments()
-    assert [bar[:, 1].tolist() for bar in bars] == [pytest.approx([0.5, 1.5]), pytest.approx([0.2, 0.6])]
-    assert [container.get_label() for container in right.containers] == ["forward-gp"]
-    for ending in ("png", "pdf"):
-        figure.savefig(tmp_path / f"compare.{ending}")
-        assert (tmp_path / f"compare.{ending}").stat().st_size > 5000
-    compare_figure([], unit="mm").savefig(tmp_path / "empty.png")
 
 
 # ------------------------------------------------------------------------------------------------ in a real browser

@@ -84,6 +84,7 @@ def save(calibration: Savable, path: str | Path) -> None:
 def _description(calibration: Savable) -> dict[str, Any]:
     data = calibration.data
     known = data.xyz
+    workspace = {"lowest": known.min(axis=0).tolist(), "highest": known.max(axis=0).tolist()} if len(known) else {}
     return {
         "format_version": FORMAT_VERSION,
         "method": calibration.method,
@@ -91,7 +92,7 @@ def _description(calibration: Savable) -> dict[str, Any]:
         "length_unit": data.length_unit,
         "pixel_convention": PIXEL_CONVENTION,
         "known_points": len(data),
-        "workspace": {"lowest": known.min(axis=0).tolist(), "highest": known.max(axis=0).tolist()},
+        "workspace": workspace,
         "residuals": calibration.residuals(),
         "versions": {
             "implicam": package_version(),

@@ -10,18 +10,20 @@ from implicam import calibration_file
 from implicam.calibrators.explicit import Explicit, ExplicitCalibration
 from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
+from implicam.calibrators.mlp import MLP, MLPCalibration
 from implicam.calibrators.protocol import Calibration, Calibrator, Rejected, Unused
 from implicam.errors import CalibrationFileError, UsageError, did_you_mean
 
 METHODS: dict[str, tuple[type[Any], type[Any]]] = {
     ForwardGP.method: (ForwardGP, ForwardGPCalibration),
     InverseGP.method: (InverseGP, InverseGPCalibration),
+    MLP.method: (MLP, MLPCalibration),
     Explicit.method: (Explicit, ExplicitCalibration),
 }
 """Method name -> (calibrator, calibration)."""
 
 DEFAULT_METHOD = ForwardGP.method
-COMING = ("mlp",)
+COMING: tuple[str, ...] = ()
 
 
 def calibrator(method: str, **options: Any) -> Calibrator:
@@ -59,6 +61,7 @@ __all__ = [
     "COMING",
     "DEFAULT_METHOD",
     "METHODS",
+    "MLP",
     "Calibration",
     "Calibrator",
     "Explicit",
@@ -67,6 +70,7 @@ __all__ = [
     "ForwardGPCalibration",
     "InverseGP",
     "InverseGPCalibration",
+    "MLPCalibration",
     "Rejected",
     "Unused",
     "calibrator",

@@ -103,12 +103,12 @@ class InverseGP:
 
     def fit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
         """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
-        usable, unused = _usable(data)
+        usable, unused = seen_by_all(data, self.method)
         if self.preset == "paper":
             from implicam.calibrators.paper_preset import train
         else:
             train = _train
-        inputs, outputs = _pixels(usable), usable.xyz
+        inputs, outputs = pixels_of(usable), usable.xyz
         pixels, positions = Scaling.of(inputs), Scaling.of(outputs)
         if self.preset == "paper":  # it never standardised its positions: they are in metres, from the robot's origin
             positions = Scaling(np.zeros(3), np.full(3, 1.0 / data.metres_per_unit))
@@ -116,26 +116,25 @@ class InverseGP:
         return InverseGPCalibration(self, data, unused, pixels, positions, hyper)
 
 
-def _usable(data: Dataset) -> tuple[Dataset, tuple[Unused, ...]]:
-    """The points with every view, and why the others are not used."""
+def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
+    """The points with every view, and why the others are not used; FitError where they are too few."""
     seen = data.observations.seen
     complete = seen.all(axis=1)
     names = data.observations.camera_names
     unused = tuple(
-        Unused(str(data.points[i]), why_not_all_seen(seen[i], names, InverseGP.method))
-        for i in np.flatnonzero(~complete)
+        Unused(str(data.points[i]), why_not_all_seen(seen[i], names, method)) for i in np.flatnonzero(~complete)
     )
     _ = data.positions  # a clear error where there are none
     per_camera = ", ".join(f"{name} sees {count}" for name, count in zip(names, seen.sum(axis=0), strict=True))
     least = 5  # fewer than a line and a noise can be learned from
     why = f"only points seen by every camera can be used; of {len(data)} points, {per_camera}" if unused else ""
-    require_points(int(complete.sum()), least, InverseGP.method, why)
+    require_points(int(complete.sum()), least, method, why)
     usable = data.select(complete)
-    require_two_values(usable.xyz, InverseGP.method)
+    require_two_values(usable.xyz, method)
     return usable, unused
 
 
-def _pixels(data: Dataset) -> Floats:
+def pixels_of(data: Dataset) -> Floats:
     """(n, 2 cameras) the concatenated pixels u1, v1, u2, v2, ..."""
     return data.observations.uv.reshape(len(data), -1)
 
@@ -175,7 +174,7 @@ class InverseGPCalibration:
     def processes(self) -> tuple[GaussianProcess, ...]:
         """The three conditioned GPs, in standardised units."""
         usable = self.data.select(self.data.observations.seen.all(axis=1))
-        X, Y = self.pixels.apply(_pixels(usable)), self.positions.apply(usable.xyz)
+        X, Y = self.pixels.apply(pixels_of(usable)), self.positions.apply(usable.xyz)
 
         def one(pair: tuple[Hyperparameters, Floats]) -> GaussianProcess:
             h, y = pair
@@ -207,7 +206,7 @@ class InverseGPCalibration:
             cov,
             seen.sum(axis=1),
             np.full(n, np.nan),  # a map from all pixels to a position cannot ask whether the views agree
-            _reasons(seen, observations.camera_names),
+            blind_reasons(seen, observations.camera_names, self.method),
             self.data.length_unit,
         )
 
@@ -217,18 +216,7 @@ class InverseGPCalibration:
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*self._flat(), *self._lattice(), *self._suspects()]
-
-    def _flat(self) -> list[str]:
-        """Known points in one plane, whichever way it lies."""
-        centred = self.data.xyz - self.data.xyz.mean(axis=0)
-        extents = np.linalg.svd(centred, compute_uv=False)
-        if extents[-1] > FLAT * extents[0]:
-            return []
-        return [
-            "The known positions lie in one plane. Positions off it are not measured but guessed, and their error bars "
-            "cannot say how badly: add known points in front of it and behind."
-        ]
+        return [*flat_note(self.data), *lattice_note(self.data, self.method), *self._suspects()]
 
     def _suspects(self) -> list[str]:
         """Known points that the others contradict: a wrong detection, a wrong position."""
@@ -245,21 +233,6 @@ class InverseGPCalibration:
         return [
             f"{len(found)} known point{'s' * (len(found) > 1)} far from what all others predict: "
             f"{', '.join(found[:5])}{more}. Look for a wrong detection or position: nothing is rejected here."
-        ]
-
-    def _lattice(self) -> list[str]:
-        lattice = [
-            f"{axis} has {len(np.unique(values))} values"
-            for axis, values in zip(AXES, self.data.xyz.T, strict=True)
-            if len(np.unique(values)) <= len(values) / LATTICE_REPEATS
-        ]
-        if not lattice:
-            return []
-        in_shots = len(np.unique(self.data.shots)) < len(self.data)
-        return [
-            f"The known positions lie on a lattice ({', '.join(lattice)} at {len(self.data)} points). inverse-gp may "
-            "learn its planes instead of the space between them: judge it by points off the lattice"
-            f"{' or by --leave-out shot' * in_shots}, not by a random split."
         ]
 
     def residuals(self) -> dict[str, Any]:
@@ -286,10 +259,7 @@ class InverseGPCalibration:
         h = self.hyperparameters
         table = asdict(self.calibrator)
         arrays = {
-            "pixel_offset": self.pixels.offset,
-            "pixel_scale": self.pixels.scale,
-            "position_offset": self.positions.offset,
-            "position_scale": self.positions.scale,
+            **scaling_arrays(self.pixels, self.positions),
             "lengthscale": np.stack([x.kernel.lengthscale for x in h]),
             "signal_variance": np.array([x.kernel.signal_variance for x in h]),
             "noise_variance": np.array([x.noise_variance for x in h]),
@@ -303,14 +273,9 @@ class InverseGPCalibration:
         calibrator = InverseGP(
             str(table["kernel"]), str(table["preset"]), int(table["seed"]), float(table["shortest_lengthscale"])
         )
-        _, unused = _usable(data)
+        _, unused = seen_by_all(data, cls.method)
         d = 2 * len(data.cameras)
-        pixels = Scaling(
-            finite_column(arrays, "pixel_offset", (d,)), finite_column(arrays, "pixel_scale", (d,), positive=True)
-        )
-        positions = Scaling(
-            finite_column(arrays, "position_offset", (3,)), finite_column(arrays, "position_scale", (3,), positive=True)
-        )
+        pixels, positions = scalings(arrays, data)
         lengthscale = finite_column(arrays, "lengthscale", (3, d), positive=True)
         signal = finite_column(arrays, "signal_variance", (3,), positive=True)
         noise, mean = finite_column(arrays, "noise_variance", (3,), positive=True), finite_column(arrays, "mean", (3,))
@@ -323,6 +288,56 @@ class InverseGPCalibration:
         return cls(calibrator, data, unused, pixels, positions, hyper)
 
 
-def _reasons(seen: NDArray[np.bool_], names: tuple[str, ...]) -> Names:
-    reasons = ["" if row.all() else why_not_all_seen(row, names, InverseGP.method) for row in seen]
+def scaling_arrays(pixels: Scaling, positions: Scaling) -> dict[str, NDArray[Any]]:
+    """The two scalings as arrays of a calibration file."""
+    return {
+        "pixel_offset": pixels.offset,
+        "pixel_scale": pixels.scale,
+        "position_offset": positions.offset,
+        "position_scale": positions.scale,
+    }
+
+
+def scalings(arrays: Arrays, data: Dataset) -> tuple[Scaling, Scaling]:
+    """The inverse of `scaling_arrays`: of pixels, of positions; ValueError where they do not fit the data."""
+    pixels, positions = (
+        Scaling(
+            finite_column(arrays, f"{what}_offset", (d,)), finite_column(arrays, f"{what}_scale", (d,), positive=True)
+        )
+        for what, d in (("pixel", 2 * len(data.cameras)), ("position", 3))
+    )
+    return pixels, positions
+
+
+def blind_reasons(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> Names:
+    """(n,) why a point was not measured, from seen (n, cameras); empty where every camera saw it."""
+    reasons = ["" if row.all() else why_not_all_seen(row, names, method) for row in seen]
     return np.array(reasons, dtype=np.str_)
+
+
+def flat_note(data: Dataset) -> list[str]:
+    """A note on known points in one plane, whichever way it lies."""
+    extents = np.linalg.svd(data.xyz - data.xyz.mean(axis=0), compute_uv=False)
+    if extents[-1] > FLAT * extents[0]:
+        return []
+    return [
+        "The known positions lie in one plane. Positions off it are not measured but guessed, and their error bars "
+        "cannot say how badly: add known points in front of it and behind."
+    ]
+
+
+def lattice_note(data: Dataset, method: str) -> list[str]:
+    """A note on known positions that share their coordinates, which a map from pixels to positions can learn."""
+    lattice = [
+        f"{axis} has {len(np.unique(values))} values"
+        for axis, values in zip(AXES, data.xyz.T, strict=True)
+        if len(np.unique(values)) <= len(values) / LATTICE_REPEATS
+    ]
+    if not lattice:
+        return []
+    in_shots = len(np.unique(data.shots)) < len(data)
+    return [
+        f"The known positions lie on a lattice ({', '.join(lattice)} at {len(data)} points). {method} may "
+        "learn its planes instead of the space between them: judge it by points off the lattice"
+        f"{' or by --leave-out shot' * in_shots}, not by a random split."
+    ]

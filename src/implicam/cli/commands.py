@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -15,21 +16,46 @@ import typer
 from implicam import calibration_file
 from implicam.calibrators import (
     DEFAULT_METHOD,
+    METHODS,
     Calibration,
+    Explicit,
     ForwardGP,
     InverseGP,
     calibrator,
     load_calibration,
 )
+from implicam.calibrators.explicit import calibration_of, rig_of
+from implicam.calibrators.explicit.lenses import FAMILIES
 from implicam.cli import show
-from implicam.compare import Trial, as_json, compare, summarise
+from implicam.compare import (
+    Split,
+    Trial,
+    as_json,
+    compare_on,
+    plane_splits,
+    random_splits,
+    shot_splits,
+    summarise,
+)
 from implicam.dataset import Dataset, folder_files, read_dataset, write_dataset
 from implicam.dataset.folder import IMAGES
 from implicam.errors import DatasetError, UsageError, import_extra
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
+from implicam.exchange import FORMATS, export_cameras, import_cameras
 from implicam.files import replacing, toml_text
 from implicam.images import PATTERN
-from implicam.simulate import Optics, ball_grid, build_rig, moving_board, random_positions, record, write_rig
+from implicam.simulate import (
+    Optics,
+    as_boards,
+    ball_grid,
+    build_rig,
+    each_and_pairs,
+    held_boards,
+    moving_board,
+    random_positions,
+    record,
+    write_rig,
+)
 
 app = typer.Typer(
     name="implicam",
@@ -52,6 +78,8 @@ EXAMPLES = {
     "compare": "implicam compare my-rig --train 35,87 --seeds 3 -o compare.png",
     "report": "implicam report my-rig.implicam -o report.html",
     "convert": "implicam convert my-rig my-rig.csv",
+    "export": "implicam export my-rig.implicam --to aniposelib -o cameras.toml",
+    "import": "implicam import cameras.toml -o cameras.implicam",
     "info": "implicam info my-rig.implicam",
 }
 """Command -> an example, in an order in which they can be run."""
@@ -71,6 +99,7 @@ class Target(StrEnum):
 
     ball = "ball"
     board = "board"
+    boards = "boards"
 
 
 class Positions(StrEnum):
@@ -105,7 +134,18 @@ Preset = Annotated[
     ),
 ]
 Lens = Annotated[
-    str | None, typer.Option("--lens", metavar="NAME", help="forward-gp: central, one model for all lenses, or none.")
+    str | None,
+    typer.Option(
+        "--lens", metavar="NAME", help="forward-gp: central or none; explicit: auto, brown-conrady, kannala-brandt."
+    ),
+]
+Boards = Annotated[
+    Path | None,
+    typer.Option("--boards", metavar="DATASET", help="explicit: learn the cameras from these pictures of a board."),
+]
+Align = Annotated[
+    str | None,
+    typer.Option("--align", metavar="NAME", help="explicit: known points match boards by name (points), or icp."),
 ]
 Cameras = Annotated[
     str | None, typer.Option("--cameras", metavar="LIST", help="Use only these cameras, separated by commas.")
@@ -137,15 +177,23 @@ class _Wanted:
     kernel: str | None
     preset: str | None
     seed: int
+    boards: Path | None = None
+    align: str | None = None
 
     @property
     def given(self) -> bool:
-        return any((self.method, self.lens, self.kernel, self.preset))
+        return any((self.method, self.lens, self.kernel, self.preset, self.boards, self.align))
 
     def calibrator(self) -> Any:
-        only_inverse = self.kernel or self.preset  # so nobody means another method
-        method = self.method or (InverseGP.method if only_inverse and not self.lens else DEFAULT_METHOD)
-        return calibrator(method, lens=self.lens, kernel=self.kernel, preset=self.preset, seed=self.seed)
+        options = {"lens": self.lens, "kernel": self.kernel, "preset": self.preset, "align": self.align}
+        boards = None if self.boards is None else read_dataset(self.boards)
+        return calibrator(self.method or self._likely(), **options, boards=boards, seed=self.seed)
+
+    def _likely(self) -> str:
+        """The method that is meant where only its options are given."""
+        if self.boards or self.align or self.lens in FAMILIES:
+            return Explicit.method
+        return InverseGP.method if (self.kernel or self.preset) and not self.lens else DEFAULT_METHOD
 
 
 @_command("demo")
@@ -193,11 +241,15 @@ def simulate_command(
     rig: Annotated[
         str, typer.Option(metavar="NAME", help="bar6 (the paper's), stereo, dome8, or any barN, domeN.")
     ] = "bar6",
-    target: Annotated[Target, typer.Option(help="A ball on a robot, or a board on a slide.")] = Target.ball,
+    target: Annotated[
+        Target, typer.Option(help="A ball on a robot, a board on a slide, boards held by hand.")
+    ] = Target.ball,
     positions: Annotated[Positions, typer.Option(help="Where the ball goes.")] = Positions.grid,
     points: Annotated[int, typer.Option(min=1, metavar="N", help="How many random positions.")] = 157,
     grid: Annotated[str, typer.Option(metavar="AxBxC", help="Positions of the grid along, down and away.")] = "5x5x7",
     boards: Annotated[int, typer.Option(min=1, metavar="N", help="How many positions of the board.")] = 20,
+    each: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every camera alone.")] = 10,
+    pairs: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every two neighbours.")] = 4,
     check: Annotated[
         int, typer.Option(min=0, metavar="N", help="Also write so many random positions to OUT/check.")
     ] = 0,
@@ -244,6 +296,8 @@ def simulate_command(
     shots = seed if shots_seed is None else shots_seed
     if target is Target.board:
         shown = moving_board(built, positions=boards)
+    elif target is Target.boards:
+        shown = held_boards(built, each_and_pairs(built, each, pairs), np.random.default_rng([shots, 9]))
     elif positions is Positions.grid:
         shown = ball_grid(built, _grid(grid))
     else:
@@ -254,6 +308,8 @@ def simulate_command(
         recorded = record(
             built, shown, seed=shots, robot_noise=robot_noise, missing=missing, outliers=outliers, optics=optics
         )
+        if target is Target.boards:  # nobody knows where a hand held them
+            recorded = replace(recorded, data=as_boards(recorded.data, shown))
         parts = {"": recorded}
         if check:
             target_points = random_positions(built, check, np.random.default_rng([shots, 2]))
@@ -360,6 +416,8 @@ def calibrate_command(
     lens: Lens = None,
     kernel: Kernel = None,
     preset: Preset = None,
+    boards: Boards = None,
+    align: Align = None,
     points: Annotated[int | None, typer.Option(min=1, metavar="N", help="Use so many points, drawn at random.")] = None,
     cameras: Cameras = None,
     without: Without = None,
@@ -368,17 +426,21 @@ def calibrate_command(
     json: Json = False,
 ) -> None:
     """Learn the rig from known points; points kept back with --points are there for `implicam evaluate`."""
-    if output.suffix.lower() != CALIBRATION_SUFFIX:
-        raise UsageError(
-            f"{output} is no name for a calibration.", fix=f"end it in {CALIBRATION_SUFFIX}: -o {output.stem}.implicam"
-        )
+    _must_be_calibration(output)
     data = _read(dataset, unit, cameras, without)
     if points is not None and points != len(data):
         data, _ = data.split(points, seed=seed)
     with show.progress(json) as progress:
-        calibration = _Wanted(method, lens, kernel, preset, seed).calibrator().fit(data, progress)
+        calibration = _Wanted(method, lens, kernel, preset, seed, boards, align).calibrator().fit(data, progress)
     calibration.save(output)
     _tell_calibration(calibration, output, json)
+
+
+def _must_be_calibration(output: Path) -> None:
+    if output.suffix.lower() != CALIBRATION_SUFFIX:
+        raise UsageError(
+            f"{output} is no name for a calibration.", fix=f"end it in {CALIBRATION_SUFFIX}: -o {output.stem}.implicam"
+        )
 
 
 def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> None:
@@ -464,6 +526,8 @@ def evaluate_command(
     lens: Lens = None,
     kernel: Kernel = None,
     preset: Preset = None,
+    boards: Boards = None,
+    align: Align = None,
     cameras: Cameras = None,
     without: Without = None,
     unit: Unit = None,
@@ -471,7 +535,7 @@ def evaluate_command(
     json: Json = False,
 ) -> None:
     """Judge errors and error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region."""
-    wanted = _Wanted(method, lens, kernel, preset, seed)
+    wanted = _Wanted(method, lens, kernel, preset, seed, boards, align)
     _check_evaluate(dataset, cv, leave_out, wanted.given)
     if report is not None:
         _need_plotly()
@@ -518,9 +582,7 @@ def _fit_and_data(
 
 
 def _own_options() -> UsageError:
-    return UsageError(
-        "a calibration file brings its own method and options.", fix="leave out --method, --lens, --kernel and --preset"
-    )
+    return UsageError("a calibration file brings its own method and options.", fix="leave out --method and its options")
 
 
 def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) -> None:
@@ -567,24 +629,33 @@ def compare_command(
     train: Annotated[
         str | None, typer.Option("--train", metavar="LIST", help="Numbers of known points, such as 17,35,87.")
     ] = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, metavar="N", help="Random splits for each number.")] = 5,
+    seeds: Annotated[
+        int | None,
+        typer.Option(
+            "--seeds", min=1, metavar="N", help="Random splits (default 5); at most so many shots, planes (all)."
+        ),
+    ] = None,
     check: Annotated[Path | None, typer.Option("--check", help="Judge on this dataset of the same rig.")] = None,
+    leave_out: Annotated[
+        str | None, typer.Option("--leave-out", metavar="shot", help="Hold each shot (a board, a plane) out in turn.")
+    ] = None,
+    lattice: Annotated[bool, typer.Option("--lattice", help="Hold each inner plane of a lattice out, too.")] = False,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf or .svg).")] = None,
     cameras: Cameras = None,
     without: Without = None,
     unit: Unit = None,
     json: Json = False,
 ) -> None:
-    """All methods on the same splits: one table, one figure, error bars over seeds."""
+    """All methods on the same splits: one table, one figure, error bars over the splits."""
     if output is not None:
         _check_figure(output)
     data = _read(dataset, unit, cameras, without)
-    sizes = _sizes(train, len(data))
-    names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
     check_data = None if check is None else _read(check, unit, cameras, without)
+    splits = _splits(data, train, seeds, check_data, leave_out, lattice)
+    names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
+    chosen = {name: _named_method(name) for name in names}
     with show.progress(json) as progress:
-        chosen = {name: _named_method(name) for name in names}
-        trials = compare(data, chosen, sizes, seeds=seeds, check=check_data, progress=progress)
+        trials = compare_on(splits, chosen, progress)
     if output is not None:
         _write_figure(trials, data.length_unit, output)
     if json:
@@ -594,30 +665,59 @@ def compare_command(
     show.table(show.compare_table(rows, data.length_unit))
     if output is not None:
         show.line(f"figure: {output}")
-    for row in rows:
-        for failure in row.failures:
-            show.note(f"{row.method} with {row.known} points failed: {failure}")
+    show.notes(show.compare_failures(trials))
+
+
+SHOWN_VARIANTS = {ForwardGP.method: ("none",), InverseGP.method: ("paper",)}
+"""Variants that stand beside their method unless --methods names others."""
+
+NEEDED = {"inverse-gp:paper": ("gpytorch", "paper"), "mlp": ("torch", "mlp")}
+"""Method or variant -> the library it needs, and the extra that brings it."""
 
 
 def _available_methods() -> list[str]:
-    try:
-        import gpytorch  # noqa: F401
-    except ImportError:
-        show.note('left out inverse-gp:paper (the paper\'s own software): pip install "implicam[paper]" to add it')
-        return ["forward-gp", "inverse-gp", "inverse-gp:matern-5/2"]
-    return ["forward-gp", "inverse-gp", "inverse-gp:matern-5/2", "inverse-gp:paper"]
+    """All methods and the variants worth showing, as far as their libraries are installed."""
+    names = [name for method in METHODS for name in (method, *_variants(method))]
+    absent = [name for name in names if name in NEEDED and find_spec(NEEDED[name][0]) is None]
+    for name in absent:
+        show.note(f'left out {name}: pip install "implicam[{NEEDED[name][1]}]" to add it')
+    return [name for name in names if name not in absent]
+
+
+def _variants(method: str) -> list[str]:
+    return [f"{method}:{variant}" for variant in SHOWN_VARIANTS.get(method, ())]
 
 
 def _named_method(name: str) -> Any:
     method, _, variant = name.partition(":")
+    if name in NEEDED:
+        import_extra(*NEEDED[name], name)  # now, so that no fit is charged for it
     if not variant:
         return calibrator(method)
-    if method == ForwardGP.method:
-        return calibrator(method, lens=variant)
-    if variant == "paper":
-        import_extra("gpytorch", "paper", "the paper preset")  # now, so that no fit is charged for it
+    if (method, variant) == (InverseGP.method, "paper"):
         return calibrator(method, preset=variant)
-    return calibrator(method, kernel=variant)
+    return calibrator(method, **{"kernel" if method == InverseGP.method else "lens": variant})
+
+
+def _splits(
+    data: Dataset, train: str | None, seeds: int | None, check: Dataset | None, leave_out: str | None, lattice: bool
+) -> list[Split]:
+    if leave_out not in (None, "shot"):
+        raise UsageError(f"--leave-out {leave_out!r} is not known.", fix="write --leave-out shot")
+    if (check is not None) + (leave_out is not None) + lattice > 1:
+        raise UsageError("--check, --leave-out and --lattice exclude each other.", fix="give one of them")
+    if leave_out is not None:
+        return shot_splits(data, _sizes(train, len(data)) if train else None, most=seeds)
+    draws = seeds or 5
+    if not lattice:
+        return random_splits(data, _sizes(train, len(data)), seeds=draws, check=check)
+    fewest = min(len(split.train) for split in plane_splits(data))
+    sizes = _sizes(train, len(data)) if train else [min(fewest, round(len(data) / 2), MOST_ON_LATTICE)]
+    return random_splits(data, sizes, seeds=draws) + plane_splits(data, sizes, most=seeds)
+
+
+MOST_ON_LATTICE = 200
+"""Points to train on with --lattice, unless --train says more: every plane costs a fit of every method."""
 
 
 def _sizes(text: str | None, n: int) -> list[int]:
@@ -639,9 +739,7 @@ def _check_figure(path: Path) -> None:
 def _write_figure(trials: Sequence[Trial], unit: str, path: Path) -> None:
     from implicam.figures import compare_figure
 
-    # its right-hand side shows the share inside the 95 % ellipsoid
-    rows = [{**asdict(t), "coverage_95": t.ellipsoid_95} for t in trials if not t.failure]
-    figure = compare_figure(rows, unit=unit)
+    figure = compare_figure([asdict(trial) for trial in trials], unit=unit)
     with replacing(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=160)
 
@@ -686,6 +784,50 @@ def convert_command(
         show.emit_json({"dataset": str(out), "points": len(data)})
     else:
         show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
+
+
+@_command("export")
+def export_command(
+    calibration: Annotated[Path, typer.Argument(help="A calibration by explicit, or by forward-gp.")],
+    to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(FORMATS)}.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The file to write; for colmap a folder.")],
+    json: Json = False,
+) -> None:
+    """Write the cameras for another program: lenses and places, as far as its format holds them."""
+    rig, lost = rig_of(load_calibration(calibration))
+    notes = [*lost, *export_cameras(rig, to, output)]
+    if json:
+        show.emit_json({"cameras": len(rig.cameras), "format": to, "file": str(output), "notes": notes})
+        return
+    show.line(f"{output}: {len(rig.cameras)} cameras as {FORMATS[to].what}")
+    show.notes(notes)
+
+
+@_command("import")
+def import_command(
+    cameras: Annotated[Path, typer.Argument(help="Cameras that another program calibrated.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The calibration file to write (*.implicam).")],
+    kind: Annotated[
+        str | None, typer.Option("--from", metavar="NAME", help="The format, where its content does not tell.")
+    ] = None,
+    noise: Annotated[
+        float, typer.Option("--noise", min=1e-6, metavar="PX", help="Noise of views that do not state theirs.")
+    ] = 0.3,
+    unit: Annotated[
+        str | None, typer.Option("--unit", metavar="UNIT", help="Length unit, where the file does not state it.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Make a calibration of another program's cameras, to measure with them and to check them."""
+    _must_be_calibration(output)
+    rig = import_cameras(cameras, kind, unit=unit)
+    calibration = calibration_of(rig, cameras.stem, noise)
+    calibration.save(output)
+    if json:
+        show.emit_json({"calibration": str(output), "cameras": len(rig.cameras), "notes": calibration.notes()})
+        return
+    show.line(f"{output}: {len(rig.cameras)} cameras, lengths in {rig.length_unit}")
+    show.notes(calibration.notes())
 
 
 @_command("info")

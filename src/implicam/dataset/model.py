@@ -41,7 +41,7 @@ TRUTH_COLUMNS = (
 )  # fmt: skip
 """Extra columns of points.csv that `implicam simulate` writes: where the point really was, and its Cramer-Rao limit."""
 
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 
 
 @dataclass(frozen=True)
@@ -271,11 +271,11 @@ class Dataset:
     def metres_per_unit(self) -> float:
         """How long one length unit is in metres."""
         try:
-            return _METRES[self.length_unit]
+            return METRES[self.length_unit]
         except KeyError:
             raise DatasetError(
-                f"the length unit {self.length_unit!r} has no known size{did_you_mean(self.length_unit, _METRES)}.",
-                fix=f"use one of {', '.join(_METRES)}",
+                f"the length unit {self.length_unit!r} has no known size{did_you_mean(self.length_unit, METRES)}.",
+                fix=f"use one of {', '.join(METRES)}",
             ) from None
 
     def select(self, index: ArrayLike) -> Dataset:

@@ -12,8 +12,7 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 
 from implicam.cameras import Bools, BrownConrady, Floats, Lens
-from implicam.dataset.model import _METRES as METRES
-from implicam.dataset.model import Camera
+from implicam.dataset.model import METRES, Camera
 from implicam.errors import DatasetError, did_you_mean
 from implicam.geometry import Pose
 

@@ -1,4 +1,4 @@
-"""Methods compared, for print: how error and honesty change with the number of known points."""
+"""Methods compared, for print: error, honesty and time against the number of known points, or what was left out."""
 
 from __future__ import annotations
 
@@ -7,95 +7,209 @@ from typing import Any
 
 import numpy as np
 
+from implicam.compare import RANDOM, mean_and_error, plane_of
 from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, MARKS, ORANGE, PURPLE, SKY, VERMILLION
 
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, BLACK)
+_LIMIT = "Cramér-Rao limit"
 
 Row = Mapping[str, Any]
 
 
 def compare_figure(table: Iterable[Row], *, unit: str) -> Any:
-    """A matplotlib Figure of rmse (left) and 95 % coverage (right) against the number of known points.
+    """A matplotlib Figure of methods side by side; save with `figure.savefig(path)`, .png, .pdf or .svg.
 
-    table: one row per method, number of known points and seed, with the keys `method`, `known`, `rmse` (in `unit`),
-    `coverage_95` (0 to 1, None or NaN where the method states none) and, optionally, `limit`, the Cramer-Rao rms. Each
-    marker is the median over seeds, each bar runs from the least to the greatest. Save with `figure.savefig(path)`,
-    .png or .pdf; nothing touches pyplot's global state.
+    table: one row per trial, with the keys `method`, `known` (points trained on), `rmse` (in `unit`), `ellipsoid_95`
+    (share of points in their 95 % ellipsoid), `fit_seconds` (each None or NaN where there is none), and optionally
+    `limit` (the Cramer-Rao rms), `split`, `left_out` and `all_others` (as in `implicam.compare.Trial`).
+
+    Random splits are drawn against the number of points. Where shots or planes were left out there is a line per
+    method (and kind of plane), each left-out shot a faint dot. Markers are means, bars one standard error of the mean
+    over seeds, shots or planes: the numbers of the table. Nothing touches pyplot's global state.
     """
-    figure_module = import_extra("matplotlib.figure", "report", "a figure for print")
     rows = list(table)
-    figure = figure_module.Figure(figsize=(9.0, 3.8), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    methods = list(dict.fromkeys(str(row["method"]) for row in rows))
+    kinds = {str(row.get("split", RANDOM)) for row in rows}
+    sizes = {int(row["known"]) for row in rows}
+    left_out = kinds - {RANDOM}
+    if left_out and (len(kinds) > 1 or len(sizes) == 1 or any(row.get("all_others") for row in rows)):
+        return _range_plot(rows, unit)
+    return _curves(rows, unit, "shots left out" if left_out else "seeds")
+
+
+def _curves(rows: Sequence[Row], unit: str, over: str) -> Any:
+    """Against the number of known points."""
+    figure = _figure(11.0, 4.3)
+    panels = figure.subplots(1, 3)
+    methods = _names(rows)
     for k, method in enumerate(methods):
         mine = [row for row in rows if str(row["method"]) == method]
         # Dodged a little, so that bars of different methods stand side by side.
         shift = 1.03 ** (k - (len(methods) - 1) / 2)
         look = {"color": _COLOURS[k % len(_COLOURS)], "marker": MARKS[k % len(MARKS)], "label": method}
-        _draw(left, mine, "rmse", shift, look)
-        _draw(right, mine, "coverage_95", shift, look)
-    _draw_limit(left, rows)
-    _finish(left, right, [int(row["known"]) for row in rows], unit)
+        for axes, key in zip(panels, ("rmse", "ellipsoid_95", "fit_seconds"), strict=True):
+            known, middle, error = _over_splits(mine, key)
+            if len(known):
+                axes.errorbar(known * shift, middle, yerr=_bars(middle, error), **_LOOK, lw=1.4, **look)
+    _draw_limit(panels[0], rows)
+    _finish_curves(panels, sorted({int(row["known"]) for row in rows}), unit)
+    _legend(figure, panels[0], f"mean ± standard error over the {over}")
     return figure
 
 
-def _draw(axes: Any, rows: Sequence[Row], key: str, shift: float, look: dict[str, Any]) -> None:
-    known, low, middle, high = _over_seeds(rows, key)
-    if len(known):
-        axes.errorbar(
-            known * shift,
-            middle,
-            yerr=[middle - low, high - middle],
-            capsize=3,
-            lw=1.4,
-            ms=5.5,
-            mec="white",
-            mew=0.6,
-            **look,
-        )
+_LOOK: dict[str, Any] = {"capsize": 3, "ms": 5.5, "mec": "white", "mew": 0.6}
+
+
+def _figure(width: float, height: float) -> Any:
+    module = import_extra("matplotlib.figure", "report", "a figure for print")
+    return module.Figure(figsize=(width, height), layout="constrained")
+
+
+def _names(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(str(row["method"]) for row in rows))
+
+
+def _values(rows: Sequence[Row], key: str) -> Floats:
+    """The numbers of a column that are there."""
+    values = [float(row[key]) for row in rows if row.get(key) is not None]
+    return np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
+
+
+def _over_splits(rows: Sequence[Row], key: str) -> tuple[Floats, Floats, Floats]:
+    """Known points, and the mean and its standard error (NaN for one split) of a column at each."""
+    known = sorted({int(row["known"]) for row in rows})
+    found = [(k, _values([row for row in rows if int(row["known"]) == k], key)) for k in known]
+    stats = [(k, *mean_and_error(values)) for k, values in found if len(values)]
+    known_points, middle, error = np.array(stats, dtype=np.float64).reshape(-1, 3).T
+    return known_points, middle, error
+
+
+def _bars(middle: Floats, error: Floats) -> Floats:
+    """(2, n) lengths of the bars; on a log axis the lower end cannot be zero."""
+    error = np.nan_to_num(error)
+    return np.stack([np.minimum(error, 0.999 * np.abs(middle)), error])
 
 
 def _draw_limit(axes: Any, rows: Sequence[Row]) -> None:
-    known, _, limit, _ = _over_seeds(rows, "limit")
+    known, limit, _ = _over_splits(rows, "limit")
     if len(known) == 1:
-        axes.axhline(limit[0], color=GREY, ls="--", lw=1.2, label="Cramér-Rao limit")
+        axes.axhline(limit[0], color=GREY, ls="--", lw=1.2, label=_LIMIT)
     elif len(known):
-        axes.plot(known, limit, color=GREY, ls="--", lw=1.2, label="Cramér-Rao limit")
+        axes.plot(known, limit, color=GREY, ls="--", lw=1.2, label=_LIMIT)
 
 
-def _over_seeds(rows: Sequence[Row], key: str) -> tuple[Floats, Floats, Floats, Floats]:
-    """Known points, and least, median and greatest of a column at each; values that are missing are left out."""
-    groups: dict[int, list[float]] = {}
-    for row in rows:
-        value = row.get(key)
-        if value is not None and np.isfinite(value):
-            groups.setdefault(int(row["known"]), []).append(float(value))
-    known = sorted(groups)
-    stats = [(min(groups[k]), float(np.median(groups[k])), max(groups[k])) for k in known]
-    low, middle, high = np.array(stats, dtype=np.float64).reshape(-1, 3).T
-    return np.array(known, dtype=np.float64), low, middle, high
-
-
-def _finish(left: Any, right: Any, known: Sequence[int], unit: str) -> None:
+def _finish_curves(panels: Sequence[Any], known: Sequence[int], unit: str) -> None:
+    error, inside, seconds = panels
     ticker = import_extra("matplotlib.ticker", "report", "a figure for print")
-    for axes in (left, right):
+    for axes in panels:
         axes.set_xscale("log")
-        axes.set_xticks(sorted(set(known)), [str(k) for k in sorted(set(known))])
+        axes.set_xticks(known, [str(k) for k in known])
         axes.xaxis.set_minor_locator(ticker.NullLocator())
         axes.set_xlabel("known points")
-        axes.grid(True, color="0.9", lw=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-    left.set_yscale("log")
-    plain = ticker.FuncFormatter(lambda value, _: f"{value:g}")
-    left.yaxis.set_major_formatter(plain)
-    left.yaxis.set_minor_formatter(ticker.NullFormatter())
-    left.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-    left.set_ylabel(f"rms error ({unit})")
-    right.axhline(0.95, color=GREY, ls="--", lw=1.2)
-    right.text(1.01, 0.95, "honest", color=GREY, ha="left", va="center", transform=right.get_yaxis_transform())
-    right.set_ylim(top=1.02)
-    right.set_ylabel("share inside the 95 % ellipsoid")
-    if left.get_legend_handles_labels()[0]:
-        left.legend(frameon=False)
+        _quiet(axes)
+    error.set_yscale("log")
+    _plain_log(error.yaxis, ticker)
+    error.set_ylabel(f"rms error ({unit})")
+    inside.axhline(0.95, color=GREY, ls="--", lw=1.2)
+    inside.set_ylim(top=1.02)
+    inside.set_ylabel("share inside 95 % ellipsoids\n(0.95 is honest)")
+    seconds.set_yscale("log")
+    _plain_log(seconds.yaxis, ticker)
+    seconds.set_ylabel("seconds to fit")
+
+
+def _quiet(axes: Any) -> None:
+    axes.grid(True, color="0.9", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _plain_log(axis: Any, ticker: Any) -> None:
+    """Label a log axis with plain numbers: 1, 2, 5 where there is room, decades where there is not."""
+    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(ticker.NullFormatter())
+    low, high = axis.get_data_interval()
+    wide = bool(0 < low < high < np.inf) and high / low > 300
+    axis.set_major_locator(ticker.LogLocator(subs=(1,) if wide else (1, 2, 5)))
+
+
+def _legend(figure: Any, axes: Any, title: str) -> None:
+    """Outside, below the panels: six methods hide nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles, labels, loc="outside lower center", ncols=min(len(labels), 4), frameon=False, title=title
+        )
+
+
+# what was left out
+
+
+def _range_plot(rows: Sequence[Row], unit: str) -> Any:
+    """A line per method, number of points and kind of split; kinds differ in colour and marker."""
+    methods = _names(rows)
+    cells = list(dict.fromkeys((_points(row), method) for method in methods for row in rows))
+    cells = sorted(cells, key=lambda cell: (cell[0], methods.index(cell[1])))
+    kinds = list(dict.fromkeys(str(row.get("split", RANDOM)) for row in rows))
+    figure = _figure(11.0, 1.9 + (0.28 + 0.16 * len(kinds)) * len(cells))
+    panels = figure.subplots(1, 2, sharey=True)
+    step = 0.8 / len(kinds)
+    for k, kind in enumerate(kinds):
+        look = {"color": _COLOURS[k % len(_COLOURS)], "marker": MARKS[k % len(MARKS)], "label": _called(kind)}
+        mine = [row for row in rows if str(row.get("split", RANDOM)) == kind]
+        for axes, key in zip(panels, ("rmse", "ellipsoid_95"), strict=True):
+            _draw_ranges(axes, mine, key, cells, step * (k - (len(kinds) - 1) / 2), look)
+    _finish_ranges(panels, cells, unit)
+    _legend(figure, panels[0], "large: mean ± standard error; small: each split")
+    return figure
+
+
+def _points(row: Row) -> int:
+    return 0 if row.get("all_others") else int(row["known"])
+
+
+def _called(kind: str) -> str:
+    if plane_of(kind):
+        return f"planes across {plane_of(kind)} left out"
+    return "random splits" if kind == RANDOM else "shots left out"
+
+
+def _draw_ranges(
+    axes: Any, rows: Sequence[Row], key: str, cells: Sequence[tuple[int, str]], shift: float, look: dict[str, Any]
+) -> None:
+    at, middle, error = [], [], []
+    for i, cell in enumerate(cells):
+        values = _values([row for row in rows if (_points(row), str(row["method"])) == cell], key)
+        if not len(values):
+            place = {"va": "center", "size": 7, "transform": axes.get_yaxis_transform()}
+            axes.text(0.01, i + shift, "no result", color=look["color"], **place)
+            continue
+        faint = {**look, "label": None, "ms": 3, "mew": 0, "alpha": 0.35}
+        axes.plot(values, np.full(len(values), i + shift), ls="", **faint)
+        mean, sd = mean_and_error(values)
+        at.append(i + shift)
+        middle.append(mean)
+        error.append(sd)
+    if at:
+        axes.errorbar(middle, at, xerr=_bars(np.array(middle), np.array(error)), ls="", **_LOOK, **look)
+
+
+def _finish_ranges(panels: Sequence[Any], cells: Sequence[tuple[int, str]], unit: str) -> None:
+    ticker = import_extra("matplotlib.ticker", "report", "a figure for print")
+    several = len({points for points, _ in cells}) > 1
+    names = [f"{method}, {points} points" if several else method for points, method in cells]
+    error, inside = panels
+    for axes in panels:
+        _quiet(axes)
+        axes.set_yticks(range(len(cells)), names)
+        axes.grid(False, axis="y")
+        for line in np.arange(0.5, len(cells) - 1):
+            axes.axhline(line, color="0.85", lw=0.6)
+    error.set_ylim(len(cells) - 0.5, -0.5)
+    error.set_xscale("log")
+    _plain_log(error.xaxis, ticker)
+    error.set_xlabel(f"rms error ({unit})")
+    inside.axvline(0.95, color=GREY, ls="--", lw=1.2)
+    inside.set_xlim(right=1.02)
+    inside.set_xlabel("share inside the 95 % ellipsoid (0.95 is honest)")

@@ -10,7 +10,15 @@ import numpy as np
 
 from implicam.dataset import Dataset
 from implicam.simulate.camera import SimulatedCamera, SmoothError
-from implicam.simulate.noise import cramer_rao_limit, each_and_pairs, simulate, simulate_boards, views, with_limit
+from implicam.simulate.noise import (
+    as_boards,
+    cramer_rao_limit,
+    each_and_pairs,
+    simulate,
+    simulate_boards,
+    views,
+    with_limit,
+)
 from implicam.simulate.photographs import BALL_RADIUS_MM, Optics, Recorded, Studio, record
 from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, build_rig, write_rig
 from implicam.simulate.targets import Target, ball_grid, held_boards, moving_board, random_positions
@@ -27,6 +35,7 @@ __all__ = [
     "SmoothError",
     "Studio",
     "Target",
+    "as_boards",
     "ball_grid",
     "build_rig",
     "cramer_rao_limit",

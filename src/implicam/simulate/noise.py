@@ -84,11 +84,17 @@ def simulate_boards(
     square: in mm. missing, outliers: as for `simulate`.
     """
     rng = np.random.default_rng([seed, 9])
-    target, takes = held_boards(rig, groups, rng, corners=corners, square=square)
-    visible = takes & views(rig, target)[1]
-    kind = {"kind": "board", "rows": corners[0], "columns": corners[1], "square": square * rig.units_per_mm}
-    data = simulate(rig, target, seed=seed, missing=missing, outliers=outliers, visible=visible, extra={"target": kind})
-    return replace(data, known=None)
+    target = held_boards(rig, groups, rng, corners=corners, square=square)
+    return as_boards(simulate(rig, target, seed=seed, missing=missing, outliers=outliers), target)
+
+
+def as_boards(data: Dataset, target: Target) -> Dataset:
+    """A recording of boards without their positions: what is known is how the corners lie on the board."""
+    assert target.board is not None
+    rows, columns = target.board
+    square = float(np.linalg.norm(target.xyz[1] - target.xyz[0]))
+    kind = {"kind": "board", "rows": rows, "columns": columns, "square": square}
+    return replace(data, known=None, extra={**data.extra, "target": kind})
 
 
 def each_and_pairs(rig: Rig, each: int, pairs: int) -> list[tuple[str, ...]]:
@@ -107,7 +113,7 @@ def views(rig: Rig, target: Target) -> tuple[Floats, Bools]:
     visible = np.stack(
         [on & _faces(camera, target) for camera, (_, on) in zip(rig.cameras, pairs, strict=True)], axis=1
     )
-    return uv, visible
+    return uv, visible if target.takes is None else visible & target.takes
 
 
 def cramer_rao_limit(rig: Rig, xyz: Floats, used: Bools, sd: Floats | None = None) -> Floats:

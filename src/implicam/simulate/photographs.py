@@ -107,9 +107,22 @@ class Studio:
         """The photograph of shot number `shot` by camera number `camera`."""
         return self._exposed(self._composed(camera, shot), camera, np.random.default_rng([self.seed, 7, camera, shot]))
 
+    @cached_property
+    def jobs(self) -> list[tuple[int, int]]:
+        """The pictures that are taken: numbers of camera and shot."""
+        takes = np.ones((len(self.target.shots), len(self.rig.cameras)), dtype=np.bool_)
+        if self.target.takes is not None:
+            takes = self.target.takes
+        return [
+            (c, s)
+            for s, shot in enumerate(self.shots)
+            for c in range(len(self.rig.cameras))
+            if takes[self.target.shots == shot, c].any()
+        ]
+
     def write(self, folder: Path, progress: Progress = silent, *, ending: str = ".png") -> int:
         """Write all pictures to folder/<camera>/<shot>.png; how many."""
-        jobs = [(c, s) for s in range(len(self.shots)) for c in range(len(self.rig.cameras))]
+        jobs = self.jobs
         done = 0
         for c in range(len(self.rig.cameras)):
             (folder / self.rig.cameras[c].name).mkdir(parents=True, exist_ok=True)
@@ -258,7 +271,7 @@ class Recorded:
     @property
     def photographs(self) -> int:
         """How many."""
-        return len(self.studio.shots) * len(self.studio.rig.cameras) if self.studio else 0
+        return len(self.studio.jobs) if self.studio else 0
 
     def write_photographs(self, folder: Path, progress: Progress = silent) -> None:
         """Into folder/images/<camera>/<shot>.png, if there are to be any."""

@@ -20,7 +20,8 @@ class Target:
     """Points with their true positions (n, 3), in the rig's world frame and unit, and the shot each belongs to.
 
     facing: (3,) or (n, 3) the side a board shows, a unit vector in the world; None for a ball, which has none. board:
-    rows and columns of its inner corners, None for a ball.
+    rows and columns of its inner corners, None for a ball. takes: (n, cameras) which cameras take a picture, None
+    for all of them.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Target:
     xyz: Floats
     facing: Floats | None = None
     board: tuple[int, int] | None = None
+    takes: NDArray[np.bool_] | None = None
 
 
 def ball_grid(rig: Rig, shape: tuple[int, int, int] = (5, 5, 7)) -> Target:
@@ -72,9 +74,8 @@ def held_boards(
     *,
     corners: tuple[int, int] = (8, 11),
     square: float = 13.29,
-) -> tuple[Target, NDArray[np.bool_]]:
-    """A board held by hand, once for each group of cameras, so that all of the group see all of it; and (n, cameras)
-    which cameras take a picture: those of the group.
+) -> Target:
+    """A board held by hand, once for each group of cameras, which all see all of it; only they take a picture.
 
     Tilted up to 50 degrees, as far away as lets its diagonal span 0.25 to 0.8 of the image's width. UsageError where no
     pose is found that a group sees together.
@@ -91,7 +92,7 @@ def held_boards(
         takes[g * len(flat) : (g + 1) * len(flat), [names.index(name) for name in group]] = True
     shots = np.repeat([f"held{g + 1:03d}" for g in range(len(groups))], len(flat))
     points = np.array([f"{shot}-c{i % len(flat) + 1:03d}" for i, shot in enumerate(shots)])
-    return Target("boards", points, shots, np.concatenate(positions), np.concatenate(facing), corners), takes
+    return Target("boards", points, shots, np.concatenate(positions), np.concatenate(facing), corners, takes)
 
 
 TRIES = 4000

@@ -1,5 +1,6 @@
 """explicit: lens models and poses, from known points or from pictures of a board; the classical calibration."""
 
 from implicam.calibrators.explicit.calibration import Explicit, ExplicitCalibration
+from implicam.calibrators.explicit.exchanged import calibration_of, rig_of
 
-__all__ = ["Explicit", "ExplicitCalibration"]
+__all__ = ["Explicit", "ExplicitCalibration", "calibration_of", "rig_of"]

@@ -145,8 +145,8 @@ class ExplicitCalibration:
             "points_used": len(self.data) - len(self.unused),
             "points_unused": len(self.unused),
             "views_rejected": len(self.rejected),
-            "leave_one_out_rms": dict(zip(axes, map(float, np.sqrt(np.mean(fitted.errors**2, axis=0))), strict=True)),
-            "leave_one_out_mean_sd": dict(zip(axes, map(float, np.mean(fitted.sds, axis=0)), strict=True)),
+            "leave_one_out_rms": dict(zip(axes, _columns(fitted.errors, 2), strict=True)),
+            "leave_one_out_mean_sd": dict(zip(axes, _columns(fitted.sds, 1), strict=True)),
             "noise_px": dict(zip(names, (float(model.noise) for model in fitted.posterior.models), strict=True)),
             "lens": dict(zip(names, (choice.lens for choice in fitted.choices), strict=True)),
         }
@@ -167,3 +167,10 @@ class ExplicitCalibration:
         fitted, boards = saved.restored(data, table, arrays)
         calibrator = Explicit(str(table["lens"]), str(table["align"]), int(table["seed"]), boards)
         return cls(calibrator, data, fitted)
+
+
+def _columns(values: Floats, power: int) -> list[float]:
+    """The power mean of each column of (m, 3); NaN where there is no row."""
+    if not len(values):
+        return [float("nan")] * 3
+    return [float(x) for x in np.mean(np.abs(values) ** power, axis=0) ** (1 / power)]

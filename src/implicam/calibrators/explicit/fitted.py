@@ -182,7 +182,8 @@ def _notes(network: Network, trained: Observations, boards: Dataset) -> list[str
         worst = _rejected(network, boards)[:NAMED]
         named = ", ".join(f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in worst)
         more = f" and {len(network.wrong) - NAMED} more" if len(network.wrong) > NAMED else ""
-        notes.append(f"{len(network.wrong)} corners contradict the others and are not used: {named}{more}.")
+        count = f"{len(network.wrong)} corner{'s' * (len(network.wrong) != 1)}"
+        notes.append(f"{count} not used, far from where the others predict them: {named}{more}.")
     return notes
 
 

@@ -1,0 +1,139 @@
+"""Cameras of a calibration for other programs, and a calibration from cameras that another program calibrated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from implicam.calibrators.explicit.calibration import Explicit, ExplicitCalibration
+from implicam.calibrators.explicit.fitted import Fitted, posterior_of
+from implicam.calibrators.explicit.lenses import Choice, name_of
+from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
+from implicam.calibrators.forward_gp.fit import without_field
+from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior
+from implicam.calibrators.forward_gp.problem import Frame
+from implicam.calibrators.forward_gp.start import Started, levenberg_marquardt
+from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
+from implicam.errors import UsageError
+from implicam.exchange import UNKNOWN, ExplicitCamera, Rig
+from implicam.geometry import Pose
+
+DRAWN = 2000
+"""Positions in the workspace at which a lens is fitted to what forward-gp predicts."""
+
+
+def rig_of(calibration: Any) -> tuple[Rig, list[str]]:
+    """The cameras of a calibration, and what is lost: forward-gp's lenses are fitted to all that it predicts, without
+    its field. UsageError for a method that has no cameras."""
+    if not isinstance(calibration, ExplicitCalibration | ForwardGPCalibration):
+        raise UsageError(
+            f"{calibration.method} has no cameras that could be exported.",
+            why="it learns the map from pixels to positions as a whole",
+            fix="calibrate the same data with --method explicit",
+        )
+    rig_map, notes, cameras = calibration.map, [], []
+    for number, c in enumerate(rig_map.cameras):
+        described = rig_map.trained.cameras[c]
+        camera = rig_map.posterior.models[number].camera
+        if not isinstance(camera, CentralCamera):
+            raise UsageError(
+                "a calibration with --lens none has no lens models.",
+                fix="calibrate the same data with --method explicit",
+            )
+        if isinstance(calibration, ForwardGPCalibration):
+            camera, note = _nearest(calibration, number, camera)
+            notes += [f"{described.name}: {note}"] if note else []
+        cameras.append(
+            ExplicitCamera(
+                described.name, described.width, described.height, camera.lens, _world(camera, rig_map.frame)
+            )
+        )
+    return Rig(tuple(cameras), rig_map.length_unit), notes
+
+
+def _world(camera: CentralCamera, frame: Frame) -> Pose:
+    """camera_from_world of a camera of the working frame: the inverse of its offset and scale."""
+    turned = camera.pose.rotation @ frame.offset
+    return Pose(camera.pose.rotation, camera.pose.translation * frame.scale - turned)
+
+
+def _nearest(calibration: ForwardGPCalibration, number: int, camera: CentralCamera) -> tuple[CentralCamera, str]:
+    """The lens and place that come nearest to what forward-gp predicts in the workspace, and the cost in pixels."""
+    points = calibration.frame.inward(calibration.data.xyz)
+    low, high = points.min(axis=0), points.max(axis=0)
+    drawn = np.random.default_rng(0).uniform(low, high, size=(DRAWN, 3))
+    model = calibration.posterior.models[number]
+    uv = model.predict(drawn)[0]
+    seen = np.isfinite(uv).all(axis=1) & (np.abs(uv - model.image.centre) <= 1.2 * model.image.half).all(axis=1)
+    drawn, uv = drawn[seen], uv[seen]
+    nothing = Prior(camera.parameters, np.zeros((camera.size, camera.size)))
+    fitted = levenberg_marquardt(camera, nothing, drawn, uv, 0.1)
+    assert isinstance(fitted, CentralCamera)
+    off = np.linalg.norm(fitted.pixel(drawn) - uv, axis=1)
+    if np.nanmax(off) < 0.01:
+        return fitted, ""
+    return fitted, (
+        f"a lens model cannot hold all that forward-gp has learned: {np.sqrt(np.nanmean(off**2)):.2g} px rms are lost, "
+        f"at most {np.nanmax(off):.2g} px"
+    )
+
+
+def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
+    """A calibration that measures with the cameras of another program; noise: of views that do not state theirs, px.
+
+    Nothing is known of how well they are calibrated: the error bars are those of the pixels alone, and a note says so.
+    UsageError where there is one camera, or the length unit is not known.
+    """
+    if len(rig.cameras) < 2:
+        raise UsageError("there is one camera; a position takes two.", fix="give the file of the whole rig")
+    if rig.length_unit == UNKNOWN:
+        raise UsageError(
+            "the file does not say what its lengths are in.", fix="state the unit of the cameras' places: --unit mm"
+        )
+    described = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
+    none = np.full((0, len(described), 2), np.nan)
+    seen = Observations(np.zeros(0, dtype=np.str_), described, none, none)
+    known = KnownPositions(np.zeros(0, dtype=np.str_), np.zeros((0, 3)), np.zeros((0, 3)))
+    frame = _frame(rig)
+    models = tuple(
+        without_field(Started(*_working(camera, frame), np.zeros(0, dtype=np.bool_)), _image(camera), noise)
+        for camera in rig.cameras
+    )
+    fitted = Fitted(
+        seen,
+        frame,
+        tuple(range(len(described))),
+        posterior_of(models, np.zeros((1, sum(model.camera.size for model in models)))),
+        tuple(Choice(name_of(model.camera), {}) for model in models if isinstance(model.camera, CentralCamera)),
+        np.zeros((0, 3)),
+        np.zeros((0, 3)),
+        (),
+        (),
+        (
+            "The cameras were calibrated elsewhere, and nothing is known of how well: error bars hold the noise of the "
+            f"pixels only ({noise:g} px where a view states none). Check them: implicam evaluate FILE DATASET.",
+            *rig.notes,
+        ),
+    )
+    return ExplicitCalibration(Explicit(), Dataset(name, rig.length_unit, seen, known), fitted)
+
+
+def _frame(rig: Rig) -> Frame:
+    centres = np.array([camera.camera_from_world.centre for camera in rig.cameras])
+    offset = centres.mean(axis=0)
+    return Frame(offset, float(np.sqrt(np.mean((centres - offset) ** 2))) or 1.0)
+
+
+def _working(camera: ExplicitCamera, frame: Frame) -> tuple[CentralCamera, Prior]:
+    pose = camera.camera_from_world
+    there = (pose.rotation @ frame.offset + pose.translation) / frame.scale
+    central = CentralCamera(camera.lens, Pose(pose.rotation, there))
+    return central, Prior(np.zeros(central.size), np.zeros((central.size, central.size)))
+
+
+def _image(camera: ExplicitCamera) -> Image:
+    if camera.width is None or camera.height is None:
+        centre: Floats = np.array([camera.lens.cx, camera.lens.cy])
+        return Image(centre, float(max(*centre, 1.0)))
+    return Image(np.array([camera.width - 1, camera.height - 1]) / 2, max(camera.width, camera.height) / 2)

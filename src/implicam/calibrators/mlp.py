@@ -1,0 +1,261 @@
+"""mlp, the paper's neural network: the pixels of all cameras in, the position out.
+
+De Boi et al., "Implicit Multi-Camera System Calibration Using Gaussian Processes", section "Moving ball in a grid".
+Network: mlp_network.py; training: mlp_training.py. Inputs and outputs are standardised.
+
+Position: the network with every unit at work. Covariance: the spread of passes with random dropout. Dropout is a device
+of training, and nothing makes its spread as large as the error, so a calibration counts on the points it kept for early
+stopping how many lie within the error bars, and always says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam import calibration_file
+from implicam.calibrators.inverse_gp import (
+    AXES,
+    Scaling,
+    blind_reasons,
+    flat_note,
+    lattice_note,
+    pixels_of,
+    scaling_arrays,
+    scalings,
+    seen_by_all,
+)
+from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
+from implicam.calibrators.mlp_training import Examples, train
+from implicam.calibrators.protocol import Arrays, Rejected, Unused, finite_column, same_cameras
+from implicam.dataset import Dataset, Floats, Observations
+from implicam.errors import FitError, UsageError
+from implicam.measurement import Measurement
+from implicam.progress import Progress, silent
+from implicam.threads import blas_threads
+
+HELD_OUT = 0.15
+"""Share of the known points kept for early stopping, at least one."""
+PASSES = 200
+"""Passes with dropout: a standard deviation is then known to 5 %."""
+MOST_DROPOUT = 0.9  # with more, many passes have no unit at work in the last layer
+WITHIN_95 = 1.959964  # standard deviations of a normal distribution
+SPLIT, SPREAD = 0, 3  # streams of random numbers of one seed; mlp_training.py has others
+
+
+@dataclass(frozen=True)
+class MLP:
+    """The paper's network. dropout: probability that a hidden unit is switched off, 0 to 0.9.
+
+    With dropout = 0 there is no spread, and the error bars are the rms errors of the points kept for early stopping.
+    """
+
+    seed: int = 0
+    dropout: float = 0.2
+
+    method: ClassVar[str] = "mlp"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.dropout <= MOST_DROPOUT:
+            raise UsageError(
+                f"dropout is {self.dropout!r}; it must be between 0 and {MOST_DROPOUT}.",
+                why="it is the probability that a hidden unit is switched off",
+                fix="the paper has 0.2",
+            )
+
+    def fit(self, data: Dataset, progress: Progress = silent) -> MLPCalibration:
+        """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
+        (found,) = self.fit_many([data], progress)
+        if isinstance(found, FitError):
+            raise found
+        return found
+
+    def fit_many(self, datasets: Sequence[Dataset], progress: Progress = silent) -> list[MLPCalibration | FitError]:
+        """Fit to each dataset, number i with seed + i, as `fit` would; those with equally many points as one batch.
+
+        A dataset that cannot be used has its FitError in the list.
+        """
+        prepared = [_prepare(replace(self, seed=self.seed + i), data) for i, data in enumerate(datasets)]
+        examples = [ready.examples for ready in prepared if isinstance(ready, _Prepared)]
+        trained = iter(train(examples, self.dropout, progress))
+        return [
+            ready if isinstance(ready, FitError) else MLPCalibration(*ready[:-1], network=next(trained).network)
+            for ready in prepared
+        ]
+
+
+class _Prepared(NamedTuple):
+    """All that a calibration needs but the network, and what that is trained from."""
+
+    calibrator: MLP
+    data: Dataset
+    unused: tuple[Unused, ...]
+    held_out: NDArray[np.bool_]
+    pixels: Scaling
+    positions: Scaling
+    examples: Examples
+
+
+def _prepare(method: MLP, data: Dataset) -> _Prepared | FitError:
+    """Split and standardise; the scaling, too, knows only the points that the weights are fitted to."""
+    try:
+        usable, unused = seen_by_all(data, method.method)
+    except FitError as error:
+        return error
+    X, Y = pixels_of(usable), usable.xyz
+    held_out = _split(len(usable), method.seed)
+    pixels, positions = Scaling.of(X[~held_out]), Scaling.of(Y[~held_out])
+    examples = Examples(pixels.apply(X), positions.apply(Y), held_out, method.seed)
+    return _Prepared(method, data, unused, held_out, pixels, positions, examples)
+
+
+def _split(n: int, seed: int) -> NDArray[np.bool_]:
+    """(n,) which points are kept for early stopping."""
+    held_out = np.zeros(n, dtype=np.bool_)
+    order = np.random.default_rng([seed, SPLIT]).permutation(n)
+    held_out[order[: max(1, round(HELD_OUT * n))]] = True
+    return held_out
+
+
+@dataclass(frozen=True, eq=False)
+class MLPCalibration:
+    """A trained network, and which of the usable known points (n,) were kept for early stopping."""
+
+    calibrator: MLP
+    data: Dataset
+    unused: tuple[Unused, ...]
+    held_out: NDArray[np.bool_]
+    pixels: Scaling
+    positions: Scaling
+    network: Network = field(repr=False)
+
+    method: ClassVar[str] = "mlp"
+
+    @property
+    def rejected(self) -> tuple[Rejected, ...]:
+        """None: this method uses every view of the points it uses."""
+        return ()
+
+    def measure(self, observations: Observations) -> Measurement:
+        """Measure the points that every camera saw; the others keep their row, with a reason."""
+        observations = same_cameras(self.data.observations, observations)
+        seen = observations.seen
+        complete = seen.all(axis=1)
+        n = len(observations)
+        xyz, cov = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+        uv = observations.uv[complete].reshape(-1, 2 * len(observations.cameras))
+        xyz[complete], cov[complete] = self._predict(uv), self._covariance(uv)
+        return Measurement(
+            observations.points,
+            xyz,
+            cov,
+            seen.sum(axis=1),
+            np.full(n, np.nan),  # a map from all pixels to a position cannot ask whether the views agree
+            blind_reasons(seen, observations.camera_names, self.method),
+            self.data.length_unit,
+        )
+
+    def _predict(self, uv: Floats) -> Floats:
+        """(n, 3) positions of pixels (n, 2 cameras)."""
+        with blas_threads(1):
+            return self.network.predict(self.pixels.apply(uv)) * self.positions.scale + self.positions.offset
+
+    def _covariance(self, uv: Floats) -> Floats:
+        """(n, 3, 3) dropout spread; without dropout the held-out points' mean squared errors, the same everywhere."""
+        if not self.calibrator.dropout:
+            squares = np.mean(self._held_out_errors**2, axis=0)
+            return np.broadcast_to(np.diag(squares), (len(uv), 3, 3))
+        rng = np.random.default_rng([self.calibrator.seed, SPREAD])
+        masks = draw_masks(rng, PASSES, self.calibrator.dropout)
+        with blas_threads(1):
+            spread = self.network.spread(self.pixels.apply(uv), masks)
+        return spread * np.multiply.outer(self.positions.scale, self.positions.scale)
+
+    @cached_property
+    def _kept(self) -> Dataset:
+        """The points kept for early stopping, which no weight was fitted to; the epoch was chosen by them."""
+        usable = self.data.select(self.data.observations.seen.all(axis=1))
+        return usable.select(self.held_out)
+
+    @cached_property
+    def _held_out_errors(self) -> Floats:
+        return self._predict(pixels_of(self._kept)) - self._kept.xyz
+
+    @cached_property
+    def _held_out_sds(self) -> Floats:
+        return np.sqrt(np.diagonal(self._covariance(pixels_of(self._kept)), axis1=1, axis2=2))
+
+    @property
+    def _coverage(self) -> float:
+        """Share of the held-out coordinates within their 95 % interval."""
+        return float(np.mean(np.abs(self._held_out_errors) <= WITHIN_95 * self._held_out_sds))
+
+    def refit(self, data: Dataset, progress: Progress = silent) -> MLPCalibration:
+        """The same method with the same options on other data."""
+        return self.calibrator.fit(data, progress)
+
+    def notes(self) -> list[str]:
+        """What the user should know before trusting this calibration: always what its error bars are worth."""
+        return [self._worth_of_error_bars(), *flat_note(self.data), *lattice_note(self.data, self.method)]
+
+    def _worth_of_error_bars(self) -> str:
+        n = int(self.held_out.sum())
+        known = f"the {n} known points" if n > 1 else "the one known point"
+        if not self.calibrator.dropout:
+            return (
+                f"The error bars are the rms errors of {known} kept for early stopping, the same at every position: "
+                "without dropout this network has no uncertainty of its own."
+            )
+        return (
+            f"The error bars are dropout spread, not a measurement uncertainty: of the {3 * n} coordinates of {known} "
+            f"kept for early stopping, {100 * self._coverage:.0f} % lie inside their 95 % bars."
+        )
+
+    def residuals(self) -> dict[str, Any]:
+        """Errors per axis in the dataset's unit, of the points kept for early stopping, not each left out in turn.
+
+        held_out_in_95: the share of their coordinates within the stated 95 % intervals. It flatters a little, because
+        the epoch was chosen by them; without dropout more, because then the intervals are made from them.
+        """
+        rms = np.sqrt(np.mean(self._held_out_errors**2, axis=0))
+        return {
+            "points_used": len(self.held_out),
+            "points_unused": len(self.unused),
+            "leave_one_out_rms": dict(zip(AXES, map(float, rms), strict=True)),
+            "leave_one_out_mean_sd": dict(zip(AXES, map(float, self._held_out_sds.mean(axis=0)), strict=True)),
+            "held_out_points": int(self.held_out.sum()),
+            "held_out_in_95": self._coverage,
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write a `.implicam` file that carries everything, the known points included."""
+        calibration_file.save(self, path)
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """Options; weights, scalings and which points were kept for early stopping."""
+        arrays: dict[str, NDArray[Any]] = {"held_out": self.held_out, **scaling_arrays(self.pixels, self.positions)}
+        for k, (weight, bias) in enumerate(zip(self.network.weights, self.network.biases, strict=True)):
+            arrays |= {f"weight{k}": weight, f"bias{k}": bias}
+        return asdict(self.calibrator), arrays
+
+    @classmethod
+    def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> MLPCalibration:
+        """Restore a calibration; PyTorch is not needed."""
+        calibrator = MLP(int(table["seed"]), float(table["dropout"]))
+        usable, unused = seen_by_all(data, cls.method)
+        held_out = arrays["held_out"]
+        if held_out.dtype != np.bool_ or held_out.shape != (len(usable),) or held_out.all() or not held_out.any():
+            raise ValueError(f"held_out must be {len(usable)} booleans, some true and some false")
+        pixels, positions = scalings(arrays, data)
+        shapes = list(enumerate(layer_shapes(2 * len(data.cameras))))
+        network = Network(
+            tuple(finite_column(arrays, f"weight{k}", shape) for k, shape in shapes),
+            tuple(finite_column(arrays, f"bias{k}", shape[1:]) for k, shape in shapes),
+        )
+        return cls(calibrator, data, unused, held_out, pixels, positions, network)

@@ -1,0 +1,197 @@
+"""Which points train and which judge: at random, a shot left out, a plane of a lattice left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Dataset, Floats
+from implicam.errors import DatasetError, UsageError
+
+Item = TypeVar("Item")
+
+RANDOM, SHOT = "random", "shot"
+AXES = "xyz"
+_PLANES = {f"plane {axis}": axis for axis in AXES}  # kind of a split whose held-out points share a coordinate
+
+THIN = 1e-3
+"""How far the points of one plane may differ in its coordinate, as a share of the largest extent of all points."""
+PER_PLANE = 4
+"""Fewer points than this on a plane, on average, are no lattice: random positions fall together too."""
+FILLED = 1 / 8
+"""The least share of the crossings of the planes of two axes that holds points."""
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Known points to train on, and known points to judge by; nobody trains on those.
+
+    kind: RANDOM, SHOT or `plane x`, `plane y`, `plane z`. left_out: the shot, or the plane as `z = 3`; empty where
+    points were held out at random. seed: of the draw, and the number of the shot or plane. all_others: nothing was
+    drawn, everything else trains.
+    """
+
+    kind: str
+    train: Dataset
+    held_out: Dataset
+    seed: int
+    left_out: str = ""
+    all_others: bool = False
+
+    @property
+    def cell(self) -> tuple[str, int]:
+        """Equal for the splits that one mean is taken over: the same kind, the same number of points drawn."""
+        return self.kind, 0 if self.all_others else len(self.train)
+
+
+def plane_of(kind: str) -> str:
+    """The coordinate that the held-out points of this kind of split share, or ""."""
+    return _PLANES.get(kind, "")
+
+
+def random_splits(data: Dataset, sizes: Sequence[int], *, seeds: int, check: Dataset | None = None) -> list[Split]:
+    """`seeds` draws of each number of points; the rest is held out, or all of `check`.
+
+    No split is drawn twice: neither for the same size again, nor where all points are taken.
+    """
+    if seeds < 1 or not sizes:
+        raise _nothing_to_compare()
+    if check is None and max(sizes) >= len(data):
+        raise UsageError(
+            f"{max(sizes)} of {len(data)} points leave none to evaluate on.",
+            fix=f"choose numbers below {len(data)}, or give another dataset with --check",
+        )
+    splits = []
+    for size in dict.fromkeys(sizes):
+        for seed in range(1 if size == len(data) else seeds):
+            train, rest = (data, data) if size == len(data) else data.split(size, seed=seed)
+            splits.append(Split(RANDOM, train, rest if check is None else check, seed))
+    return splits
+
+
+def shot_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int | None = None) -> list[Split]:
+    """Each shot (a board, a plate) held out in turn; all others train, or so many points drawn from them.
+
+    most: hold out no more shots than this, drawn at random. A UsageError where a shot is a single point: leaving it
+    out is a random split, only slower.
+    """
+    names = [str(name) for name in np.unique(data.shots)]
+    if len(names) < 2:
+        raise DatasetError(
+            f"dataset {data.name!r} has one shot only, so no shot can be left out.",
+            fix="leave out --leave-out, or give the points of each exposure their own shot in points.csv; where they "
+            "stand on a lattice, --lattice leaves its planes out",
+        )
+    if len(names) == len(data):
+        raise UsageError(
+            f"each of the {len(data)} points of {data.name!r} is a shot of its own, so leaving a shot out leaves out "
+            "one point.",
+            why="only points of one exposure (a board, a plate) share errors that a random split would hide",
+            fix="leave out --leave-out: random splits are as honest here",
+        )
+    held_out = [(name, data.shots == name) for name in _at_most(most, names)]
+    return _left_out(SHOT, data, held_out, sizes)
+
+
+def plane_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int | None = None) -> list[Split]:
+    """Each inner plane of a lattice of known positions held out in turn, along x, y and z of the world.
+
+    The others train, or so many points drawn from them. The outer planes stay: to measure them is to extrapolate.
+    most: hold out no more planes along an axis than this, drawn at random. UsageError where there is no lattice.
+    """
+    splits = []
+    for kind, axis in _PLANES.items():
+        planes = lattice_planes(data.xyz, AXES.index(axis))
+        inner = [] if planes is None else [(f"{axis} = {value:g}", on) for value, on in planes[1:-1]]
+        splits += _left_out(kind, data, _at_most(most, inner), sizes)
+    if not splits:
+        raise _no_lattice(data)
+    return splits
+
+
+def lattice_planes(xyz: Floats, axis: int) -> list[tuple[float, NDArray[np.bool_]]] | None:
+    """The planes of a lattice across one axis, by rising coordinate: its value, and (n,) which points lie on it.
+
+    None where the coordinates (n, 3) do not gather at few values: a plane is thinner than THIN and has PER_PLANE points
+    on average; and where they do, but meet those of another axis at few of their crossings only (FILLED): these are
+    the rows of a lattice that is turned about the third axis. Planes are looked for across the axes of the world.
+    """
+    gathered = [_gathered(xyz, k) for k in range(3)]
+    mine = gathered[axis]
+    if mine is None:
+        return None
+    for other in (found for k, found in enumerate(gathered) if k != axis and found is not None):
+        crossings = (mine.max() + 1) * (other.max() + 1)
+        if len(np.unique(mine * (other.max() + 1) + other)) < FILLED * crossings:
+            return None
+    return [(float(np.median(xyz[mine == k, axis])), mine == k) for k in range(mine.max() + 1)]
+
+
+def _gathered(xyz: Floats, axis: int) -> NDArray[np.intp] | None:
+    """(n,) which of few values the coordinate has, counted from the least; None where it has many."""
+    if not len(xyz):
+        return None
+    values = xyz[:, axis]
+    tolerance = THIN * float(np.ptp(xyz, axis=0).max())
+    order = np.argsort(values)
+    label = np.empty(len(values), dtype=np.intp)
+    label[order] = np.cumsum(np.diff(values[order], prepend=values[order[0]]) > tolerance)
+    count = label.max() + 1
+    lowest, highest = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(lowest, label, values)
+    np.maximum.at(highest, label, values)
+    too_thick = (highest - lowest).max() > tolerance
+    return None if too_thick or len(values) < PER_PLANE * count else label
+
+
+def _left_out(
+    kind: str, data: Dataset, held_out: list[tuple[str, NDArray[np.bool_]]], sizes: Sequence[int] | None
+) -> list[Split]:
+    """By number of points, then by what is left out, which has the same number in every cell."""
+    if sizes is not None and not sizes:
+        raise _nothing_to_compare()
+    splits = []
+    for size in (None,) if sizes is None else tuple(dict.fromkeys(sizes)):
+        for i, (name, out) in enumerate(held_out):
+            train = _drawn(data.select(~out), size, i, name)
+            splits.append(Split(kind, train, data.select(out), i, name, size is None))
+    return splits
+
+
+def _drawn(others: Dataset, size: int | None, seed: int, left_out: str) -> Dataset:
+    if size is None or size == len(others):
+        return others
+    if size > len(others):
+        raise UsageError(
+            f"{size} points cannot be drawn where {left_out} is left out: {len(others)} others are there.",
+            fix=f"choose numbers up to {len(others)} with --train",
+        )
+    return others.split(size, seed=seed)[0]
+
+
+def _at_most(most: int | None, items: list[Item]) -> list[Item]:
+    if most is None or most >= len(items):
+        return items
+    if most < 1:
+        raise _nothing_to_compare()
+    return [items[i] for i in np.sort(np.random.default_rng(0).permutation(len(items))[:most])]
+
+
+def _nothing_to_compare() -> UsageError:
+    return UsageError("comparing needs at least one method, one number of points and one seed.")
+
+
+def _no_lattice(data: Dataset) -> DatasetError:
+    found = [len(np.unique(values)) for values in data.xyz.T]
+    return DatasetError(
+        f"the {len(data)} known positions of {data.name!r} stand on no lattice with an inner plane.",
+        why=f"x, y and z have {found[0]}, {found[1]} and {found[2]} values; a lattice has three or more, each shared "
+        f"by {PER_PLANE} points or more within {THIN:g} of the extent. Planes are looked for across x, y and z of the "
+        "world only, not across a lattice that stands at an angle",
+        fix="leave out --lattice: away from a lattice a random split flatters nobody; or --leave-out shot, where each "
+        "plane is a shot",
+    )

@@ -1,0 +1,210 @@
+"""Every method on every split: fit, measure, judge, and the error where all methods measured."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from implicam.calibrators import Calibration, Calibrator
+from implicam.compare.splits import RANDOM, Split
+from implicam.dataset import Dataset
+from implicam.errors import DatasetError, FitError, ImplicamError, NumericalError, UsageError
+from implicam.evaluate import Evaluation, evaluate
+from implicam.progress import Progress, silent
+
+NAN = float("nan")
+_WHAT = "comparing"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One method on one split. Lengths in the dataset's unit.
+
+    known: points trained on. seed, split, left_out, all_others: those of the `Split`.
+    limit: rms of the Cramer-Rao limit at the same points, NaN where unknown. coverage_95: per axis, pooled;
+    ellipsoid_95: of the 3D ellipsoid. held_out points were to be measured, and unmeasured of them could not be.
+    rmse_common: over the `common` held-out points that every method measured (`compare_on` says which methods count).
+    fit_seconds: of this fit; where a method fits all splits at once, its share. failure: why there are no numbers.
+    """
+
+    method: str
+    known: int
+    seed: int
+    rmse: float = NAN
+    median: float = NAN
+    limit: float = NAN
+    coverage_95: float = NAN
+    ellipsoid_95: float = NAN
+    nees: float = NAN
+    held_out: int = 0
+    unmeasured: int = 0
+    fit_seconds: float = NAN
+    failure: str = ""
+    split: str = RANDOM
+    left_out: str = ""
+    all_others: bool = False
+    rmse_common: float = NAN
+    common: int = 0
+
+
+@runtime_checkable
+class FitsMany(Protocol):
+    """A method that fits many datasets in less time together than one by one."""
+
+    def fit_many(self, datasets: Sequence[Dataset], progress: Progress = silent) -> Sequence[Calibration | FitError]:
+        """A calibration of each dataset, in order, or why it cannot be had."""
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """A trial, and the squared error of each held-out point that was measured, by name."""
+
+    trial: Trial
+    squared: Mapping[str, float]
+
+
+def compare_on(splits: Sequence[Split], methods: Mapping[str, Calibrator], progress: Progress = silent) -> list[Trial]:
+    """Fit and judge every method on every split; trials in the order of the splits, then of the methods.
+
+    A fit that fails is a trial with a reason. Where methods measure different points, their errors are those of easy
+    and of hard points, so each trial also has the error at the points that all of them measured. A method that measured
+    nothing in a cell (all splits of one kind and number of points) has no say in that cell; one that measured
+    something has a say in every split of it, so that the means over the splits are of the same points, too.
+    """
+    if not methods or not splits:
+        raise UsageError("comparing needs at least one method, one number of points and one seed.")
+    _check_lengths(splits)
+    total, done = len(methods) * len(splits), 0
+    trials: list[Trial] = []
+    for _, group in groupby(splits, key=lambda split: split.cell):
+        cell = list(group)
+        judged = {}
+        for name, method in methods.items():
+            judged[name] = _judge_cell(name, method, cell, _Counting(progress, done, total))
+            done += len(cell)
+        trials += _with_common(judged)
+    progress(_WHAT, total, total)
+    return trials
+
+
+@dataclass(frozen=True)
+class _Counting:
+    """Progress of one cell, counted in fits of the whole comparison."""
+
+    progress: Progress
+    before: int
+    total: int
+
+    def __call__(self, done: int) -> None:
+        self.progress(_WHAT, self.before + done, self.total)
+
+
+def _check_lengths(splits: Sequence[Split]) -> None:
+    """Before the work: known positions are there, in one unit."""
+    for split in splits:
+        _ = split.train.positions, split.held_out.positions
+        if split.train.length_unit != split.held_out.length_unit:
+            raise DatasetError(
+                f"{split.held_out.name!r} is in {split.held_out.length_unit}, and {split.train.name!r} is in "
+                f"{split.train.length_unit}.",
+                why="errors are differences of positions, so both must be in one length unit",
+                fix="convert the known positions of one of them",
+            )
+
+
+def _judge_cell(name: str, method: Calibrator, cell: Sequence[Split], counting: _Counting) -> list[_Judged]:
+    if isinstance(method, FitsMany):
+        counting(0)
+        start = time.perf_counter()
+        fits = _fit_many(method, [split.train for split in cell], counting.progress)
+        seconds = (time.perf_counter() - start) / len(cell)
+        return [_judge(name, split, fit, seconds) for split, fit in zip(cell, fits, strict=True)]
+    judged = []
+    for i, split in enumerate(cell):
+        counting(i)
+        start = time.perf_counter()
+        fit = _fit(method, split.train)
+        judged.append(_judge(name, split, fit, time.perf_counter() - start))
+    return judged
+
+
+# Data that one method cannot use are its failure, not the end of the comparison. A mistake in its code is no result.
+_CANNOT = (FitError, NumericalError, DatasetError)
+
+
+def _fit(method: Calibrator, train: Dataset) -> Calibration | ImplicamError:
+    try:
+        return method.fit(train)
+    except _CANNOT as error:
+        return error
+    except np.linalg.LinAlgError as error:
+        return NumericalError(f"the equations have no solution: {error}.")
+
+
+def _fit_many(method: FitsMany, datasets: list[Dataset], progress: Progress) -> Sequence[Calibration | ImplicamError]:
+    try:
+        return method.fit_many(datasets, progress)
+    except _CANNOT as error:
+        return [error] * len(datasets)
+
+
+def _judge(name: str, split: Split, fit: Calibration | ImplicamError, seconds: float) -> _Judged:
+    known: dict[str, Any] = {"split": split.kind, "left_out": split.left_out, "all_others": split.all_others}
+    blank = Trial(name, len(split.train), split.seed, **known)
+    if isinstance(fit, ImplicamError):
+        return _Judged(replace(blank, failure=fit.what), {})
+    try:
+        evaluation = evaluate(fit, split.held_out, regions=False)
+    except (FitError, NumericalError) as error:
+        return _Judged(replace(blank, failure=error.what), {})
+    trial = replace(trial_of(evaluation, name, len(split.train), split.seed, seconds), **known)
+    return _Judged(trial, _squared(evaluation))
+
+
+def trial_of(evaluation: Evaluation, name: str, known: int, seed: int, seconds: float) -> Trial:
+    """The numbers of an evaluation that a comparison shows."""
+    overall = evaluation.coverage.overall
+    level = overall.level(0.95)
+    return Trial(
+        name,
+        known,
+        seed,
+        rmse=overall.rmse,
+        median=overall.median_error,
+        limit=overall.rmse / overall.rmse_over_limit,
+        coverage_95=level.pooled.value,
+        ellipsoid_95=level.ellipsoid.value,
+        nees=overall.nees.value,
+        held_out=len(evaluation.data),
+        unmeasured=overall.unmeasured,
+        fit_seconds=seconds,
+    )
+
+
+def _squared(evaluation: Evaluation) -> dict[str, float]:
+    squared = ((evaluation.measurement.xyz - evaluation.true_xyz) ** 2).sum(axis=1)
+    names = map(str, evaluation.data.points)
+    return {name: float(value) for name, value in zip(names, squared, strict=True) if np.isfinite(value)}
+
+
+def _with_common(judged: Mapping[str, list[_Judged]]) -> list[Trial]:
+    """The trials of a cell by split, each with the error at the points that all methods measured."""
+    have_a_say = [k for k, trials in enumerate(judged.values()) if any(one.squared for one in trials)]
+    trials: list[Trial] = []
+    for row in zip(*judged.values(), strict=True):
+        measured = [row[k].squared.keys() for k in have_a_say]
+        common = set.intersection(*map(set, measured)) if measured else set()
+        trials += [_at(one, common) if k in have_a_say else one.trial for k, one in enumerate(row)]
+    return trials
+
+
+def _at(one: _Judged, common: set[str]) -> Trial:
+    if not common:
+        return one.trial
+    mean = float(np.mean([one.squared[name] for name in sorted(common)]))
+    return replace(one.trial, rmse_common=mean**0.5, common=len(common))
