@@ -5,8 +5,8 @@
 points: the same known points for both; lenses inside the model family, and with errors outside of it (0.5 px rms).
 boards: the paper's budgets of checkerboard pictures, simulated corners (0.2 px), 40 known points to align. hard: 20
 rigs with bad corners (0.5 px noise, lens errors of 1 px, 20 % missing, 5 % wrong). photographs: rendered boards, 5 %
-noise and 1.5 px blur, through the detector. *limit*: Cramer-Rao with perfectly known cameras. ± and intervals: 95 %, over
-rigs.
+noise and 1.5 px blur, through the detector. *limit*: Cramer-Rao with perfectly known cameras. ± and intervals: over
+rigs, 95 %.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from implicam.calibrators import (
-    COMING,
     METHODS,
     Calibration,
     InverseGP,
@@ -379,9 +378,6 @@ def test_progress_starts_at_nothing_and_ends_at_all(case: Case) -> None:
 def test_options_are_checked_by_name() -> None:
     with pytest.raises(UsageError, match="not known \\(did you mean 'inverse-gp'"):
         calibrator("inverse_gp")
-    for method in COMING:
-        with pytest.raises(UsageError, match="not in this version yet"):
-            calibrator(method)
     with pytest.raises(UsageError, match="no kernel 'matern'"):
         InverseGP(kernel="matern")
     with pytest.raises(UsageError, match="no preset 'papre' \\(did you mean 'paper'"):

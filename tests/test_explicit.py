@@ -603,6 +603,24 @@ def test_wrong_views_are_rejected() -> None:
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.5
 
 
+def test_precise_boards_do_not_spoil_the_noise_of_other_views() -> None:
+    """Boards found to 0.01 px with lens errors of 0.3 px say nothing about the 0.2 px of a ball: variances add."""
+    rig = build_rig("bar6", seed=2, frame="random", lens_error=0.3, noise=0.01, cameras="2R")
+    boards = simulate_boards(rig, each_and_pairs(rig, 8, 5), seed=3)
+    ball = replace(rig, cameras=tuple(replace(camera, noise_sd=0.2) for camera in rig.cameras))
+    calibration = Explicit(boards=boards).fit(points(ball, 30, 5))
+    noise = calibration.residuals()["noise_px"]
+    assert all(sd > 0.03 for sd in noise.values())
+    others = points(ball, 200, 6)
+    _, found = calibration.map.views(others.observations)
+    np.testing.assert_allclose(
+        found, np.hypot(0.2, np.sqrt(np.array(list(noise.values())) ** 2 - 0.01**2))[None] + 0 * found
+    )
+    measured = calibration.measure(others.observations)
+    error = measured.xyz - others.truth.xyz
+    assert 1 < np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(measured.cov), error)) < 12
+
+
 # files and hostile input
 
 

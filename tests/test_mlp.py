@@ -40,11 +40,6 @@ def fitted(n: int = 60, **options: Any) -> MLPCalibration:
     return MLP(**options).fit(known(400).select(np.arange(n)))
 
 
-def some_network(inputs: int = 8, seed: int = 0) -> Network:
-    arrays = initial_weights(inputs, np.random.default_rng(seed))
-    return Network(tuple(arrays[::2]), tuple(bias[0] for bias in arrays[1::2]))
-
-
 def layers_of(network: Network, dropout: float = 0.0) -> Any:
     """The same network out of PyTorch's own parts, in float64."""
     parts: list[Any] = []

@@ -13,11 +13,15 @@
 from implicam.calibration_file import package_version
 from implicam.calibrators import (
     METHODS,
+    MLP,
     Calibration,
+    Explicit,
+    ExplicitCalibration,
     ForwardGP,
     ForwardGPCalibration,
     InverseGP,
     InverseGPCalibration,
+    MLPCalibration,
     calibrator,
     load_calibration,
 )
@@ -49,6 +53,7 @@ __version__ = package_version()
 
 __all__ = [
     "METHODS",
+    "MLP",
     "Calibration",
     "CalibrationFileError",
     "Camera",
@@ -56,6 +61,8 @@ __all__ = [
     "Dataset",
     "DatasetError",
     "Evaluation",
+    "Explicit",
+    "ExplicitCalibration",
     "FitError",
     "ForwardGP",
     "ForwardGPCalibration",
@@ -64,6 +71,7 @@ __all__ = [
     "InverseGP",
     "InverseGPCalibration",
     "KnownPositions",
+    "MLPCalibration",
     "Measurement",
     "MissingExtraError",
     "NumericalError",

@@ -23,14 +23,15 @@ METHODS: dict[str, tuple[type[Any], type[Any]]] = {
 """Method name -> (calibrator, calibration)."""
 
 DEFAULT_METHOD = ForwardGP.method
-COMING: tuple[str, ...] = ()
 
 
 def calibrator(method: str, **options: Any) -> Calibrator:
     """The calibrator of a method by name; options that are None are left at their default."""
     if method not in METHODS:
-        known = "not in this version yet" if method in COMING else f"not known{did_you_mean(method, METHODS)}"
-        raise UsageError(f"method {method!r} is {known}.", fix=f"this version has {', '.join(METHODS)}")
+        raise UsageError(
+            f"method {method!r} is not known{did_you_mean(method, METHODS)}.",
+            fix=f"the methods are {', '.join(METHODS)}",
+        )
     given = {key: value for key, value in options.items() if value is not None}
     known_options = [field.name for field in fields(METHODS[method][0])]
     for key in given:
@@ -58,7 +59,6 @@ def load_calibration(path: str | Path) -> Calibration:
 
 
 __all__ = [
-    "COMING",
     "DEFAULT_METHOD",
     "METHODS",
     "MLP",

@@ -1,6 +1,6 @@
 """mlp, the paper's neural network: the pixels of all cameras in, the position out.
 
-De Boi et al., "Implicit Multi-Camera System Calibration Using Gaussian Processes", section "Moving ball in a grid".
+De Boi et al., "Implicit Multi-Camera System Calibration Using Gaussian Processes", section "Moving Ball in Grid".
 Network: mlp_network.py; training: mlp_training.py. Inputs and outputs are standardised.
 
 Position: the network with every unit at work. Covariance: the spread of passes with random dropout. Dropout is a device

@@ -1,4 +1,4 @@
-"""The paper's network (De Boi et al., section "Moving ball in a grid"): 2 cameras -> 128 -> 128 -> 64 -> 3.
+"""The paper's network (De Boi et al., section "Moving Ball in Grid"): 2 cameras -> 128 -> 128 -> 64 -> 3.
 
 After each hidden layer a leaky ReLU and dropout. In NumPy and float64, so that measuring needs no PyTorch; training is
 in mlp_training.py.

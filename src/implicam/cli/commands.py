@@ -458,7 +458,10 @@ def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> Non
     rms = residuals["leave_one_out_rms"]
     show.line(f"{output}: {calibration.method} from {residuals['points_used']} points")
     within = ", ".join(f"{axis} {show.number(value)}" for axis, value in rms.items())
-    show.line(f"each left out in turn is predicted from the rest within {within} {unit} rms")
+    how = "each left out in turn is predicted from the rest"
+    if "held_out_points" in residuals:  # a method that is not refitted for each
+        how = f"the {residuals['held_out_points']} of them that it was not trained on are predicted"
+    show.line(f"{how} within {within} {unit} rms")
     show.notes(show.counted((entry.reason for entry in calibration.unused), "known point", "not used"))
     show.notes(notes)
 

@@ -58,7 +58,7 @@ def _curves(rows: Sequence[Row], unit: str, over: str) -> Any:
     return figure
 
 
-_LOOK: dict[str, Any] = {"capsize": 3, "ms": 5.5, "mec": "white", "mew": 0.6}
+_LOOK: dict[str, Any] = {"capsize": 3, "ms": 6.5, "mec": "white", "mew": 0.5}
 
 
 def _figure(width: float, height: float) -> Any:

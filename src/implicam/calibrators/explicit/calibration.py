@@ -105,7 +105,9 @@ class ExplicitCalibration:
     def map(self) -> RigMap:
         """The cameras, and how they measure."""
         fitted = self.fitted
-        return RigMap(fitted.trained, self.data.length_unit, fitted.frame, fitted.cameras, fitted.posterior)
+        return RigMap(
+            fitted.trained, self.data.length_unit, fitted.frame, fitted.cameras, fitted.posterior, misfit_adds=True
+        )
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure each point with the views it has, two or more: maximum likelihood."""

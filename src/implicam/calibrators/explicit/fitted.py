@@ -92,7 +92,7 @@ def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple
     network = calibrate_network(boards_of(data), family, progress)
     placed = _placed(data, network)
     posterior = _posterior(network, network.bundle.cameras, network.root)
-    measured = RigMap(data.observations, data.length_unit, _UNIT, network.cameras, posterior).measure(
+    measured = RigMap(data.observations, data.length_unit, _UNIT, network.cameras, posterior, misfit_adds=True).measure(
         placed.observations
     )
     first = data.observations.camera_names[network.cameras[0]]

@@ -19,7 +19,8 @@ from implicam.measurement import Measurement
 @dataclass(frozen=True, eq=False)
 class RigMap:
     """trained: what the cameras saw when they were fitted, all cameras; cameras: numbers of those that could be, in
-    the order of posterior.models; posterior: in the working frame; labels: how known positions are off, if they are."""
+    the order of posterior.models; posterior: in the working frame; labels: how known positions are off, if they are.
+    misfit_adds: residuals that are larger than the views state come from the lens models, and not from the views."""
 
     trained: Observations
     length_unit: str
@@ -27,6 +28,7 @@ class RigMap:
     cameras: tuple[int, ...]
     posterior: Posterior
     labels: Labels | None = None
+    misfit_adds: bool = False
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -89,6 +91,8 @@ class RigMap:
         usual, stated = self.posterior.models[c].noise, self._stated[self.cameras[c]]
         given = view_noise(observations)[:, k]
         corrected = given * (usual / stated) if np.isfinite(stated) else given
+        if self.misfit_adds and usual > stated:
+            corrected = np.sqrt(given**2 + usual**2 - stated**2)
         return np.where(np.isfinite(given) & (given > 0), corrected, usual)
 
     @cached_property
