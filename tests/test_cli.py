@@ -1097,3 +1097,35 @@ def test_killed_at_any_moment_the_old_or_the_new_is_there(victim: Victim, made: 
         assert real(victim.words, folder).code == 0
         assert state(folder, victim.target) == new
     assert in_time > 5
+
+
+def test_the_classical_way_on_the_command_line(made: Path, cli: Cli) -> None:
+    assert cli("simulate", "boards", "--target", "boards", "--cameras", "2R", "--seed", "1", "--pairs", "6").code == 0
+    ran = cli("calibrate", made / "rig", "--boards", "boards", "-o", "b.implicam")  # nobody means another method
+    assert ran.code == 0
+    assert ran.out.startswith("b.implicam: explicit from 40 points\neach left out in turn is predicted from the rest")
+    same = cli("calibrate", made / "rig", "--boards", "boards", "--align", "icp", "-o", "c.implicam", "--json").json
+    assert set(same["residuals"]["lens"]) == {"cam2", "cam3"}
+    told = cli("evaluate", "b.implicam", made / "rig" / "check", "--json").json
+    assert told["rows"][0]["rmse_over_limit"] < 3
+    alone = cli("calibrate", "boards", "--method", "explicit", "-o", "alone.implicam")
+    assert "Positions are in the frame of cam2" in alone.err
+    turned = cli("evaluate", made / "rig", "--cv", "4", "--boards", "boards", "--json").json
+    assert (turned["method"], turned["rows"][0]["n"]) == ("explicit", 40)
+    assert cli("calibrate", made / "rig", "--lens", "kannala-brandt", "-o", "k.implicam").out.startswith(
+        "k.implicam: explicit from 40 points"
+    )
+    for to, name in (("opencv", "b.yaml"), ("kalibr", "camchain.yaml"), ("colmap", "model"), ("dlt", "b.csv")):
+        ran = cli("export", "b.implicam", "--to", to, "-o", name)
+        assert ran.code == 0
+        assert ran.out.startswith(f"{name}: 2 cameras as ")
+    for name, more in (("b.yaml", []), ("camchain.yaml", []), ("model", ["--unit", "mm"]), ("b.csv", [])):
+        assert cli("import", name, "-o", "i.implicam", *more).code == 0
+        assert cli("measure", "i.implicam", made / "rig" / "check").code == 0
+
+
+def test_a_neural_network_says_what_its_numbers_are(made: Path, cli: Cli) -> None:
+    pytest.importorskip("torch")
+    ran = cli("calibrate", made / "rig", "--method", "mlp", "-o", "n.implicam")
+    assert "of them that it was not trained on are predicted within" in ran.out
+    assert "dropout" in ran.err

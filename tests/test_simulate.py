@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +14,20 @@ from scipy.stats import binom
 
 from implicam.dataset import Dataset
 from implicam.errors import UsageError
+from implicam.geometry import Pose
 from implicam.simulate import (
+    Optics,
     Rig,
     SimulatedCamera,
     ball_grid,
     build_rig,
+    each_and_pairs,
+    held_boards,
     moving_board,
     random_positions,
+    record,
     simulate,
+    simulate_boards,
     views,
     write_rig,
 )
@@ -341,3 +348,52 @@ def test_any_number_of_cameras(spec: str) -> None:
     data = simulate(rig, ball_grid(rig, (3, 3, 3)), seed=0)
     assert len(data.cameras) == int(spec.lstrip("bardome"))
     assert data.observations.seen.mean() > 0.9
+
+
+# boards held by hand
+
+
+def test_held_boards_are_seen_whole_by_their_group_and_by_nobody_else() -> None:
+    rig = build_rig("bar6", seed=5, lens_error=0.0)
+    groups = each_and_pairs(rig, 2, 1)
+    assert groups == [(c.name,) for c in rig.cameras for _ in range(2)] + [
+        ("cam1", "cam4"), ("cam4", "cam2"), ("cam2", "cam3"), ("cam3", "cam5"), ("cam5", "cam6"),
+    ]  # fmt: skip
+    target = held_boards(rig, groups, np.random.default_rng(0))
+    data = simulate_boards(rig, groups, seed=1)
+    assert data.known is None
+    assert data.extra["target"]["kind"] == "board"
+    assert data.extra["target"]["square"] == pytest.approx(13.29)
+    names = [camera.name for camera in rig.cameras]
+    for g, group in enumerate(groups):
+        rows = slice(88 * g, 88 * g + 88)
+        seen = data.observations.seen[rows]
+        np.testing.assert_array_equal(seen.all(axis=0), [name in group for name in names])
+        np.testing.assert_array_equal(seen.any(axis=0), seen.all(axis=0))
+        corners = target.xyz[rows].reshape(8, 11, 3)
+        for axis in (0, 1):
+            np.testing.assert_allclose(np.linalg.norm(np.diff(corners, axis=axis), axis=-1), 13.29)
+        assert target.facing is not None
+        away = np.cross(corners[0, 1] - corners[0, 0], corners[1, 0] - corners[0, 0])
+        np.testing.assert_allclose(away / np.linalg.norm(away), -target.facing[88 * g], atol=1e-12)
+
+
+def test_cameras_that_share_no_place_cannot_hold_a_board_together() -> None:
+    rig = build_rig("bar6", seed=5)
+    turned = replace(
+        rig.cameras[0],
+        camera_from_world=Pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)) @ rig.cameras[0].camera_from_world,
+    )
+    with pytest.raises(UsageError, match="no place was found where cam1, cam2 see"):
+        held_boards(replace(rig, cameras=(turned, rig.cameras[1])), [("cam1", "cam2")], np.random.default_rng(0))
+
+
+def test_only_the_cameras_of_the_group_take_a_photograph(tmp_path: Path) -> None:
+    rig = build_rig("bar6", seed=5, cameras="2R")
+    target = held_boards(rig, [("cam2",), ("cam3",), ("cam2", "cam3")], np.random.default_rng(0))
+    recorded = record(rig, target, seed=1, optics=Optics())
+    assert recorded.photographs == 4
+    recorded.write_photographs(tmp_path)
+    assert sorted(str(p.relative_to(tmp_path / "images")) for p in tmp_path.rglob("*.png")) == [
+        "cam2/held001.png", "cam2/held003.png", "cam3/held002.png", "cam3/held003.png",
+    ]  # fmt: skip

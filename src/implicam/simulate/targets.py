@@ -95,27 +95,19 @@ def held_boards(
     return Target("boards", points, shots, np.concatenate(positions), np.concatenate(facing), corners, takes)
 
 
-TRIES = 4000
+TRIES = 1500
+"""Places and tilts that are tried for a board; of neighbours on a bar one in a hundred will do."""
 
 
 def _held(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Corners (k, 3) of a board that all the cameras see, and the side (3,) it shows."""
     middle = np.mean([camera.camera_from_world.centre for camera in cameras], axis=0)
-    diagonal = float(np.linalg.norm(np.ptp(flat, axis=0)))
-    for _ in range(TRIES):
-        camera = cameras[int(rng.integers(len(cameras)))]
-        pixel = rng.uniform(0.05, 0.95, size=2) * [camera.width - 1, camera.height - 1]
-        rays, valid = camera.lens.ray_from_pixel(pixel[None])
-        if not valid[0]:
-            continue
-        reach = camera.lens.fx * diagonal / (rng.uniform(0.25, 0.8) * camera.width)
-        centre = camera.camera_from_world.centre + reach * (rays[0] @ camera.camera_from_world.rotation)
+    up = -cameras[0].camera_from_world.rotation[1]
+    for centre in _places(float(np.linalg.norm(np.ptp(flat, axis=0))), cameras, rng):
         turn = rng.normal(size=3) * [1.0, 1.0, 0.4]  # tilted more than turned in its own plane
         turn *= np.radians(rng.uniform(0, 50)) / np.linalg.norm(turn)
         # a board's x runs to the right and y down as seen from its front: its z looks away from the cameras
-        frame = look_at(middle, centre, -cameras[0].camera_from_world.rotation[1]).rotation.T @ rotation_from_vector(
-            turn
-        )
+        frame = look_at(middle, centre, up).rotation.T @ rotation_from_vector(turn)
         xyz, towards = flat @ frame.T + centre, -frame[:, 2]
         if all(_sees(each, xyz, towards) for each in cameras):
             return xyz, towards
@@ -123,6 +115,22 @@ def _held(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random.Gener
         f"no place was found where {', '.join(c.name for c in cameras)} see a whole board together.",
         fix="choose cameras that look at the same place, or a smaller board",
     )
+
+
+def _places(diagonal: float, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> Floats:
+    """(n, 3) places for a board's middle, of `TRIES` those that all cameras see."""
+    chosen = rng.integers(len(cameras), size=TRIES)
+    part, span = rng.uniform(0.05, 0.95, size=(TRIES, 2)), rng.uniform(0.25, 0.8, size=TRIES)
+    places = np.full((TRIES, 3), np.nan)
+    for c, camera in enumerate(cameras):
+        mine = chosen == c
+        rays, _ = camera.lens.ray_from_pixel(part[mine] * [camera.width - 1, camera.height - 1])
+        reach = camera.lens.fx * diagonal / (span[mine] * camera.width)
+        world = rays @ camera.camera_from_world.rotation
+        places[mine] = camera.camera_from_world.centre + reach[:, None] * world
+    places = places[np.isfinite(places).all(axis=1)]
+    seen = np.all([camera.pixel_from_world(places)[1] for camera in cameras], axis=0)
+    return np.asarray(places[seen], dtype=np.float64)
 
 
 def _sees(camera: SimulatedCamera, xyz: Floats, towards: Floats) -> bool:
