@@ -17,6 +17,7 @@ from implicam import calibration_file
 from implicam.calibrators import (
     DEFAULT_METHOD,
     METHODS,
+    MLP,
     Calibration,
     Explicit,
     ForwardGP,
@@ -671,10 +672,14 @@ def compare_command(
     show.notes(show.compare_failures(trials))
 
 
-SHOWN_VARIANTS = {ForwardGP.method: ("none",), InverseGP.method: ("paper",)}
+SHOWN_VARIANTS = {ForwardGP.method: ("none",), InverseGP.method: ("paper",), MLP.method: ("no-dropout",)}
 """Variants that stand beside their method unless --methods names others."""
 
-NEEDED = {"inverse-gp:paper": ("gpytorch", "paper"), "mlp": ("torch", "mlp")}
+NEEDED = {
+    "inverse-gp:paper": ("gpytorch", "paper"),
+    "mlp": ("torch", "mlp"),
+    "mlp:no-dropout": ("torch", "mlp"),
+}
 """Method or variant -> the library it needs, and the extra that brings it."""
 
 
@@ -699,6 +704,8 @@ def _named_method(name: str) -> Any:
         return calibrator(method)
     if (method, variant) == (InverseGP.method, "paper"):
         return calibrator(method, preset=variant)
+    if (method, variant) == (MLP.method, "no-dropout"):
+        return calibrator(method, dropout=0.0)
     return calibrator(method, **{"kernel" if method == InverseGP.method else "lens": variant})
 
 
