@@ -1,13 +1,14 @@
 # make demo   the main job on a simulated rig          make test   every test
 # make check  all that CI checks                        make bench  speed against the limits
-# make real   the table of docs/real-data.md            make rigs   the table of docs/choose.md
+# make real   the table of docs/real-data.md            make rigs   the tables of docs/choose.md on forward-gp
+# make methods   all methods side by side, the first table of docs/choose.md
 # make clean  start over
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-slow check lint bench real rigs clean
+.PHONY: demo test test-slow check lint bench real rigs methods clean
 
 demo: $(VENV)/.demo
 	$(BIN)/implicam demo
@@ -35,6 +36,9 @@ rigs: $(VENV)/.dev
 
 real: $(VENV)/.dev
 	$(BIN)/python benchmarks/real_data.py ../shared/real
+
+methods: $(VENV)/.dev
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/methods.py ../shared/real
 
 clean:
 	rm -rf $(VENV) implicam-demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -55,12 +55,16 @@ def real(folder):
         yield f"{name}, inner plane of z left out, {min(n, fewest)}", cut
 
 
+def short(x):
+    return f"{x:.1g}" if x < 9.5 else f"{round(x, -1):.0f}"
+
+
 def cell(row):
     if not row.seeds or not np.isfinite(row.mean["rmse"]):
         return "no result"
     text = f"{row.mean['rmse']:.3g}"
     if np.isfinite(row.standard_error["rmse"]):
-        text += f" ± {row.standard_error['rmse']:.1g}"
+        text += f" ± {short(row.standard_error['rmse'])}"
     text += f" / {100 * row.mean['ellipsoid_95']:.0f} %"
     return text + (f", {100 * row.mean['measured']:.0f} % measured" if row.mean["measured"] < 0.995 else "")
 

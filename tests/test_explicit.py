@@ -31,6 +31,7 @@ from implicam.exchange import Rig as ExchangeRig
 from implicam.geometry import Pose, candidate_rays, rotation_from_vector
 from implicam.simulate import (
     Rig,
+    ball_grid,
     build_rig,
     each_and_pairs,
     held_boards,
@@ -486,9 +487,118 @@ def test_icp_is_the_closed_form_where_the_names_are_right() -> None:
     pose = Pose(rotation_from_vector([0.3, 0.2, -0.5]), np.array([10.0, 20.0, 30.0]))
     measured = pose.apply(known)[rng.permutation(60)] + rng.normal(scale=0.01, size=(60, 3))
     near = Pose(rotation_from_vector([0.03, 0.0, 0.02]) @ pose.rotation, pose.translation + 2.0)
-    found = icp(known, measured, near)
+    found, left = icp(known, measured, near)
+    assert left < 0.03
     np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-3)
     np.testing.assert_allclose(found.translation, pose.translation, atol=0.02)
+
+
+def test_icp_needs_no_names() -> None:
+    rig, data = pair()
+    known = points(rig, 30, 5)
+    mixed = np.random.default_rng(3).permutation(30)
+    renamed = replace(known, known=replace(known.positions, xyz=known.xyz[mixed], extra={}))
+    others = points(rig, 40, 6)
+    expected = from_boards().measure(others.observations)
+    found = Explicit(boards=data, align="icp").fit(renamed).measure(others.observations)
+    np.testing.assert_allclose(found.xyz, expected.xyz, atol=1e-6)
+    np.testing.assert_allclose(found.cov, expected.cov, rtol=1e-6, atol=1e-12)
+    with pytest.raises(FitError, match="contradict each other"):
+        Explicit(boards=data).fit(renamed)
+    lattice = simulate(rig, ball_grid(rig, (3, 3, 4)), seed=4)  # turned by half a turn it is the same
+    turned = replace(
+        lattice, known=replace(lattice.positions, xyz=lattice.xyz[np.random.default_rng(3).permutation(36)], extra={})
+    )
+    with pytest.raises(FitError, match="in more than one way"):
+        Explicit(boards=data, align="icp").fit(turned)
+    named = Explicit(boards=data, align="icp").fit(lattice).measure(others.observations)
+    assert np.sqrt(np.mean((named.xyz - others.truth.xyz) ** 2)) < 0.5
+
+
+def test_cameras_that_hardly_meet_have_error_bars_that_say_so() -> None:
+    """Two shared boards only: errors of lenses and poses are far larger than those of the pixels."""
+    distances = []
+    for seed in range(6):
+        rig = build_rig("stereo", seed=seed, frame="random", lens_error=0.0)
+        boards = simulate_boards(rig, each_and_pairs(rig, 2, 2), seed=seed)
+        others = points(rig, 100, 900 + seed)
+        measured = (
+            Explicit(boards=boards, lens="brown-conrady").fit(points(rig, 30, 800 + seed)).measure(others.observations)
+        )
+        ok = measured.measured
+        error = (measured.xyz - others.truth.xyz)[ok]
+        distances.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(measured.cov[ok]), error)))
+    assert 1.8 < np.mean(distances) < 4.5  # 3
+
+
+def test_a_wrong_square_is_told_with_its_size() -> None:
+    rig, data = pair()
+    known = points(rig, 40, 5)
+    assert not any("contradict" in note for note in Explicit(boards=data).fit(known).notes())
+    target = data.extra["target"]
+
+    def with_square(factor: float) -> Dataset:
+        return replace(data, extra={"target": {**target, "square": target["square"] * factor}})
+
+    notes = Explicit(boards=with_square(1.01)).fit(known).notes()
+    (told,) = [note for note in notes if "contradict each other" in note]
+    assert float(told.split("known points are ")[1].split(" times")[0]) == pytest.approx(1 / 1.01, abs=2e-3)
+    with pytest.raises(FitError, match="contradict each other") as caught:
+        Explicit(boards=with_square(10.0)).fit(known)
+    assert float(caught.value.why.split("known points are ")[1].split(" times")[0]) == pytest.approx(0.1, rel=0.01)
+
+
+def test_boards_may_be_in_another_unit() -> None:
+    rig, data = pair()
+    target = data.extra["target"]
+    metres = replace(data, length_unit="m", extra={"target": {**target, "square": target["square"] / 1000}})
+    others = points(rig, 30, 6).observations
+    a = Explicit(boards=metres).fit(points(rig, 30, 5)).measure(others)
+    np.testing.assert_allclose(a.xyz, from_boards().measure(others).xyz, atol=1e-6)
+
+
+def test_corners_of_a_board_share_its_declared_error() -> None:
+    """A board on a slide that is off by 0.5 mm as a whole: six errors, not five hundred."""
+    distances = []
+    for seed in range(5):
+        rig = build_rig("bar6", seed=seed, frame="random", lens_error=0.0, cameras="2R")
+        boards = simulate_boards(rig, each_and_pairs(rig, 8, 5), seed=seed)
+        known = simulate(rig, moving_board(rig, positions=6), seed=seed, robot_noise=0.5)
+        others = points(rig, 60, 900 + seed)
+        measured = Explicit(boards=boards).fit(known).measure(others.observations)
+        error = measured.xyz - others.truth.xyz
+        distances.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(measured.cov), error)))
+    assert 1.0 < np.mean(distances) < 7.0  # 3; 16 when each corner counted as a point of its own
+
+
+def test_boards_alone_hold_nothing_out() -> None:
+    calibration = Explicit().fit(fisheyes()[1])
+    assert calibration.residuals()["held_out"] == "the corners of the boards are measured"
+    with pytest.raises(UsageError, match="made without known points"):
+        calibration.refit(calibration.data)
+    with pytest.raises(UsageError, match="align 'icp' is for boards"):
+        Explicit(align="icp").fit(points(fisheyes()[0], 30, 1))
+
+
+def test_small_boards_end_in_the_pose_that_all_cameras_see() -> None:
+    """A small board: one camera cannot tell a tilt from its mirror image; two can."""
+    for seed in range(3):
+        rig = build_rig("bar6", seed=seed, frame="random", lens_error=0.0, cameras="2R")
+        boards = simulate_boards(rig, [("cam2", "cam3")] * 15, seed=seed, corners=(4, 5), square=14.0)
+        others = points(rig, 60, 900 + seed)
+        calibration = Explicit(boards=boards).fit(points(rig, 30, 800 + seed))
+        assert len(calibration.rejected) <= 2
+        measured = calibration.measure(others.observations)
+        error = measured.xyz - others.truth.xyz
+        assert np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(measured.cov), error)) < 8
+
+
+def test_a_shifted_lens_is_no_wrong_lens() -> None:
+    rig = build_rig("stereo", seed=1, frame="random", lens_error=0.0)
+    shifted = replace(rig, cameras=tuple(replace(c, lens=replace(c.lens, cx=c.lens.cx + 250.0)) for c in rig.cameras))
+    others = points(shifted, 100, 6)
+    overall = evaluate(Explicit().fit(points(shifted, 35, 5)), others).coverage.overall
+    assert overall.rmse_over_limit < 1.35
 
 
 def test_the_error_of_the_alignment_is_in_the_error_bars() -> None:
@@ -695,6 +805,11 @@ def spoilt_target(target: dict[str, Any] | None) -> Dataset:
     [
         (None, "nothing says where the corners"),
         ({"kind": "board", "rows": 8, "columns": 11}, "does not describe a board"),
+        ({"kind": "board", "rows": -8, "columns": -11, "square": 13.0}, "rows = -8 must be a whole number"),
+        ({"kind": "board", "rows": 8.5, "columns": 11, "square": 13.0}, "rows = 8.5 must be a whole number"),
+        ({"kind": "board", "rows": 8, "columns": 11, "square": float("nan")}, "square = nan must be a length"),
+        ({"kind": "board", "rows": 8, "columns": 11, "square": 0.0}, "square = 0.0 must be a length"),
+        ({"kind": "dots"}, "is no board, or not there"),
         ({"kind": "board", "rows": "eight", "columns": 11, "square": 13.0}, "does not describe a board"),
         ({"kind": "board", "rows": 4, "columns": 5, "square": 13.0}, "is no corner of a board of 4 x 5"),
     ],
@@ -707,7 +822,7 @@ def test_a_board_that_is_not_described_is_a_clear_error(target: dict[str, Any] |
 def test_boards_of_other_cameras_or_sizes_are_a_clear_error() -> None:
     rig, data = pair()
     other = build_rig("stereo", seed=0)
-    with pytest.raises(DatasetError, match="have no camera"):
+    with pytest.raises(FitError, match="share 1 camera; a position takes two"):
         Explicit(boards=data).fit(points(other, 20, 1))
     cameras = tuple(replace(c, width=640, height=400) for c in data.observations.cameras)
     uv = data.observations.uv / 2

@@ -26,6 +26,7 @@ from implicam.calibrators import (
     load_calibration,
 )
 from implicam.calibrators.explicit import calibration_of, rig_of
+from implicam.calibrators.explicit.boards import has_boards
 from implicam.calibrators.explicit.lenses import FAMILIES
 from implicam.cli import show
 from implicam.compare import (
@@ -42,7 +43,7 @@ from implicam.dataset import Dataset, folder_files, read_dataset, write_dataset
 from implicam.dataset.folder import IMAGES
 from implicam.errors import DatasetError, UsageError, import_extra
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
-from implicam.exchange import FORMATS, export_cameras, import_cameras
+from implicam.exchange import FORMATS, UNKNOWN, export_cameras, import_cameras
 from implicam.files import replacing, toml_text
 from implicam.images import PATTERN
 from implicam.simulate import (
@@ -431,8 +432,11 @@ def calibrate_command(
     data = _read(dataset, unit, cameras, without)
     if points is not None and points != len(data):
         data, _ = data.split(points, seed=seed)
+    wanted = _Wanted(method, lens, kernel, preset, seed, boards, align)
+    if data.known is None and has_boards(data) and not wanted.given:
+        wanted = replace(wanted, method=Explicit.method)  # nothing else can be made of boards
     with show.progress(json) as progress:
-        calibration = _Wanted(method, lens, kernel, preset, seed, boards, align).calibrator().fit(data, progress)
+        calibration = wanted.calibrator().fit(data, progress)
     calibration.save(output)
     _tell_calibration(calibration, output, json)
 
@@ -460,6 +464,8 @@ def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> Non
     show.line(f"{output}: {calibration.method} from {residuals['points_used']} points")
     within = ", ".join(f"{axis} {show.number(value)}" for axis, value in rms.items())
     how = "each left out in turn is predicted from the rest"
+    if "held_out" in residuals:
+        how = residuals["held_out"]
     if "held_out_points" in residuals:  # a method that is not refitted for each
         how = f"the {residuals['held_out_points']} of them that it was not trained on are predicted"
     show.line(f"{how} within {within} {unit} rms")
@@ -830,7 +836,8 @@ def import_command(
 ) -> None:
     """Make a calibration of another program's cameras, to measure with them and to check them."""
     _must_be_calibration(output)
-    rig = import_cameras(cameras, kind, unit=unit)
+    rig = import_cameras(cameras, kind)
+    rig = rig.in_unit(unit) if unit and rig.length_unit != UNKNOWN else import_cameras(cameras, kind, unit=unit)
     calibration = calibration_of(rig, cameras.stem, noise)
     calibration.save(output)
     if json:

@@ -98,9 +98,14 @@ def as_boards(data: Dataset, target: Target) -> Dataset:
 
 
 def each_and_pairs(rig: Rig, each: int, pairs: int) -> list[tuple[str, ...]]:
-    """The paper's budget: `each` pictures by every camera alone, and `pairs` by every two neighbours on the bar."""
+    """The paper's budget: `each` pictures by every camera alone, and `pairs` by every two neighbours."""
     along = rig.volume.world_from_box.rotation[:, 0]
-    order = sorted(rig.cameras, key=lambda camera: float(camera.camera_from_world.centre @ along))
+    left = sorted(rig.cameras, key=lambda camera: float(camera.camera_from_world.centre @ along))
+    order = [left.pop(0)]
+    while left:  # from one to the nearest: along a bar, and around a dome
+        here = order[-1].camera_from_world.centre
+        order.append(min(left, key=lambda camera: float(np.linalg.norm(camera.camera_from_world.centre - here))))
+        left.remove(order[-1])
     alone = [(camera.name,) for camera in rig.cameras for _ in range(each)]
     together = [(a.name, b.name) for a, b in pairwise(order) for _ in range(pairs)]
     return [*alone, *together]

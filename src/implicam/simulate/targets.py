@@ -80,7 +80,7 @@ def held_boards(
     Tilted up to 50 degrees, as far away as lets its diagonal span 0.25 to 0.8 of the image's width. UsageError where no
     pose is found that a group sees together.
     """
-    _check_counts(corners=corners)
+    _check_counts(corners=corners, pictures=(len(groups),))
     y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in corners), indexing="ij")
     flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * square * rig.units_per_mm
     names = [camera.name for camera in rig.cameras]

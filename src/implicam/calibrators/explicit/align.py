@@ -6,17 +6,19 @@ paper, by iterative closest point. Its uncertainty goes into the cameras': a rig
 
 from __future__ import annotations
 
+from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from implicam.calibrators.forward_gp.lens import CentralCamera, Floats
 from implicam.calibrators.forward_gp.posterior import CameraModel
+from implicam.dataset import Names
 from implicam.errors import FitError
 from implicam.geometry import Bools, Pose, register, rotation_from_vector
-from implicam.measurement import Measurement
 
 FAR = 25.0
 """Squared distance, in its own covariance, of a known point from where it should be: one in 65,000 of good ones."""
@@ -25,11 +27,25 @@ MATCHING = ("points", "icp")
 
 ROUNDS = 60
 
+ALIKE = 1.3
+"""Two ways to match points by closeness are told apart where one leaves so many times what the other leaves."""
+
+HOPELESS = 0.05
+"""Part of the extent of the known points that the boards may be off without being of another rig."""
+
+
+class Known(NamedTuple):
+    """Known points: xyz (n, 3) in the world, their declared sd (n, 3), 0 where none, and shots (n,)."""
+
+    xyz: Floats
+    sd: Floats
+    shots: Names
+
 
 class Alignment(NamedTuple):
     """rig_from_world; used (n,) the known points it comes from; K (6, P) how its step (rotation vector, translation)
     follows errors of the cameras' unknowns, and own (6, 6) its covariance from the points' own noise; errors and sds
-    (m, 3) of the used points in the world, each left out in turn."""
+    (m, 3) of the used points in the world, each left out in turn; scale: world over rig, if it were free."""
 
     rig_from_world: Pose
     used: Bools
@@ -37,109 +53,200 @@ class Alignment(NamedTuple):
     own: Floats
     errors: Floats
     sds: Floats
+    scale: float
+
+    @property
+    def misfit(self) -> float:
+        """Rms of the errors in their own standard deviations: 1 where boards and known points agree."""
+        return float(np.sqrt(np.mean((self.errors / self.sds) ** 2)))
 
 
 def align(
-    models: tuple[CameraModel, ...], uv: Floats, noise: Floats, measured: Measurement, xyz: Floats, sd: Floats, how: str
+    models: tuple[CameraModel, ...], root: Floats, uv: Floats, noise: Floats, start: Floats, known: Known, how: str
 ) -> Alignment:
-    """models: cameras in the rig's frame. uv (n, C, 2) and noise (n, C): their views of the known points xyz (n, 3),
-    whose declared sd is (n, 3); measured: these points in the rig's frame. FitError where they do not fix a motion."""
-    there = np.asarray(measured.measured, dtype=np.bool_)
-    used = there
-    if used.sum() < 3:
+    """models: cameras in the rig's frame; root (q, P) of their covariance. uv (n, C, 2) and noise (n, C): their views
+    of the known points, NaN where not used; start (n, 3): where they are in the rig's frame, roughly, NaN where not
+    measured. FitError where they do not fix a motion, or contradict the boards."""
+    there = np.asarray(np.isfinite(start).all(axis=1))
+    if there.sum() < 3:
         raise FitError(
-            f"{used.sum()} known points can be measured with the boards' calibration; it takes three to align it.",
+            f"{there.sum()} known points can be measured with the boards' calibration; it takes three to align it.",
             fix="add known points that two cameras see, or leave out points.csv to measure in the first camera's frame",
         )
-    point, M = _sensitivities(models, uv, noise, measured.xyz, used)
+    measured, point, M = _by_pixels(models, uv, noise, start, there)
+    spread = M @ root.T
+    cov = point + spread @ spread.swapaxes(1, 2)
+    used = there
     for _ in range(8):
-        pose = _matched(measured.xyz, xyz, used, how)
-        pose, Q, G, W, residual = _weighted(pose, measured, xyz, sd, used, there)
+        pose, pairs = _matched(measured, known.xyz, used, how)
+        xyz, sd = known.xyz[pairs], known.sd[pairs]
+        pose, Q, G, W, residual = _weighted(pose, measured, cov, xyz, sd, used, there)
         distance = np.einsum("ni,nij,nj->n", residual, W, residual)
         good = there & (distance <= max(FAR, float(np.quantile(distance[used], 0.9))))
-        if good.sum() < 3 or (good == used).all():
+        if (good == used).all():
+            break
+        if good.sum() < max(3, 0.5 * there.sum()):  # no few wrong points: the whole does not fit, and a note says so
+            used = there
+            pose, Q, G, W, residual = _weighted(pose, measured, cov, xyz, sd, used, there)
             break
         used = good
-    GtW = G.swapaxes(1, 2) @ W
-    declared = np.nan_to_num(sd)[:, :, None] ** 2 * np.eye(3)
-    declared = pose.rotation @ declared @ pose.rotation.T
-    own = Q @ np.einsum("nai,nij,nbj->ab", GtW[used], (point + declared)[used], GtW[used]) @ Q.T
-    K = Q @ np.einsum("nai,nip->ap", GtW[used], M[used])
-    errors, sds = _left_out(pose, Q, G, W, residual, measured.cov, own, used)
-    return Alignment(pose, used, K, own, errors, sds)
+    B = (Q @ G.swapaxes(1, 2) @ W)[used]
+    own = _own_noise(B, point[used], pose, sd[used], known.shots[pairs][used])
+    K = np.einsum("nai,nip->ap", B, M[used])
+    follows = (M[used] - G[used] @ K) @ root.T
+    left = point[used] + follows @ follows.swapaxes(1, 2) + G[used] @ own @ G[used].swapaxes(1, 2)
+    left = left + pose.rotation @ (sd[used][:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
+    errors, sds = _left_out(pose, Q, G[used], W[used], residual[used], left)
+    found = Alignment(pose, used, K, own, errors, sds, _scale(measured[used], xyz[used]))
+    _check(found, residual[there], float(np.sqrt(np.sum(known.xyz.var(axis=0)))))
+    return found
 
 
-def _matched(measured: Floats, xyz: Floats, used: Bools, how: str) -> Pose:
-    """rig_from_world in closed form, from named pairs or from the closest ones."""
-    pose, _ = register(xyz[used], measured[used])
-    return pose if how == "points" else icp(xyz, measured[used], pose)
+def _by_pixels(
+    models: tuple[CameraModel, ...], uv: Floats, noise: Floats, start: Floats, there: Bools
+) -> tuple[Floats, Floats, Floats]:
+    """Points (n, 3) by least squares on the pixels alone; their covariance (n, 3, 3) from the pixels' noise; and (n, 3,
+    P) how they follow errors of the cameras' unknowns. Zero where not there."""
+    n, total = len(start), sum(model.camera.size for model in models)
+    x = np.where(there[:, None], start, 0)
+    for _ in range(6):
+        H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        back, first = np.zeros((n, 3, total)), 0
+        for c, model in enumerate(models):
+            rows = np.flatnonzero(there & np.isfinite(uv[:, c]).all(axis=1))
+            view = model.camera.view(x[rows])
+            Jt = view.by_point.swapaxes(1, 2) / noise[rows, c, None, None] ** 2
+            H[rows] += Jt @ view.by_point
+            g[rows] += np.einsum("nij,nj->ni", Jt, uv[rows, c] - view.uv)
+            back[rows, :, first : first + model.camera.size] = -Jt @ view.by_parameters
+            first += model.camera.size
+        point = np.zeros((n, 3, 3))
+        point[there] = np.linalg.inv(H[there])
+        x = x + np.einsum("nij,nj->ni", point, g)
+    return x, point, point @ back
 
 
-def icp(known: Floats, measured: Floats, start: Pose) -> Pose:
-    """measured_from_known by iterative closest point (Besl & McKay 1992): each measured point (m, 3) is matched with
-    the known point (n, 3) closest to it, whatever its name."""
+def _matched(measured: Floats, xyz: Floats, used: Bools, how: str) -> tuple[Pose, NDArray[np.int64]]:
+    """rig_from_world in closed form, and the number of each measured point's known one: its own, or the closest."""
+    if how == "points":
+        return register(xyz[used], measured[used])[0], np.arange(len(xyz))
+    pose = closest_points(xyz, measured[used], register(xyz[used], measured[used])[0])
+    _, nearest = cKDTree(xyz).query(pose.inverse().apply(measured))
+    return pose, np.asarray(nearest, dtype=np.int64)
+
+
+def closest_points(known: Floats, measured: Floats, named: Pose) -> Pose:
+    """measured_from_known by iterative closest point, from the principal axes in all 24 ways, whatever the names.
+
+    Where a symmetric target fits in several ways, that which the names lead to (`named`) is taken if it is one of them;
+    else FitError.
+    """
+    starts = [named, *_by_axes(known, measured)]
+    found = sorted(((icp(known, measured, start), i) for i, start in enumerate(starts)), key=lambda one: one[0][1])
+    least = max(found[0][0][1], 1e-9 * float(np.ptp(known)))
+    alike = [(pose, i) for (pose, rms), i in found if rms <= ALIKE * least]
+    for pose, i in alike:
+        if i == 0:
+            return pose
+    best = alike[0][0]
+    if any(np.abs(pose.rotation - best.rotation).max() > 0.02 for pose, _ in alike):
+        raise FitError(
+            "the known points can be matched by closeness in more than one way.",
+            why="turned by a symmetry of their arrangement they fit as well, and their names fit none of it",
+            fix="correct the names and use --align points",
+        )
+    return best
+
+
+def _by_axes(known: Floats, measured: Floats) -> list[Pose]:
+    """measured_from_known that bring principal axes onto principal axes, in all ways that are rotations."""
+    a, b = known - known.mean(axis=0), measured - measured.mean(axis=0)
+    axes_a, axes_b = (np.linalg.svd(x, full_matrices=False)[2] for x in (a, b))
+    poses = []
+    for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+        rotation = axes_b.T @ (np.array(signs)[:, None] * axes_a[list(order)])
+        if np.linalg.det(rotation) > 0:
+            poses.append(Pose(rotation, measured.mean(axis=0) - rotation @ known.mean(axis=0)))
+    return poses
+
+
+def icp(known: Floats, measured: Floats, start: Pose) -> tuple[Pose, float]:
+    """measured_from_known by iterative closest point (Besl & McKay 1992), and the rms distance left: each measured
+    point (m, 3) is matched with the known point (n, 3) closest to it."""
     tree, pose = cKDTree(known), start
     pairs = np.full(len(measured), -1)
     for _ in range(ROUNDS):
         _, nearest = tree.query(pose.inverse().apply(measured))
-        if (nearest == pairs).all():
+        if (nearest == pairs).all() or len(np.unique(nearest)) < 3:
             break
         pairs = np.asarray(nearest)
-        pose, _ = register(known[pairs], measured)
-    return pose
+        try:
+            pose, _ = register(known[pairs], measured)
+        except FitError:  # all onto one line: a start that leads nowhere
+            return pose, float("inf")
+    distance, _ = tree.query(pose.inverse().apply(measured))
+    return pose, float(np.sqrt(np.mean(np.square(distance))))
 
 
 def _weighted(
-    pose: Pose, measured: Measurement, xyz: Floats, sd: Floats, used: Bools, there: Bools
+    pose: Pose, measured: Floats, cov: Floats, xyz: Floats, sd: Floats, used: Bools, there: Bools
 ) -> tuple[Pose, Floats, Floats, Floats, Floats]:
     """The most probable motion, by Gauss-Newton: it, the inverse Q (6, 6) of the normal matrix, and for all points G
     (n, 3, 6), weights W (n, 3, 3) and residuals (n, 3) in the rig's frame; zero where not measured."""
     n = len(xyz)
-    cov = np.where(there[:, None, None], measured.cov, np.eye(3))
+    cov = np.where(there[:, None, None], cov, np.eye(3))
     for _ in range(4):
-        declared = pose.rotation @ (np.nan_to_num(sd)[:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
+        declared = pose.rotation @ (sd[:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
         W = np.where(there[:, None, None], np.linalg.inv(cov + declared), 0)
         turned = xyz @ pose.rotation.T
         G = np.concatenate([-_cross(turned), np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
-        residual = np.where(there[:, None], measured.xyz - turned - pose.translation, 0)
+        residual = np.where(there[:, None], measured - turned - pose.translation, 0)
         GtW = G.swapaxes(1, 2) @ W
         Q = np.linalg.inv(np.einsum("nai,nib->ab", GtW[used], G[used]))
         step = Q @ np.einsum("nai,ni->a", GtW[used], residual[used])
         pose = Pose(rotation_from_vector(step[:3]) @ pose.rotation, pose.translation + step[3:])
-    residual = np.where(there[:, None], measured.xyz - pose.apply(xyz), 0)
+    residual = np.where(there[:, None], measured - pose.apply(xyz), 0)
     return pose, Q, G, W, residual
 
 
-def _sensitivities(
-    models: tuple[CameraModel, ...], uv: Floats, noise: Floats, xyz: Floats, used: Bools
-) -> tuple[Floats, Floats]:
-    """(n, 3, 3) covariance of a measured point from its own pixels' noise, and (n, 3, P) how it follows errors of the
-    cameras' unknowns; zero where not used."""
-    n, total = len(xyz), sum(model.camera.size for model in models)
-    H, back = np.zeros((n, 3, 3)), np.zeros((n, 3, total))
-    start = 0
-    for c, model in enumerate(models):
-        rows = np.flatnonzero(used & np.isfinite(uv[:, c]).all(axis=1))
-        view = model.camera.view(xyz[rows])
-        weight = 1 / noise[rows, c] ** 2
-        Jt = view.by_point.swapaxes(1, 2) * weight[:, None, None]
-        H[rows] += Jt @ view.by_point
-        back[rows, :, start : start + model.camera.size] = -Jt @ view.by_parameters
-        start += model.camera.size
-    point = np.zeros((n, 3, 3))
-    point[used] = np.linalg.inv(H[used])
-    return point, point @ back
+def _own_noise(B: Floats, point: Floats, pose: Pose, sd: Floats, shots: Names) -> Floats:
+    """(6, 6) covariance of the motion from the pixels' noise of each point, and from the declared errors of the known
+    ones: those of a shot are one error. B (m, 6, 3): how the motion follows each measured point."""
+    total = np.einsum("nai,nij,nbj->ab", B, point, B)
+    for shot in np.unique(shots):
+        mine = shots == shot
+        lever = B[mine].sum(axis=0) @ pose.rotation
+        total += lever @ np.diag(np.mean(sd[mine] ** 2, axis=0)) @ lever.T
+    return np.asarray(total, dtype=np.float64)
 
 
-def _left_out(
-    pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats, cov: Floats, own: Floats, used: Bools
-) -> tuple[Floats, Floats]:
+def _left_out(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats, cov: Floats) -> tuple[Floats, Floats]:
     """Errors and sds (m, 3) in the world of the used points, each as if the motion came from the others."""
-    inside = np.eye(3) - G[used] @ Q @ (G[used].swapaxes(1, 2) @ W[used])
-    error = np.linalg.solve(inside, residual[used, :, None])[..., 0]
-    spread = cov[used] + G[used] @ own @ G[used].swapaxes(1, 2)
-    world = pose.rotation.T @ spread @ pose.rotation
+    error = residual
+    if len(residual) > 3:  # with three, two would be left: nothing to align with
+        inside = np.eye(3) - G @ Q @ (G.swapaxes(1, 2) @ W)
+        error = np.asarray(np.linalg.solve(inside, residual[..., None])[..., 0], dtype=np.float64)
+    world = pose.rotation.T @ cov @ pose.rotation
     return error @ pose.rotation, np.sqrt(np.diagonal(world, axis1=1, axis2=2))
+
+
+def _scale(measured: Floats, xyz: Floats) -> float:
+    """World over rig, the ratio of the extents: 1 where the board's square is right."""
+    a, b = measured - measured.mean(axis=0), xyz - xyz.mean(axis=0)
+    return float(np.sqrt(np.sum(b**2) / np.sum(a**2)))
+
+
+def _check(found: Alignment, residual: Floats, extent: float) -> None:
+    """FitError where boards and known points are not of one rig, or not of one unit."""
+    rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+    if rms < HOPELESS * extent and abs(found.scale - 1) < HOPELESS:
+        return
+    raise FitError(
+        f"the boards and the known points contradict each other: aligned, they are {rms:.3g} apart, and the known points "
+        f"extend over {extent:.3g}.",
+        why=f"the known points are {found.scale:.4g} times as far apart as the boards say",
+        fix="check the board's square, the length units, and the names and positions of the known points",
+    )
 
 
 def in_world(

@@ -18,6 +18,9 @@ from implicam.errors import FitError
 FEWEST_CORNERS = 12
 """Corners of one picture; with fewer it says little more than that there is a board."""
 
+MOST = 500
+"""Rows or columns of a board."""
+
 FEWEST_BOARDS = 3
 """Pictures that a camera needs: Zhang's method takes three planes for a lens."""
 
@@ -62,12 +65,14 @@ class Boards:
         return tuple(view for view in self.views if view.camera == c)
 
 
-def boards_of(data: Dataset) -> Boards:
-    """The boards of a dataset: corners as [target] in dataset.toml lays them out, or as its known positions do.
+def boards_of(data: Dataset, scale: float = 1.0) -> Boards:
+    """The boards of a dataset: corners as [target] in dataset.toml lays them out, or as its known positions do; lengths
+    times `scale`.
 
     FitError where neither says where the corners are on the board.
     """
     shots, flat = _laid_out(data)
+    flat = flat * scale
     names, number = np.unique(shots, return_inverse=True)
     observations = data.observations
     stated = stated_noise(observations)
@@ -96,7 +101,7 @@ def _laid_out(data: Dataset) -> tuple[Names, Floats]:
     if data.known is None:
         raise FitError(
             f"nothing says where the corners of {data.name!r} are on the board.",
-            why="dataset.toml has no [target], and there is no points.csv",
+            why="[target] in dataset.toml is no board, or not there, and there is no points.csv",
             fix='write into dataset.toml: [target] kind = "board", rows = 8, columns = 11, square = 13.29',
         )
     return data.shots, _by_positions(data)
@@ -104,7 +109,12 @@ def _laid_out(data: Dataset) -> tuple[Names, Floats]:
 
 def _by_target(data: Dataset, target: Mapping[str, Any]) -> tuple[Names, Floats]:
     try:
-        rows, columns, square = int(target["rows"]), int(target["columns"]), float(target["square"])
+        rows, columns, square = target["rows"], target["columns"], float(target["square"])
+        for what, count in (("rows", rows), ("columns", columns)):
+            if type(count) is not int or not 2 <= count <= MOST:
+                raise ValueError(f"{what} = {count!r} must be a whole number from 2 to {MOST}")
+        if not 1e-9 < square < 1e9:
+            raise ValueError(f"square = {square!r} must be a length")
     except (KeyError, TypeError, ValueError) as error:
         raise FitError(
             f"[target] of {data.name!r} does not describe a board: {error}.",
@@ -138,8 +148,6 @@ def _by_positions(data: Dataset) -> Floats:
                 why=f"it has {len(centred)} points; a board has {FEWEST_CORNERS} or more, on one plane",
                 fix="give pictures of a board with --boards, and balls as the dataset itself",
             )
-        if np.linalg.det(np.vstack([axes[:2], np.cross(axes[0], axes[1])])) < 0:
-            axes[1] = -axes[1]
         flat[rows] = centred @ axes[:2].T
     return flat
 

@@ -70,6 +70,11 @@ class Explicit:
         the positions that the adjustment gives them.
         """
         with solvable(), blas_threads(1):
+            if self.boards is None and self.align != MATCHING[0]:
+                raise UsageError(
+                    f"align {self.align!r} is for boards, and there are none.",
+                    fix="give them with --boards, or leave it out",
+                )
             if self.boards is None and data.known is None and has_boards(data):
                 data, fitted = fit_to_boards_alone(data, self.lens, progress)
             elif self.boards is None:
@@ -82,7 +87,10 @@ class Explicit:
         """The rig from the boards: the same for all known points, so it is adjusted once."""
         if data.observations.camera_names not in self._networks:
             assert self.boards is not None
-            boards = boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)))
+            scale = 1.0
+            if self.boards.length_unit != data.length_unit:
+                scale = self.boards.metres_per_unit / data.metres_per_unit
+            boards = boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)), scale)
             self._networks[data.observations.camera_names] = calibrate_network(boards, self.lens, progress)
         return self._networks[data.observations.camera_names]
 
@@ -132,7 +140,15 @@ class ExplicitCalibration:
         return self.fitted.rejected
 
     def refit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
-        """The same method with the same options, and the same boards, on other known points."""
+        """The same method with the same options, and the same boards, on other known points.
+
+        UsageError for a calibration that has no known points of its own: nothing can be held out of it.
+        """
+        if self.fitted.alone:
+            raise UsageError(
+                "this calibration was made without known points, so none can be held out.",
+                fix="evaluate it with a dataset of known points: implicam evaluate FILE DATASET",
+            )
         return self.calibrator.fit(data, progress)
 
     def notes(self) -> list[str]:
@@ -147,6 +163,7 @@ class ExplicitCalibration:
             "points_used": len(self.data) - len(self.unused),
             "points_unused": len(self.unused),
             "views_rejected": len(self.rejected),
+            **({"held_out": "the corners of the boards are measured"} if fitted.alone else {}),
             "leave_one_out_rms": dict(zip(axes, _columns(fitted.errors, 2), strict=True)),
             "leave_one_out_mean_sd": dict(zip(axes, _columns(fitted.sds, 1), strict=True)),
             "noise_px": dict(zip(names, (float(model.noise) for model in fitted.posterior.models), strict=True)),

@@ -115,6 +115,7 @@ def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
             f"pixels only ({noise:g} px where a view states none). Check them: implicam evaluate FILE DATASET.",
             *rig.notes,
         ),
+        alone=True,
     )
     return ExplicitCalibration(Explicit(), Dataset(name, rig.length_unit, seen, known), fitted)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from implicam.calibrators.explicit.align import Alignment, align, in_frame, in_world
+from implicam.calibrators.explicit.align import Alignment, Known, align, in_frame, in_world
 from implicam.calibrators.explicit.boards import boards_of
 from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
@@ -15,12 +15,15 @@ from implicam.calibrators.explicit.network import Network, calibrate_network
 from implicam.calibrators.forward_gp.diagnosis import NAMED, Diagnosis
 from implicam.calibrators.forward_gp.fit import without_field
 from implicam.calibrators.forward_gp.lens import CentralCamera
+from implicam.calibrators.forward_gp.locate import locate
 from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior
-from implicam.calibrators.forward_gp.problem import Frame, problem_of
+from implicam.calibrators.forward_gp.problem import Frame, problem_of, stated_noise
 from implicam.calibrators.forward_gp.rig_map import RigMap
 from implicam.calibrators.forward_gp.start import Started
 from implicam.calibrators.protocol import Rejected, Unused, same_cameras
 from implicam.dataset import Dataset, Floats, KnownPositions, Names, Observations
+from implicam.errors import FitError
+from implicam.geometry import Bools
 from implicam.progress import Progress
 
 METHOD = "explicit"
@@ -30,7 +33,7 @@ METHOD = "explicit"
 class Fitted:
     """Cameras in the working frame. trained: the observations that cameras, sizes and stated noise are known from;
     cameras: numbers of those calibrated; choices: their lens models; errors, sds (m, 3): of known points, each left
-    out in turn."""
+    out in turn. alone: from boards alone, so that nothing is known and errors are those of corners as adjusted."""
 
     trained: Observations
     frame: Frame
@@ -42,6 +45,7 @@ class Fitted:
     rejected: tuple[Rejected, ...]
     unused: tuple[Unused, ...]
     notes: tuple[str, ...]
+    alone: bool = False
 
 
 def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
@@ -66,11 +70,13 @@ def fit_to_boards(data: Dataset, network: Network, boards: Dataset, how: str) ->
     """Cameras from boards, brought into the world by the known points."""
     trained = by_cameras_of(data, boards)
     known, bundle = data.positions, network.bundle
-    in_rig = RigMap(
-        trained, data.length_unit, _UNIT, network.cameras, _posterior(network, bundle.cameras, network.root)
-    )
-    measured = in_rig.measure(data.observations)
-    alignment = align(in_rig.posterior.models, *in_rig.views(data.observations), measured, known.xyz, known.sd, how)
+    posterior = _posterior(network, bundle.cameras, network.root)
+    in_rig = RigMap(trained, data.length_unit, _UNIT, network.cameras, posterior, misfit_adds=True)
+    uv, noise = in_rig.views(data.observations)
+    found = locate(posterior, uv, noise)
+    uv[found.left_out] = np.nan
+    points = Known(known.xyz, np.nan_to_num(known.sd), known.shots)
+    alignment = align(posterior.models, network.root, uv, noise, found.xyz, points, how)
     frame = _frame(known.xyz)
     cameras, root = in_frame(*in_world(bundle.cameras, network.root, alignment), frame.offset, frame.scale)
     return Fitted(
@@ -82,8 +88,13 @@ def fit_to_boards(data: Dataset, network: Network, boards: Dataset, how: str) ->
         alignment.errors,
         alignment.sds,
         _rejected(network, boards),
-        _not_used(data, measured.reason, alignment),
-        (*_notes(network, trained, boards), *_alignment_notes(alignment, data.length_unit)),
+        _not_used(data, in_rig.measure(data.observations).reason, alignment),
+        (
+            *_without_boards(data, trained),
+            *_moved_notes(in_rig, found.left_out, np.isfinite(uv).all(axis=2)),
+            *_notes(network, trained, boards),
+            *_alignment_notes(alignment, data.length_unit),
+        ),
     )
 
 
@@ -111,6 +122,7 @@ def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple
             "of your own: implicam calibrate POINTS --method explicit --boards BOARDS.",
             *_notes(network, data.observations, data),
         ),
+        alone=True,
     )
     return placed, fitted
 
@@ -126,9 +138,23 @@ def _frame(xyz: Floats) -> Frame:
 def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
     """The boards' observations by the cameras of the data; an error where sizes differ, or no two are the same."""
     names = [name for name in data.observations.camera_names if name in boards.observations.camera_names]
-    trained = boards.observations.with_cameras(names) if len(names) > 1 else boards.observations
-    same_cameras(trained, data.observations)
+    if len(names) < 2:
+        raise FitError(
+            f"boards and known points share {len(names)} camera{'s' * (len(names) != 1)}; a position takes two.",
+            why=f"the boards were seen by {', '.join(boards.observations.camera_names)}, "
+            f"the known points by {', '.join(data.observations.camera_names)}",
+            fix="give boards that the same cameras saw, with the same names in dataset.toml",
+        )
+    trained = boards.observations.with_cameras(names)
+    same_cameras(trained, data.observations.with_cameras(names))
     return trained
+
+
+def _without_boards(data: Dataset, trained: Observations) -> list[str]:
+    missing = [name for name in data.observations.camera_names if name not in trained.camera_names]
+    return [
+        f"{name} is not calibrated, and its views are not used: it is not among the boards' cameras" for name in missing
+    ]
 
 
 def _placed(data: Dataset, network: Network) -> Dataset:
@@ -184,21 +210,57 @@ def _notes(network: Network, trained: Observations, boards: Dataset) -> list[str
         more = f" and {len(network.wrong) - NAMED} more" if len(network.wrong) > NAMED else ""
         count = f"{len(network.wrong)} corner{'s' * (len(network.wrong) != 1)}"
         notes.append(f"{count} not used, far from where the others predict them: {named}{more}.")
+    return [*notes, *_lens_notes(network, trained)]
+
+
+def _lens_notes(network: Network, trained: Observations) -> list[str]:
+    """Lenses that the boards hardly fix, noise that is not what the views state, an adjustment that did not settle."""
+    notes, bundle = [], network.bundle
+    sd = np.sqrt(np.sum(network.root**2, axis=0))
+    stated = stated_noise(trained)
+    for number, c in enumerate(network.cameras):
+        name, lens = trained.camera_names[c], bundle.cameras[number].lens
+        loose = float(sd[bundle.starts[number]] / lens.fx)
+        if loose > LOOSE:
+            notes.append(
+                f"{name}: the boards fix its focal length to {100 * loose:.1g} % only. Show them tilted, near and far."
+            )
+        if np.isfinite(stated[c]) and not 0.5 < bundle.noise[number] / stated[c] < 2:
+            notes.append(
+                f"{name}: corners are off by {bundle.noise[number]:.2g} px, and they state {stated[c]:.2g} px: "
+                "their sd is wrong, or no lens model holds this lens."
+            )
+    if not network.converged:
+        notes.append("The bundle adjustment had not settled when it was stopped: look for wrong pictures.")
+    return notes
+
+
+def _moved_notes(in_rig: RigMap, left_out: Bools, used: Bools) -> list[str]:
+    """Cameras whose views of the known points are mostly left out: they may have moved since the boards."""
+    notes = []
+    for c, name in enumerate(in_rig.camera_names):
+        away, seen = int(left_out[:, c].sum()), int(left_out[:, c].sum() + used[:, c].sum())
+        if away > 0.3 * seen:
+            notes.append(
+                f"{name}: {away} of its {seen} views of the known points contradict the other cameras. Was it moved after "
+                "the pictures of the boards?"
+            )
     return notes
 
 
 def _alignment_notes(alignment: Alignment, unit: str) -> list[str]:
     """Where the world and the rig from the boards differ by more than their error bars."""
-    off = alignment.errors / alignment.sds
-    size = float(np.sqrt(np.mean(off**2)))
-    if size < DISAGREE:
+    n = int(alignment.used.sum())
+    # 3 n errors, each with the square of a normal variable: what chance leaves, and four standard errors of it
+    if n < 4 or alignment.misfit**2 < 1 + 4 * np.sqrt(2 / (3 * n)):
         return []
     rms = float(np.sqrt(np.mean(np.sum(alignment.errors**2, axis=1))))
     return [
         f"The boards and the known points contradict each other: after alignment {rms:.2g} {unit} are left, "
-        f"{size:.1f} times what the error bars say. Check the board's square, and that no camera moved in between."
+        f"{alignment.misfit:.1f} times what the error bars say; the known points are {alignment.scale:.5g} times as "
+        "far apart as the boards say. Check the board's square, that no camera moved in between, and the lens models."
     ]
 
 
-DISAGREE = 2.0
-"""Times its sd that known points are off in the mean, beyond which boards and known points disagree."""
+LOOSE = 0.01
+"""Part of the focal length that may be unknown without a note."""

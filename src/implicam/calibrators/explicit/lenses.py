@@ -7,8 +7,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image
-from implicam.calibrators.forward_gp.start import FAR, Started, levenberg_marquardt, start_camera
+from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image, Prior
+from implicam.calibrators.forward_gp.start import FAR, FEWEST, Started, levenberg_marquardt, start_camera
 from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import FitError
 
@@ -24,6 +24,9 @@ WIDEST = np.radians(75.0)
 """Off the axis; a perspective lens is not tried beyond."""
 
 FOLDS = 5
+
+SHIFTED = 5.0
+"""How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""
 
 
 class Choice(NamedTuple):
@@ -106,19 +109,43 @@ def chosen(
 
 def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tuple[Started, Choice]:
     """A camera from known points (n, 3), all seen at uv (n, 2), and its lens model; FitError as `start_camera`."""
-    first = start_camera(points, uv, image, "central")
+    first = _freely_centred(start_camera(points, uv, image, "central"), points, uv, image)
     assert isinstance(first.camera, CentralCamera)
     bent = first.camera
 
     def perspective() -> Started:
         kept = points[first.kept]
         camera = as_brown_conrady(bent, kept)
-        prior = camera.prior(image, float(angles(bent, kept).max()))
+        prior = freely_centred(camera.prior(image, float(angles(bent, kept).max())))
         fitted = levenberg_marquardt(camera, prior, kept, uv[first.kept], _sd(camera, kept, uv[first.kept], image))
         return Started(fitted, prior, first.kept)
 
     candidates: dict[str, Callable[[], Started]] = {"kannala-brandt": lambda: first, "brown-conrady": perspective}
     return chosen(family, candidates, lambda started: _held_out(started, points, uv, image))
+
+
+def freely_centred(prior: Prior) -> Prior:
+    """The prior without a strong opinion on where the lens stands over the sensor: shifted lenses exist."""
+    precision = prior.precision.copy()
+    precision[2:4, 2:4] /= SHIFTED**2
+    return prior._replace(precision=precision)
+
+
+def _freely_centred(started: Started, points: Floats, uv: Floats, image: Image) -> Started:
+    """The start refined with that prior, and with the views that it then explains."""
+    assert isinstance(started.camera, CentralCamera)
+    prior, kept, camera = freely_centred(started.prior), started.kept, started.camera
+    for _ in range(3):
+        sd = _sd(camera, points[kept], uv[kept], image)
+        fitted = levenberg_marquardt(camera, prior, points[kept], uv[kept], sd)
+        assert isinstance(fitted, CentralCamera)
+        camera = fitted
+        error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+        inside = np.asarray(error <= max(FAR * float(np.median(error[kept])), 1e-4 * image.half))
+        if inside.sum() < FEWEST or (inside == kept).all():
+            break
+        kept = inside
+    return Started(camera, prior, kept)
 
 
 def _sd(camera: CentralCamera, points: Floats, uv: Floats, image: Image) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
 from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import Choice, angles
-from implicam.calibrators.explicit.zhang import OneCamera, calibrate_camera
+from implicam.calibrators.explicit.zhang import STUCK, OneCamera, calibrate_camera, pose_and_mirror
 from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image
 from implicam.dataset import Names
 from implicam.errors import FitError
@@ -27,6 +27,9 @@ FAR = 5.0
 
 AS_IF = 2.0
 """The stated noise counts like so many residuals."""
+
+CONTRADICT = 0.15
+"""Share of the corners on shared boards that do not fit, beyond which two cameras contradict each other."""
 
 TOLERABLE = 0.02
 """Usual residual of a camera in the whole rig, in half the longer side of its image, beyond which there is no fit."""
@@ -46,6 +49,7 @@ class Network:
     wrong: tuple[tuple[int, int, float], ...]
     images: tuple[Image, ...]
     shots: Names
+    converged: bool
 
 
 def calibrate_network(boards: Boards, family: str, progress: Progress = silent) -> Network:
@@ -63,6 +67,9 @@ def calibrate_network(boards: Boards, family: str, progress: Progress = silent) 
     half = np.array([boards.images[c].half for c in cameras])
     bundle = _bundle(boards, singles, poses, cameras)
     found = adjust_in_steps(bundle, half, progress=progress)
+    better = _placed_again(found.bundle)
+    if better is not None:
+        found = adjust_in_steps(better, half, progress=progress)
     _check(boards, cameras, found, half)
     found, wrong = _refined(boards, cameras, found, progress)
     return Network(
@@ -74,6 +81,7 @@ def calibrate_network(boards: Boards, family: str, progress: Progress = silent) 
         tuple(wrong),
         tuple(boards.images[c] for c in cameras),
         boards.shots,
+        found.converged,
     )
 
 
@@ -125,7 +133,8 @@ def _joined(boards: Boards, singles: Mapping[int, OneCamera]) -> tuple[dict[int,
         first = poses[min(poses)].inverse()
         poses = {c: first @ pose for c, pose in poses.items()}
     others = [c for c in singles if c not in poses]
-    return poses, [(c, "it saw no board at the same time as the others") for c in others]
+    why = "it saw no board at the same time as the others" if len(singles) > 1 else "there is no other camera to join"
+    return poses, [(c, why) for c in others]
 
 
 def _placed(boards: Boards, c: int, single: OneCamera) -> dict[int, Pose]:
@@ -197,12 +206,52 @@ def _bundle(
     return Bundle(there, tuple(priors), Placed.of(rig_from_board), Views(views, len(cameras)), noise)
 
 
+def _placed_again(bundle: Bundle) -> Bundle | None:
+    """The bundle with boards placed anew that contradict a camera: a small board has a mirrored pose as well, and one
+    camera alone cannot tell which is right. None where there is none."""
+    usual, lengths = spreads(bundle), [bundle.lengths(c) for c in range(len(bundle.cameras))]
+    views: dict[int, list[BoardView]] = {}
+    stuck = set()
+    for c, view, rows in bundle.views.in_stacks():
+        views.setdefault(view.board, []).append(view)
+        if np.median(lengths[c][rows]) > STUCK * usual[c]:
+            stuck.add(view.board)
+    rotation, translation, changed = bundle.boards.rotation.copy(), bundle.boards.translation.copy(), False
+    for k in sorted(stuck):
+        if len(views[k]) < 2:
+            continue
+        now = bundle.boards.pose(k)
+        candidates = [pose for view in views[k] for pose in _seen_by(bundle, view, now)]
+        best = min(candidates, key=lambda pose: _off(bundle, views[k], pose))
+        if _off(bundle, views[k], best) < 0.5 * _off(bundle, views[k], now):
+            rotation[k], translation[k], changed = best.rotation, best.translation, True
+    return replace(bundle, boards=Placed(rotation, translation)) if changed else None
+
+
+def _seen_by(bundle: Bundle, view: BoardView, now: Pose) -> list[Pose]:
+    """rig_from_board as one camera sees it: its best pose, and the mirrored one."""
+    camera = bundle.cameras[view.camera]
+    alone = CentralCamera(camera.lens, Pose(np.eye(3), np.zeros(3)))
+    both = pose_and_mirror(alone, view, camera.pose @ now, float(bundle.noise[view.camera]))
+    return [camera.pose.inverse() @ pose for pose in both]
+
+
+def _off(bundle: Bundle, views: list[BoardView], pose: Pose) -> float:
+    """How far off the corners of a board are in the worst of its views, over the camera's usual."""
+    usual = spreads(bundle)
+    worst = 0.0
+    for view in views:
+        length = np.linalg.norm(bundle.cameras[view.camera].pixel(pose.apply(view.xyz)) - view.uv, axis=1)
+        worst = max(worst, float(np.median(np.nan_to_num(length, nan=1e4)) / usual[view.camera]))
+    return worst
+
+
 def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floats) -> None:
     usual = spreads(found.bundle)
     worst = int(np.argmax(usual / half))
     if usual[worst] < TOLERABLE * half[worst]:
         return
-    raise _contradiction(boards, cameras[worst], f"its corners are left {usual[worst]:.3g} px off")
+    raise _contradiction(boards, [cameras[worst]], f"its corners are left {usual[worst]:.3g} px off")
 
 
 def _refined(
@@ -231,28 +280,35 @@ def _refined(
 
 def _check_shared(boards: Boards, cameras: tuple[int, ...], views: Views, kept: list[Bools]) -> None:
     """FitError where a camera's corners do not fit on boards that another camera saw too, though alone they do."""
-    seen = np.bincount([view.board for view in views.each])
-    total, lost = np.zeros(len(cameras)), np.zeros(len(cameras))
+    rows_of: dict[int, dict[int, Bools]] = {}
     for c, view, rows in views.in_stacks():
-        if seen[view.board] > 1:
-            total[c] += len(view.rows)
-            lost[c] += np.sum(~kept[c][rows])
-    share = lost / np.maximum(total, 1)
-    worst = int(np.argmax(share))
-    if share[worst] > 0.3:
-        raise _contradiction(
-            boards,
-            cameras[worst],
-            f"{100 * share[worst]:.0f} % of its corners do not fit where another camera saw them too",
-        )
+        rows_of.setdefault(view.board, {})[c] = kept[c][rows]
+    lost: dict[tuple[int, int], list[float]] = {}
+    for seen in rows_of.values():
+        for a, b in combinations(sorted(seen), 2):
+            lost.setdefault((a, b), []).append(1 - float(np.mean(np.concatenate([seen[a], seen[b]]))))
+    bad = [pair for pair, shares in lost.items() if np.mean(shares) > CONTRADICT]
+    if not bad:
+        return
+    in_all = set(bad[0]).intersection(*bad)
+    culprits = sorted(in_all or set().union(*bad))
+    share = 100 * max(np.mean(lost[pair]) for pair in bad)
+    raise _contradiction(
+        boards,
+        [cameras[c] for c in culprits],
+        f"on boards that they saw together up to {share:.0f} % of the corners do not fit",
+    )
 
 
-def _contradiction(boards: Boards, c: int, how: str) -> FitError:
-    name = boards.names[c]
+def _contradiction(boards: Boards, which: list[int], how: str) -> FitError:
+    names = [boards.names[c] for c in which]
+    one = len(names) == 1
     return FitError(
-        f"the cameras contradict each other: {name}: {how}.",
-        why="alone it fits its boards; with the others it does not",
-        fix=f"see that its pictures are of the same instants and that no camera moved; or use --without {name}",
+        f"the cameras contradict each other: {' and '.join(names)}: {how}.",
+        why="alone it fits its boards; with the others it does not"
+        if one
+        else "each fits its boards, but not the other",
+        fix=f"see that all pictures are of the same instants and that no camera moved; or use --without {names[0]}",
     )
 
 

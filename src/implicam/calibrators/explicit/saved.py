@@ -30,6 +30,7 @@ def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[
         "calibrated": [names[c] for c in fitted.cameras],
         "lenses": [{"name": choice.lens, "held_out_px": dict(choice.held_out)} for choice in fitted.choices],
         "notes": list(fitted.notes),
+        "alone": fitted.alone,
         "rejected": [[view.point, view.camera, float(view.residual)] for view in fitted.rejected],
         "unused": [[one.point, one.reason] for one in fitted.unused],
     }
@@ -88,6 +89,7 @@ def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[F
         tuple(Rejected(str(point), str(camera), float(off)) for point, camera, off in table["rejected"]),
         tuple(Unused(str(point), str(reason)) for point, reason in table["unused"]),
         tuple(map(str, table["notes"])),
+        bool(table["alone"]),
     )
     return fitted, boards
 

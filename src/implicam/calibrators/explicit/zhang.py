@@ -146,8 +146,22 @@ def placed_again(bundle: Bundle) -> Bundle | None:
 
 
 def _best_pose(camera: CentralCamera, view: BoardView, now: Pose, noise: float) -> tuple[Pose, float]:
-    """Of poses from random corners (RANSAC) and the present one, and the mirrored ones of both, refined: that with the
-    least median error, and the error in pixels."""
+    """The better of both, and its median error in pixels."""
+
+    def error(pose: Pose) -> float:
+        return _median_error(camera, view, pose)
+
+    best = min(pose_and_mirror(camera, view, now, noise), key=error)
+    return best, error(best)
+
+
+def _median_error(camera: CentralCamera, view: BoardView, pose: Pose) -> float:
+    off = np.linalg.norm(camera.pixel(pose.apply(view.xyz)) - view.uv, axis=1)
+    return float(np.median(np.nan_to_num(off, nan=np.inf)))
+
+
+def pose_and_mirror(camera: CentralCamera, view: BoardView, now: Pose, noise: float) -> list[Pose]:
+    """The best pose from random corners (RANSAC) or the present one, and that with the tilt the other way; refined."""
     rng = np.random.default_rng(0)
     rays, valid = camera.lens.ray_from_pixel(view.uv)
     good = np.flatnonzero(valid)
@@ -155,20 +169,14 @@ def _best_pose(camera: CentralCamera, view: BoardView, now: Pose, noise: float) 
     for _ in range(SUBSETS if len(good) >= 8 else 0):
         some = rng.choice(good, 8, replace=False)
         found.append(planar_poses(view.xyz[some, :2], rays[None, some], np.ones(1))[0][0])
-
-    def error(pose: Pose) -> float:
-        off = np.linalg.norm(camera.pixel(pose.apply(view.xyz)) - view.uv, axis=1)
-        return float(np.median(np.nan_to_num(off, nan=np.inf)))
-
-    best = min(found, key=error)
+    best = min(found, key=lambda pose: _median_error(camera, view, pose))
     only = Views((replace(view, camera=0, board=0),), 1)
     prior = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))
     refined = []
     for start in (best, _mirrored(best, view.xyz.mean(axis=0))):
         bundle = Bundle((camera,), (prior,), Placed.of([start]), only, np.array([noise]), held=True)
         refined.append(adjust(bundle).bundle.boards.pose(0))
-    best = min(refined, key=error)
-    return best, error(best)
+    return refined
 
 
 def _mirrored(pose: Pose, middle: Floats) -> Pose:

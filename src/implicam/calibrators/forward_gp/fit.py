@@ -188,7 +188,12 @@ def start_rig(
 def _check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:
     error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.kept]
     half = float(np.ptp(uv, axis=0).max()) / 2
-    if len(error) < FEWEST or not np.median(error) < TOLERABLE[problem.lens] * half:
+    if len(error) < FEWEST:
+        raise FitError(
+            f"{len(error)} of its {len(uv)} views agree on one camera, and it takes {FEWEST}.",
+            fix="add known points, or look for wrong detections",
+        )
+    if not np.median(error) < TOLERABLE[problem.lens] * half:
         raise FitError(
             f"no camera sees the known points at these pixels: the best of all fits leaves {np.median(error):.3g} px."
         )

@@ -1,0 +1,218 @@
+"""Sweeps: a list of independent cells, one result file each.
+
+A result is written when its cell is done, so that an interrupted sweep goes on where it stopped, and nothing is
+computed twice. A cell that fails is reported, and the others go on. Where the cells are computed (`workers`) does not
+change a bit of any result, on processors of one kind: another BLAS kernel rounds differently.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pkgutil
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from implicam.calibration_file import package_version
+from implicam.errors import ImplicamError, UsageError
+from implicam.experiments.stored import (
+    Stored,
+    Values,
+    canonical,
+    decode,
+    failure_file,
+    result_file,
+    write_result,
+)
+from implicam.experiments.workers import DaskCluster, LocalProcesses, Task, attempts
+from implicam.files import write_text
+from implicam.progress import Progress, silent
+from implicam.threads import cores
+
+Work = Callable[..., Mapping[str, Any]]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}(/[A-Za-z0-9][A-Za-z0-9._+-]{0,99})*")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One independent piece of a sweep.
+
+    work: a top-level function of a module, or its name "package.module:function". It is called as work(**options) in
+    another process, perhaps on another machine, and returns a dict of plain JSON values and NumPy arrays. Its numbers
+    must depend on the options only: a seed is an option.
+    name: unique in the sweep and the path of its result, such as "ball/2R/inverse-gp/157".
+    options: plain JSON values, as `work` gets them: a tuple becomes a list.
+    """
+
+    work: str | Work
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(self.name) or any(part.endswith((".npz", ".txt", ".")) for part in self.name.split("/")):
+            raise UsageError(
+                f"{self.name[:200]!r} cannot be the name of a cell.",
+                why="it becomes the path of a file on any system",
+                fix="parts of letters, digits and . _ + - that begin with a letter or digit, joined by /",
+            )
+        try:
+            plain = json.loads(canonical(self.options))
+        except (TypeError, ValueError) as error:
+            raise UsageError(
+                f"the options of the cell {self.name!r} are no plain JSON values.",
+                why=str(error),
+                fix="give numbers, text, lists and dicts; a NumPy number by float(...) or int(...)",
+            ) from error
+        object.__setattr__(self, "options", plain)
+        object.__setattr__(self, "work", _dotted(self.work))
+
+    @property
+    def task(self) -> Task:
+        """The cell as a worker is sent it."""
+        return Task(str(self.work), self.name, canonical(self.options))
+
+
+def _dotted(work: str | Work) -> str:
+    """The name by which another process finds the function; UsageError where it could not."""
+    name = work if isinstance(work, str) else f"{work.__module__}:{getattr(work, '__qualname__', '')}"
+    try:
+        found = pkgutil.resolve_name(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        found, why = None, str(error)
+    else:
+        why = "it is a function within a function, or has another name" if callable(found) else "it is no function"
+    if not callable(found) or (found is not work and not isinstance(work, str)) or name.startswith("__main__"):
+        raise UsageError(
+            f"{name!r} cannot be the work of a cell.",
+            why="other processes do not have what the main script defines" if name.startswith("__main__") else why,
+            fix='give a top-level function of a module that can be imported, or its name "package.module:function"',
+        )
+    return name
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a sweep has, by the names of its cells, in their order.
+
+    values: of each cell that has a result. seconds: what its work took. failures: why a cell has none, in three lines
+    (what, why, fix); the traceback is in <folder>/<name>.failed.txt. already: results that were there before.
+    notes: what should be known before the numbers are trusted.
+    """
+
+    values: Mapping[str, Values]
+    seconds: Mapping[str, float]
+    failures: Mapping[str, str]
+    already: int
+    notes: tuple[str, ...] = ()
+
+
+def run(
+    cells: Sequence[Cell],
+    folder: str | Path,
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress = silent,
+) -> Results:
+    """Compute the cells that have no result in `folder` yet; failed ones are tried again.
+
+    A result counts when its file is whole and its work and options are those of the cell. jobs: processes on this
+    machine, by default one a core; scheduler: the address of a Dask scheduler whose workers compute instead. Interrupt
+    it at any time: what is done is kept. Two runs on one folder may compute a cell twice, and do no other harm.
+    UsageError for two cells of one name; ImplicamError where the folder cannot be written, or there is no scheduler.
+    """
+    _check(cells, jobs, scheduler)
+    folder = Path(folder)
+    there, notes = _there(cells, folder)
+    missing = [cell.task for cell in cells if cell.name not in there]
+    already, failures = len(there), dict[str, str]()
+    what = f"computing {', '.join(sorted({cell.name.partition('/')[0] for cell in cells})[:3])}"
+    progress(what, already, len(cells))
+    if missing:
+        _make(folder)
+        with closing(attempts(_workers(len(missing), jobs, scheduler), missing)) as all_done:
+            for done in all_done:
+                if done.failure:
+                    failures[done.name] = done.failure
+                    write_text(failure_file(folder, done.name), f"{done.failure}\n\n{done.trace}")
+                else:
+                    write_result(folder, done.name, done.content)
+                    there[done.name] = decode(done.content)
+                progress(what, len(there) + len(failures), len(cells))
+    return _results(cells, there, failures, already, notes)
+
+
+def _check(cells: Sequence[Cell], jobs: int | None, scheduler: str | None) -> None:
+    same = Counter(cell.name.casefold() for cell in cells)  # some file systems take upper for lower case
+    twice = [cell.name for cell in cells if same[cell.name.casefold()] > 1]
+    if twice:
+        raise UsageError(
+            f"two cells are called {twice[0]!r}, or differ in upper and lower case only.",
+            why="each has a file of its name",
+            fix="put what differs between them into their names",
+        )
+    if jobs is not None and jobs < 1:
+        raise UsageError(f"{jobs} processes cannot compute anything.", fix="give 1 or more, or leave it out")
+    if jobs is not None and scheduler is not None:
+        raise UsageError("give a number of processes or a scheduler, not both.", why="a cluster has its own workers")
+
+
+def _make(folder: Path) -> None:
+    """Before the work: a place for its results."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ImplicamError(
+            f"cannot create the folder {folder}.", why=str(error), fix="choose a place you may write to"
+        ) from error
+    if not os.access(folder, os.W_OK):
+        raise ImplicamError(f"cannot write into {folder}.", fix="choose a place you may write to")
+
+
+def _workers(count: int, jobs: int | None, scheduler: str | None) -> LocalProcesses | DaskCluster:
+    return DaskCluster(scheduler) if scheduler is not None else LocalProcesses(min(count, jobs or cores()))
+
+
+def _there(cells: Sequence[Cell], folder: Path) -> tuple[dict[str, Stored], list[str]]:
+    """The results that count, and notes on those that do not."""
+    there, notes, other = dict[str, Stored](), list[str](), 0
+    for cell in cells:
+        path = result_file(folder, cell.name)
+        if not path.exists():
+            continue
+        try:
+            stored = decode(path)
+        except ImplicamError as error:
+            notes.append(f"{path} is damaged and was computed again: {error.why}")
+            continue
+        if (stored.work, stored.options) == (cell.work, cell.task.options):
+            there[cell.name] = stored
+        else:
+            other += 1
+    if other:
+        notes.append(f"{other} results in {folder} were of other options or other work and were computed again")
+    return there, notes
+
+
+def _results(
+    cells: Sequence[Cell], there: Mapping[str, Stored], failures: Mapping[str, str], already: int, notes: list[str]
+) -> Results:
+    ours = package_version()
+    versions = Counter(stored.version for stored in there.values() if stored.version != ours)
+    notes += [
+        f"{count} results were computed by implicam {version}; this is {ours}" for version, count in versions.items()
+    ]
+    names = [cell.name for cell in cells if cell.name in there]
+    return Results(
+        values={name: there[name].values for name in names},
+        seconds={name: there[name].seconds for name in names},
+        failures={cell.name: failures[cell.name] for cell in cells if cell.name in failures},
+        already=already,
+        notes=tuple(notes),
+    )

@@ -1,0 +1,162 @@
+"""The panels of `implicam.figures.panels3d` for a browser: one scene, a menu of panels, a page that loads nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.errors import import_extra
+from implicam.figures.panels3d import (
+    COLOURS,
+    Drawn,
+    Panel,
+    Scales,
+    drawn,
+    known_of,
+    room,
+    scales_of,
+    segments,
+    title_of,
+    to_fit,
+)
+from implicam.figures.style import BLACK, BLUE, CLEAR, GREEN, GREY, ORANGE, SKY, graph_objects, layout, number, plain
+
+# Nothing may be loaded from anywhere; Plotly compiles some of its own code, hence eval.
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; "
+    "font-src data:; base-uri 'none'; form-action 'none'"
+)
+_PER_PANEL = 4  # traces
+# From where the printed figures look: 60 degrees to the side, 30 above.
+_VIEW = {"eye": {"x": 1.05, "y": -1.8, "z": 1.2}, "center": {"x": 0, "y": 0, "z": -0.1}}
+
+
+def panels_3d(panels: Iterable[Panel], *, scales: Scales | None = None, every: int = 1) -> Any:
+    """A Plotly figure that shows one of the panels at a time, chosen from a menu; all in the same room and scale.
+
+    One scene, since a browser gives a page some eight to sixteen of them and experiment 3 has twelve panels.
+    """
+    go = graph_objects()
+    chosen = list(panels)
+    scales = scales or scales_of(chosen)
+    found = [drawn(panel, every) for panel in chosen]
+    traces = [trace for i, panel in enumerate(chosen) for trace in _traces(go, panel, found[i], scales, i == 0)]
+    titles = [plain(title_of(panel, d)) for panel, d in zip(chosen, found, strict=True)]
+    corners = room([c for panel, d in zip(chosen, found, strict=True) for c in to_fit(panel, d, scales)])
+    return _figure(go, traces, corners, [_menu(titles)] if len(titles) > 1 else [])
+
+
+def aligned_3d(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2") -> Any:
+    """A Plotly figure of explicit calibration's points before and after alignment; see `panels3d.aligned`."""
+    go = graph_objects()
+    parts: list[tuple[Floats | None, str, str, str]] = [
+        (true_xyz, "robot's positions", "cross", BLUE),
+        (aligned_xyz, "explicit, aligned", "circle-open", GREEN),
+        (camera_xyz, f"explicit, in the frame of {camera}", "diamond-open", ORANGE),
+    ]
+    traces = [
+        _points(go, np.asarray(xyz), plain(name), marker={"symbol": symbol, "size": 4, "color": colour})
+        for xyz, name, symbol, colour in parts
+        if xyz is not None
+    ]
+    return _figure(go, traces, room(xyz for xyz, *_ in parts if xyz is not None), [])
+
+
+def html_page(figure: Any, *, title: str, caption: str = "") -> str:
+    """A figure as one HTML page that works offline (about 5 MB, nearly all of it plotly.js); same figure, same text."""
+    plotly = import_extra("plotly.offline", "report", "an interactive figure")
+    # Inside a script element only "<" can end it; in JSON it stands in strings only, where \u003c is the same.
+    content = figure.to_json().replace("<", "\\u003c")
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
+        f"<style>{_STYLE}</style>\n<script>{plotly.get_plotlyjs()}</script>\n</head>\n<body>\n"
+        f'<h1>{escape(title)}</h1>\n<div id="plot" role="img" aria-label="{escape(title)}"></div>\n'
+        f"<p>{escape(caption)}</p>\n"
+        f'<script type="application/json" id="data">{content}</script>\n<script>{_SCRIPT}</script>\n</body>\n</html>\n'
+    )
+
+
+_STYLE = """
+body { margin: 0 auto; padding: 20px; max-width: 1100px; color: #1d2733; background: #ffffff;
+  font: 16px/1.5 system-ui, sans-serif; }
+h1 { font-size: 22px; margin: 0 0 8px; } p { color: #5a6675; } #plot { width: 100%; height: 72vh; min-height: 420px; }
+"""
+_SCRIPT = """
+"use strict";
+const figure = JSON.parse(document.getElementById("data").textContent);
+Plotly.newPlot("plot", figure.data, figure.layout, {displaylogo: false, responsive: true, scrollZoom: true});
+"""
+
+
+def _traces(go: Any, panel: Panel, found: Drawn, scales: Scales, visible: bool) -> list[Any]:
+    """The _PER_PANEL traces of a panel."""
+    lines = segments(found.xyz, found.true)
+    known = known_of(panel)
+    traces = [
+        _points(go, known, f"training points ({len(known)})", marker={"symbol": "cross", "size": 3, "color": SKY}),
+        _points(go, lines, "to the truth", mode="lines", line={"color": BLACK, "width": 2}),
+        _points(go, found.true, "truth", marker={"size": 2, "color": BLACK}),
+        _measured(go, found, scales),
+    ]
+    for trace in traces:
+        trace.visible = visible
+    return traces
+
+
+def _points(go: Any, xyz: Floats, name: str, **look: Any) -> Any:
+    x, y, z = xyz.T
+    return go.Scatter3d(x=x, y=y, z=z, name=name, hoverinfo="skip", **{"mode": "markers", **look})
+
+
+def _measured(go: Any, found: Drawn, scales: Scales) -> Any:
+    bar = {
+        "title": {"text": "distance from<br>the truth (mm)", "side": "top"}, "thickness": 14, "len": 0.7,
+        "outlinewidth": 0, "ticks": "outside", "x": 0.95,
+    }  # fmt: skip
+    marker = {
+        "size": scales.diameters(found.sd, len(found.xyz)), "color": found.error, "cmin": 0.0,
+        "cmax": scales.error_top, "colorscale": COLOURS.capitalize(), "colorbar": bar,
+        "line": {"width": 1, "color": BLACK}, "opacity": 1.0,
+    }  # fmt: skip
+    certain = "" if found.sd is None else ", larger: less certain"
+    trace = _points(go, found.xyz, f"measured ({len(found.xyz)}){certain}", marker=marker)
+    return trace.update(text=_hover(found), hoverinfo="text")
+
+
+def _hover(found: Drawn) -> list[str]:
+    sd = np.full(len(found.error), np.nan) if found.sd is None else found.sd
+    return [f"off by {number(e)} mm<br>stated sd {number(s)} mm" for e, s in zip(found.error, sd, strict=True)]
+
+
+def _menu(titles: Sequence[str]) -> dict[str, Any]:
+    def shown(i: int) -> list[bool]:
+        return [k == i for k in range(len(titles)) for _ in range(_PER_PANEL)]
+
+    buttons = [{"label": t, "method": "restyle", "args": [{"visible": shown(i)}]} for i, t in enumerate(titles)]
+    return {
+        "type": "dropdown", "buttons": buttons, "x": 0, "xanchor": "left", "y": 1.0, "yanchor": "bottom",
+        "pad": {"b": 6}, "bgcolor": "#ffffff", "bordercolor": GREY,
+    }  # fmt: skip
+
+
+def _figure(go: Any, traces: list[Any], corners: Floats, menus: list[Any]) -> Any:
+    """One scene with the same room for all panels, so that another panel does not change the view."""
+    sides = {
+        f"{name}axis": {
+            "title": {"text": f"{name} (mm)"}, "range": list(corners[:, i]), "gridcolor": GREY, "gridwidth": 0.5,
+            "zeroline": False, "showbackground": False,
+        }
+        for i, name in enumerate("xyz")
+    }  # fmt: skip
+    scene = {**sides, "aspectmode": "data", "camera": _VIEW}
+    figure = go.Figure(traces, layout(scene=scene, updatemenus=menus, uirevision="keep"))
+    figure.update_layout(margin={"l": 0, "r": 0, "t": 44, "b": 0}, modebar={"bgcolor": CLEAR, "color": GREY})
+    return figure.update_layout(
+        legend={"x": 0, "y": 0, "yanchor": "bottom", "bgcolor": CLEAR, "itemsizing": "constant"}
+    )

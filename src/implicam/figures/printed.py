@@ -1,0 +1,70 @@
+"""What the figures for print share: an empty figure, quiet axes, plain numbers on log axes, the look of a method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.errors import import_extra
+from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+
+PURPOSE = "a figure for print"
+# Marker and dash differ wherever the colour does, so that methods are told apart in grey too.
+_LOOKS: dict[str, dict[str, Any]] = {
+    "inverse-gp": {"color": BLUE, "marker": "o", "ls": "-"},
+    "inverse-gp:paper": {"color": SKY, "marker": "s", "ls": "--"},
+    "mlp": {"color": PURPLE, "marker": "^", "ls": "-."},
+    "forward-gp": {"color": BLACK, "marker": "D", "ls": ":"},
+    "explicit": {"color": GREEN, "marker": "v", "ls": (0, (7, 2))},
+}
+_OTHERS: tuple[dict[str, Any], ...] = (
+    {"color": VERMILLION, "marker": "P", "ls": "-"},
+    {"color": ORANGE, "marker": "X", "ls": "--"},
+    {"color": GREY, "marker": "*", "ls": "-."},
+)
+
+
+def blank(width: float, height: float) -> Any:
+    """An empty matplotlib Figure of so many inches; nothing touches pyplot's global state."""
+    module = import_extra("matplotlib.figure", "report", PURPOSE)
+    return module.Figure(figsize=(width, height), layout="constrained")
+
+
+def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Colour, marker and dash of each method, the same in every figure for the methods we know; those come first."""
+    names = set(methods)
+    others = sorted(names - set(_LOOKS))
+    known = {name: look for name, look in _LOOKS.items() if name in names}
+    return known | {name: _OTHERS[i % len(_OTHERS)] for i, name in enumerate(others)}
+
+
+def quiet(axes: Any) -> None:
+    """A light grid behind the data, and no box around them."""
+    axes.grid(True, color="0.9", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def plain_log(axis: Any, *, name: str) -> None:
+    """Make the x or y axis (`name`) logarithmic, with plain numbers: 1, 2, 5 where there is room, else decades."""
+    ticker = import_extra("matplotlib.ticker", "report", PURPOSE)
+    axis.axes.set(**{f"{name}scale": "log"})
+    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(ticker.NullFormatter())
+    low, high = axis.get_data_interval()
+    wide = bool(0 < low < high < np.inf) and high / low > 300
+    axis.set_major_locator(ticker.LogLocator(subs=(1,) if wide else (1, 2, 5)))
+
+
+def values(rows: Iterable[Mapping[str, Any]], key: str) -> Floats:
+    """The numbers of a column that are there and finite."""
+    found = [float(row[key]) for row in rows if row.get(key) is not None]
+    return np.array([value for value in found if np.isfinite(value)], dtype=np.float64)
+
+
+def nothing_to_draw(axes: Any) -> None:
+    """Say in an empty panel that it is empty on purpose."""
+    axes.text(0.5, 0.5, "no result", ha="center", va="center", color="0.4", transform=axes.transAxes)
