@@ -426,7 +426,7 @@ def test_a_cluster_without_workers_is_given_up(tmp_path: Path, monkeypatch: pyte
 def test_an_address_without_a_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "CONNECT_SECONDS", 1)
-    with pytest.raises(ImplicamError, match="no Dask scheduler at 'tcp://127.0.0.1:1'"):
+    with pytest.raises(ImplicamError, match="no Dask scheduler at"):
         run(squares(1, tmp_path / "journal"), tmp_path / "out", scheduler="tcp://127.0.0.1:1")
     for address in ("nonsense", "", "tcp://", "tcp://host", "tcp://host:port"):
         with pytest.raises(UsageError, match="not the address"):

@@ -242,7 +242,7 @@ def _check(found: Alignment, residual: Floats, extent: float) -> None:
     if rms < HOPELESS * extent and abs(found.scale - 1) < HOPELESS:
         return
     raise FitError(
-        f"the boards and the known points contradict each other: aligned, they are {rms:.3g} apart, and the known points "
+        f"the boards and the known points contradict each other: aligned, they are {rms:.3g} apart, the known points "
         f"extend over {extent:.3g}.",
         why=f"the known points are {found.scale:.4g} times as far apart as the boards say",
         fix="check the board's square, the length units, and the names and positions of the known points",

@@ -242,8 +242,8 @@ def _moved_notes(in_rig: RigMap, left_out: Bools, used: Bools) -> list[str]:
         away, seen = int(left_out[:, c].sum()), int(left_out[:, c].sum() + used[:, c].sum())
         if away > 0.3 * seen:
             notes.append(
-                f"{name}: {away} of its {seen} views of the known points contradict the other cameras. Was it moved after "
-                "the pictures of the boards?"
+                f"{name}: {away} of its {seen} views of the known points contradict the other cameras. Was it moved "
+                "after the pictures of the boards?"
             )
     return notes
 
