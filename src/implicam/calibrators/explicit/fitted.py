@@ -91,7 +91,7 @@ def fit_to_boards(data: Dataset, network: Network, boards: Dataset, how: str) ->
         _not_used(data, in_rig.measure(data.observations).reason, alignment),
         (
             *_without_boards(data, trained),
-            *_moved_notes(in_rig, found.left_out, np.isfinite(uv).all(axis=2)),
+            *_moved_notes(in_rig, found.left_out, np.asarray(np.isfinite(uv).all(axis=2))),
             *_notes(network, trained, boards),
             *_alignment_notes(alignment, data.length_unit),
         ),
