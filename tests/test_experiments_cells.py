@@ -416,7 +416,7 @@ def test_a_cluster_without_workers_is_given_up(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(workers, "LOOK_SECONDS", 0.1)
     monkeypatch.setattr(workers, "LONELY_SECONDS", 0.5)
     with (
-        distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=":0", silence_logs=60) as empty,
+        distributed.LocalCluster(n_workers=0, protocol="tcp", dashboard_address=":0", silence_logs=60) as empty,
         pytest.raises(ImplicamError, match="has had no worker") as caught,
     ):
         run(squares(2, tmp_path / "journal"), tmp_path / "out", scheduler=empty.scheduler_address)
