@@ -365,6 +365,7 @@ def bits(values: dict[str, Any]) -> dict[str, bytes]:
     return {key: np.asarray(value).tobytes() for key, value in values.items()}
 
 
+@pytest.mark.slow
 def test_the_bits_do_not_depend_on_who_computes(tmp_path: Path, cluster: Any) -> None:
     cells = [Cell(algebra, f"a/{seed}", {"seed": seed}) for seed in range(3)]
     around = [Cell(surroundings, f"around/{i}") for i in range(4)]
@@ -382,6 +383,7 @@ def test_the_bits_do_not_depend_on_who_computes(tmp_path: Path, cluster: Any) ->
     assert threads.cores() >= 1
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_midway_changes_nothing(tmp_path: Path, cluster: Any) -> None:
     journal, folder = tmp_path / "journal", tmp_path / "out"
     cells = squares(12, journal, seconds=0.2)
@@ -398,6 +400,7 @@ def test_a_worker_that_is_killed_midway_changes_nothing(tmp_path: Path, cluster:
     assert run(cells, folder).already == 12
 
 
+@pytest.mark.slow
 def test_a_cell_that_kills_its_workers_fails_alone(
     tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -411,6 +414,7 @@ def test_a_cell_that_kills_its_workers_fails_alone(
     assert "died, again and again" in results.failures["bad/kill"]
 
 
+@pytest.mark.slow
 def test_a_cluster_without_workers_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "LOOK_SECONDS", 0.1)
@@ -423,6 +427,7 @@ def test_a_cluster_without_workers_is_given_up(tmp_path: Path, monkeypatch: pyte
     assert "dask worker" in caught.value.fix
 
 
+@pytest.mark.slow
 def test_an_address_without_a_scheduler_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "CONNECT_SECONDS", 1)
