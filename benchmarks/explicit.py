@@ -11,22 +11,17 @@ rigs, 95 %.
 
 from __future__ import annotations
 
-import argparse
-import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from forward import HEAD, held_out, row
+from forward import HEAD, held_out, row, run_parts
 from implicam.calibrators import Explicit, ForwardGP
 from implicam.coverage import tercile_labels
 from implicam.dataset import Observations
 from implicam.detect.board import Board
 from implicam.detect.model import View
 from implicam.errors import ImplicamError
-from implicam.files import write_text
 from implicam.geometry import depth_of_points
 from implicam.simulate import (
     Optics,
@@ -161,26 +156,5 @@ def _ratio(found):
 PARTS = {"points": points, "boards": boards, "hard": hard, "photographs": photographs}
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rigs", type=int, default=16)
-    parser.add_argument("--only", default=",".join(PARTS))
-    parser.add_argument("-o", "--output", type=Path)
-    args = parser.parse_args()
-    lines = [f"explicit on simulated rigs: `python benchmarks/explicit.py --rigs {args.rigs} --only {args.only}`", ""]
-    started = time.perf_counter()
-    with ProcessPoolExecutor() as pool:
-        for name in args.only.split(","):
-            lines += [PARTS[name].__doc__, ""]
-            print(f"\n{PARTS[name].__doc__}\n", flush=True)
-            for line in PARTS[name](pool, args.rigs):
-                print(line, flush=True)
-                lines += line.splitlines() or [""]
-            lines.append("")
-    lines.append(f"{time.perf_counter() - started:.0f} s.")
-    if args.output:
-        write_text(args.output, "\n".join(lines) + "\n")
-
-
 if __name__ == "__main__":
-    main()
+    run_parts("explicit", "explicit", PARTS, __doc__, 16)

@@ -217,21 +217,23 @@ def recalibrations(pool, rigs):
 PARTS = {"few": few, "hard": hard, "boards": boards, "implicit": implicit, "recalibrations": recalibrations}
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rigs", type=int, default=12)
-    parser.add_argument("--only", default=",".join(PARTS))
+def run_parts(name, what, parts, doc, rigs):
+    """Parse the options, run the parts, print them and write them down."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rigs", type=int, default=rigs)
+    parser.add_argument("--only", default=",".join(parts))
     parser.add_argument("-o", "--output", type=Path)
     args = parser.parse_args()
-    lines = [f"forward-gp on simulated rigs: `python benchmarks/forward.py --rigs {args.rigs}`", ""]
+    only = f" --only {args.only}" * (args.only != ",".join(parts))
+    lines = [f"{what} on simulated rigs: `python benchmarks/{name}.py --rigs {args.rigs}{only}`", ""]
     started = time.perf_counter()
     with ProcessPoolExecutor() as pool:
-        for name in args.only.split(","):
-            lines += [PARTS[name].__doc__, ""]
-            print(f"\n{PARTS[name].__doc__}\n", flush=True)
-            for line in PARTS[name](pool, args.rigs):
+        for part in args.only.split(","):
+            lines += [parts[part].__doc__, ""]
+            print(f"\n{parts[part].__doc__}\n", flush=True)
+            for line in parts[part](pool, args.rigs):
                 print(line, flush=True)
-                lines += line.splitlines()
+                lines += line.splitlines() or [""]
             lines.append("")
     lines.append(f"{time.perf_counter() - started:.0f} s.")
     if args.output:
@@ -239,4 +241,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    run_parts("forward", "forward-gp", PARTS, __doc__, 12)

@@ -1122,6 +1122,11 @@ def test_the_classical_way_on_the_command_line(made: Path, cli: Cli) -> None:
     for name, more in (("b.yaml", []), ("camchain.yaml", []), ("model", ["--unit", "mm"]), ("b.csv", [])):
         assert cli("import", name, "-o", "i.implicam", *more).code == 0
         assert cli("measure", "i.implicam", made / "rig" / "check").code == 0
+    assert cli("import", "b.yaml", "-o", "i.implicam", "--unit", "mm").code == 0  # written in metres, as OpenCV has it
+    same = cli("evaluate", "i.implicam", made / "rig" / "check", "--json").json
+    assert same["rows"][0]["rmse"] == pytest.approx(told["rows"][0]["rmse"], rel=0.05)
+    assert cli("calibrate", "boards", "-o", "c.implicam").out.startswith("c.implicam: explicit from")
+    assert "made without known points" in cli("evaluate", "c.implicam", "--cv", "3").err
 
 
 def test_a_neural_network_says_what_its_numbers_are(made: Path, cli: Cli) -> None:
