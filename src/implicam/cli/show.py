@@ -52,7 +52,7 @@ def progress(quiet: bool = False) -> Iterator[Progress]:
         return
     times = (TimeElapsedColumn(), TimeRemainingColumn())
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times)
-    with Bars(*columns, console=err, transient=True) as bars:
+    with Bars(*columns, console=err, transient=True, speed_estimate_period=600) as bars:  # a cell may take minutes
         tasks: dict[str, Any] = {}
 
         def step(what: str, done: int, total: int) -> None:

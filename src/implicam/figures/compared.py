@@ -10,6 +10,7 @@ import numpy as np
 from implicam.compare import RANDOM, mean_and_error, plane_of
 from implicam.dataset import Floats
 from implicam.errors import import_extra
+from implicam.figures.printed import PURPOSE, blank, plain_log, quiet, values
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, MARKS, ORANGE, PURPLE, SKY, VERMILLION
 
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, BLACK)
@@ -40,7 +41,7 @@ def compare_figure(table: Iterable[Row], *, unit: str) -> Any:
 
 def _curves(rows: Sequence[Row], unit: str, over: str) -> Any:
     """Against the number of known points."""
-    figure = _figure(11.0, 4.3)
+    figure = blank(11.0, 4.3)
     panels = figure.subplots(1, 3)
     methods = _names(rows)
     for k, method in enumerate(methods):
@@ -61,25 +62,14 @@ def _curves(rows: Sequence[Row], unit: str, over: str) -> Any:
 _LOOK: dict[str, Any] = {"capsize": 3, "ms": 6.5, "mec": "white", "mew": 0.5}
 
 
-def _figure(width: float, height: float) -> Any:
-    module = import_extra("matplotlib.figure", "report", "a figure for print")
-    return module.Figure(figsize=(width, height), layout="constrained")
-
-
 def _names(rows: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(str(row["method"]) for row in rows))
-
-
-def _values(rows: Sequence[Row], key: str) -> Floats:
-    """The numbers of a column that are there."""
-    values = [float(row[key]) for row in rows if row.get(key) is not None]
-    return np.array([value for value in values if np.isfinite(value)], dtype=np.float64)
 
 
 def _over_splits(rows: Sequence[Row], key: str) -> tuple[Floats, Floats, Floats]:
     """Known points, and the mean and its standard error (NaN for one split) of a column at each."""
     known = sorted({int(row["known"]) for row in rows})
-    found = [(k, _values([row for row in rows if int(row["known"]) == k], key)) for k in known]
+    found = [(k, values([row for row in rows if int(row["known"]) == k], key)) for k in known]
     stats = [(k, *mean_and_error(values)) for k, values in found if len(values)]
     known_points, middle, error = np.array(stats, dtype=np.float64).reshape(-1, 3).T
     return known_points, middle, error
@@ -101,37 +91,20 @@ def _draw_limit(axes: Any, rows: Sequence[Row]) -> None:
 
 def _finish_curves(panels: Sequence[Any], known: Sequence[int], unit: str) -> None:
     error, inside, seconds = panels
-    ticker = import_extra("matplotlib.ticker", "report", "a figure for print")
+    ticker = import_extra("matplotlib.ticker", "report", PURPOSE)
     for axes in panels:
         axes.set_xscale("log")
         axes.set_xticks(known, [str(k) for k in known])
         axes.xaxis.set_minor_locator(ticker.NullLocator())
         axes.set_xlabel("known points")
-        _quiet(axes)
-    error.set_yscale("log")
-    _plain_log(error.yaxis, ticker)
+        quiet(axes)
+    plain_log(error.yaxis, name="y")
     error.set_ylabel(f"rms error ({unit})")
     inside.axhline(0.95, color=GREY, ls="--", lw=1.2)
     inside.set_ylim(top=1.02)
     inside.set_ylabel("share inside 95 % ellipsoids\n(0.95 is honest)")
-    seconds.set_yscale("log")
-    _plain_log(seconds.yaxis, ticker)
+    plain_log(seconds.yaxis, name="y")
     seconds.set_ylabel("seconds to fit")
-
-
-def _quiet(axes: Any) -> None:
-    axes.grid(True, color="0.9", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _plain_log(axis: Any, ticker: Any) -> None:
-    """Label a log axis with plain numbers: 1, 2, 5 where there is room, decades where there is not."""
-    axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(ticker.NullFormatter())
-    low, high = axis.get_data_interval()
-    wide = bool(0 < low < high < np.inf) and high / low > 300
-    axis.set_major_locator(ticker.LogLocator(subs=(1,) if wide else (1, 2, 5)))
 
 
 def _legend(figure: Any, axes: Any, title: str) -> None:
@@ -152,7 +125,7 @@ def _range_plot(rows: Sequence[Row], unit: str) -> Any:
     cells = list(dict.fromkeys((_points(row), method) for method in methods for row in rows))
     cells = sorted(cells, key=lambda cell: (cell[0], methods.index(cell[1])))
     kinds = list(dict.fromkeys(str(row.get("split", RANDOM)) for row in rows))
-    figure = _figure(11.0, 1.9 + (0.28 + 0.16 * len(kinds)) * len(cells))
+    figure = blank(11.0, 1.9 + (0.28 + 0.16 * len(kinds)) * len(cells))
     panels = figure.subplots(1, 2, sharey=True)
     step = 0.8 / len(kinds)
     for k, kind in enumerate(kinds):
@@ -180,14 +153,14 @@ def _draw_ranges(
 ) -> None:
     at, middle, error = [], [], []
     for i, cell in enumerate(cells):
-        values = _values([row for row in rows if (_points(row), str(row["method"])) == cell], key)
-        if not len(values):
+        found = values([row for row in rows if (_points(row), str(row["method"])) == cell], key)
+        if not len(found):
             place = {"va": "center", "size": 7, "transform": axes.get_yaxis_transform()}
             axes.text(0.01, i + shift, "no result", color=look["color"], **place)
             continue
         faint = {**look, "label": None, "ms": 3, "mew": 0, "alpha": 0.35}
-        axes.plot(values, np.full(len(values), i + shift), ls="", **faint)
-        mean, sd = mean_and_error(values)
+        axes.plot(found, np.full(len(found), i + shift), ls="", **faint)
+        mean, sd = mean_and_error(found)
         at.append(i + shift)
         middle.append(mean)
         error.append(sd)
@@ -196,19 +169,17 @@ def _draw_ranges(
 
 
 def _finish_ranges(panels: Sequence[Any], cells: Sequence[tuple[int, str]], unit: str) -> None:
-    ticker = import_extra("matplotlib.ticker", "report", "a figure for print")
     several = len({points for points, _ in cells}) > 1
     names = [f"{method}, {points} points" if several else method for points, method in cells]
     error, inside = panels
     for axes in panels:
-        _quiet(axes)
+        quiet(axes)
         axes.set_yticks(range(len(cells)), names)
         axes.grid(False, axis="y")
         for line in np.arange(0.5, len(cells) - 1):
             axes.axhline(line, color="0.85", lw=0.6)
     error.set_ylim(len(cells) - 0.5, -0.5)
-    error.set_xscale("log")
-    _plain_log(error.xaxis, ticker)
+    plain_log(error.xaxis, name="x")
     error.set_xlabel(f"rms error ({unit})")
     inside.axvline(0.95, color=GREY, ls="--", lw=1.2)
     inside.set_xlim(right=1.02)

@@ -12,17 +12,13 @@ from typing import Any
 from implicam import figures
 from implicam.coverage import Summary
 from implicam.errors import import_extra
+from implicam.figures.interactive3d import POLICY
 from implicam.figures.style import number
 from implicam.files import write_text
 from implicam.report import words
 from implicam.report.data import ReportData
 from implicam.report.look import SCRIPT, STYLE
 
-# Nothing may be loaded from anywhere, whatever a name tries; Plotly compiles some of its own code, hence eval.
-_POLICY = (
-    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; "
-    "font-src data:; base-uri 'none'; form-action 'none'"
-)
 _LONG = 15
 
 
@@ -42,7 +38,7 @@ def page(data: ReportData) -> str:
     )
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(data.title)}</title>\n'
         f"<style>{STYLE}</style>\n<script>{plotly.get_plotlyjs()}</script>\n</head>\n<body>\n<main>\n{body}\n</main>\n"
         f"<script>{SCRIPT}</script>\n</body>\n</html>\n"
