@@ -1,7 +1,8 @@
 """Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium).
 
 Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of the demo's
-overlays, and one of a simulated board. Dots: `python benchmarks/dots.py ../shared/real --overlays docs/images`.
+overlays, and one of a simulated board; compares all methods, which takes minutes.
+Dots: `python benchmarks/dots.py ../shared/real --overlays docs/images`.
 """
 
 from __future__ import annotations
@@ -44,6 +45,10 @@ def main() -> None:
         implicam("simulate", str(board), "--images", "--target", "board", "--boards", "1", "--cameras", "cam5")
         implicam("detect", str(board))
         shutil.copy(board / "detections" / "overlays" / "cam5" / "board01.jpg", IMAGES / "detect-board.jpg")
+        six = Path(folder) / "six"
+        implicam("simulate", str(six), "--positions", "random", "--points", "200", "--check", "300")
+        implicam("compare", str(six), "--train", "17,35,87,157", "--seeds", "3", "--check", str(six / "check"),
+                 "-o", str(IMAGES / "compare.png"))  # fmt: skip
 
 
 if __name__ == "__main__":
