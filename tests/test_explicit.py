@@ -553,8 +553,12 @@ def test_boards_may_be_in_another_unit() -> None:
     target = data.extra["target"]
     metres = replace(data, length_unit="m", extra={"target": {**target, "square": target["square"] / 1000}})
     others = points(rig, 30, 6).observations
-    a = Explicit(boards=metres).fit(points(rig, 30, 5)).measure(others)
+    method = Explicit(boards=metres)
+    a = method.fit(points(rig, 30, 5)).measure(others)
     np.testing.assert_allclose(a.xyz, from_boards().measure(others).xyz, atol=1e-6)
+    known = points(rig, 30, 5)  # and the same method with known points in another unit
+    in_m = replace(known, length_unit="m", known=replace(known.positions, xyz=known.xyz / 1000, extra={}))
+    np.testing.assert_allclose(method.fit(in_m).measure(others).xyz * 1000, a.xyz, atol=1e-4)
 
 
 def test_corners_of_a_board_share_its_declared_error() -> None:

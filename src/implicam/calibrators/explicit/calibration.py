@@ -84,18 +84,19 @@ class Explicit:
         return ExplicitCalibration(self, data, fitted)
 
     def _network(self, data: Dataset, progress: Progress) -> Network:
-        """The rig from the boards: the same for all known points, so it is adjusted once."""
-        if data.observations.camera_names not in self._networks:
+        """The rig from the boards: adjusted once for all known points of the same cameras in the same unit."""
+        key = (data.length_unit, data.observations.camera_names)
+        if key not in self._networks:
             assert self.boards is not None
             scale = 1.0
             if self.boards.length_unit != data.length_unit:
                 scale = self.boards.metres_per_unit / data.metres_per_unit
             boards = boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)), scale)
-            self._networks[data.observations.camera_names] = calibrate_network(boards, self.lens, progress)
-        return self._networks[data.observations.camera_names]
+            self._networks[key] = calibrate_network(boards, self.lens, progress)
+        return self._networks[key]
 
     @cached_property
-    def _networks(self) -> dict[tuple[str, ...], Network]:
+    def _networks(self) -> dict[tuple[str, tuple[str, ...]], Network]:
         return {}
 
 

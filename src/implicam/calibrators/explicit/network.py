@@ -14,7 +14,7 @@ import numpy as np
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
 from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import Choice, angles
-from implicam.calibrators.explicit.zhang import STUCK, OneCamera, calibrate_camera, pose_and_mirror
+from implicam.calibrators.explicit.zhang import STUCK, OneCamera, calibrate_camera, median_error, pose_and_mirror
 from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image
 from implicam.dataset import Names
 from implicam.errors import FitError
@@ -173,14 +173,8 @@ def _relative(
     candidates = [placed[a][k] @ placed[b][k].inverse() for k in common]
 
     def error(pose: Pose) -> float:
-        off = []
-        for k in common:
-            for camera, view, there in (
-                (singles[a].camera, seen[a][k], pose @ placed[b][k]),
-                (singles[b].camera, seen[b][k], pose.inverse() @ placed[a][k]),
-            ):
-                length = np.linalg.norm(camera.pixel(there.apply(view.xyz)) - view.uv, axis=1)
-                off.append(float(np.median(np.nan_to_num(length, nan=1e4))))
+        off = [median_error(singles[a].camera, seen[a][k], pose @ placed[b][k]) for k in common]
+        off += [median_error(singles[b].camera, seen[b][k], pose.inverse() @ placed[a][k]) for k in common]
         return float(np.median(off))
 
     return min(candidates, key=error)
@@ -222,9 +216,11 @@ def _placed_again(bundle: Bundle) -> Bundle | None:
             continue
         now = bundle.boards.pose(k)
         candidates = [pose for view in views[k] for pose in _seen_by(bundle, view, now)]
-        best = min(candidates, key=lambda pose: _off(bundle, views[k], pose))
-        if _off(bundle, views[k], best) < 0.5 * _off(bundle, views[k], now):
-            rotation[k], translation[k], changed = best.rotation, best.translation, True
+        off = [_off(bundle, usual, views[k], pose) for pose in (now, *candidates)]
+        best = int(np.argmin(off))
+        if off[best] < 0.5 * off[0]:
+            pose = candidates[best - 1]
+            rotation[k], translation[k], changed = pose.rotation, pose.translation, True
     return replace(bundle, boards=Placed(rotation, translation)) if changed else None
 
 
@@ -236,14 +232,9 @@ def _seen_by(bundle: Bundle, view: BoardView, now: Pose) -> list[Pose]:
     return [camera.pose.inverse() @ pose for pose in both]
 
 
-def _off(bundle: Bundle, views: list[BoardView], pose: Pose) -> float:
-    """How far off the corners of a board are in the worst of its views, over the camera's usual."""
-    usual = spreads(bundle)
-    worst = 0.0
-    for view in views:
-        length = np.linalg.norm(bundle.cameras[view.camera].pixel(pose.apply(view.xyz)) - view.uv, axis=1)
-        worst = max(worst, float(np.median(np.nan_to_num(length, nan=1e4)) / usual[view.camera]))
-    return worst
+def _off(bundle: Bundle, usual: Floats, views: list[BoardView], pose: Pose) -> float:
+    """How far off the corners of a board are in the worst of its views, over the cameras' usual (C,)."""
+    return max(median_error(bundle.cameras[v.camera], v, pose) / float(usual[v.camera]) for v in views)
 
 
 def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floats) -> None:

@@ -149,13 +149,14 @@ def _best_pose(camera: CentralCamera, view: BoardView, now: Pose, noise: float) 
     """The better of both, and its median error in pixels."""
 
     def error(pose: Pose) -> float:
-        return _median_error(camera, view, pose)
+        return median_error(camera, view, pose)
 
     best = min(pose_and_mirror(camera, view, now, noise), key=error)
     return best, error(best)
 
 
-def _median_error(camera: CentralCamera, view: BoardView, pose: Pose) -> float:
+def median_error(camera: CentralCamera, view: BoardView, pose: Pose) -> float:
+    """Of the corners of a board at a pose, in pixels; infinite where the camera does not see most of them."""
     off = np.linalg.norm(camera.pixel(pose.apply(view.xyz)) - view.uv, axis=1)
     return float(np.median(np.nan_to_num(off, nan=np.inf)))
 
@@ -169,7 +170,7 @@ def pose_and_mirror(camera: CentralCamera, view: BoardView, now: Pose, noise: fl
     for _ in range(SUBSETS if len(good) >= 8 else 0):
         some = rng.choice(good, 8, replace=False)
         found.append(planar_poses(view.xyz[some, :2], rays[None, some], np.ones(1))[0][0])
-    best = min(found, key=lambda pose: _median_error(camera, view, pose))
+    best = min(found, key=lambda pose: median_error(camera, view, pose))
     only = Views((replace(view, camera=0, board=0),), 1)
     prior = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))
     refined = []
