@@ -29,11 +29,12 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from implicam.calibrators.inverse_gp import EXTENT, Scaling
-from implicam.calibrators.paper_preset import LEARNING_RATE, STEPS, exact_gp
+from implicam.calibrators.paper_preset import LEARNING_RATE, exact_gp
 from implicam.files import write_text
 from implicam.gp import Fit, GaussianProcess, Kernel, maximise_each
 from implicam.simulate import simulated
 
+GPYTORCH_STEPS = 100  # the steps of its tutorial, twice
 SETS = {4: "2R", 8: "2R2W", 12: "2R4W"}
 
 
@@ -58,7 +59,7 @@ def _gpytorch_one(X, y):
     model = exact_gp(X, y, likelihood)
     objective = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
     optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
-    for _ in range(STEPS):
+    for _ in range(GPYTORCH_STEPS):
         optimiser.zero_grad()
         loss = -objective(model(X), y)
         loss.backward()

@@ -13,11 +13,13 @@ import pytest
 
 from implicam.calibrators import (
     METHODS,
+    NEEDED,
     Calibration,
     InverseGP,
     InverseGPCalibration,
     calibrator,
     load_calibration,
+    named,
 )
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import DatasetError, FitError, MissingExtraError, UsageError
@@ -228,7 +230,7 @@ def test_an_offset_of_the_world_frame_moves_the_answer_and_nothing_else(case: Ca
     data, held_out = sets()
     offset = np.array([1000.0, -250.0, 40.0])
     if dict(case.options).get("preset") == "paper":
-        pytest.skip("the paper never centred its positions: 100 steps from the origin reach another place")
+        pytest.skip("the paper never centred its positions: its steps from the origin reach another place")
     shifted = case.make.fit(moved(data, data.xyz + offset))
     a, b = fitted(case).measure(held_out.observations), shifted.measure(held_out.observations)
     assert_same(case, a.xyz, a.cov, b.xyz - offset, b.cov)
@@ -389,6 +391,33 @@ def test_options_are_checked_by_name() -> None:
             InverseGP(shortest_lengthscale=wrong)
 
 
+@pytest.mark.parametrize(("name", "options"), [
+    ("forward-gp", {}),
+    ("forward-gp:none", {"lens": "none"}),
+    ("explicit:kannala-brandt", {"lens": "kannala-brandt"}),
+    ("inverse-gp", {}),
+    ("inverse-gp:matern-5/2", {"kernel": "matern-5/2"}),
+    ("inverse-gp:paper", {"preset": "paper"}),
+    ("mlp", {}),
+    ("mlp:no-dropout", {"dropout": 0.0}),
+])  # fmt: skip
+def test_a_name_is_a_method_with_one_option(
+    name: str, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name in NEEDED:
+        pytest.importorskip(NEEDED[name][0])
+    assert named(name) == calibrator(name.partition(":")[0], **options)
+    for wrong in (f"no-{name}", f"{name}-no"):
+        with pytest.raises(UsageError):
+            named(wrong)
+    if name in NEEDED:  # told when it is named, not in the middle of a sweep
+        library, extra = NEEDED[name]
+        monkeypatch.setitem(sys.modules, library, None)
+        with pytest.raises(MissingExtraError, match=f"{name} needs the library '{library}'") as caught:
+            named(name)
+        assert f"implicam[{extra}]" in caught.value.fix
+
+
 # inverse-gp
 
 
@@ -528,7 +557,7 @@ def test_the_training_is_gpytorchs_tutorial() -> None:
     likelihood.train()
     mll = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
     optimiser = torch.optim.Adam(model.parameters(), lr=0.1)
-    for _ in range(100):
+    for _ in range(200):
         optimiser.zero_grad()
         loss = -mll(model(X), y)
         loss.backward()

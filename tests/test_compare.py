@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from implicam.calibrators import METHODS, Calibration, ForwardGP, InverseGP
-from implicam.cli import commands, main, show
+from implicam.calibrators import METHODS, NEEDED, Calibration, ForwardGP, InverseGP, named
+from implicam.cli import main
+from implicam.cli.compare import _available_methods
+from implicam.cli.compare_table import compare_failures, compare_table
 from implicam.compare import (
     NUMBERS,
     Trial,
@@ -524,7 +526,7 @@ def test_a_split_in_which_nothing_was_measured_does_not_wipe_out_the_others() ->
 
 def printed(trials: Sequence[Trial]) -> list[str]:
     console = Console(width=200, record=True, file=io.StringIO())
-    console.print(show.compare_table(summarise(trials), "mm"))
+    console.print(compare_table(summarise(trials), "mm"))
     return [line.rstrip() for line in console.export_text().splitlines()]
 
 
@@ -572,14 +574,14 @@ def test_failures_are_told_once_with_how_many() -> None:
     trials = [Trial(m, 10, seed, failure="too few points.") for m in "ab" for seed in range(3)]
     trials += [Trial("a", 10, 3, failure="flat."), trial("a", 10, 4, 1.0)]
     trials += [Trial("a", 9 + seed, seed, failure="x", split="shot", all_others=True) for seed in (0, 1)]
-    assert show.compare_failures(trials) == [
+    assert compare_failures(trials) == [
         "a with 10 points failed in 3 of 5 splits: too few points.",
         "b with 10 points failed in 3 of 3 splits: too few points.",
         "a with all other points failed in 2 of 2 splits (shot): x",
         "a with 10 points failed in 1 of 5 splits: flat.",
     ]
     both = [Trial(m, 10, 0, failure="no.") for m in "ab"]
-    assert show.compare_failures(both) == ["a, b with 10 points failed in 1 of 1 splits: no."]
+    assert compare_failures(both) == ["a, b with 10 points failed in 1 of 1 splits: no."]
 
 
 # figure
@@ -738,17 +740,16 @@ def test_all_methods_are_those_that_are_there(
         method = "other"
 
     monkeypatch.setitem(METHODS, "other", (Other, Other))
-    monkeypatch.setitem(commands.NEEDED, "other", ("no_such_library", "other-extra"))
-    monkeypatch.setattr(commands, "NEEDED", commands.NEEDED)
-    names = commands._available_methods()
+    monkeypatch.setitem(NEEDED, "other", ("no_such_library", "other-extra"))
+    names = _available_methods()
     assert "other" not in names
     assert 'left out other: pip install "implicam[other-extra]"' in capsys.readouterr().err
-    monkeypatch.delitem(commands.NEEDED, "other")
-    names = commands._available_methods()
+    monkeypatch.delitem(NEEDED, "other")
+    names = _available_methods()
     assert {"forward-gp", "forward-gp:none", "inverse-gp", "other"} <= set(names)
-    assert set(METHODS) - set(commands.NEEDED) <= set(names)
+    assert set(METHODS) - set(NEEDED) <= set(names)
     for name in names:
-        assert commands._named_method(name).method == name.partition(":")[0]
-    assert commands._named_method("inverse-gp:matern-5/2").kernel == "matern-5/2"
-    assert commands._named_method("forward-gp:none").lens == "none"
-    assert commands._named_method("explicit:kannala-brandt").lens == "kannala-brandt"
+        assert named(name).method == name.partition(":")[0]
+    assert named("inverse-gp:matern-5/2").kernel == "matern-5/2"
+    assert named("forward-gp:none").lens == "none"
+    assert named("explicit:kannala-brandt").lens == "kannala-brandt"

@@ -14,7 +14,16 @@ import pytest
 
 from implicam.calibrators import MLP, MLPCalibration, load_calibration
 from implicam.calibrators.mlp_network import HIDDEN, Network, draw_masks, layer_shapes
-from implicam.calibrators.mlp_training import CHECK_EVERY, Examples, _Adam, _Batch, initial_weights, train
+from implicam.calibrators.mlp_training import (
+    CHECK_EVERY,
+    Backpropagation,
+    Examples,
+    _Batch,
+    _Masks,
+    forward,
+    initial_weights,
+    train,
+)
 from implicam.dataset import Dataset, Observations
 from implicam.errors import CalibrationFileError, FitError, MissingExtraError, UsageError
 from implicam.progress import silent
@@ -101,6 +110,7 @@ def test_the_position_is_the_network_between_its_scalings() -> None:
 
 def test_it_starts_where_torchs_layers_start() -> None:
     """Uniform within 1 / sqrt(fan in): the largest of many draws is just inside, the variance a third of its square."""
+    torch.manual_seed(0)
     arrays = initial_weights(12, np.random.default_rng(0))
     for weight, bias in zip(arrays[::2], arrays[1::2], strict=True):
         theirs = torch.nn.Linear(*weight.shape).weight.detach().numpy()
@@ -161,24 +171,60 @@ def test_masks_switch_off_the_share_and_keep_the_mean() -> None:
 # the training
 
 
-def test_the_optimiser_is_torchs_adam_and_networks_can_leave() -> None:
+def test_its_gradients_are_those_of_autograd() -> None:
+    """In float64, with masks and without; the losses of the three networks apart, so that none gets another's slope."""
     rng = np.random.default_rng(0)
-    start = torch.tensor(rng.normal(size=(3, 5, 2)))
-    targets = torch.tensor(rng.normal(size=(3, 5, 2)))
-    reference = [start[i].clone().requires_grad_() for i in range(3)]
-    theirs = torch.optim.Adam(reference)  # its default learning rate and decays
-    ours = _Adam(torch, [start.clone()])
-    running = np.arange(3)
+    starts = [initial_weights(4, rng) for _ in range(3)]
+    parameters = [torch.tensor(np.stack(arrays)) for arrays in zip(*starts, strict=True)]
+    X, Y = torch.tensor(rng.normal(size=(3, 7, 4))), torch.tensor(rng.normal(size=(3, 7, 3)))
+    masks = [torch.tensor((rng.random((3, 7, width)) >= 0.3) / 0.7) for width in HIDDEN]
+    written = [torch.full_like(parameter, torch.nan) for parameter in parameters]
+    gradients = Backpropagation(torch, parameters, written, 7)
+    for given in (masks, (), masks):
+        gradients(X, Y, given)
+        for i in range(3):
+            theirs = [parameter[i].clone().requires_grad_() for parameter in parameters]
+            hidden = X[i]
+            for layer, (weight, bias) in enumerate(zip(theirs[::2], theirs[1::2], strict=True)):
+                hidden = hidden @ weight + bias
+                if layer < len(HIDDEN):
+                    hidden = torch.nn.functional.leaky_relu(hidden) * (given[layer][i] if given else 1)
+            torch.nn.functional.mse_loss(hidden, Y[i]).backward()
+            np.testing.assert_allclose(gradients.outputs[-1][i], hidden.detach(), rtol=0, atol=1e-13)
+            for found, expected in zip(written, theirs, strict=True):
+                np.testing.assert_allclose(found[i], expected.grad, rtol=0, atol=1e-14)
+
+
+def test_the_prediction_is_not_overwritten_by_the_next() -> None:
+    parameters = [torch.tensor(a[None]) for a in initial_weights(4, np.random.default_rng(0))]
+    X = torch.tensor(np.random.default_rng(1).normal(size=(1, 7, 4)))
+    first = forward(torch, parameters, X)[-1]
+    before = first.clone()
+    forward(torch, parameters, -X)
+    np.testing.assert_array_equal(first, before)
+
+
+def test_a_network_that_stays_is_not_disturbed_by_others_that_leave() -> None:
+    """Given the same gradients, bit by bit: the weights, Adam's means and its count of steps, in any company."""
+    rng = np.random.default_rng(0)
+    batch = _Batch(torch, [examples(seed=seed) for seed in range(5)], 0.2)
+    alone = [_Batch(torch, [examples(seed=seed)], 0.2) for seed in range(5)]
     for step in range(60):
-        if step == 30:
-            ours.keep(np.array([True, False, True]))
-            running = np.array([0, 2])
-        ours.step(((ours.parameters[0] - targets[running]) ** 4).sum())
-        theirs.zero_grad()
-        sum(((p - t) ** 4).sum() for p, t in zip(reference, targets, strict=True)).backward()
-        theirs.step()
-    for row, i in zip(ours.parameters[0], running, strict=True):
-        np.testing.assert_allclose(row.detach().numpy(), reference[i].detach().numpy(), rtol=0, atol=1e-12)
+        if step in (20, 40):
+            batch._keep(batch.running != step / 20)
+        for i, one in enumerate(alone):
+            one.weights.grad[:] = torch.tensor(rng.normal(size=one.weights.shape))
+            batch.weights.grad[batch.running == i] = one.weights.grad
+            one.optimiser.step()
+        batch.optimiser.step()
+    assert list(batch.running) == [0, 3, 4]
+    ours = batch.optimiser.state[batch.weights]
+    for row, i in enumerate(batch.running):
+        theirs = alone[i].optimiser.state[alone[i].weights]
+        np.testing.assert_array_equal(batch.weights[row], alone[i].weights[0])
+        assert ours["step"] == theirs["step"] == 60
+        for name in ("exp_avg", "exp_avg_sq"):
+            np.testing.assert_array_equal(ours[name][row], theirs[name][0])
 
 
 def test_training_is_the_usual_loop_of_torch() -> None:
@@ -201,16 +247,52 @@ def test_training_is_the_usual_loop_of_torch() -> None:
     assert ours.loss == pytest.approx(losses[ours.epoch - 1], rel=1e-3)
 
 
+def drawn(masks: _Masks) -> np.ndarray:
+    return np.concatenate([layer.numpy() for layer in masks.draw()], axis=2)
+
+
 def test_training_drops_the_share_afresh_in_each_step() -> None:
-    batch = _Batch(torch, [examples(seed=0), examples(seed=1)], 0.2)
-    first, again = (np.concatenate([m.numpy() for m in batch._draw_masks(32)], axis=2) for _ in range(2))
+    masks = _Batch(torch, [examples(seed=0), examples(seed=1)], 0.2).masks
+    first, again = drawn(masks), drawn(masks)
     assert first.shape == (2, 32, sum(HIDDEN))
     assert (first != again).any()
     assert (first[0] != first[1]).any()
     np.testing.assert_allclose(np.unique(first), [0, 1.25], rtol=1e-6)
     share = np.mean([first == 0, again == 0])
     assert share == pytest.approx(0.2, abs=5 * 0.4 / np.sqrt(2 * first.size))
-    assert _Batch(torch, [examples()], 0.0)._draw_masks(32) == ()
+    assert _Batch(torch, [examples()], 0.0).masks.draw() == ()
+
+
+@pytest.mark.parametrize("dropout", [0.01, 0.2, 0.5, 0.9])
+def test_masks_are_independent_with_the_stated_probability(dropout: float) -> None:
+    """4 million draws, five standard errors: the share of each layer, and pairs of units, points and steps."""
+    masks = _Masks(torch, [np.random.SFC64(s) for s in (3, 4)], 3000, dropout)
+    off = np.stack([drawn(masks) == 0 for _ in range(2)]) - dropout  # (step, network, point, unit)
+    sd = dropout * (1 - dropout)
+    for layer in np.split(off, np.cumsum(HIDDEN)[:-1], axis=3):
+        assert abs(layer.mean()) < 5 * np.sqrt(sd / layer.size)
+    pairs = [(off[..., :-k], off[..., k:]) for k in (1, 2, 3, 4, 8)]
+    pairs += [(off[:, :, :-1], off[:, :, 1:]), (off[:, :1], off[:, 1:]), (off[:1], off[1:])]
+    for a, b in pairs:
+        assert abs(np.mean(a * b)) < 5 * sd / np.sqrt(a.size)
+
+
+def test_masks_are_numpys_own_draws_of_16_bits() -> None:
+    rng = np.random.Generator(np.random.SFC64(5))
+    masks = _Masks(torch, [np.random.SFC64(5)], 7, 0.2)
+    for _ in range(3):
+        expected = rng.integers(0, 1 << 16, (7, sum(HIDDEN)), dtype=np.uint16) >= 0.2 * (1 << 16)
+        np.testing.assert_array_equal(drawn(masks)[0] > 0, expected)
+
+
+def test_masks_do_not_depend_on_the_company() -> None:
+    together = _Batch(torch, [examples(seed=seed) for seed in range(3)], 0.2)
+    alone = _Batch(torch, [examples(seed=2)], 0.2)
+    np.testing.assert_array_equal(drawn(together.masks)[2], drawn(alone.masks)[0])
+    together._step()  # Adam has no state to take along before the first step
+    alone._step()
+    together._keep(np.array([False, True, True]))
+    np.testing.assert_array_equal(drawn(together.masks)[1], drawn(alone.masks)[0])
 
 
 def test_it_stops_early_and_restores_the_best_weights() -> None:

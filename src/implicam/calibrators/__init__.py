@@ -12,7 +12,7 @@ from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
 from implicam.calibrators.mlp import MLP, MLPCalibration
 from implicam.calibrators.protocol import Calibration, Calibrator, Rejected, Unused
-from implicam.errors import CalibrationFileError, UsageError, did_you_mean
+from implicam.errors import CalibrationFileError, UsageError, did_you_mean, import_extra
 
 METHODS: dict[str, tuple[type[Any], type[Any]]] = {
     ForwardGP.method: (ForwardGP, ForwardGPCalibration),
@@ -23,6 +23,13 @@ METHODS: dict[str, tuple[type[Any], type[Any]]] = {
 """Method name -> (calibrator, calibration)."""
 
 DEFAULT_METHOD = ForwardGP.method
+
+NEEDED = {
+    "inverse-gp:paper": ("gpytorch", "paper"),
+    "mlp": ("torch", "mlp"),
+    "mlp:no-dropout": ("torch", "mlp"),
+}
+"""Method or variant -> the library it needs to be fitted, and the extra that brings it."""
 
 
 def calibrator(method: str, **options: Any) -> Calibrator:
@@ -44,6 +51,26 @@ def calibrator(method: str, **options: Any) -> Calibrator:
     return made
 
 
+def named(name: str) -> Calibrator:
+    """The calibrator of a name, `method` or `method:variant`, as tables and sweeps name them.
+
+    The variant is `paper` (inverse-gp: its preset) or `no-dropout` (mlp); any other is a kernel of inverse-gp, or a
+    lens of the other methods: `inverse-gp:matern-5/2`, `forward-gp:none`, `explicit:kannala-brandt`. What the name
+    does not say is at its default. UsageError where the method or the variant is not known; MissingExtraError where
+    its library (`NEEDED`) is not installed.
+    """
+    method, _, variant = name.partition(":")
+    if name in NEEDED:
+        import_extra(*NEEDED[name], name)  # now, so that no fit is charged for it
+    if not variant:
+        return calibrator(method)
+    if (method, variant) == (InverseGP.method, "paper"):
+        return calibrator(method, preset=variant)
+    if (method, variant) == (MLP.method, "no-dropout"):
+        return calibrator(method, dropout=0.0)
+    return calibrator(method, **{"kernel" if method == InverseGP.method else "lens": variant})
+
+
 def load_calibration(path: str | Path) -> Calibration:
     """Read a `.implicam` file; CalibrationFileError says what is wrong with one that cannot be used."""
     contents = calibration_file.read(path)
@@ -62,6 +89,7 @@ __all__ = [
     "DEFAULT_METHOD",
     "METHODS",
     "MLP",
+    "NEEDED",
     "Calibration",
     "Calibrator",
     "Explicit",
@@ -75,4 +103,5 @@ __all__ = [
     "Unused",
     "calibrator",
     "load_calibration",
+    "named",
 ]

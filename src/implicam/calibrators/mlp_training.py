@@ -6,6 +6,9 @@ stopping on points kept aside, the best weights restored. In trials on other sim
 learning rates from 3e-4 to 1e-2, constant or falling as a cosine, weight decay of 0.01, batches of 32 points and 10 to
 20 % of the points kept aside changed the error by a few percent or made it worse; initial weights after He doubled it.
 The dropout of 0.2 costs most: without it the error is two to three times smaller where there are many points.
+
+The gradients are written out, into memory that every step uses again. PyTorch's autograd takes new memory in each step:
+with 50 networks of 157 points a step was then 25 % longer.
 """
 
 from __future__ import annotations
@@ -27,7 +30,11 @@ EPOCHS = 5000
 PATIENCE = 1000
 """Epochs without better weights after which a network stops."""
 CHECK_EVERY = 10
-LEARNING_RATE, DECAY_OF_MEAN, DECAY_OF_SQUARE, EPSILON = 1e-3, 0.9, 0.999, 1e-8
+LAYERS = len(HIDDEN) + 1
+ALIGNED = 16
+"""Numbers of a network are filled up to a multiple of this, the longest vector of a processor. Adam's fused step works
+on vectors and rounds the rest at the end differently: a network would depend on its place in the batch."""
+LEARNING_RATE = 1e-3
 WEIGHTS, MASKS = 1, 2  # streams of random numbers of one seed; mlp.py has others
 
 
@@ -95,44 +102,94 @@ def initial_weights(inputs: int, rng: np.random.Generator) -> list[Floats]:
     ]
 
 
-def forward(torch: Any, parameters: Sequence[Any], X: Any, masks: Sequence[Any] = ()) -> Any:
-    """(networks, n, 3) of X (networks, n, d); masks: one (networks, n, units) for each hidden layer, or none."""
-    last = len(HIDDEN)
-    for layer in range(last + 1):
-        X = torch.baddbmm(parameters[2 * layer + 1], X, parameters[2 * layer])
-        if layer < last:
-            X = torch.nn.functional.leaky_relu(X, SLOPE)
-            X = X * masks[layer] if masks else X
-    return X
+def _in_line(arrays: Sequence[Floats]) -> Floats:
+    """(numbers,) of one network's weight, bias, weight, ..., filled up with zeros; `_layers` is the way back."""
+    line = np.concatenate([array.ravel() for array in arrays])
+    return np.pad(line, (0, -len(line) % ALIGNED))
 
 
-class _Adam:
-    """Adam (Kingma and Ba 2015) on parameters (networks, ...) of which whole networks can be taken away.
+def _layers(lines: Any, inputs: int) -> list[Any]:
+    """Weight, bias, weight, ... of networks (networks, numbers), as views; a bias is (networks, 1, outputs)."""
+    shapes = [shape for fan_in, fan_out in layer_shapes(inputs) for shape in ((fan_in, fan_out), (1, fan_out))]
+    ends = np.cumsum([rows * columns for rows, columns in shapes])
+    return [
+        lines[:, end - rows * columns : end].unflatten(1, (rows, columns))
+        for end, (rows, columns) in zip(ends, shapes, strict=True)
+    ]
 
-    It works element by element, so every network has an optimiser of its own.
+
+def forward(
+    torch: Any, parameters: Sequence[Any], X: Any, masks: Sequence[Any] = (), into: Sequence[Any] = (None,) * LAYERS
+) -> list[Any]:
+    """Outputs (networks, n, units) of every layer for X (networks, n, d), of the hidden ones times their masks.
+
+    masks: one (networks, n, units) for each hidden layer, or none. into: memory for the outputs.
     """
+    outputs: list[Any] = []
+    for layer in range(LAYERS):
+        X = torch.baddbmm(parameters[2 * layer + 1], X, parameters[2 * layer], out=into[layer])
+        if layer < len(HIDDEN):
+            torch.nn.functional.leaky_relu_(X, SLOPE)
+            if masks:
+                X.mul_(masks[layer])
+        outputs.append(X)
+    return outputs
 
-    def __init__(self, torch: Any, parameters: Sequence[Any]) -> None:
-        self.torch, self.steps = torch, 0
-        self.parameters = [parameter.requires_grad_() for parameter in parameters]
-        self.means = [torch.zeros_like(parameter) for parameter in parameters]
-        self.squares = [torch.zeros_like(parameter) for parameter in parameters]
 
-    def step(self, loss: Any) -> None:
-        self.steps += 1
-        rate = LEARNING_RATE / (1 - DECAY_OF_MEAN**self.steps)
-        square_bias = (1 - DECAY_OF_SQUARE**self.steps) ** 0.5
-        gradients = self.torch.autograd.grad(loss, self.parameters)
-        with self.torch.no_grad():
-            for value, slope, mean, square in zip(self.parameters, gradients, self.means, self.squares, strict=True):
-                mean.lerp_(slope, 1 - DECAY_OF_MEAN)
-                square.mul_(DECAY_OF_SQUARE).addcmul_(slope, slope, value=1 - DECAY_OF_SQUARE)
-                value.addcdiv_(mean, square.sqrt().div_(square_bias).add_(EPSILON), value=-rate)
+class Backpropagation:
+    """Gradients of every network's mean squared error on n points, written into tensors shaped as `parameters`."""
 
-    def keep(self, which: NDArray[np.bool_]) -> None:
-        self.parameters = [parameter.detach()[which].requires_grad_() for parameter in self.parameters]
-        self.means = [mean[which] for mean in self.means]
-        self.squares = [square[which] for square in self.squares]
+    def __init__(self, torch: Any, parameters: Sequence[Any], gradients: Sequence[Any], n: int) -> None:
+        self.torch, self.parameters, self.gradients = torch, parameters, gradients
+        biases = parameters[1::2]
+        self.outputs, self.slopes = ([b.new_empty(len(b), n, b.shape[2]) for b in biases] for _ in range(2))
+
+    def __call__(self, X: Any, Y: Any, masks: Sequence[Any]) -> None:
+        """X (networks, n, d), Y (networks, n, 3); masks as `forward` takes them."""
+        predicted = forward(self.torch, self.parameters, X, masks, self.outputs)[-1]
+        slope = self.torch.sub(predicted, Y, out=self.slopes[-1]).mul_(2 / Y[0].numel())
+        for layer in reversed(range(LAYERS)):
+            below = self.outputs[layer - 1] if layer else X
+            self.torch.bmm(below.transpose(1, 2), slope, out=self.gradients[2 * layer])
+            self.torch.sum(slope, 1, keepdim=True, out=self.gradients[2 * layer + 1])
+            if layer:
+                slope = self._through(layer, slope, masks)
+
+    def _through(self, layer: int, slope: Any, masks: Sequence[Any]) -> Any:
+        """From the slope at the sums of `layer` to the slope at the sums of the layer below."""
+        below, weight = self.slopes[layer - 1], self.parameters[2 * layer]
+        self.torch.bmm(slope, weight.transpose(1, 2), out=below)
+        if masks:
+            below.mul_(masks[layer - 1])
+        # a leaky ReLU keeps the sign, so its output tells its slope; where a mask made that 0, `below` is 0 as well
+        return self.torch.ops.aten.leaky_relu_backward.grad_input(
+            below, self.outputs[layer - 1], SLOPE, True, grad_input=below
+        )
+
+
+class _Masks:
+    """Dropout of the hidden units at n points, for every network out of a stream of its own."""
+
+    def __init__(self, torch: Any, streams: Sequence[np.random.SFC64], n: int, dropout: float) -> None:
+        self.streams, self.dropout = streams, dropout
+        units = sum(HIDDEN)
+        self.words = np.empty((len(streams), n * units // 4), dtype=np.uint64)
+        self.on = np.empty((len(streams), n, units), dtype=np.bool_)
+        self.factors = [np.empty((len(streams), n, width), dtype=np.float32) for width in HIDDEN]
+        self.layers = tuple(torch.from_numpy(factors) for factors in self.factors)
+
+    def draw(self) -> tuple[Any, ...]:
+        """One (networks, n, units) for each hidden layer, none without dropout; the next draw overwrites it."""
+        if not self.dropout:
+            return ()
+        for words, stream in zip(self.words, self.streams, strict=True):
+            words[:] = stream.random_raw(words.size)
+        # 16 bits decide finely enough, and one word of the stream has four times as many
+        drawn = self.words.view(np.uint16).reshape(self.on.shape)
+        np.greater_equal(drawn, np.uint16(round(self.dropout * (1 << 16))), out=self.on)
+        for on, factors in zip(np.split(self.on, np.cumsum(HIDDEN)[:-1], axis=2), self.factors, strict=True):
+            np.multiply(on, np.float32(1 / (1 - self.dropout)), out=factors)
+        return self.layers
 
 
 class _Batch:
@@ -144,14 +201,23 @@ class _Batch:
             [self._stack([(run.X, run.Y)[k][run.held_out == aside] for run in runs]) for k in range(2)]
             for aside in (False, True)
         )
+        self.streams = [np.random.SFC64([run.seed, MASKS]) for run in runs]
         starts = [initial_weights(run.X.shape[1], np.random.default_rng([run.seed, WEIGHTS])) for run in runs]
-        self.optimiser = _Adam(torch, [self._stack(layer) for layer in zip(*starts, strict=True)])
-        self.masks = [np.random.Generator(np.random.SFC64([run.seed, MASKS])) for run in runs]
-        self.kept = [parameter.detach().clone() for parameter in self.optimiser.parameters]
+        self._prepare(self._stack([_in_line(arrays) for arrays in starts]))
+        self.kept = self.weights.clone()
         self.losses, self.epochs = np.full(len(runs), np.inf), np.zeros(len(runs), dtype=np.int64)
 
     def _stack(self, arrays: Sequence[Floats]) -> Any:
         return self.torch.from_numpy(np.stack(arrays).astype(np.float32))
+
+    def _prepare(self, weights: Any) -> None:
+        """All that a step of the running networks needs, from their weights (running, numbers)."""
+        _, n, inputs = self.training[0].shape
+        self.weights, weights.grad = weights, self.torch.zeros_like(weights)
+        self.optimiser = self.torch.optim.Adam([weights], lr=LEARNING_RATE, fused=True)
+        self.parameters = _layers(weights, inputs)
+        self.gradients = Backpropagation(self.torch, self.parameters, _layers(weights.grad, inputs), n)
+        self.masks = _Masks(self.torch, [self.streams[i] for i in self.running], n, self.dropout)
 
     def train(self, epochs: int, patience: int) -> Iterator[int]:
         """Train until every network has stopped; yields the epochs at which it looks."""
@@ -165,42 +231,36 @@ class _Batch:
 
     def best(self, i: int) -> Trained:
         """The best weights of network i."""
-        arrays = [parameter[i].numpy().astype(np.float64) for parameter in self.kept]
+        parameters = _layers(self.kept[[i]], self.training[0].shape[2])
+        arrays = [parameter[0].numpy().astype(np.float64) for parameter in parameters]
         network = Network(tuple(arrays[::2]), tuple(bias[0] for bias in arrays[1::2]))
         return Trained(network, int(self.epochs[i]), float(self.losses[i]))
 
     def _step(self) -> None:
-        """One step of each running network on all its points: the sum's gradients are those of its own loss."""
+        """One step of each running network on all its points."""
         X, Y = self.training
-        predicted = forward(self.torch, self.optimiser.parameters, X, self._draw_masks(X.shape[1]))
-        self.optimiser.step(_mean_squares(predicted, Y).sum())
-
-    def _draw_masks(self, n: int) -> tuple[Any, ...]:
-        """One (running, n, units) for each hidden layer, none without dropout; a network draws from its own stream."""
-        if not self.dropout:
-            return ()
-        drawn = np.stack(  # 16 bits decide finely enough, and are quickly drawn
-            [self.masks[i].integers(0, 1 << 16, (n, sum(HIDDEN)), dtype=np.uint16) for i in self.running]
-        )
-        factors = (drawn >= round(self.dropout * (1 << 16))) * np.float32(1 / (1 - self.dropout))
-        return tuple(self.torch.from_numpy(factors).split(HIDDEN, dim=2))
+        self.gradients(X, Y, self.masks.draw())
+        self.optimiser.step()
 
     def _check(self, epoch: int, patience: int) -> None:
         """Note the weights that do better than before on the points kept aside, and stop who has not for too long."""
         X, Y = self.checking
-        with self.torch.no_grad():
-            losses = _mean_squares(forward(self.torch, self.optimiser.parameters, X), Y).numpy()
+        losses = _mean_squares(forward(self.torch, self.parameters, X)[-1], Y).numpy()
         better = losses < self.losses[self.running]
         improved = self.running[better]
         self.losses[improved], self.epochs[improved] = losses[better], epoch
-        for kept, parameter in zip(self.kept, self.optimiser.parameters, strict=True):
-            kept[improved] = parameter.detach()[better]
+        self.kept[improved] = self.weights[better]
         going_on = epoch - self.epochs[self.running] < patience
         if not going_on.all():
-            self.running = self.running[going_on]
-            self.training = [tensor[going_on] for tensor in self.training]
-            self.checking = [tensor[going_on] for tensor in self.checking]
-            self.optimiser.keep(going_on)
+            self._keep(going_on)
+
+    def _keep(self, which: NDArray[np.bool_]) -> None:
+        """Go on with these only. Adam works element by element: each network takes its own means and squares along."""
+        self.running = self.running[which]
+        self.training, self.checking = ([tensor[which] for tensor in pair] for pair in (self.training, self.checking))
+        state = self.optimiser.state[self.weights]
+        self._prepare(self.weights[which])
+        self.optimiser.state[self.weights] = {name: x[which] if x.ndim else x for name, x in state.items()}
 
 
 def _mean_squares(predicted: Any, Y: Any) -> Any:

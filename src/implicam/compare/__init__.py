@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from implicam.calibrators import Calibrator
 from implicam.compare.splits import RANDOM, SHOT, Split, plane_of, plane_splits, random_splits, shot_splits
 from implicam.compare.summary import NUMBERS, Row, as_json, mean_and_error, summarise
-from implicam.compare.trials import Trial, compare_on, trial_of
+from implicam.compare.trials import Trial, compare_on, fit_each, judge, trial_of
 from implicam.dataset import Dataset
 from implicam.progress import Progress, silent
 
@@ -44,6 +44,8 @@ __all__ = [
     "as_json",
     "compare",
     "compare_on",
+    "fit_each",
+    "judge",
     "mean_and_error",
     "plane_of",
     "plane_splits",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Protocol, runtime_checkable
@@ -15,6 +15,7 @@ from implicam.compare.splits import RANDOM, Split
 from implicam.dataset import Dataset
 from implicam.errors import DatasetError, FitError, ImplicamError, NumericalError, UsageError
 from implicam.evaluate import Evaluation, evaluate
+from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 
 NAN = float("nan")
@@ -29,6 +30,7 @@ class Trial:
     limit: rms of the Cramer-Rao limit at the same points, NaN where unknown. coverage_95: per axis, pooled;
     ellipsoid_95: of the 3D ellipsoid. held_out points were to be measured, and unmeasured of them could not be.
     rmse_common: over the `common` held-out points that every method measured (`compare_on` says which methods count).
+    mean_sd: stated standard deviation, mean over x, y, z and the points, as the paper averages it.
     fit_seconds: of this fit; where a method fits all splits at once, its share. failure: why there are no numbers.
     """
 
@@ -50,6 +52,7 @@ class Trial:
     all_others: bool = False
     rmse_common: float = NAN
     common: int = 0
+    mean_sd: float = NAN
 
 
 @runtime_checkable
@@ -118,19 +121,33 @@ def _check_lengths(splits: Sequence[Split]) -> None:
 
 
 def _judge_cell(name: str, method: Calibrator, cell: Sequence[Split], counting: _Counting) -> list[_Judged]:
+    """The fits of a method that fits many at once are counted when they are all done."""
+    fits = fit_each(method, [split.train for split in cell], counting, counting.progress)
+    return [_judge(name, split, fit, seconds) for split, (fit, seconds) in zip(cell, fits, strict=True)]
+
+
+def fit_each(
+    method: Calibrator,
+    datasets: Sequence[Dataset],
+    starting: Callable[[int], None] = lambda i: None,
+    progress: Progress = silent,
+) -> Iterator[tuple[Calibration | ImplicamError, float]]:
+    """Fit to each dataset: the calibration or why there is none, and the seconds it took; many at once where it can.
+
+    starting: called with the number of a dataset before the work on it. progress: of a fit of many at once.
+    """
     if isinstance(method, FitsMany):
-        counting(0)
+        starting(0)
         start = time.perf_counter()
-        fits = _fit_many(method, [split.train for split in cell], counting.progress)
-        seconds = (time.perf_counter() - start) / len(cell)
-        return [_judge(name, split, fit, seconds) for split, fit in zip(cell, fits, strict=True)]
-    judged = []
-    for i, split in enumerate(cell):
-        counting(i)
+        fits = _fit_many(method, datasets, progress)
+        seconds = (time.perf_counter() - start) / len(datasets)
+        yield from ((fit, seconds) for fit in fits)
+        return
+    for i, data in enumerate(datasets):
+        starting(i)
         start = time.perf_counter()
-        fit = _fit(method, split.train)
-        judged.append(_judge(name, split, fit, time.perf_counter() - start))
-    return judged
+        fit = _fit(method, data)
+        yield fit, time.perf_counter() - start
 
 
 # Data that one method cannot use are its failure, not the end of the comparison. A mistake in its code is no result.
@@ -146,11 +163,18 @@ def _fit(method: Calibrator, train: Dataset) -> Calibration | ImplicamError:
         return NumericalError(f"the equations have no solution: {error}.")
 
 
-def _fit_many(method: FitsMany, datasets: list[Dataset], progress: Progress) -> Sequence[Calibration | ImplicamError]:
+def _fit_many(
+    method: FitsMany, datasets: Sequence[Dataset], progress: Progress
+) -> Sequence[Calibration | ImplicamError]:
     try:
         return method.fit_many(datasets, progress)
     except _CANNOT as error:
         return [error] * len(datasets)
+
+
+def judge(name: str, split: Split, fit: Calibration | ImplicamError, seconds: float) -> Trial:
+    """The trial of a fit, or of why there is none, at the held-out points of a split."""
+    return _judge(name, split, fit, seconds).trial
 
 
 def _judge(name: str, split: Split, fit: Calibration | ImplicamError, seconds: float) -> _Judged:
@@ -183,7 +207,14 @@ def trial_of(evaluation: Evaluation, name: str, known: int, seed: int, seconds: 
         held_out=len(evaluation.data),
         unmeasured=overall.unmeasured,
         fit_seconds=seconds,
+        mean_sd=mean_sd(evaluation.measurement),
     )
+
+
+def mean_sd(measurement: Measurement) -> float:
+    """Stated standard deviation, mean over x, y, z and the points that were measured; NaN where none was."""
+    sd = measurement.sd[measurement.measured]
+    return float(sd.mean()) if len(sd) else NAN
 
 
 def _squared(evaluation: Evaluation) -> dict[str, float]:

@@ -254,7 +254,7 @@ def _draw_pairs(axes: Any, rows: Sequence[Row], look: dict[str, Any]) -> None:
     axes.plot(values(rows, "rmse"), values(rows, "mean_sd"), **dots)
     cells: dict[Any, list[Row]] = {}
     for row in rows:
-        cells.setdefault(row["budget"] if row["method"] == EXPLICIT else int(row["known"]), []).append(row)
+        cells.setdefault(row["budget"] if "budget" in row else int(row["known"]), []).append(row)
     medians = [[float(np.median(values(cells[c], key))) for c in sorted(cells)] for key in ("rmse", "mean_sd")]
     axes.plot(*medians, **look, lw=1.1, ms=6, mec="white", mew=0.5)
 

@@ -1,0 +1,142 @@
+"""The command line itself: its examples, and the options and checks that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import typer
+
+from implicam.calibrators import DEFAULT_METHOD
+from implicam.dataset import Dataset, read_dataset
+from implicam.errors import UsageError, import_extra
+
+app = typer.Typer(
+    name="implicam",
+    help="Turn a set of fixed cameras into a 3D measuring instrument with honest error bars.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Start with: implicam demo      Any command: --debug shows the traceback of an error.",
+)
+
+EXAMPLES = {
+    "demo": "implicam demo",
+    "simulate": "implicam simulate my-rig --positions random --points 157 --check 300",
+    "detect": "implicam detect my-photos --target ball --radius 8",
+    "calibrate": "implicam calibrate my-rig -o my-rig.implicam",
+    "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
+    "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
+    "compare": "implicam compare my-rig --train 35,87 --seeds 3 -o compare.png",
+    "report": "implicam report my-rig.implicam -o report.html",
+    "convert": "implicam convert my-rig my-rig.csv",
+    "export": "implicam export my-rig.implicam --to aniposelib -o cameras.toml",
+    "import": "implicam import cameras.toml -o cameras.implicam",
+    "info": "implicam info my-rig.implicam",
+}
+"""Command -> an example, in an order in which they can be run."""
+
+CALIBRATION_SUFFIX = ".implicam"
+FILE_SUFFIXES = (".csv", ".parquet", ".npz")
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def command(name: str) -> Callable[[Function], Function]:
+    """Register a command; its help ends with its example, so it must be in `EXAMPLES`."""
+    return app.command(name, epilog=f"Example:  [bold]{EXAMPLES[name]}[/bold]")
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="The same seed gives the same numbers.")]
+Unit = Annotated[
+    str | None, typer.Option("--unit", metavar="UNIT", help="Length unit of a wide CSV that does not state it.")
+]
+Method = Annotated[
+    str | None, typer.Option("--method", metavar="NAME", help=f"Calibration method (default {DEFAULT_METHOD}).")
+]
+Kernel = Annotated[
+    str | None, typer.Option("--kernel", metavar="NAME", help="inverse-gp: squared-exponential or matern-5/2.")
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset", metavar="NAME", help='inverse-gp: standardised, or "paper" for the paper\'s own software.'
+    ),
+]
+Lens = Annotated[
+    str | None,
+    typer.Option(
+        "--lens", metavar="NAME", help="forward-gp: central or none; explicit: auto, brown-conrady, kannala-brandt."
+    ),
+]
+Boards = Annotated[
+    Path | None,
+    typer.Option("--boards", metavar="DATASET", help="explicit: learn the cameras from these pictures of a board."),
+]
+Align = Annotated[
+    str | None,
+    typer.Option("--align", metavar="NAME", help="explicit: known points match boards by name (points), or icp."),
+]
+Cameras = Annotated[
+    str | None, typer.Option("--cameras", metavar="LIST", help="Use only these cameras, separated by commas.")
+]
+Without = Annotated[
+    str | None, typer.Option("--without", metavar="LIST", help="Leave these cameras out, separated by commas.")
+]
+LeaveOut = Annotated[
+    str | None, typer.Option("--leave-out", metavar="shot", help="Hold each shot (a board, a plane) out in turn.")
+]
+Report = Annotated[Path | None, typer.Option("--report", help="Also write a one-page HTML report with a 3D view.")]
+
+
+def read(path: Path, unit: str | None, cameras: str | None = None, without: str | None = None) -> Dataset:
+    """The dataset, with the cameras that were asked for."""
+    return chosen(read_dataset(path, unit=unit), cameras, without)
+
+
+def chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:
+    """The cameras that `--cameras` and `--without` leave."""
+    if cameras:
+        data = data.with_cameras([name.strip() for name in cameras.split(",")])
+    if without:
+        data = data.without([name.strip() for name in without.split(",")])
+    return data
+
+
+def must_be_folder(path: Path) -> None:
+    """UsageError where the name is that of a file."""
+    if path.suffix.lower() in FILE_SUFFIXES:
+        raise UsageError(
+            f"{path} is the name of a file, and this command writes a folder.",
+            fix="leave the ending out; implicam convert makes a file of it",
+        )
+
+
+def must_be_calibration(output: Path) -> None:
+    """UsageError where the name does not end as that of a calibration."""
+    if output.suffix.lower() != CALIBRATION_SUFFIX:
+        raise UsageError(
+            f"{output} is no name for a calibration.", fix=f"end it in {CALIBRATION_SUFFIX}: -o {output.stem}.implicam"
+        )
+
+
+def must_be_shot(leave_out: str | None) -> None:
+    """UsageError where `--leave-out` names anything but a shot."""
+    if leave_out not in (None, "shot"):
+        raise UsageError(f"--leave-out {leave_out!r} is not known.", fix="write --leave-out shot")
+
+
+def check_figure(path: Path) -> None:
+    """Say that it cannot be drawn before the work, not after."""
+    if path.suffix.lower() not in (".png", ".pdf", ".svg"):
+        raise UsageError(f"{path} is no picture.", fix="end the name in .png, .pdf or .svg")
+    import_extra("matplotlib", "report", "a figure for print")
+
+
+def need_plotly() -> None:
+    """Say what is missing before the work, not after."""
+    import_extra("plotly", "report", "the HTML report")

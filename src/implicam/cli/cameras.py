@@ -1,0 +1,59 @@
+"""`implicam export` and `implicam import`: cameras for other programs, and from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from implicam.calibrators import load_calibration
+from implicam.calibrators.explicit import calibration_of, rig_of
+from implicam.cli import show
+from implicam.cli.app import Json, command, must_be_calibration
+from implicam.exchange import FORMATS, UNKNOWN, export_cameras, import_cameras
+
+
+@command("export")
+def export_command(
+    calibration: Annotated[Path, typer.Argument(help="A calibration by explicit, or by forward-gp.")],
+    to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(FORMATS)}.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The file to write; for colmap a folder.")],
+    json: Json = False,
+) -> None:
+    """Write the cameras for another program: lenses and places, as far as its format holds them."""
+    rig, lost = rig_of(load_calibration(calibration))
+    notes = [*lost, *export_cameras(rig, to, output)]
+    if json:
+        show.emit_json({"cameras": len(rig.cameras), "format": to, "file": str(output), "notes": notes})
+        return
+    show.line(f"{output}: {len(rig.cameras)} cameras as {FORMATS[to].what}")
+    show.notes(notes)
+
+
+@command("import")
+def import_command(
+    cameras: Annotated[Path, typer.Argument(help="Cameras that another program calibrated.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The calibration file to write (*.implicam).")],
+    kind: Annotated[
+        str | None, typer.Option("--from", metavar="NAME", help="The format, where its content does not tell.")
+    ] = None,
+    noise: Annotated[
+        float, typer.Option("--noise", min=1e-6, metavar="PX", help="Noise of views that do not state theirs.")
+    ] = 0.3,
+    unit: Annotated[
+        str | None, typer.Option("--unit", metavar="UNIT", help="Length unit, where the file does not state it.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Make a calibration of another program's cameras, to measure with them and to check them."""
+    must_be_calibration(output)
+    rig = import_cameras(cameras, kind)
+    rig = rig.in_unit(unit) if unit and rig.length_unit != UNKNOWN else import_cameras(cameras, kind, unit=unit)
+    calibration = calibration_of(rig, cameras.stem, noise)
+    calibration.save(output)
+    if json:
+        show.emit_json({"calibration": str(output), "cameras": len(rig.cameras), "notes": calibration.notes()})
+        return
+    show.line(f"{output}: {len(rig.cameras)} cameras, lengths in {rig.length_unit}")
+    show.notes(calibration.notes())

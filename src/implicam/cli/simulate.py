@@ -1,0 +1,162 @@
+"""`implicam simulate`: a rig with known truth, what it is shown, and a dataset of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from implicam.cli import show
+from implicam.cli.app import Json, Seed, command, must_be_folder
+from implicam.dataset import folder_files, write_dataset
+from implicam.errors import UsageError
+from implicam.files import toml_text
+from implicam.simulate import (
+    Optics,
+    as_boards,
+    ball_grid,
+    build_rig,
+    each_and_pairs,
+    held_boards,
+    moving_board,
+    random_positions,
+    record,
+    write_rig,
+)
+
+
+class Target(StrEnum):
+    """What the simulated rig is shown."""
+
+    ball = "ball"
+    board = "board"
+    boards = "boards"
+
+
+class Positions(StrEnum):
+    """Where the ball goes."""
+
+    grid = "grid"
+    random = "random"
+
+
+class Frame(StrEnum):
+    """The world frame of a simulated rig."""
+
+    robot = "robot"
+    random = "random"
+
+
+@command("simulate")
+def simulate_command(
+    out: Annotated[Path, typer.Argument(help="Folder to write the dataset to.")],
+    rig: Annotated[
+        str, typer.Option(metavar="NAME", help="bar6 (the paper's), stereo, dome8, or any barN, domeN.")
+    ] = "bar6",
+    target: Annotated[
+        Target, typer.Option(help="A ball on a robot, a board on a slide, boards held by hand.")
+    ] = Target.ball,
+    positions: Annotated[Positions, typer.Option(help="Where the ball goes.")] = Positions.grid,
+    points: Annotated[int, typer.Option(min=1, metavar="N", help="How many random positions.")] = 157,
+    grid: Annotated[str, typer.Option(metavar="AxBxC", help="Positions of the grid along, down and away.")] = "5x5x7",
+    boards: Annotated[int, typer.Option(min=1, metavar="N", help="How many positions of the board.")] = 20,
+    each: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every camera alone.")] = 10,
+    pairs: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every two neighbours.")] = 4,
+    check: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Also write so many random positions to OUT/check.")
+    ] = 0,
+    cameras: Annotated[
+        str | None, typer.Option(metavar="LIST", help="2R, 2R2W, 2R4W, or names separated by commas.")
+    ] = None,
+    noise: Annotated[float, typer.Option(min=0, metavar="PX", help="Pixel noise, standard deviation.")] = 0.2,
+    lens_error: Annotated[
+        float, typer.Option(min=0, metavar="PX", help="Error no lens model contains, rms pixels.")
+    ] = 0.5,
+    robot_noise: Annotated[
+        float, typer.Option(min=0, metavar="LENGTH", help="Error of the known positions, sd per axis.")
+    ] = 0.0,
+    missing: Annotated[
+        float, typer.Option(min=0, max=1, metavar="SHARE", help="Share of views that are missing.")
+    ] = 0.0,
+    outliers: Annotated[
+        float, typer.Option(min=0, max=1, metavar="SHARE", help="Share of views that are wrong.")
+    ] = 0.0,
+    images: Annotated[bool, typer.Option("--images", help="Also take photographs, for implicam detect.")] = False,
+    image_noise: Annotated[
+        float, typer.Option(min=0, max=0.5, metavar="PART", help="Noise of the photographs, part of full scale.")
+    ] = 0.01,
+    image_blur: Annotated[
+        float, typer.Option(min=0, max=10, metavar="PX", help="Blur of the photographs, standard deviation.")
+    ] = 0.7,
+    frame: Annotated[Frame, typer.Option(help="World frame: axes along the bench, or any.")] = Frame.robot,
+    unit: Annotated[str, typer.Option(metavar="UNIT", help="mm or m.")] = "mm",
+    seed: Seed = 0,
+    shots_seed: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Record the same rig again with other noise.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it exists.")] = False,
+    json: Json = False,
+) -> None:
+    """Write a dataset of a simulated rig, with the truth and the Cramer-Rao limit of every point beside it."""
+    must_be_folder(out)
+    if unit not in ("mm", "m"):
+        raise UsageError(f"a simulated rig has no unit {unit!r}.", fix="choose mm or m")
+    built = build_rig(
+        rig, seed=seed, lens_error=lens_error, noise=noise, frame=frame.value, unit="mm" if unit == "mm" else "m",
+        cameras=cameras,
+    )  # fmt: skip
+    shots = seed if shots_seed is None else shots_seed
+    if target is Target.board:
+        shown = moving_board(built, positions=boards)
+    elif target is Target.boards:
+        shown = held_boards(built, each_and_pairs(built, each, pairs), np.random.default_rng([shots, 9]))
+    elif positions is Positions.grid:
+        shown = ball_grid(built, _grid(grid))
+    else:
+        shown = random_positions(built, points, np.random.default_rng([shots, 1]))
+    optics = Optics(noise=image_noise, blur=image_blur) if images else None
+    files = {"truth.toml": toml_text({**write_rig(built), "shots_seed": shots})}
+    with show.progress(json) as progress:
+        recorded = record(
+            built, shown, seed=shots, robot_noise=robot_noise, missing=missing, outliers=outliers, optics=optics
+        )
+        if target is Target.boards:  # nobody knows where a hand held them
+            recorded = replace(recorded, data=as_boards(recorded.data, shown))
+        parts = {"": recorded}
+        if check:
+            target_points = random_positions(built, check, np.random.default_rng([shots, 2]))
+            parts["check"] = record(built, target_points, seed=shots + 1_000_003, missing=missing, optics=optics)
+            files |= {f"check/{name}": text for name, text in folder_files(parts["check"].data).items()}
+
+        def photographs(folder: Path) -> None:
+            for part, one in parts.items():
+                one.write_photographs(folder / part, progress)
+
+        write_dataset(recorded.data, out, overwrite=overwrite, also=files, fill=photographs)
+    data = recorded.data
+    seen = int(data.observations.seen.sum())
+    pictures = sum(one.photographs for one in parts.values())
+    if json:
+        show.emit_json(
+            {"dataset": str(out), "points": len(data), "views": seen, "check_points": check, "pictures": pictures}
+        )
+        return
+    show.line(f"{out}: {len(data)} points, {seen} views in {len(data.cameras)} cameras")
+    if images:
+        show.line(f"{out / 'images'}: {pictures} photographs{' with those of check' if check else ''}")
+    if check:
+        show.line(f"{out / 'check'}: {check} random positions to judge by")
+
+
+def _grid(text: str) -> tuple[int, int, int]:
+    try:
+        a, b, c = (int(part) for part in text.lower().split("x"))
+        if min(a, b, c) < 1:
+            raise ValueError(text)
+    except ValueError:
+        raise UsageError(f"--grid {text!r} is not a grid.", fix="write three numbers, for example 5x5x7") from None
+    return a, b, c
