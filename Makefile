@@ -2,13 +2,14 @@
 # make check  all that CI checks                        make bench  speed against the limits
 # make real   the table of docs/real-data.md            make rigs   the tables of docs/choose.md on forward-gp
 # make methods   all methods side by side, the first table of docs/choose.md
+# make paper  the paper's experiments, 20 minutes; docs/reproduce.md
 # make clean  start over
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-slow check lint bench real rigs methods clean
+.PHONY: demo test test-slow check lint bench real rigs methods paper clean
 
 demo: $(VENV)/.demo
 	$(BIN)/implicam demo
@@ -40,8 +41,12 @@ real: $(VENV)/.dev
 methods: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/methods.py ../shared/real
 
+paper: $(VENV)/.dev
+	$(BIN)/implicam paper all
+	$(BIN)/python docs/make_reproduce.py implicam-paper
+
 clean:
-	rm -rf $(VENV) implicam-demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) implicam-demo implicam-paper build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 
 # One environment; each stamp says what has been put into it.
 $(VENV)/bin/python:

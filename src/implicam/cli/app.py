@@ -35,6 +35,7 @@ EXAMPLES = {
     "convert": "implicam convert my-rig my-rig.csv",
     "export": "implicam export my-rig.implicam --to aniposelib -o cameras.toml",
     "import": "implicam import cameras.toml -o cameras.implicam",
+    "paper": "implicam paper board --quick",
     "info": "implicam info my-rig.implicam",
 }
 """Command -> an example, in an order in which they can be run."""

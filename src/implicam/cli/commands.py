@@ -15,7 +15,8 @@ import typer
 
 import implicam.cli.cameras
 import implicam.cli.compare
-import implicam.cli.simulate  # noqa: F401  the three register their commands
+import implicam.cli.paper
+import implicam.cli.simulate  # noqa: F401  the four register their commands
 from implicam import calibration_file
 from implicam.calibrators import DEFAULT_METHOD, Calibration, Explicit, InverseGP, calibrator, load_calibration
 from implicam.calibrators.explicit.boards import has_boards

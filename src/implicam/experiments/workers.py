@@ -17,6 +17,7 @@ import sys
 import threading
 import time
 import traceback
+import warnings
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future
@@ -194,6 +195,8 @@ class LocalProcesses:
 
     def __init__(self, jobs: int) -> None:
         self._loky = import_extra("joblib.externals.loky", "paper", "computing cells side by side")
+        # loky replaces a process whose memory has grown, loses nothing by it, and says so as if something were wrong.
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
         self.at_once = jobs
         self._pool = self._new_pool()
 

@@ -104,19 +104,19 @@ def clouds(panels: Iterable[Panel], *, scales: Scales | None = None) -> Any:
     return _fill(figure, axes, chosen, scales or scales_of(chosen), width=4.1, every=1)
 
 
-def board_panels(panels: Iterable[Panel], *, scales: Scales = BOARD_SCALES, every: int = EVERY) -> Any:
+def board_panels(panels: Iterable[Panel], *, scales: Scales | None = BOARD_SCALES, every: int = EVERY) -> Any:
     """A matplotlib Figure: a row of panels for each set, a column for each number of boards (the paper's Figure 11).
 
-    Each panel has the keys `set` and `boards` besides; without a title it gets them as title. A combination that is
-    not there stays an empty panel.
+    scales: the paper's, or None for those of the panels. Each panel has the keys `set` and `boards` besides; without a
+    title it gets them as title. A combination that is not there stays an empty panel.
     """
     cells = {(str(panel["set"]), int(panel["boards"])): panel for panel in panels}
     sets, boards = sorted({name for name, _ in cells}), sorted({count for _, count in cells})
     shape = (max(len(sets), 1), max(len(boards), 1))
-    figure = blank(1.2 + 2.6 * shape[1], 1.0 + 2.7 * shape[0])
+    figure = blank(1.2 + 2.6 * shape[1], 1.0 + 2.3 * shape[0])
     axes = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": _projection()})
     chosen = [_with_title(cells.get((name, count), {}), name, count) for name in sets for count in boards]
-    return _fill(figure, axes.ravel(), chosen, scales, width=2.6, every=every)
+    return _fill(figure, axes.ravel(), chosen, scales or scales_of(cells.values()), width=2.6, every=every)
 
 
 def aligned(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2") -> Any:
@@ -218,13 +218,14 @@ def _walls(axes: Any, corners: Floats, *, size: float) -> None:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(high - low, zoom=0.95)
     axes.grid(False)
+    axes.patch.set_visible(False)  # it would hide the labels of its neighbour
     ticker = import_extra("matplotlib.ticker", "report", PURPOSE)
     for axis, name, shade in zip((axes.xaxis, axes.yaxis, axes.zaxis), "xyz", (0.97, 0.95, 0.92), strict=True):
         axis.set_major_locator(ticker.MaxNLocator(3))
         axis.set_pane_color((shade, shade, shade, 1))
         axis.set_label_text(f"{name} (mm)", size=size)
-        axis.set_tick_params(labelsize=size, pad=-2)
-        axis.labelpad = -5
+        axis.set_tick_params(labelsize=size, pad=2 if name == "z" else -2)  # beside the z axis, a minus needs room
+        axis.labelpad = -2 if name == "z" else -5
 
 
 def _legend(figure: Any, panels: Sequence[Panel], scales: Scales, points_per_pixel: float) -> None:

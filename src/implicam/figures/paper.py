@@ -176,7 +176,7 @@ def _runs_of_methods(axes: Any, rows: Sequence[Row], key: str, sizes: Sequence[i
 
 def _dodge(sizes: Sequence[int], i: int, n: int) -> float:
     """How far the i-th of n series stands to the side, so that bars do not cover each other."""
-    gap = float(np.diff(sizes).min()) if len(sizes) > 1 else 1.0
+    gap = min(float(np.diff(sizes).min()), np.ptp(sizes) / 8) if len(sizes) > 1 else 1.0
     return 0.62 * gap * (i - (n - 1) / 2) / n
 
 

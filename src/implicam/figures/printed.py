@@ -55,8 +55,11 @@ def plain_log(axis: Any, *, name: str) -> None:
     axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(ticker.NullFormatter())
     low, high = axis.get_data_interval()
-    wide = bool(0 < low < high < np.inf) and high / low > 300
-    axis.set_major_locator(ticker.LogLocator(subs=(1,) if wide else (1, 2, 5)))
+    decades = np.log10(high / low) if 0 < low < high < np.inf else 1.0
+    if decades < 0.7:  # one or two of 1, 2, 5 at most
+        axis.set_major_locator(ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+    else:
+        axis.set_major_locator(ticker.LogLocator(subs=(1,) if decades > 2.5 else (1, 2, 5)))
 
 
 def values(rows: Iterable[Mapping[str, Any]], key: str) -> Floats:

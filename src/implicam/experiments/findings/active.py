@@ -1,0 +1,64 @@
+"""Experiment 2: the cases of each finding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from implicam.experiments.evidence import Case, Row, Rows, Test, column, share_of_drop, stages, where
+
+EARLY, AROUND = 20, 10
+"""Points added that are almost none of 100; steps that are looked at there and at the end."""
+CONVERGED = 0.1
+"""The range of the starts, over the whole drop, that is one value."""
+
+
+def _starts(rows: Rows, gp: str, cameras: str, added: int) -> dict[int, Row]:
+    return {int(row["repeat"]): row for row in where(rows, method=gp, set=cameras, added=added)}
+
+
+def _last_step(rows: Rows, gp: str, cameras: str) -> int:
+    """How many points are added in all; 0 where these are too few to tell early from late."""
+    last = max((int(row["added"]) for row in where(rows, method=gp, set=cameras)), default=0)
+    return last if last >= 2 * EARLY else 0
+
+
+def _drops_fast(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    """Of the largest and of the mean standard deviation of the positions that are left."""
+    last = _last_step(rows, gp, sets[0])
+    if not last:
+        return []
+    parts = [_starts(rows, gp, sets[0], added) for added in (0, EARLY, last)]
+    return [
+        share_of_drop(*stages(parts, key), f"{what} sd: {{}} % of its drop by {EARLY} of {last} points (fast: half)")
+        for key, what in (("max_sd", "largest"), ("mean_sd", "mean"))
+    ]
+
+
+def _one_value(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    """The range of the starts over the whole drop, the median of some steps: without an interval, a case is one number.
+
+    A case supports the finding above a threshold, so it is the drop over the range.
+    """
+    last = _last_step(rows, gp, sets[0])
+    if not last:
+        return []
+    mean = {added: column(_starts(rows, gp, sets[0], added).values(), "mean_sd") for added in range(last + 1)}
+    if not all(len(sd) > 1 for sd in mean.values()):
+        return []
+    drop = float(mean[0].mean() - mean[last].mean())
+    if drop <= 0:
+        return []
+    ranges = {added: float(np.ptp(sd)) / drop for added, sd in mean.items()}
+    early = float(np.median([ranges[added] for added in range(EARLY, EARLY + AROUND)]))
+    late = float(np.median([ranges[added] for added in range(last - AROUND + 1, last + 1)]))
+    words = (
+        f"starts differ by {100 * ranges[0]:.0f} % of the drop at first, {100 * early:.1f} % after {EARLY} points, "
+        f"{100 * late:.1f} % at the end (one value: {100 * CONVERGED:g} %)"
+    )
+    over = [1 / max(share, 1e-9) for share in (early, late)]
+    return [Case(value, value, value, words, 1 / CONVERGED) for value in over]
+
+
+TESTS: dict[str, Test] = {"sd_drops_fast": _drops_fast, "any_start_converges": _one_value}

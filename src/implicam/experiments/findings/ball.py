@@ -1,0 +1,169 @@
+"""Experiment 1: the cases of each finding."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise, permutations
+from typing import Any
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.experiments import published
+from implicam.experiments.evidence import Case, Row, Rows, Test, column, ratio, share_of_drop, stages, unpaired, where
+from implicam.experiments.plan import EXPLICIT, NETWORK
+from implicam.experiments.source import BALL, BUDGETS
+from implicam.simulate import CAMERA_SETS
+
+PAIR = next(iter(CAMERA_SETS))
+"""The set of two cameras."""
+MUCH, CLEARLY, ALIKE = 1.5, 1.1, 1.1
+"""Factors that stand for the paper's words: much worse, a clear gain, at most so far apart."""
+TOO_FEW = 2.0
+"""Points are too few where twice as many of them more than halve the error."""
+
+
+def _known(rows: Rows, **wanted: Any) -> list[int]:
+    return sorted({int(row["known"]) for row in where(rows, **wanted) if "known" in row})
+
+
+def _lattice(rows: Rows, method: str, cameras: str, known: int) -> dict[int, Row]:
+    """The runs on the lattice, by number."""
+    found = where(rows, method=method, set=cameras, trained=BALL, judged=BALL, known=known)
+    return {int(row["run"]): row for row in found}
+
+
+def _paired(a: Mapping[int, Row], b: Mapping[int, Row], key: str) -> tuple[Floats, Floats]:
+    runs = sorted(a.keys() & b.keys())
+    return column([a[run] for run in runs], key), column([b[run] for run in runs], key)
+
+
+def _line(rows: Rows, cameras: str, budget: tuple[int, int]) -> Floats:
+    return column(where(rows, method=EXPLICIT, set=cameras, judged=BALL, budget="{}+{}".format(*budget)), "rmse")
+
+
+def _against(above: Floats, below: Floats, words: str, rows: Rows, cameras: str, *, least: float = 1.0) -> Case:
+    """A ratio with a line of explicit; the largest budget is one calibration, which scatters as the next one's do."""
+    next_one = np.log(_line(rows, cameras, BUDGETS[1]))
+    alone = float(next_one.std(ddof=1)) if len(next_one) > 1 else 0.0
+    return unpaired(above, below, words, least=least, alone=alone)
+
+
+def _errors(rows: Rows, method: str, cameras: str, known: int) -> Floats:
+    return column(_lattice(rows, method, cameras, known).values(), "rmse")
+
+
+def _network_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    cases = []
+    for known in _known(rows, method=gp, set=sets[0], trained=BALL):
+        network, ours = _paired(_lattice(rows, NETWORK, sets[0], known), _lattice(rows, gp, sets[0], known), "rmse")
+        cases.append(ratio(network, ours, f"the network's error is {{}} times as large, with {known} points"))
+    return cases
+
+
+def _explicit_wins(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    known = _most(rows, gp, sets[0])
+    own = _errors(rows, gp, sets[0], known)
+    return [
+        _against(own, _line(rows, sets[0], budget), f"error with {known} points {{}} times that of {_words(budget)}",
+                 rows, sets[0])
+        for budget in BUDGETS
+    ]  # fmt: skip
+
+
+def _explicit_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    """From the paper's number of points on; of smaller data with the most."""
+    line, sizes = _line(rows, sets[0], BUDGETS[0]), _known(rows, method=gp, set=sets[0], trained=BALL)
+    if not sizes or not len(line):
+        return []
+    better = [bool(np.median(_errors(rows, gp, sets[0], known)) < np.median(line)) for known in sizes]
+    first = next((k for k in range(len(sizes)) if all(better[k:])), None)
+    since = "not better with any number of points" if first is None else f"better from {sizes[first]} points on"
+    stated = published.load("ball").numbers["gp_overtakes_explicit_at"].value
+    return [
+        _against(line, _errors(rows, gp, sets[0], known),
+                 f"{since}; error of {_words(BUDGETS[0])} {{}} times its own with {known} points", rows, sets[0])
+        for known in [known for known in sizes if known >= float(np.max(stated))] or sizes[-1:]
+    ]  # fmt: skip
+
+
+def _few_boards_hurt(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    many, few = (_line(rows, sets[0], budget) for budget in (BUDGETS[0], BUDGETS[-1]))
+    words = f"10 + 4 pictures: {{}} times the error of 50 + 10 (much: {MUCH:g})"
+    return [_against(few, many, words, rows, sets[0], least=MUCH)]
+
+
+def _budget_matters(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    lines = {budget: _line(rows, sets[0], budget) for budget in BUDGETS}
+    most, middle, least = BUDGETS
+
+    def alike(a: tuple[int, int], b: tuple[int, int]) -> Case:
+        words = f"error of {a[0]} + {a[1]} over {b[0]} + {b[1]} pictures {{}} (alike: above {1 / ALIKE:.2f})"
+        return _against(lines[a], lines[b], words, rows, sets[0], least=1 / ALIKE)
+
+    if sets[0] == PAIR:
+        return [alike(a, b) for a, b in permutations(BUDGETS, 2)]
+    words = f"error of 10 + 4 over 25 + 6 pictures {{}} (clear: {CLEARLY:g})"
+    return [_against(lines[least], lines[middle], words, rows, sets[0], least=CLEARLY), alike(most, middle)]
+
+
+def _poor_explicit_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    line, cases = _line(rows, sets[0], BUDGETS[-1]), []
+    for method in (gp, NETWORK):
+        known = _most(rows, method, sets[0])
+        who = "the network's" if method == NETWORK else "its own"
+        words = f"error of {_words(BUDGETS[-1])} {{}} times {who} with {known} points"
+        cases.append(unpaired(line, _errors(rows, method, sets[0], known), words))
+    return cases
+
+
+def _more_cameras(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    cases = []
+    for fewer, more in pairwise(sets):
+        for known in _known(rows, method=gp, set=more, trained=BALL):
+            a, b = _paired(_lattice(rows, gp, fewer, known), _lattice(rows, gp, more, known), "mean_sd")
+            cases.append(ratio(a, b, f"sd of {fewer} {{}} times that of {more}, with {known} points"))
+    return cases
+
+
+def _more_points(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    """It drops at all, and more than half of the drop comes with the first third of the points."""
+    sizes = _known(rows, method=gp, set=sets[0], trained=BALL)
+    if len(sizes) < 3:
+        return []
+    third = min(sizes[1:-1], key=lambda known: abs(known - sizes[-1] / 3))
+    runs = [_lattice(rows, gp, sets[0], known) for known in (sizes[0], third, sizes[-1])]
+    words = f"sd with {sizes[0]} points {{}} times that with {sizes[-1]}"
+    early = f"{{}} % of the drop with the first {third} of {sizes[-1]} points (fast: half)"
+    return [ratio(*_paired(runs[0], runs[-1], "mean_sd"), words), share_of_drop(*stages(runs, "mean_sd"), early)]
+
+
+def _too_few(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
+    sizes = _known(rows, method=gp, set=sets[0], trained=BALL)
+    if len(sizes) < 2:
+        return []
+    twice = min(sizes[1:], key=lambda known: abs(known - 2 * sizes[0]))
+    few, more = (_lattice(rows, gp, sets[0], known) for known in (sizes[0], twice))
+    words = f"error with {sizes[0]} points {{}} times that with {twice} (too few: {TOO_FEW:g})"
+    return [ratio(*_paired(few, more, "rmse"), words, least=TOO_FEW)]
+
+
+def _most(rows: Rows, method: str, cameras: str) -> int:
+    return max(_known(rows, method=method, set=cameras, trained=BALL), default=0)
+
+
+def _words(budget: tuple[int, int]) -> str:
+    return "explicit with {} + {} pictures".format(*budget)
+
+
+TESTS: dict[str, Test] = {
+    "gp_beats_network": _network_loses,
+    "explicit_wins_2R": _explicit_wins,
+    "gp_beats_explicit": _explicit_loses,
+    "few_boards_hurt_explicit": _few_boards_hurt,
+    "budget_matters_with_six_cameras": _budget_matters,
+    "learners_beat_poor_explicit": _poor_explicit_loses,
+    "more_cameras_lower_sd": _more_cameras,
+    "more_points_lower_sd": _more_points,
+    "fewest_points_too_few": _too_few,
+}

@@ -1,0 +1,45 @@
+"""Tables and numbers as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from implicam.figures.style import number as plain
+
+
+def table(head: Sequence[str], body: Iterable[Sequence[str]], *, left: int = 1) -> str:
+    """A table: the first `left` columns are words, the others numbers."""
+    rule = [":--" if i < left else "--:" for i in range(len(head))]
+    lines = [head, rule, *body]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def number(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
+    """So many significant digits; a dash where there is none."""
+    if value is None:
+        return "–"
+    return ("+" if sign and value > 0 else "") + ("−" if value < 0 else "") + plain(abs(value), digits)
+
+
+def quartiles(values: Sequence[float | None]) -> str:
+    """Median and, where the runs differ, the middle half."""
+    low, middle, high = values
+    if low == high:
+        return number(middle)
+    return f"{number(middle)} [{number(low, 2)}, {number(high, 2)}]"
+
+
+def span(values: Sequence[float | None]) -> str:
+    """Median and, where they differ, lowest and highest."""
+    low, middle, high = values
+    return f"{number(middle)} ({number(low, 2)} to {number(high, 2)})" if low != high else number(middle)
+
+
+def spread(values: Sequence[float | None] | None) -> str:
+    """Mean / standard deviation, or nothing."""
+    return "" if not values else f"{number(values[0])} / {number(values[1], 2)}"
+
+
+def percent(value: float | None) -> str:
+    """A share in whole per cent."""
+    return "–" if value is None else f"{100 * value:.0f} %"

@@ -1,0 +1,75 @@
+"""How much of the paper's experiments is computed: everything, or a taste."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+GP, PAPER, NETWORK, EXPLICIT, FORWARD = "inverse-gp", "inverse-gp:paper", "mlp", "explicit", "forward-gp"
+METHODS = (PAPER, GP, NETWORK, EXPLICIT, FORWARD)
+"""The paper's Gaussian process with its own software, and with our fit; its network; explicit; ours."""
+LEARNERS = (PAPER, GP, NETWORK, FORWARD)
+"""Those that experiment 1 trains on positions; there, explicit learns from pictures of a board."""
+
+SHOWN = (PAPER, NETWORK, FORWARD)
+"""Whose boards are drawn."""
+
+
+def slug(method: str) -> str:
+    """A method as part of the name of a file."""
+    return method.replace(":", "-")
+
+
+Counts = Mapping[str, int]
+
+
+def _counts(**others: int) -> dict[str, int]:
+    return dict.fromkeys(METHODS, others.pop("each")) | {
+        {"gp": GP, "paper": PAPER, "network": NETWORK, "explicit": EXPLICIT, "forward": FORWARD}[key]: value
+        for key, value in others.items()
+    }
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The experiments' sizes; the paper's by default, with fewer runs of the methods that it does not have.
+
+    shares: % of the ball's positions to train on; runs: random splits of each, by method. random_shares, random_runs:
+    of the same with training positions off the lattice. subsets: of the pictures, for the smaller budgets of
+    `explicit`. additions: points added by active learning to start_share %, in `repeats` runs, by method; lot: points
+    added between two fits, by method (a Gaussian process takes those between with its hyperparameters kept). boards:
+    to train on.
+    """
+
+    name: str = "full"
+    shares: tuple[int, ...] = (90, 80, 70, 60, 50, 40, 30, 20, 10)
+    runs: Counts = field(default_factory=lambda: _counts(each=50, paper=4, forward=5))
+    random_shares: tuple[int, ...] = (90, 10)
+    random_runs: Counts = field(default_factory=lambda: _counts(each=5, paper=2))
+    subsets: int = 10
+    start_share: int = 20
+    additions: int = 100
+    repeats: Counts = field(default_factory=lambda: _counts(each=2, gp=5, paper=5))
+    lot: Counts = field(default_factory=lambda: _counts(each=20, gp=1, paper=20))
+    boards: tuple[int, ...] = (2, 3, 5, 9)
+
+    def with_runs(self, runs: int) -> Plan:
+        """So many runs of every method."""
+        each = dict.fromkeys(METHODS, runs)
+        return replace(self, name=f"{self.name}-{runs}-runs", runs=each, random_runs=each, repeats=each)
+
+
+FULL = Plan()
+QUICK = Plan(
+    name="quick",
+    shares=(90, 50, 10),
+    runs=_counts(each=3, gp=10, paper=2),
+    random_shares=(90, 10),
+    random_runs=_counts(each=2, paper=1),
+    subsets=2,
+    additions=30,
+    repeats=_counts(each=2),
+    lot=_counts(each=15, gp=3),
+    boards=(2, 3),
+)
+"""A taste in a few minutes."""

@@ -1,0 +1,175 @@
+"""Run the paper's experiments: compute what is missing, put it into tables, judge the findings, draw, write it down."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from implicam.errors import DatasetError, ImplicamError, import_extra
+from implicam.experiments import active, ball, board, tables
+from implicam.experiments.account import markdown
+from implicam.experiments.cells import Cell, Results, computed, run
+from implicam.experiments.evidence import Row
+from implicam.experiments.findings import verdicts
+from implicam.experiments.pictures import draw
+from implicam.experiments.plan import Plan
+from implicam.experiments.source import Source
+from implicam.experiments.stored import Values
+from implicam.files import write_text
+from implicam.progress import Progress, silent
+
+EXPERIMENTS = (ball.NAME, active.NAME, board.NAME)
+_CELLS: dict[str, Callable[[Source, Plan], list[Cell]]] = {
+    ball.NAME: ball.cells,
+    active.NAME: active.cells,
+    board.NAME: board.cells,
+}
+NEEDED = {"torch": "paper", "gpytorch": "paper", "joblib": "paper", "matplotlib": "report", "plotly": "report"}
+"""Library -> the extra that brings it."""
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """summary: all tables and verdicts as plain values; files: what was written, by what it is."""
+
+    summary: Mapping[str, Any]
+    files: Mapping[str, Path]
+    failures: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+def reproduce(
+    experiments: Sequence[str],
+    folder: Path,
+    source: Source,
+    plan: Plan,
+    *,
+    jobs: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress = silent,
+) -> Reproduction:
+    """Run some of EXPERIMENTS into `folder`; what was computed before, by the same plan on the same data, is kept.
+
+    The account is of all experiments that have been computed whole, this time or before. DatasetError where the data
+    have nothing for any; ImplicamError where every cell failed.
+    """
+    for library, extra in NEEDED.items():
+        if find_spec(library) is None:  # said before the work, not after; importing them all takes seconds
+            import_extra(library, extra, "the paper's experiments")
+    start = time.perf_counter()
+    cells = {name: _CELLS[name](source, plan) for name in experiments}
+    absent = [name for name, found in cells.items() if not found]
+    if len(absent) == len(experiments):
+        raise DatasetError(
+            f"{source.folder} has no data for {', '.join(absent)}.",
+            fix="it needs the folder ball (or a dataset itself) for ball and active, board for board",
+        )
+    everything = [cell for found in cells.values() for cell in found]
+    place = folder / "cells" / f"{plan.name}-{source.name}"
+    results = run(everything, place, jobs=jobs, scheduler=scheduler, progress=progress)
+    if not results.values:
+        raise ImplicamError(f"all {len(everything)} cells failed.", why=next(iter(results.failures.values())))
+    progress("tables and figures", 0, 1)
+    before = _whole_before([name for name in EXPERIMENTS if name not in cells], source, plan, place)
+    cells, values = {**cells, **before[0]}, {**results.values, **before[1].values}
+    seconds = {**results.seconds, **before[1].seconds}
+    rows = {name: _rows(cells[name], values) for name in EXPERIMENTS if name in cells}
+    for name, table in rows.items():
+        if table:
+            write_text(folder / f"{name}.csv", _csv(table))
+    if rows.get(board.NAME):
+        write_text(folder / "board-by-board.csv", _csv(tables.by_board(rows[board.NAME])))
+    figures = dict(draw(rows, values, folder / "figures"))
+    summary = {
+        "source": {**source.options, "sets": {name: list(cameras) for name, cameras in source.sets.items()}},
+        "plan": _plain(plan),
+        "parts": {name: _part(cells[name], seconds) for name in EXPERIMENTS if cells.get(name)},
+        "cells": {"all": len(everything), "already": results.already, "failed": len(results.failures)},
+        "failures": {name: " ".join(text.split()) for name, text in results.failures.items()},
+        "wall_seconds": time.perf_counter() - start,
+        **_tables(rows),
+        "verdicts": [asdict(verdict) for verdict in verdicts(rows)],
+        "figures": figures,
+    }
+    write_text(folder / "summary.json", json.dumps(_without_nan(summary), indent=1) + "\n")
+    write_text(folder / "reproduce.md", markdown(_without_nan(summary)))
+    progress("tables and figures", 1, 1)
+    notes = [*results.notes, *(f"{source.folder} has no data for {name}; it is left out" for name in absent)]
+    files = {"account": folder / "reproduce.md", "figures": folder / "figures", "summary": folder / "summary.json"}
+    return Reproduction(summary, files, results.failures, tuple(notes))
+
+
+def _whole_before(
+    names: Sequence[str], source: Source, plan: Plan, place: Path
+) -> tuple[dict[str, list[Cell]], Results]:
+    """The cells of other experiments of which every one has been computed before, and their results."""
+    cells = {}
+    for name in names:
+        found = _CELLS[name](source, plan)
+        if found and len(computed(found, place).values) == len(found):
+            cells[name] = found
+    return cells, computed([cell for found in cells.values() for cell in found], place)
+
+
+def _rows(cells: Sequence[Cell], values: Mapping[str, Values]) -> list[Row]:
+    """The rows of all cells that have a result."""
+    found = [values[cell.name].get("rows", []) for cell in cells if cell.name in values]
+    return [row for rows in found for row in rows]
+
+
+def _tables(rows: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    if rows.get(ball.NAME):
+        mine = rows[ball.NAME]
+        found |= {"ball": tables.ball_table(mine), "tenfold": tables.tenfold(mine), "flattery": tables.flattery(mine)}
+    if rows.get(active.NAME):
+        found["active"] = tables.active_table(rows[active.NAME])
+    if rows.get(board.NAME):
+        mine = rows[board.NAME]
+        found |= {
+            "board": tables.board_table(mine),
+            "published": tables.published_beside(mine),
+            "nearness": tables.nearness(mine),
+        }
+    return found
+
+
+def _part(cells: Sequence[Cell], seconds: Mapping[str, float]) -> dict[str, Any]:
+    """What a part took: seconds of work of its cells, in all and by method."""
+    by_method: dict[str, float] = {}
+    for cell in cells:
+        method = str(cell.options.get("method", "explicit"))
+        by_method[method] = by_method.get(method, 0.0) + seconds.get(cell.name, 0.0)
+    return {"cells": len(cells), "seconds": sum(by_method.values()), "by_method": by_method}
+
+
+def _csv(rows: Sequence[Row]) -> str:
+    """All rows, a column for each key that any of them has; six digits, lists left out."""
+    columns = list(dict.fromkeys(key for row in rows for key, value in row.items() if not isinstance(value, list)))
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    return buffer.getvalue()
+
+
+def _plain(plan: Plan) -> dict[str, Any]:
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(plan).items()}
+
+
+def _without_nan(value: Any) -> Any:
+    """JSON has no NaN; and six digits are enough to read."""
+    if isinstance(value, Mapping):
+        return {str(key): _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if value - value == 0 else None
+    return value

@@ -1,0 +1,159 @@
+"""The rows of all runs, put together into the tables that people read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.experiments import published
+from implicam.experiments.evidence import Row, column, unpaired, where
+from implicam.experiments.findings.active import EARLY
+from implicam.experiments.findings.board import nearest_and_farthest
+from implicam.experiments.plan import FORWARD, GP, METHODS
+from implicam.experiments.source import BALL, BOARD, CHECK, RANDOM
+
+Table = list[dict[str, Any]]
+
+
+def ball_table(rows: Sequence[Row]) -> Table:
+    """A line for each set, method and number of points: quartiles of the rms errors of its runs, in mm."""
+    keys = ("trained", "judged", "set", "method", "known", "budget")
+    table = []
+    for key, runs in _grouped(rows, keys):
+        good = where(runs)
+        line = {**key, "runs": len(good), "failed": len(runs) - len(good)}
+        for name in ("rmse", "mean_sd", "ellipsoid_95", "limit"):
+            line |= {name: quartiles(numbers(good, name))}
+        measured = numbers(good, "measured")
+        table.append({**line, "measured": float(measured.mean()) if len(measured) else float("nan")})
+    return table
+
+
+def active_table(rows: Sequence[Row]) -> Table:
+    """A line for each set, method and stage (the start, 20 points added, the end): over the starts, lowest, median and
+    highest, in mm."""
+    table = []
+    steps = {0, EARLY, max((int(row["added"]) for row in rows), default=0)}
+    for key, runs in _grouped(rows, ("set", "method", "added", "known")):
+        good = where(runs)
+        if key["added"] in steps and good:
+            line = {**key, "starts": len(good)}
+            names = ("mean_sd", "max_sd", "rmse", "check_mean_sd", "check_rmse")
+            line |= {name: _range(numbers(good, name)) for name in names}
+            table.append(line)
+    return table
+
+
+def board_table(rows: Sequence[Row]) -> Table:
+    """A line for each set, number of boards and method: mean and standard deviation over the test points, in mm."""
+    names = ("error", "error_sd", "sd", "sd_sd", "rmse", "mean_sd", "ellipsoid_95", "limit", "measured", "failure")
+    keys = ("set", "boards", "method", "judged", "known", *names)
+    return [{key: row[key] for key in keys if key in row} for row in rows]
+
+
+def published_beside(rows: Sequence[Row]) -> Table:
+    """The paper's table, and ours beside it: a line for each of its rows that was computed."""
+    table = []
+    for row in published.load("board").table:
+        line: dict[str, Any] = {"set": row.set, "boards": row.boards}
+        for key, spread in (("gp_rmse", row.gp_rmse), ("gp_sd", row.gp_sd), ("network_rmse", row.network_rmse)):
+            line[f"paper_{key}"] = [spread.mean, spread.sd]
+        for method in METHODS:
+            for own in where(rows, set=row.set, boards=row.boards, method=method, judged=BOARD):
+                line[method] = {"rmse": [own["error"], own["error_sd"]], "sd": [own["sd"], own["sd_sd"]]}
+        if len(line) > 5:
+            table.append(line)
+    return table
+
+
+def tenfold(rows: Sequence[Row]) -> Table:
+    """forward-gp with the fewest points against inverse-gp, at random positions: with the most points, and at its best.
+
+    times: ratio of the geometric means of the runs' errors, with its 95 % interval.
+    """
+    table = []
+    for cameras in dict.fromkeys(str(row["set"]) for row in rows):
+        for trained in (BALL, RANDOM):
+            ours, theirs = (
+                where(rows, method=method, set=cameras, trained=trained, judged=CHECK) for method in (FORWARD, GP)
+            )
+            if not ours or not theirs:
+                continue
+            few, known = min(row["known"] for row in ours), sorted({row["known"] for row in theirs})
+            errors = {size: numbers(where(theirs, known=size), "rmse") for size in known}
+            best = min(known, key=lambda size: quartiles(errors[size])[1])
+            own = numbers(where(ours, known=few), "rmse")
+            line: dict[str, Any] = {"set": cameras, "trained": trained, "few": few, FORWARD: quartiles(own)}
+            for key, size in (("most", known[-1]), ("best", best)):
+                case = unpaired(errors[size], own, "{}")
+                times = [case.value, case.low, case.high]
+                line[key] = {"known": size, GP: quartiles(errors[size]), "times": times}
+            table.append(line)
+    return table
+
+
+def flattery(rows: Sequence[Row]) -> Table:
+    """What a lattice hides: rms error over the limit, at held-out positions of the lattice and at random ones.
+
+    Only where the data have a Cramer-Rao limit: positions differ in how exactly anybody can measure them.
+    """
+    table = []
+    for key, runs in _grouped(where(rows, trained=BALL), ("set", "method", "known")):
+        over = {}
+        for judged in (BALL, CHECK):
+            own = where(runs, judged=judged)
+            values = numbers(own, "rmse") / numbers(own, "limit") if own else np.zeros(0)
+            values = values[np.isfinite(values)]
+            if len(values):
+                over[judged] = float(np.median(values))
+        if len(over) == 2:
+            table.append({**key, "lattice": over[BALL], "random": over[CHECK]})
+    return table
+
+
+def nearness(rows: Sequence[Row]) -> Table:
+    """Stated standard deviation and error of the nearest third of the test boards, over those of the farthest."""
+    table = []
+    for row in where(rows, judged=BOARD):
+        line = {key: row[key] for key in ("set", "boards", "method")}
+        for key in ("sd", "error"):
+            near, far = nearest_and_farthest(rows, row["method"], row["set"], row["boards"], key)
+            line[key] = float(near.mean() / far.mean()) if len(far) else float("nan")
+        table.append(line)
+    return table
+
+
+def by_board(rows: Sequence[Row]) -> Table:
+    """A line for each test board: mean error and mean stated standard deviation of its corners, in mm."""
+    return [
+        {**{key: row[key] for key in ("set", "boards", "method")}, "board": number + 1, "error": error, "sd": sd}
+        for row in where(rows, judged=BOARD)
+        for number, error, sd in zip(row["numbers"], row["error_by_board"], row["sd_by_board"], strict=True)
+    ]
+
+
+def quartiles(values: Floats) -> list[float]:
+    """The quartiles of (n,) numbers; NaN where there are none."""
+    values = values[np.isfinite(values)]
+    return [float(q) for q in np.quantile(values, [0.25, 0.5, 0.75])] if len(values) else [float("nan")] * 3
+
+
+def _range(values: Floats) -> list[float]:
+    values = values[np.isfinite(values)]
+    return [float(q) for q in np.quantile(values, [0, 0.5, 1])] if len(values) else [float("nan")] * 3
+
+
+def numbers(rows: Iterable[Row], key: str) -> Floats:
+    """A column; NaN where a row has no such number."""
+    return column([{key: row.get(key, np.nan)} for row in rows], key)
+
+
+def _grouped(rows: Iterable[Row], keys: Sequence[str]) -> Iterator[tuple[dict[str, Any], list[Row]]]:
+    """Rows that agree in these keys, as far as they have them, in the order of the first of each."""
+    groups: dict[tuple[tuple[str, Any], ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple((key, row[key]) for key in keys if key in row), []).append(row)
+    yield from ((dict(key), found) for key, found in groups.items())
