@@ -2,7 +2,7 @@
 # make check  all that CI checks                        make bench  speed against the limits
 # make real   the table of docs/real-data.md            make rigs   the tables of docs/choose.md on forward-gp
 # make methods   all methods side by side, the first table of docs/choose.md
-# make paper  the paper's experiments, 20 minutes; docs/reproduce.md
+# make paper  the paper's experiments, 21 minutes; docs/reproduce.md
 # make clean  start over
 PYTHON ?= python3
 VENV := .venv

@@ -81,19 +81,18 @@ def _findings(summary: Summary) -> str:
     verdicts = summary["verdicts"]
     if not verdicts:
         return ""
-    lines, reasons = [], list[str]()
+    lines: list[list[str]] = []
     groups: dict[tuple[str, str, str], dict[str, Mapping[str, Any]]] = {}
     for verdict in verdicts:
         key = verdict["experiment"], verdict["key"], verdict["sets"]
         groups.setdefault(key, {})[verdict["method"]] = verdict
-    for (_, finding, sets), verdict_of in groups.items():
+    for (_, _, sets), verdict_of in groups.items():
         first = next(iter(verdict_of.values()))
         cells = [_verdict(verdict_of.get(method)) for method in (PAPER, GP)]
         if "" in verdict_of:
             cells = [_verdict(verdict_of[""]), "the same"]
-        lines.append([first["statement"], sets, *cells])
-        if any(v["verdict"] == FAILS for v in verdict_of.values()) and not summary["source"]["folder"]:
-            reasons += [f"- *{first['statement']}* {WHY[finding]}"] if WHY.get(finding) else []
+        said = any(line[0] == first["statement"] for line in lines)  # once, over the rows of its sets
+        lines.append(["" if said else first["statement"], sets, *cells])
     counts = {method: _count(verdicts, method) for method in (PAPER, GP)}
     text = [
         "## Does what the paper finds hold?",
@@ -108,9 +107,19 @@ def _findings(summary: Summary) -> str:
     remarks = dict.fromkeys(f"- *{v['statement']}* {v['remark']}" for v in verdicts if v["remark"])
     if remarks:
         text += ["Where the paper's own table says otherwise:", "\n".join(remarks)]
+    reasons = "" if summary["source"]["folder"] else _reasons(verdicts)
     if reasons:
-        text += ["Why some do not hold on this rig:", "\n".join(dict.fromkeys(reasons))]
+        text += ["Why some do not hold on this rig:", reasons]
     return "\n\n".join(text)
+
+
+def _reasons(verdicts: Sequence[Mapping[str, Any]]) -> str:
+    """Each reason that is known, with the findings that do not hold for it."""
+    found: dict[str, list[str]] = {}
+    for verdict in verdicts:
+        if verdict["verdict"] == FAILS and verdict["key"] in WHY:
+            found.setdefault(WHY[verdict["key"]], []).append(f"*{verdict['statement']}*")
+    return "\n".join(f"- {' '.join(dict.fromkeys(said))} {reason}" for reason, said in found.items())
 
 
 def _verdict(verdict: Mapping[str, Any] | None) -> str:
