@@ -1,9 +1,7 @@
 """The paper's numbers as its LaTeX source has them, and figures that show what the data say."""
 
 import json
-import os
 import re
-import shutil
 from dataclasses import FrozenInstanceError
 from html.parser import HTMLParser
 from pathlib import Path
@@ -538,31 +536,15 @@ def test_the_page_is_whole_and_loads_nothing() -> None:
     assert interactive3d.html_page(again, title=HOSTILE, caption=HOSTILE) == text
 
 
-def chromium() -> str:
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if not found:
-        if os.environ.get("IMPLICAM_REQUIRE_BROWSER") == "1":
-            pytest.fail("IMPLICAM_REQUIRE_BROWSER=1, but there is no chromium on the path")
-        pytest.skip("no chromium on the path")
-    return found
-
-
-FLAGS = [
-    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-]  # fmt: skip
-
-
 @pytest.mark.browser
-def test_the_page_draws_in_a_browser(tmp_path: Path) -> None:
-    executable = chromium()
+def test_the_page_draws_in_a_browser(tmp_path: Path, chromium: dict[str, Any]) -> None:
     sync_api = pytest.importorskip("playwright.sync_api")
     file = tmp_path / "boards.html"
     rows = [panel(60, title=f"{name}, {b} boards") for name in SETS for b in (2, 3, 5, 9)]
     figure = interactive3d.panels_3d(rows, scales=BOARD_SCALES, every=10)
     file.write_text(interactive3d.html_page(figure, title="twelve panels"), encoding="utf-8")
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=executable, args=FLAGS)
+        browser = playwright.chromium.launch(**chromium)
         try:
             view = browser.new_page(viewport={"width": 1100, "height": 800})
             told: list[str] = []

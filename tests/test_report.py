@@ -1,13 +1,12 @@
 """The report: nothing loaded, nothing unescaped, everything there; and in a real browser it draws."""
 
 import json
-import os
 import re
-import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -276,28 +275,12 @@ def test_error_against_sd_leaves_out_what_a_log_axis_cannot_show():
 # ------------------------------------------------------------------------------------------------ in a real browser
 
 
-def chromium() -> str:
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if not found:
-        if os.environ.get("IMPLICAM_REQUIRE_BROWSER") == "1":
-            pytest.fail("IMPLICAM_REQUIRE_BROWSER=1, but there is no chromium on the path")
-        pytest.skip("no chromium on the path")
-    return found
-
-
-FLAGS = [
-    "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-]  # fmt: skip
-
-
 @pytest.mark.browser
-def test_page_draws_in_a_browser(tmp_path: Path):
-    executable = chromium()
+def test_page_draws_in_a_browser(tmp_path: Path, chromium: dict[str, Any]):
     sync_api = pytest.importorskip("playwright.sync_api")
     write_report(tmp_path / "report.html", report_data(name="<b onclick=alert(1)>é"))
     with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=executable, args=FLAGS)
+        browser = playwright.chromium.launch(**chromium)
         try:
             view = browser.new_page(viewport={"width": 1400, "height": 1000})
             told, asked = listen(view)

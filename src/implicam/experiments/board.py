@@ -91,7 +91,7 @@ def _spreads(panel: Mapping[str, Any], number: NDArray[np.int64]) -> Values:
     error = np.linalg.norm(panel["xyz"] - panel["true_xyz"], axis=1)
     good = np.isfinite(error)
     if not good.any():
-        return {}
+        return {"failure": "no position was measured"}
     row: Values = {"numbers": [int(i) for i in np.unique(number[good])]}
     for key, values in (("error", error[good]), ("sd", panel["sd"][good])):
         row |= {key: float(values.mean()), f"{key}_sd": float(values.std())}

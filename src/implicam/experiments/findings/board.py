@@ -85,8 +85,9 @@ def _nearer(key: str, what: str) -> Test:
         if not counts:
             return []
         boards = PANELS if PANELS in counts else counts[-1]
-        found, taken = _by_board(rows, gp, sets[0], boards, key), max(_by_board(rows, gp, sets[0], boards, key)) + 1
-        pairs = [(i, taken - i) for i in found if i < taken - i and taken - i in found]
+        found = _by_board(rows, gp, sets[0], boards, key)
+        last = max(found) + 1  # the farthest board, which trains
+        pairs = [(i, last - i) for i in found if i < last - i and last - i in found]
         words = f"{what} of a near board {{}} times that of the one as far behind the middle, with {boards} boards"
         near, far = (np.array([found[pair[k]] for pair in pairs], dtype=np.float64) for k in (0, 1))
         return [ratio(near, far, words)]
