@@ -7,6 +7,7 @@
     ├── CalibrationFileError  a .implicam file is damaged, hostile or too new
     ├── NumericalError        a matrix that must be positive definite is not
     ├── MissingExtraError     an optional library is not installed
+    ├── HardwareError         a camera, a trigger or a robot does not do what it was told
     └── UsageError            options that do not go together
 
 The command line prints the three lines and no traceback; `--debug` shows it.
@@ -58,6 +59,10 @@ class NumericalError(ImplicamError):
 
 class MissingExtraError(ImplicamError):
     """An optional library is not installed."""
+
+
+class HardwareError(ImplicamError):
+    """A camera, a trigger or a robot does not answer, or does not do what it was told; nothing was lost."""
 
 
 class UsageError(ImplicamError):

@@ -127,6 +127,15 @@ class ForwardGPCalibration:
         """The same method with the same options on other data."""
         return self.calibrator.fit(data, progress)
 
+    def grown(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
+        """As `refit`, starting from what is known: for a few points more, in a third of the time.
+
+        What is found is the nearest optimum and not the best of many, so fit anew where the points have grown much.
+        """
+        with solvable(), blas_threads(1):
+            fitted = fit_rig(problem_of(self.calibrator.lens, data, self.frame), progress, self.fitted)
+        return ForwardGPCalibration(self.calibrator, data, self.frame, fitted)
+
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         return [*self.diagnosis.notes(), *self._label_notes(), *self.diagnosis.noise_notes()]

@@ -24,7 +24,7 @@ from implicam.calibrators.forward_gp.posterior import (
     empty_field,
     spread,
 )
-from implicam.calibrators.forward_gp.start import FEWEST, Started, start_camera
+from implicam.calibrators.forward_gp.start import FEWEST, Started, start_again, start_camera
 from implicam.errors import FitError
 from implicam.progress import Progress
 from implicam.threads import side_by_side
@@ -80,10 +80,18 @@ class FittedRig:
     label_sd: Floats | None
 
 
-def fit_rig(problem: Problem, progress: Progress) -> FittedRig:
-    """Fit every camera that can be fitted."""
+def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = None) -> FittedRig:
+    """Fit every camera that can be fitted. before: a fit in the same working frame to most of these points, from a
+    moment ago: its cameras and hyperparameters are the guess."""
     progress("fitting", 0, 3)
-    started, blind = start_rig(problem, lambda c, points, uv: start_camera(points, uv, problem.images[c], problem.lens))
+    guess = {} if before is None else dict(zip(before.cameras, before.posterior.models, strict=True))
+
+    def start(c: int, points: Floats, uv: Floats) -> Started:
+        if c in guess:
+            return start_again(guess[c].camera, points, uv, problem.images[c], problem.lens)
+        return start_camera(points, uv, problem.images[c], problem.lens)
+
+    started, blind = start_rig(problem, start)
     cameras = tuple(started)
     seen = tuple(problem.sightings[c] for c in cameras)
     images = tuple(problem.images[c] for c in cameras)
@@ -92,7 +100,8 @@ def fit_rig(problem: Problem, progress: Progress) -> FittedRig:
     progress("fitting", 1, 3)
     stated = problem.stated[list(cameras)]
     rounds = ROUNDS_WITH_SHOTS if problem.errors is not None and problem.errors.estimated else ROUNDS
-    state = _Round(None, models, None, kept, problem.errors, None, settled=False)
+    hyper = before.hyperparameters if before is not None and before.cameras == cameras else None
+    state = _Round(hyper, models, None, kept, problem.errors, None, settled=False)
     for number in range(rounds):
         state = _round(problem, state, seen, images, stated)
         judged = state.kept

@@ -4,16 +4,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.locate import Labels, Located, locate
-from implicam.calibrators.forward_gp.posterior import Posterior
+from implicam.calibrators.forward_gp.posterior import Posterior, spread
 from implicam.calibrators.forward_gp.problem import Frame, stated_noise, view_noise
 from implicam.calibrators.protocol import same_cameras
 from implicam.dataset import Floats, Names, Observations
 from implicam.measurement import Measurement
+
+
+class Sensitivity(NamedTuple):
+    """How what some cameras see of n places depends on the place and on what is unknown of the cameras.
+
+    pixels = mean + slope @ (step of the place) + half @ N(0, I) + N(0, rest + noise), r pixel coordinates together.
+    cameras: their numbers in the dataset, two coordinates each; slope (n, r, 3) pixels per length unit; half (n, r, q)
+    pixels; rest (n, r) variance of what is unknown besides, of every place its own; noise (n, r) variance of a view.
+    """
+
+    cameras: tuple[int, ...]
+    slope: Floats
+    half: Floats
+    rest: Floats
+    noise: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +92,22 @@ class RigMap:
         for number, c in enumerate(self.cameras):
             uv[there, c] = self.posterior.models[number].predict(where)[0]
         return uv
+
+    def sensitivities(self, xyz: Floats) -> list[Sensitivity]:
+        """For positions (n, 3): one for each camera; a single one of all cameras where errors of the known positions
+        tie them together. NaN where a lens has no answer."""
+        points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        parts = []
+        for number, (c, model) in enumerate(zip(self.cameras, self.posterior.models, strict=True)):
+            rows = model.rows(points)
+            slope = model.predict(points)[1] / self.frame.scale
+            half = spread(rows, self.posterior.root(number))
+            noise = np.full((len(points), 2), model.noise**2)
+            parts.append(Sensitivity((c,), slope, half, rows.rest[:, None].repeat(2, axis=1), noise))
+        if self.posterior.joint is None:
+            return parts
+        together = (np.concatenate([part[i] for part in parts], axis=1) for i in range(1, len(Sensitivity._fields)))
+        return [Sensitivity(self.cameras, *together)]
 
     def centres(self) -> dict[str, Floats]:
         """Where the calibrated cameras are: name -> (3,) in the world."""

@@ -52,9 +52,22 @@ def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> Started
     camera = CentralCamera(
         KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist()), found.camera_from_world
     )
-    there = camera.pose.apply(points[found.kept])
+    return _with_prior(camera, points, uv, image, found.kept)
+
+
+def start_again(camera: AnyCamera, points: Floats, uv: Floats, image: Image, lens: str) -> Started:
+    """The same from a camera that fitted most of these points a moment ago; from no guess where it does not."""
+    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+    kept = error <= max(FAR * float(np.nanmedian(error)), 1e-4 * image.half)
+    if not isinstance(camera, CentralCamera) or kept.sum() < max(FEWEST, len(points) / 2):
+        return start_camera(points, uv, image, lens)
+    return _with_prior(camera, points, uv, image, kept)
+
+
+def _with_prior(camera: CentralCamera, points: Floats, uv: Floats, image: Image, kept: Bools) -> Started:
+    there = camera.pose.apply(points[kept])
     widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
-    return _refined(camera, camera.prior(image, widest), points, uv, image, found.kept)
+    return _refined(camera, camera.prior(image, widest), points, uv, image, kept)
 
 
 def _start_projective(points: Floats, uv: Floats, image: Image) -> Started:

@@ -1,0 +1,50 @@
+"""Where to measure next, and when to stop.
+
+>>> from implicam.active import Budget, Loop, SimulatedOracle, Workspace
+>>> from implicam.simulate import build_rig
+>>> from implicam import ForwardGP
+>>> rig = build_rig("stereo", seed=1)
+>>> loop = Loop(ForwardGP(), Workspace.of_box(rig.volume), rule=Budget(12))
+>>> loop = loop.run(SimulatedOracle(rig))
+>>> loop.stop, len(loop.data)
+('all 12 points of the budget are measured', 12)
+"""
+
+from implicam.active.acquisition import ACQUISITIONS, Acquisition, acquisition, choose, path_length
+from implicam.active.loop import Answer, Loop, Oracle, Target, step_of
+from implicam.active.oracles import RecordedOracle, SimulatedOracle
+from implicam.active.outlook import Outlook, Places, Prospect, outlook_of
+from implicam.active.stopping import AtLeast, Below, Budget, Converged, Never, Rule, Step, Time
+from implicam.active.suggest import Suggestion, suggest
+from implicam.active.workspace import Workspace, workspace_from
+
+__all__ = [
+    "ACQUISITIONS",
+    "Acquisition",
+    "Answer",
+    "AtLeast",
+    "Below",
+    "Budget",
+    "Converged",
+    "Loop",
+    "Never",
+    "Oracle",
+    "Outlook",
+    "Places",
+    "Prospect",
+    "RecordedOracle",
+    "Rule",
+    "SimulatedOracle",
+    "Step",
+    "Suggestion",
+    "Target",
+    "Time",
+    "Workspace",
+    "acquisition",
+    "choose",
+    "outlook_of",
+    "path_length",
+    "step_of",
+    "suggest",
+    "workspace_from",
+]

@@ -1,0 +1,201 @@
+"""Where to measure next: a score for every candidate, the largest wins.
+
+To add one: write a frozen class with `scores`, add it to ACQUISITIONS, run the tests: one contract runs over all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from implicam.active.outlook import Outlook
+from implicam.dataset import Floats
+from implicam.errors import UsageError, did_you_mean
+
+
+class Acquisition(Protocol):
+    """A rule, without any state: the same outlook and random numbers give the same scores."""
+
+    name: ClassVar[str]
+
+    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+        """(m,) how much is to be expected of a known point at each candidate, never negative; NaN for nothing."""
+
+
+@dataclass(frozen=True)
+class Random:
+    """Anywhere, all candidates alike."""
+
+    name: ClassVar[str] = "random"
+
+    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+        """Random numbers."""
+        return rng.random(len(outlook.candidates))
+
+
+@dataclass(frozen=True)
+class Sobol:
+    """Evenly spread, whatever the cameras: the candidates in their own order, which is that of a Sobol sequence."""
+
+    name: ClassVar[str] = "sobol"
+
+    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+        """The first one first."""
+        return np.arange(len(outlook.candidates), 0, -1, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class MaximumVariance:
+    """The paper's rule, uncertainty sampling: the largest standard deviation, averaged over x, y and z."""
+
+    name: ClassVar[str] = "variance"
+
+    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+        """In the length unit."""
+        total = outlook.there.total
+        return np.asarray(np.sqrt(np.diagonal(total, axis1=1, axis2=2)).mean(axis=1), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class RelativeExcess:
+    """What more points can still remove: total variance over the variance that pixel noise alone would leave."""
+
+    name: ClassVar[str] = "excess"
+
+    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+        """The ratio, minus one."""
+        return np.asarray(np.maximum(outlook.there.excess**2 - 1, 0), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class IntegratedVariance:
+    """By how much a point would reduce the variance of the whole workspace (Cohn, Ghahramani & Jordan 1996).
+
+    relative: in units of what pixel noise alone would leave, or else in length units, where the far end, with its large
+    noise, counts most. power: of the excess that a place already has; the larger, the more the worst places count: it
+    is the slope of the mean of `excess^(2 power)`.
+    """
+
+    relative: bool = True
+    power: float = 2.0
+
+    name: ClassVar[str] = "integrated"
+
+    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+        """The reduction of the weighted mean over the judged places."""
+        now = outlook.now
+        floor = np.trace(now.floor, axis1=1, axis2=2) if self.relative else 1.0
+        excess = np.trace(now.total, axis1=1, axis2=2) / floor
+        worst = np.nanmax(excess, initial=0.0) or 1.0
+        weights = (excess / worst) ** (self.power - 1) / floor / max(1, int(now.measured.sum()))
+        return np.asarray(outlook.gain(weights), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class DOptimal:
+    """The view that tells most of the unknowns, wherever it matters: the largest information, in nats."""
+
+    name: ClassVar[str] = "d-optimal"
+
+    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+        """Half the log of the determinant's ratio."""
+        return outlook.information()
+
+
+ACQUISITIONS: dict[str, Acquisition] = {
+    rule.name: rule
+    for rule in (Random(), Sobol(), MaximumVariance(), RelativeExcess(), IntegratedVariance(), DOptimal())
+}
+"""Name -> rule."""
+
+DEFAULT = IntegratedVariance.name
+
+
+def acquisition(name: str) -> Acquisition:
+    """The rule with this name; UsageError for another."""
+    if name not in ACQUISITIONS:
+        raise UsageError(
+            f"there is no acquisition {name!r}{did_you_mean(name, ACQUISITIONS)}.",
+            fix=f"use one of {', '.join(ACQUISITIONS)}",
+        )
+    return ACQUISITIONS[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Candidates chosen, in the order in which to go there, the score of each when it was chosen, and the outlook when
+    all are known points."""
+
+    index: list[int]
+    scores: list[float]
+    after: Outlook
+
+
+def choose(
+    outlook: Outlook,
+    rule: Acquisition,
+    rng: np.random.Generator,
+    *,
+    count: int = 1,
+    here: Floats | None = None,
+    reach: float = np.inf,
+) -> Choice:
+    """The `count` best candidates, each as if those before it were known already.
+
+    reach: the distance that costs as much time as one measurement; a score counts per time, so that a robot `here`
+    (3,) does not cross the volume for little. Several are then ordered to a short path. UsageError where no candidate
+    is of any use.
+    """
+    chosen: list[int] = []
+    scores: list[float] = []
+    place = here
+    for _ in range(count):
+        score = np.where(outlook.useful, rule.scores(outlook, rng), np.nan)
+        score[chosen] = np.nan
+        if not np.isfinite(score).any():
+            break
+        worth = score
+        if place is not None and np.isfinite(reach):
+            worth = score / (1 + np.linalg.norm(outlook.candidates.xyz - place, axis=1) / reach)
+        best = int(np.nanargmax(worth))
+        chosen.append(best)
+        scores.append(float(score[best]))
+        place = outlook.candidates.xyz[best] if place is not None else None
+        outlook = outlook.after(best)
+    if not chosen:
+        raise UsageError(
+            "no candidate can be used for calibration.",
+            why="the cameras would see none of them",
+            fix="give another workspace (--workspace), one that the cameras look at",
+        )
+    order = _path(outlook.candidates.xyz[chosen], here)
+    return Choice([chosen[k] for k in order], [scores[k] for k in order], outlook)
+
+
+def _path(xyz: Floats, here: Floats | None) -> list[int]:
+    """A short way through all places (k, 3) from `here`: to the nearest, and on; then pieces are turned round while
+    that helps (2-opt)."""
+    if here is None:
+        return list(range(len(xyz)))
+    left, order, place = list(range(len(xyz))), [], here
+    while left:
+        order.append(min(left, key=lambda k: float(np.linalg.norm(xyz[k] - place))))
+        left.remove(order[-1])
+        place = xyz[order[-1]]
+    better = True
+    while better:
+        better = False
+        for i in range(len(order)):
+            for j in range(i + 2, len(order) + 1):
+                turned = [*order[:i], *reversed(order[i:j]), *order[j:]]
+                if path_length(xyz[turned], here) < path_length(xyz[order], here) * (1 - 1e-12):
+                    order, better = turned, True
+    return order
+
+
+def path_length(xyz: Floats | Sequence[Floats], here: Floats) -> float:
+    """The length of the way from `here` through places (k, 3)."""
+    return float(np.linalg.norm(np.diff(np.concatenate([here[None], np.asarray(xyz)]), axis=0), axis=1).sum())

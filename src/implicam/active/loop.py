@@ -1,0 +1,296 @@
+"""The loop: while not stop: choose, observe, tell, refit.
+
+loop = Loop(ForwardGP(), Workspace.box(low, high), rule=Below(0.2) | Budget(60))
+loop.run(oracle)                                  # or, one at a time:
+while not loop.stop:
+    (target,) = loop.ask()
+    loop.tell(oracle.observe(target))
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count, islice
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from implicam.active.acquisition import DEFAULT, Acquisition, Choice, acquisition, choose
+from implicam.active.outlook import ForwardOutlook, InverseOutlook, Places, Prospect, outlook_of
+from implicam.active.stopping import Never, Rule, Step
+from implicam.active.workspace import Workspace
+from implicam.calibrators import Calibration, Calibrator, ForwardGP, ForwardGPCalibration, InverseGP
+from implicam.dataset import Dataset, Floats, join
+from implicam.errors import FitError, ImplicamError, UsageError
+from implicam.progress import Progress, silent
+
+GROWTH = 1.25
+"""Between two fits from no guess the points grow by this factor at most: forward-gp, and the forward model that
+predicts pixels for inverse-gp."""
+
+FEW = 16
+"""So few points say little of where the best fit is: each fit is one from no guess."""
+
+MOST_SKIPPED = 20
+"""So many targets in a row that nobody could measure are no accident."""
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Where to put the next known point: xyz (3,) in the world; uv (cameras, 2) where each camera is going to see it,
+    NaN where it does not or where nothing is known yet; score: of the acquisition, NaN for a point to begin with."""
+
+    name: str
+    xyz: Floats
+    uv: Floats
+    score: float = float("nan")
+
+
+def targets_of(places: Places, chosen: Choice, known: int) -> list[Target]:
+    """The candidates chosen, named p<number> after so many known points."""
+    uv = np.where(places.seen[..., None], places.uv, np.nan)
+    return [
+        Target(f"p{known + k + 1:03d}", places.xyz[i], uv[i], score)
+        for k, (i, score) in enumerate(zip(chosen.index, chosen.scores, strict=True))
+    ]
+
+
+class Answer(NamedTuple):
+    """What came of a target: one shot of known points, or why there is none."""
+
+    data: Dataset | None
+    reason: str = ""
+
+
+class Oracle(Protocol):
+    """Answers what the cameras see when the target is there."""
+
+    def observe(self, target: Target) -> Answer:
+        """The known point that was measured there, or nearby; a target that cannot be measured is no error."""
+
+
+@dataclass(eq=False)
+class Loop:
+    """Active learning of a calibration; changes as points are told.
+
+    calibrator: the method; workspace: where targets can be and where the calibration has to be good. start: so many
+    points before the first fit, evenly spread. candidates, judged: numbers of places. reach: the distance that costs
+    as much as one measurement. pool: a recorded dataset that the targets are chosen from, its own pixels known. data:
+    what is known already.
+    """
+
+    calibrator: Calibrator
+    workspace: Workspace
+    acquisition: Acquisition = field(default_factory=lambda: acquisition(DEFAULT))
+    rule: Rule = field(default_factory=Never)
+    start: int = 8
+    candidates: int = 1500
+    judged: int = 400
+    reach: float = np.inf
+    seed: int = 0
+    pool: Dataset | None = None
+    data: Dataset | None = None
+
+    def __post_init__(self) -> None:
+        self.history: list[Step] = []
+        self.calibration: Calibration | None = None
+        self.problem: ImplicamError | None = None
+        self.prospect: Prospect | None = None
+        self.judged_at: Floats = self.workspace.judged(self.judged, self.seed)
+        self._began = time.monotonic()
+        self._refused: list[tuple[Floats, str]] = []
+        self._pilot: Calibration | None = None
+        self._asked = self._from_no_guess = 0
+        if self.data is not None:
+            self.reset(self.data)
+
+    @property
+    def stop(self) -> str:
+        """Why to stop, in words; empty where not yet."""
+        return self.rule.met(self.history, self.data.length_unit if self.data is not None else "")
+
+    @property
+    def points(self) -> int:
+        """How many known points there are."""
+        return 0 if self.data is None else len(self.data)
+
+    @property
+    def skipped(self) -> list[tuple[Floats, str]]:
+        """Where targets could not be measured, and why."""
+        return self._refused
+
+    def ask(self, number: int = 1, here: Floats | None = None) -> list[Target]:
+        """The next targets, in the order in which to go there from `here` (3,).
+
+        UsageError where there is no place left that any camera would see.
+        """
+        self._asked += 1
+        if self.calibration is None:
+            return self._to_begin(number, here)
+        outlook = self._outlook()
+        rng = np.random.default_rng([self.seed, self._asked, 3])
+        chosen = choose(outlook, self.acquisition, rng, count=number, here=here, reach=self.reach)
+        targets = targets_of(outlook.candidates, chosen, self.points)
+        return [replace(target, name=self._name(target.xyz, k)) for k, target in enumerate(targets)]
+
+    def tell(self, answer: Answer | Dataset, target: Target | None = None, progress: Progress = silent) -> None:
+        """Add what was measured and fit again; what could not be measured is remembered, and not asked for again."""
+        data, reason = (answer, "") if isinstance(answer, Dataset) else answer
+        if data is None:
+            if target is not None:
+                self.refuse(target, reason)
+            return
+        self.reset(data if self.data is None else join(self.data, data), progress)
+
+    def refuse(self, target: Target, reason: str) -> None:
+        """A target that could not be measured: neither it nor what is near it is asked for again."""
+        self._refused.append((target.xyz, reason))
+
+    def reset(self, data: Dataset | None, progress: Progress = silent) -> None:
+        """Go on from other known points: some that were there already, or fewer because one was taken back."""
+        if data is None or self.data is None or len(data) <= len(self.data):
+            self._pilot = None
+            self.history = [step for step in self.history if data is not None and step.points < len(data)]
+        self.data = data
+        before, self.calibration = self.calibration, None
+        self.prospect = self.problem = None
+        if data is not None and len(data) >= self.start:
+            try:
+                self.calibration = self._fitted(before, data, progress)
+            except FitError as error:
+                self.problem = error  # more points will help
+        if data is not None:
+            self.history.append(self._step())
+
+    def run(self, oracle: Oracle, progress: Progress = silent) -> Loop:
+        """Ask and tell until a rule says stop, or no place is left; the loop itself."""
+        in_vain = 0
+        while not self.stop and in_vain < MOST_SKIPPED:
+            try:
+                (target, *_) = self.ask(here=None if self.data is None else self.data.xyz[-1])
+            except UsageError:
+                break
+            answer = oracle.observe(target)
+            in_vain = in_vain + 1 if answer.data is None else 0
+            self.tell(answer, target)
+            progress("measuring", self.points, self.points + 1)
+        return self
+
+    def _fitted(self, before: Calibration | None, data: Dataset, progress: Progress) -> Calibration:
+        """A fit with everything; of forward-gp from the last one's result while the points have not grown by much."""
+        grown = FEW < len(data) < GROWTH * self._from_no_guess
+        if grown and isinstance(before, ForwardGPCalibration) and len(before.data) < len(data):
+            return before.grown(data, progress)
+        self._from_no_guess = len(data)
+        return self.calibrator.fit(data, progress)
+
+    def _to_begin(self, number: int, here: Floats | None) -> list[Target]:
+        """Places to begin with: the evenly spread ones that are farthest from what is known and what was refused."""
+        used = [*(self.data.xyz if self.data is not None else ()), *(xyz for xyz, _ in self._refused)]
+        pool = self.pool.xyz if self.pool is not None else self.workspace.design(self.start, self.seed)
+        if self.pool is None and len(used) + number > len(pool):
+            pool = self.workspace.candidates(self.candidates, self.seed)
+        targets: list[Target] = []
+        nowhere = np.full((self._cameras, 2), np.nan)
+        for k in range(number):
+            free = pool[[not any(np.array_equal(xyz, place) for place in used) for xyz in pool]]
+            if not len(free):
+                break
+            first = free[0] if not used else free[np.argmax(_distance(free, np.array(used)))]
+            targets.append(Target(self._name(first, k), first, nowhere))
+            used.append(first)
+        if not targets:
+            raise UsageError("no place of the workspace is left.", fix="give a larger one (--workspace)")
+        return targets
+
+    @property
+    def _cameras(self) -> int:
+        known = self.data if self.data is not None else self.pool
+        return 0 if known is None else len(known.cameras)
+
+    def _name(self, xyz: Floats, k: int) -> str:
+        if self.pool is not None:
+            return str(self.pool.points[int(np.argmin(np.linalg.norm(self.pool.xyz - xyz, axis=1)))])
+        used = {*(self.data.points.tolist() if self.data is not None else ())}
+        free = (name for number in count(self.points + 1) if (name := f"p{number:03d}") not in used)
+        return next(islice(free, k, None))
+
+    def _outlook(self) -> ForwardOutlook | InverseOutlook:
+        assert self.calibration is not None
+        candidates: Floats | Places
+        if self.pool is not None:
+            candidates = Places.recorded(self.pool.select(self._unused()))
+        else:
+            # Others each time, or what is between the candidates would never be measured.
+            candidates = self.workspace.candidates(self.candidates, 1000 * self.seed + self._asked)
+            if self.acquisition.name == "sobol":
+                candidates = self.workspace.candidates(self.candidates, self.seed)[self.points :]
+            candidates = self._not_refused(candidates)
+        return outlook_of(self.calibration, candidates, self.judged_at, self._forward())
+
+    def _unused(self) -> list[int]:
+        assert self.pool is not None
+        used = {*(self.data.points.tolist() if self.data is not None else ())}
+        refused = {tuple(xyz) for xyz, _ in self._refused}
+        left = [
+            i
+            for i, (name, xyz) in enumerate(zip(self.pool.points.tolist(), self.pool.xyz, strict=True))
+            if name not in used and tuple(xyz) not in refused
+        ]
+        if not left:
+            raise UsageError("every point of the pool is used.", fix="record more, or stop here")
+        return left
+
+    def _not_refused(self, candidates: Floats) -> Floats:
+        """Without the surroundings of what could not be measured, and without the very places that are known."""
+        size = self.workspace.size
+        away = [(xyz, 0.05 * size) for xyz, _ in self._refused]
+        if self.workspace.places is not None and self.data is not None:
+            away = [(xyz, 1e-6 * size) for xyz, _ in self._refused] + [(xyz, 1e-6 * size) for xyz in self.data.xyz]
+        for place, radius in away:
+            candidates = candidates[np.linalg.norm(candidates - place, axis=1) > radius]
+        if not len(candidates):
+            raise UsageError("no place of the workspace is left.", fix="give a larger one (--workspace)")
+        return candidates
+
+    def _forward(self) -> Calibration | None:
+        """For inverse-gp a forward model of the same points, which predicts pixels; None where it is not needed."""
+        if not isinstance(self.calibrator, InverseGP) or self.data is None:
+            return None
+        if self._pilot is None or len(self.data) >= GROWTH * len(self._pilot.data):
+            self._pilot = ForwardGP().fit(self.data)
+        return self._pilot
+
+    def _step(self) -> Step:
+        """What is known now, and the prospect at the judged places."""
+        passed = time.monotonic() - self._began
+        if self.calibration is None:
+            return Step(self.points, seconds=passed)
+        nothing = self.judged_at[:0]
+        try:
+            prospect = outlook_of(self.calibration, nothing, self.judged_at, self._forward()).now
+        except FitError as error:
+            self.problem = error
+            return Step(self.points, seconds=passed)
+        self.prospect = prospect
+        return step_of(prospect, self.points, passed)
+
+
+def step_of(prospect: Prospect, points: int, seconds: float = 0.0) -> Step:
+    """The numbers of a prospect over the places where it is measured."""
+    u95, excess = prospect.u95[prospect.measured], prospect.excess[prospect.measured]
+    share = float(prospect.measured.mean()) if len(prospect.measured) else 0.0
+    if not len(u95):
+        return Step(points, seconds=seconds)
+    return Step(
+        points, float(u95.max()), float(u95.mean()), float(np.quantile(u95, 0.95)), float(np.quantile(excess, 0.95)),
+        share, seconds,
+    )  # fmt: skip
+
+
+def _distance(xyz: Floats, others: Floats) -> Floats:
+    """(n,) from each of (n, 3) to the nearest of others (k, 3)."""
+    found: Sequence[Floats] = [np.linalg.norm(xyz - other, axis=1) for other in others]
+    return np.asarray(np.min(found, axis=0), dtype=np.float64)

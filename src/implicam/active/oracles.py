@@ -1,0 +1,61 @@
+"""What answers a target: a simulated rig, a recorded dataset. A robot with cameras, and a person: session/."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from implicam.active.loop import Answer, Target
+from implicam.dataset import Dataset
+from implicam.simulate import Rig, simulate
+from implicam.simulate import Target as Shown
+
+
+@dataclass(eq=False)
+class SimulatedOracle:
+    """A simulated rig that looks at a ball where the target is; `seed` rules the noise.
+
+    robot_noise: sd per axis of the known position. missing: probability that a view is lost. fails: that nothing is
+    measured at all.
+    """
+
+    rig: Rig
+    seed: int = 0
+    robot_noise: float = 0.0
+    missing: float = 0.0
+    fails: float = 0.0
+    asked: int = field(default=0, init=False)
+
+    def observe(self, target: Target) -> Answer:
+        """One known point with the views of the cameras that see it."""
+        self.asked += 1
+        if np.random.default_rng([self.seed, self.asked, 7]).random() < self.fails:
+            return Answer(None, "the ball was not found")
+        names = np.array([target.name])
+        data = simulate(
+            self.rig, Shown("ball", names, names, target.xyz[None]), seed=1_000_003 * self.seed + self.asked,
+            robot_noise=self.robot_noise, missing=self.missing,
+        )  # fmt: skip
+        return Answer(data) if data.observations.seen.any() else Answer(None, "no camera sees this place")
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedOracle:
+    """A dataset that was recorded before; a target is answered by the point nearest to it that was not used yet."""
+
+    data: Dataset
+    used: set[str] = field(default_factory=set)
+
+    def observe(self, target: Target) -> Answer:
+        """The point with the target's name, else the nearest one."""
+        names = self.data.points.tolist()
+        left = [i for i, name in enumerate(names) if name not in self.used]
+        if not left:
+            return Answer(None, "every recorded point is used")
+        if target.name in names and target.name not in self.used:
+            i = names.index(target.name)
+        else:
+            i = left[int(np.argmin(np.linalg.norm(self.data.xyz[left] - target.xyz, axis=1)))]
+        self.used.add(names[i])
+        return Answer(self.data.select([i]))

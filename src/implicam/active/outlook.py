@@ -1,0 +1,382 @@
+"""What a calibration is worth at places, and what a known point there would add to it; nothing is measured yet.
+
+A calibration is linear in what it does not know, near what it does: so the covariance after one more point depends on
+where the point is, not on what the cameras will see. Both kinds of methods answer the same questions:
+
+- forward (forward-gp, explicit): pixels depend on the unknowns of the cameras, `RigMap.sensitivities`;
+- inverse (inverse-gp): each coordinate is a Gaussian process of the pixels, and the pixels of a place are predicted by
+  a forward model that was fitted to the same points, or known because the place was recorded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from implicam.calibrators import Calibration, ExplicitCalibration, ForwardGPCalibration, InverseGPCalibration
+from implicam.calibrators.forward_gp.rig_map import RigMap, Sensitivity
+from implicam.dataset import Dataset, Floats, Observations
+from implicam.errors import UsageError
+from implicam.gp.linalg import solve_lower
+
+Bools = NDArray[np.bool_]
+
+K95 = float(np.sqrt(chi2.ppf(0.95, 3)))
+"""The 95 % ellipsoid of a position is so many times as large as that of one standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Positions xyz (n, 3), the pixels (n, cameras, 2) at which all cameras of the dataset see them or would, and
+    seen (n, cameras) where they do: in the picture, and not behind the lens."""
+
+    xyz: Floats
+    uv: Floats
+    seen: Bools
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def select(self, index: NDArray[np.int64] | Bools) -> Places:
+        """Some of them."""
+        return Places(self.xyz[index], self.uv[index], self.seen[index])
+
+    @classmethod
+    def predicted(cls, forward: ForwardGPCalibration | ExplicitCalibration, xyz: Floats) -> Places:
+        """Where a forward model says that the cameras would see positions (n, 3)."""
+        uv = forward.predict(xyz)
+        return cls(xyz, uv, on_image(forward.map.trained, uv))
+
+    @classmethod
+    def recorded(cls, data: Dataset) -> Places:
+        """Known points that were recorded already: a pool to choose from."""
+        return cls(data.xyz, data.observations.uv, data.observations.seen)
+
+
+def on_image(observations: Observations, uv: Floats) -> Bools:
+    """(n, cameras) which pixels (n, cameras, 2) are in the picture; where its size is not told, among those seen."""
+    seen = np.zeros(uv.shape[:2], dtype=np.bool_)
+    for c, camera in enumerate(observations.cameras):
+        if camera.width is not None and camera.height is not None:
+            low, high = np.array([-0.5, -0.5]), np.array([camera.width, camera.height]) - 0.5
+        elif observations.seen[:, c].any():
+            pixels = observations.uv[observations.seen[:, c], c]
+            low, high = pixels.min(axis=0), pixels.max(axis=0)
+        else:
+            continue
+        seen[:, c] = ((uv[:, c] >= low) & (uv[:, c] <= high)).all(axis=1)
+    return seen
+
+
+class Prospect(NamedTuple):
+    """What measuring at n places would be worth: total (n, 3, 3) the covariance of a position measured there; floor
+    (n, 3, 3) what pixel noise alone would leave, however well the cameras are known. NaN where nothing is measured."""
+
+    total: Floats
+    floor: Floats
+
+    @property
+    def measured(self) -> Bools:
+        """(n,) where a position can be measured."""
+        return np.isfinite(self.total[:, 0, 0])
+
+    @property
+    def sd(self) -> Floats:
+        """(n,) standard deviation of a position, of all three axes together."""
+        return np.asarray(np.sqrt(np.trace(self.total, axis1=1, axis2=2)), dtype=np.float64)
+
+    @property
+    def excess(self) -> Floats:
+        """(n,) how many times as large it is as pixel noise alone would leave."""
+        return np.asarray(self.sd / np.sqrt(np.trace(self.floor, axis1=1, axis2=2)), dtype=np.float64)
+
+    @property
+    def u95(self) -> Floats:
+        """(n,) 95 % uncertainty: the longest semi-axis of the ellipsoid that holds the position with 95 %."""
+        largest = np.full(len(self.total), np.nan)
+        i = self.measured
+        largest[i] = K95 * np.sqrt(np.linalg.eigvalsh(self.total[i])[:, -1])
+        return largest
+
+
+class Outlook(Protocol):
+    """A calibration, the candidates for the next known point, and the places at which it is judged."""
+
+    @property
+    def candidates(self) -> Places:
+        """Where the next known point may be."""
+
+    @property
+    def judged(self) -> Places:
+        """Where the calibration has to be good."""
+
+    @property
+    def now(self) -> Prospect:
+        """What measuring at the judged places is worth."""
+
+    @property
+    def there(self) -> Prospect:
+        """What measuring at the candidates is worth."""
+
+    @property
+    def useful(self) -> Bools:
+        """(m,) at which candidates a known point could be used."""
+
+    def gain(self, weights: Floats) -> Floats:
+        """(m,) by how much a known point at each candidate would reduce `sum weights * total variance` of the judged
+        places (m judged,), to first order."""
+
+    def information(self) -> Floats:
+        """(m,) what a known point at each candidate would tell of the unknowns, in nats."""
+
+    def after(self, i: int) -> Self:
+        """The outlook when candidate number i is a known point too."""
+
+
+@dataclass(frozen=True, eq=False)
+class ForwardOutlook:
+    """Of a method that predicts pixels. parts: the sensitivities at candidates and judged places, in this order; what
+    is not seen is zero, with unit noise. place: (3, 3) covariance of a known position."""
+
+    candidates: Places
+    judged: Places
+    parts: tuple[Sensitivity, ...]
+    place: Floats
+
+    @classmethod
+    def of(cls, rig: RigMap, candidates: Places, judged: Places) -> ForwardOutlook:
+        """What the rig's cameras would see."""
+        xyz = np.concatenate([candidates.xyz, judged.xyz])
+        seen = np.concatenate([candidates.seen, judged.seen])
+        parts = tuple(_masked(part, seen[:, part.cameras]) for part in rig.sensitivities(xyz))
+        return cls(candidates, judged, parts, np.zeros((3, 3)))
+
+    @property
+    def useful(self) -> Bools:
+        """Seen by any camera: its position is known."""
+        return np.asarray(self.candidates.seen.any(axis=1))
+
+    @cached_property
+    def _prospect(self) -> Prospect:
+        seen = np.concatenate([self.candidates.seen, self.judged.seen]).sum(axis=1) >= 2
+        n = len(seen)
+        now, ever = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+        for part, S in zip(self.parts, self._covariances, strict=True):
+            Dt = part.slope.swapaxes(1, 2)
+            now += Dt @ np.linalg.solve(S, part.slope)
+            ever += Dt @ (part.slope / part.noise[..., None])
+        total, floor = np.full((n, 3, 3), np.nan), np.full((n, 3, 3), np.nan)
+        total[seen], floor[seen] = np.linalg.inv(now[seen]), np.linalg.inv(ever[seen])
+        return Prospect(total, floor)
+
+    @cached_property
+    def _covariances(self) -> tuple[Floats, ...]:
+        """(n, r, r) of the pixels of each place: noise, and what is unknown of the cameras."""
+        return tuple(_covariance(part) for part in self.parts)
+
+    @property
+    def now(self) -> Prospect:
+        """At the judged places."""
+        return Prospect(*(values[len(self.candidates) :] for values in self._prospect))
+
+    @property
+    def there(self) -> Prospect:
+        """At the candidates."""
+        return Prospect(*(values[: len(self.candidates)] for values in self._prospect))
+
+    def gain(self, weights: Floats) -> Floats:
+        """(m,) the expected reduction: a position is off by `A (error of the pixels)`, A = T D^T S^-1, and one more
+        point takes `K (S + place)^-1 K^T` off their covariance (Cohn's criterion, for a Gaussian linear model)."""
+        m = len(self.candidates)
+        total = self._prospect.total[m:]
+        good = np.isfinite(total[:, 0, 0]) & np.isfinite(weights)
+        root = np.sqrt(weights[good])[:, None, None]
+        found = np.zeros(m)
+        for part, S in zip(self.parts, self._covariances, strict=True):
+            judged = slice(m, None)
+            A = total[good] @ np.linalg.solve(S[judged][good], part.slope[judged][good]).swapaxes(1, 2)
+            moved = (root * (A @ part.half[judged][good])).reshape(-1, part.half.shape[2])
+            M = moved.T @ moved
+            h = part.half[:m]
+            observed = S[:m] + self._of_place(part)
+            found += np.einsum("nii->n", np.linalg.solve(observed, (h @ M) @ h.swapaxes(1, 2)))
+        return np.where(self.useful, found, 0.0)
+
+    def information(self) -> Floats:
+        """(m,) half the log determinant of the predicted views' covariance over that of their noise."""
+        m = len(self.candidates)
+        found = np.zeros(m)
+        for part, S in zip(self.parts, self._covariances, strict=True):
+            noise = self._of_place(part) + _diagonal(part.noise[:m] + part.rest[:m])
+            found += 0.5 * (np.linalg.slogdet(S[:m] + self._of_place(part))[1] - np.linalg.slogdet(noise)[1])
+        return np.where(self.useful, found, 0.0)
+
+    def _of_place(self, part: Sensitivity) -> Floats:
+        """(m, r, r) what the error of a known position adds to its views."""
+        D = part.slope[: len(self.candidates)]
+        return np.asarray(D @ self.place @ D.swapaxes(1, 2), dtype=np.float64)
+
+    def after(self, i: int) -> ForwardOutlook:
+        """Candidate i known too: `half <- half (I - V diag(1 - 1/sqrt(1 + s^2)) V^T)`, s and V of its whitened half."""
+        parts = []
+        for part in self.parts:
+            noise = self._of_place(part)[i] + np.diag(part.noise[i] + part.rest[i])
+            _, s, Vt = np.linalg.svd(np.linalg.solve(np.linalg.cholesky(noise), part.half[i]), full_matrices=False)
+            shrink = Vt.T * (1 - 1 / np.sqrt(1 + s**2))
+            parts.append(part._replace(half=part.half - (part.half @ shrink) @ Vt))
+        return replace(self, parts=tuple(parts))
+
+
+def _masked(part: Sensitivity, seen: Bools) -> Sensitivity:
+    """Zero slope and spread, unit noise, where a camera does not see a place."""
+    there = seen.repeat(2, axis=1)
+    for values in (part.slope, part.half):
+        there = there & np.isfinite(values).all(axis=2)
+    return part._replace(
+        slope=np.where(there[..., None], part.slope, 0.0),
+        half=np.where(there[..., None], part.half, 0.0),
+        rest=np.where(there, part.rest, 0.0),
+        noise=np.where(there, part.noise, 1.0),
+    )
+
+
+def _covariance(part: Sensitivity) -> Floats:
+    return part.half @ part.half.swapaxes(1, 2) + _diagonal(part.noise + part.rest)
+
+
+def _diagonal(variances: Floats) -> Floats:
+    return np.asarray(variances[:, :, None] * np.eye(variances.shape[1]), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class InverseOutlook:
+    """Of three Gaussian processes from pixels to positions, over candidates and judged places, in this order.
+
+    known: per axis V (n, places) with `covariance of places = K - V^T V`, K (m, judged) between candidates and judged;
+    variance, noise and scale: per axis, of the function, of its outputs, and the length unit of one standardised.
+    """
+
+    candidates: Places
+    judged: Places
+    calibration: InverseGPCalibration
+    known: tuple[Floats, ...]
+
+    @classmethod
+    def of(cls, calibration: InverseGPCalibration, candidates: Places, judged: Places) -> InverseOutlook:
+        """The three processes of a calibration at the predicted pixels; only places that every camera sees count."""
+        X = _inputs(calibration, candidates, judged)
+        known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp in calibration.processes)
+        return cls(candidates, judged, calibration, known)
+
+    @cached_property
+    def _X(self) -> Floats:
+        return _inputs(self.calibration, self.candidates, self.judged)
+
+    @property
+    def useful(self) -> Bools:
+        """Seen by every camera."""
+        return np.asarray(self.candidates.seen.all(axis=1))
+
+    @cached_property
+    def _variances(self) -> Floats:
+        """(places, 3) of the functions, standardised."""
+        signal = [gp.kernel.signal_variance for gp in self.calibration.processes]
+        columns = [s - np.einsum("ij,ij->j", V, V) for s, V in zip(signal, self.known, strict=True)]
+        return np.asarray(np.maximum(np.stack(columns, axis=1), 0.0), dtype=np.float64)
+
+    @cached_property
+    def _noise(self) -> Floats:
+        return np.array([h.noise_variance for h in self.calibration.hyperparameters])
+
+    def _prospect(self, part: slice, seen: Bools) -> Prospect:
+        scale = self.calibration.positions.scale
+        total = (self._variances[part] + self._noise) * scale**2
+        total[~seen] = np.nan
+        floor = np.broadcast_to(self._noise * scale**2, total.shape)
+        return Prospect(_diagonal(total), _diagonal(floor))
+
+    @property
+    def now(self) -> Prospect:
+        """At the judged places."""
+        return self._prospect(slice(len(self.candidates), None), np.asarray(self.judged.seen.all(axis=1)))
+
+    @property
+    def there(self) -> Prospect:
+        """At the candidates."""
+        return self._prospect(slice(len(self.candidates)), self.useful)
+
+    def gain(self, weights: Floats) -> Floats:
+        """(m,) the expected reduction, in closed form: covariance squared over the variance of a new output."""
+        m, scale = len(self.candidates), self.calibration.positions.scale
+        good = np.isfinite(weights) & self.judged.seen.all(axis=1)
+        found = np.zeros(m)
+        for k, (gp, V) in enumerate(zip(self.calibration.processes, self.known, strict=True)):
+            covariance = gp.kernel(self._X[:m], self._X[m:][good]) - V[:, :m].T @ V[:, m:][:, good]
+            found += scale[k] ** 2 * (covariance**2 @ weights[good]) / (self._variances[:m, k] + self._noise[k])
+        return np.where(self.useful, found, 0.0)
+
+    def information(self) -> Floats:
+        """(m,) half the log of the variance of a new output over that of its noise, all three axes."""
+        m = len(self.candidates)
+        found = 0.5 * np.log1p(self._variances[:m] / self._noise).sum(axis=1)
+        return np.where(self.useful, found, 0.0)
+
+    def after(self, i: int) -> InverseOutlook:
+        """Candidate i known too: V gets one more row."""
+        rows = []
+        for k, (gp, V) in enumerate(zip(self.calibration.processes, self.known, strict=True)):
+            row = gp.kernel(self._X[i : i + 1], self._X)[0] - V[:, i] @ V
+            rows.append(np.concatenate([V, row[None] / np.sqrt(self._variances[i, k] + self._noise[k])]))
+        return replace(self, known=tuple(rows))
+
+
+def _inputs(calibration: InverseGPCalibration, candidates: Places, judged: Places) -> Floats:
+    """(places, 2 cameras) standardised pixels; the middle of the data where a place is not seen, which masks it."""
+    uv = np.concatenate([candidates.uv, judged.uv]).reshape(len(candidates) + len(judged), -1)
+    X = calibration.pixels.apply(uv)
+    return np.where(np.isfinite(X), X, 0.0)
+
+
+def outlook_of(
+    calibration: Calibration, candidates: Floats | Places, judged: Floats | Places, pilot: Calibration | None = None
+) -> ForwardOutlook | InverseOutlook:
+    """The outlook of a calibration at positions (m, 3) and (g, 3), or at places whose pixels are known.
+
+    pilot: a forward calibration of the same rig that predicts pixels; the calibration itself where it is one.
+    UsageError for a method without an outlook.
+    """
+    forward = calibration if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration) else pilot
+
+    def places(where: Floats | Places) -> Places:
+        if isinstance(where, Places):
+            return where
+        if not isinstance(forward, ForwardGPCalibration | ExplicitCalibration):
+            raise UsageError(
+                f"{calibration.method} does not say what the cameras would see of a place.",
+                fix="give a forward-gp calibration of the same points as well, or places whose pixels are known",
+            )
+        return Places.predicted(forward, where)
+
+    if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration):
+        made = ForwardOutlook.of(calibration.map, places(candidates), places(judged))
+        return replace(made, place=_place(calibration.data))
+    if isinstance(calibration, InverseGPCalibration):
+        return InverseOutlook.of(calibration, places(candidates), places(judged))
+    raise UsageError(
+        f"{calibration.method} cannot say where to measure next.",
+        why="its error bars do not say what one more known point would change",
+        fix="use forward-gp, inverse-gp or explicit",
+    )
+
+
+def _place(data: Dataset) -> Floats:
+    """(3, 3) the covariance of a known position, as those of the data state it."""
+    if data.known is None or not (data.known.sd > 0).any():
+        return np.zeros((3, 3))
+    sd = np.nan_to_num(data.known.sd)
+    return np.diag(np.median(sd**2, axis=0))

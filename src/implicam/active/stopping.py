@@ -1,0 +1,157 @@
+"""When to stop: rules that combine with `&` (both) and `|` (either). Each says why, in words, or nothing.
+
+rule = (Below(0.2) & AtLeast(12)) | Budget(60)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from implicam.errors import UsageError, did_you_mean
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is known after so many known points, over the workspace.
+
+    worst, mean, usual: 95 % uncertainty of a position in the length unit, at the worst place, on average, and not
+    exceeded in 95 % of the workspace; excess: the same 95th percentile of the standard deviation over what pixel noise
+    alone would leave; measured: part of the workspace that can be measured. seconds: since the beginning. NaN before
+    there is a calibration.
+    """
+
+    points: int
+    worst: float = math.nan
+    mean: float = math.nan
+    usual: float = math.nan
+    excess: float = math.nan
+    measured: float = 0.0
+    seconds: float = 0.0
+
+
+class Rule:
+    """A stopping rule: `met(history)` is why to stop, empty for not yet."""
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """Why to stop now, in words; empty where not yet. unit: of lengths, for the words."""
+        raise NotImplementedError
+
+    def __and__(self, other: Rule) -> Rule:
+        return Both(self, other)
+
+    def __or__(self, other: Rule) -> Rule:
+        return Either(self, other)
+
+
+@dataclass(frozen=True)
+class Both(Rule):
+    """When both are met."""
+
+    first: Rule
+    second: Rule
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """Both reasons."""
+        one, two = self.first.met(history, unit), self.second.met(history, unit)
+        return f"{one}, and {two}" if one and two else ""
+
+
+@dataclass(frozen=True)
+class Either(Rule):
+    """When one of them is met."""
+
+    first: Rule
+    second: Rule
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """The first reason there is."""
+        return self.first.met(history, unit) or self.second.met(history, unit)
+
+
+OF = {"worst": "everywhere", "usual": "in 95 % of the workspace", "mean": "on average"}
+
+
+@dataclass(frozen=True)
+class Below(Rule):
+    """When the 95 % uncertainty, in the length unit, is at most `value`: everywhere ("worst"), in 95 % of the workspace
+    ("usual"), or on average ("mean")."""
+
+    value: float
+    of: str = "worst"
+
+    def __post_init__(self) -> None:
+        if self.of not in OF:
+            raise UsageError(
+                f"there is no uncertainty {self.of!r}{did_you_mean(self.of, OF)}.", fix=f"use {', '.join(OF)}"
+            )
+        if not 0 < self.value < math.inf:
+            raise UsageError(f"a stop below {self.value} is never reached.", fix="give a length greater than zero")
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """The uncertainty now."""
+        now = getattr(history[-1], self.of) if history else math.nan
+        return f"{now:.2g} {unit}".strip() + f" {OF[self.of]}" if now <= self.value else ""
+
+
+@dataclass(frozen=True)
+class Converged(Rule):
+    """When the last `over` points together changed the 95 % uncertainty by less than the part `change` of it."""
+
+    change: float = 0.05
+    over: int = 5
+    of: str = "usual"
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """By how much it still changes."""
+        values = [getattr(step, self.of) for step in history]
+        if len(values) <= self.over or not all(math.isfinite(v) for v in values[-self.over - 1 :]):
+            return ""
+        last = values[-self.over - 1 :]
+        spread = (max(last) - min(last)) / last[-1]
+        return f"the last {self.over} points changed it by {100 * spread:.0f} %" if spread <= self.change else ""
+
+
+@dataclass(frozen=True)
+class AtLeast(Rule):
+    """When there are so many known points."""
+
+    points: int
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """How many there are."""
+        return f"{history[-1].points} points" if history and history[-1].points >= self.points else ""
+
+
+@dataclass(frozen=True)
+class Budget(AtLeast):
+    """When the budget of known points is spent."""
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """How many there were."""
+        return f"all {self.points} points of the budget are measured" if super().met(history, unit) else ""
+
+
+@dataclass(frozen=True)
+class Time(Rule):
+    """When so many seconds have passed since the beginning."""
+
+    seconds: float
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """How many have."""
+        over = history and history[-1].seconds >= self.seconds
+        return f"{history[-1].seconds:.0f} s have passed" if over else ""
+
+
+@dataclass(frozen=True)
+class Never(Rule):
+    """Until a person says so."""
+
+    reason: ClassVar[str] = ""
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """Nothing."""
+        return self.reason

@@ -1,0 +1,49 @@
+"""Where to measure next, from a calibration alone: what `implicam suggest` prints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from implicam.active.acquisition import DEFAULT, Acquisition, acquisition, choose
+from implicam.active.loop import Target, step_of, targets_of
+from implicam.active.outlook import outlook_of
+from implicam.active.stopping import Step
+from implicam.active.workspace import Workspace
+from implicam.calibrators import Calibration, ForwardGP, InverseGPCalibration
+from implicam.dataset import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestion:
+    """The next targets in the order in which to go there; what is known of the workspace now, and what is to be
+    expected when all of them are known points."""
+
+    targets: list[Target]
+    now: Step
+    then: Step
+
+
+def suggest(
+    calibration: Calibration,
+    workspace: Workspace,
+    *,
+    count: int = 5,
+    rule: Acquisition | None = None,
+    here: Floats | None = None,
+    reach: float = np.inf,
+    candidates: int = 1500,
+    judged: int = 400,
+    seed: int = 0,
+) -> Suggestion:
+    """The `count` best next targets for a calibration. rule: the default acquisition where None. here, reach: as for
+    `choose`. UsageError for a method that cannot say, and for a workspace that the cameras do not see."""
+    pilot = ForwardGP().fit(calibration.data) if isinstance(calibration, InverseGPCalibration) else None
+    places = workspace.candidates(candidates, seed)
+    outlook = outlook_of(calibration, places, workspace.judged(judged, seed), pilot)
+    rng = np.random.default_rng([seed, 3])
+    chosen = choose(outlook, rule or acquisition(DEFAULT), rng, count=count, here=here, reach=reach)
+    known = len(calibration.data)
+    then = step_of(chosen.after.now, known + len(chosen.index))
+    return Suggestion(targets_of(outlook.candidates, chosen, known), step_of(outlook.now, known), then)

@@ -1,0 +1,183 @@
+"""Where a target can be put: a box, the hull of some points, or a list of places; convex, in the world frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import ConvexHull, QhullError
+from scipy.stats import qmc
+
+from implicam.dataset import Floats
+from implicam.errors import UsageError
+from implicam.simulate import Box
+
+ON_SURFACE = 5
+"""One candidate of so many lies on the surface: the outermost places tell most of a lens."""
+
+EDGE = 1e-9
+"""Part of the size by which a point may be outside and still counts as inside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """A convex region: `normals (k, 3) @ xyz <= offsets (k,)`; vertices (v, 3) its corners; places (n, 3) the only
+    ones where a target can be, None for anywhere inside. name: in words."""
+
+    normals: Floats
+    offsets: Floats
+    vertices: Floats
+    places: Floats | None
+    name: str
+
+    @classmethod
+    def box(cls, low: ArrayLike, high: ArrayLike) -> Workspace:
+        """From `low` (3,) to `high` (3,), along the axes of the world; UsageError for an empty one."""
+        a, b = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        if a.shape != (3,) or b.shape != (3,) or not np.isfinite([a, b]).all() or not (a < b).all():
+            raise UsageError(
+                f"a workspace from {a.tolist()} to {b.tolist()} is empty.", fix="give x, y and z, the lower end first"
+            )
+        corners = np.array([[(a, b)[i][k] for k, i in enumerate(ends)] for ends in product((0, 1), repeat=3)])
+        size = " x ".join(f"{n:.4g}" for n in b - a)
+        return cls._of(corners, None, f"a box of {size}")
+
+    @classmethod
+    def of_box(cls, box: Box) -> Workspace:
+        """The working volume of a simulated rig, whichever way it lies."""
+        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * box.size
+        size = " x ".join(f"{n:.4g}" for n in box.size)
+        return cls._of(box.world_from_box.apply(corners), None, f"a box of {size}")
+
+    @classmethod
+    def hull(cls, xyz: ArrayLike) -> Workspace:
+        """The convex hull of points (n, 3); UsageError where they do not fill a volume."""
+        points = np.asarray(xyz, dtype=np.float64)
+        return cls._of(points, None, f"the hull of {len(points)} points")
+
+    @classmethod
+    def only(cls, xyz: ArrayLike) -> Workspace:
+        """Some reachable places (n, 3), and no others; what lies between them is judged too."""
+        points = np.asarray(xyz, dtype=np.float64)
+        return cls._of(points, points, f"{len(points)} places")
+
+    @classmethod
+    def _of(cls, points: Floats, places: Floats | None, name: str) -> Workspace:
+        if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
+            raise UsageError("the places of a workspace are finite x, y, z.")
+        try:
+            found = ConvexHull(points)
+        except (QhullError, ValueError) as error:
+            raise UsageError(
+                f"{name} fill no volume.",
+                why=str(error).splitlines()[0],
+                fix="give a box: --workspace x0:x1,y0:y1,z0:z1, in the dataset's unit",
+            ) from error
+        equations = np.unique(np.round(found.equations, 12), axis=0)
+        return cls(equations[:, :3], -equations[:, 3], points[found.vertices], places, name)
+
+    @property
+    def size(self) -> float:
+        """The diagonal of the box around it."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    @property
+    def centre(self) -> Floats:
+        """(3,) the mean of its corners."""
+        return np.asarray(self.vertices.mean(axis=0), dtype=np.float64)
+
+    def inside(self, xyz: Floats) -> NDArray[np.bool_]:
+        """(n,) which of points (n, 3) are in it."""
+        return np.asarray((xyz @ self.normals.T <= self.offsets + EDGE * self.size).all(axis=1), dtype=np.bool_)
+
+    def candidates(self, n: int, seed: int) -> Floats:
+        """(n, 3) where the next target may be, evenly spread; of a list of places all of them, in random order."""
+        if self.places is not None:
+            return self.places[np.random.default_rng(seed).permutation(len(self.places))]
+        found = self._spread(n, seed)
+        found[::ON_SURFACE] = self._on_surface(found[::ON_SURFACE])
+        return found
+
+    def judged(self, n: int, seed: int = 0) -> Floats:
+        """(about n, 3) places at which a calibration is judged: evenly spread, and the corners."""
+        corners = self.vertices if len(self.vertices) <= n // 4 else self.vertices[:: len(self.vertices) * 4 // n]
+        return np.concatenate([corners, self._spread(n - len(corners), [seed, 1])])
+
+    def design(self, n: int, seed: int) -> Floats:
+        """(n, 3) places to begin with while nothing is known of the cameras: each as far from the others as can be."""
+        pool = self.candidates(64 * n, seed)
+        if len(pool) < n:
+            raise UsageError(f"{self.name} are fewer than the {n} that are needed to begin.", fix="add places")
+        chosen = [int(np.argmax(np.linalg.norm(pool - self.centre, axis=1)))]
+        distance = np.linalg.norm(pool - pool[chosen[0]], axis=1)
+        while len(chosen) < n:
+            chosen.append(int(np.argmax(distance)))
+            distance = np.minimum(distance, np.linalg.norm(pool - pool[chosen[-1]], axis=1))
+        return pool[chosen]
+
+    def _spread(self, n: int, seed: int | list[int]) -> Floats:
+        """So many points of a scrambled Sobol sequence in it."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        sequence = qmc.Sobol(3, rng=np.random.default_rng(seed))
+        found = np.zeros((0, 3))
+        while len(found) < n:
+            points = low + sequence.random(1 << max(6, int(np.ceil(np.log2(max(1, n)))))) * (high - low)
+            found = np.concatenate([found, points[self.inside(points)]])
+        return found[:n]
+
+    def _on_surface(self, xyz: Floats) -> Floats:
+        """Points (n, 3) moved away from the centre as far as possible."""
+        along = xyz - self.centre
+        speed, room = along @ self.normals.T, self.offsets - self.normals @ self.centre
+        with np.errstate(divide="ignore"):
+            reach = np.where(speed > 0, room / np.where(speed > 0, speed, 1.0), np.inf).min(axis=1)
+        return np.asarray(self.centre + along * reach[:, None], dtype=np.float64)
+
+
+def workspace_from(text: str, xyz: Floats | None) -> Workspace:
+    """The workspace that a word of the command line means: `x0:x1,y0:y1,z0:z1`, a CSV file of places (x,y,z), or `box`
+    or `hull`, those of the known points xyz (n, 3)."""
+    if text in ("box", "hull"):
+        if xyz is None or len(xyz) < 4:
+            raise UsageError(
+                f"there are no known points to take the {text} of.", fix="give a box: --workspace x0:x1,y0:y1,z0:z1"
+            )
+        return Workspace.hull(xyz) if text == "hull" else Workspace.box(xyz.min(axis=0), xyz.max(axis=0))
+    if text.lower().endswith(".csv"):
+        return Workspace.only(read_places(Path(text)))
+    try:
+        ends = [[float(end) for end in axis.split(":")] for axis in text.split(",")]
+        low, high = np.array(ends, dtype=np.float64).reshape(3, 2).T
+    except ValueError as error:
+        raise UsageError(
+            f"the workspace {text!r} cannot be read.",
+            why="it is x0:x1,y0:y1,z0:z1 in the dataset's unit, a CSV file with x,y,z, or box or hull",
+            fix="for example --workspace=-120:120,-80:80,0:240",
+        ) from error
+    return Workspace.box(low, high)
+
+
+def read_places(path: Path) -> Floats:
+    """(n, 3) the positions in a CSV file with columns x, y and z; UsageError with the line of what cannot be read."""
+    import csv
+
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{path} cannot be read.", why=str(error), fix="give a CSV file with columns x,y,z") from error
+    found = []
+    for number, row in enumerate(rows, start=2):
+        try:
+            place = [float(row[axis]) for axis in "xyz"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise UsageError(
+                f"{path}, line {number}: no position.", why=str(error), fix="write x,y,z in the first line, and numbers"
+            ) from error
+        if not np.isfinite(place).all():
+            raise UsageError(f"{path}, line {number}: {place} is not finite.", fix="remove the line")
+        found.append(place)
+    return np.array(found, dtype=np.float64).reshape(-1, 3)
