@@ -27,6 +27,7 @@ from implicam.active import (
     Step,
     Target,
     Time,
+    Within,
     Workspace,
     acquisition,
     choose,
@@ -346,6 +347,8 @@ def test_stopping_rules_say_why() -> None:
     assert not Budget(12).met(steps)
     assert Time(30).met(steps)
     assert not Time(31).met(steps)
+    assert Within(1.5).met(steps) == "1.50 times what pixel noise alone leaves"
+    assert not Within(1.4).met(steps)
     assert not Never().met(steps)
     assert not Converged(0.1, 3, "worst").met(steps)
     assert Converged(0.1, 2, "worst").met(history(3, 1.01, 1.0, 1.05))

@@ -35,7 +35,7 @@ from implicam.simulate import build_rig, random_positions, simulate
 
 COMMANDS = sorted(command.name for command in app.registered_commands)
 UNWATCHED = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80", "NO_COLOR": "1"}
-HEAVY = ["plotly", "matplotlib", "torch", "gpytorch", "pyarrow", "cv2", "sklearn"]
+HEAVY = ["viser", "plotly", "matplotlib", "torch", "gpytorch", "pyarrow", "cv2", "sklearn"]
 
 with contextlib.suppress(ImportError), warnings.catch_warnings(action="ignore"):
     import gpytorch  # noqa: F401  now, because it warns of PyTorch when it is imported first
@@ -120,6 +120,8 @@ MAKES = {
     "convert": {"my-rig.csv", "my-rig.csv.toml"},
     "export": {"cameras.toml"},
     "import": {"cameras.implicam"},
+    "suggest": set(),
+    "acquire": {"my-session"},
     "paper": {"implicam-paper"},
     "info": set(),
 }
@@ -235,6 +237,8 @@ def json_commands(made: Path) -> dict[str, list[str]]:
         "convert": ["convert", rig, "out.npz"],
         "export": ["export", file, "--to", "colmap", "-o", "model"],
         "import": ["import", str(made / "cameras.toml"), "-o", "cameras.implicam"],
+        "suggest": ["suggest", file, "-n", "3"],
+        "acquire": ["acquire", "session", "--rig", "stereo", "--budget", "9", "--speed", "1000", "--unattended"],
         "info": ["info", file],
     }
 
@@ -281,6 +285,48 @@ def test_json_says_what_the_tables_say(made: Path, cli: Cli) -> None:
     assert (told["rows"], told["points_measured"], told["not_measured"]) == (30, 30, [])
     assert told["views_left_out"] == []
     assert cli(*commands["info"], "--json").json["method"] == "forward-gp"
+    told = cli(*commands["suggest"], "--json").json
+    assert [target["name"] for target in told["targets"]] == ["p041", "p042", "p043"]
+    assert told["expected"]["usual"] < told["now"]["usual"]
+
+
+def test_suggest_says_where_and_what_the_cameras_see(made: Path, cli: Cli) -> None:
+    file = str(made / "rig.implicam")
+    told = cli("suggest", file, "-n", "4", "--from=0,0,0", "--reach", "100", "-o", "targets.csv", "--json").json
+    rows = list(csv.DictReader(Path("targets.csv").read_text().splitlines()))
+    assert [float(row["x"]) for row in rows] == [target["xyz"][0] for target in told["targets"]]
+    for row, target in zip(rows, told["targets"], strict=True):
+        for camera, pixel in target["pixels"].items():
+            assert row[f"u_{camera}"] == ("" if pixel is None else repr(pixel[0]))
+    for words, why in (
+        ("--workspace 1:0,0:1,0:1", "empty"),
+        ("--from 1,2", "position"),
+        ("--acquisition best", "best"),
+    ):
+        ran = cli("suggest", file, *words.split())
+        assert (ran.code, ran.out) == (2, "")
+        assert why in ran.err
+        assert "fix:" in ran.err
+
+
+def test_acquire_goes_on_and_refuses_what_it_cannot(cli: Cli) -> None:
+    words = ["acquire", "session", "--unattended", "--json"]
+    assert cli(*words, "--rig", "stereo", "--speed", "1000", "--budget", "8").json["points"] == 8
+    again = cli(*words, "--budget", "9")
+    assert again.json["points"] == 9
+    assert again.json["stopped"] == "all 9 points of the budget are measured"
+    assert len(read_dataset("session")) == 9
+    for wrong, why in (
+        (["--rig", "bar6"], "begun with rig stereo"),
+        (["--camera", "left"], "names no camera"),
+        (["--robot", "ur:10.0.0.1"], "while nobody looks"),
+        (["--unit", "furlong"], "length unit"),
+        (["--method", "mlp"], "where to measure next"),
+    ):
+        ran = cli(*words, *wrong)
+        assert (ran.code, ran.out) == (2, "")
+        assert why in ran.err
+        assert "fix:" in ran.err
 
 
 def test_a_failure_with_json_leaves_stdout_empty(cli: Cli) -> None:

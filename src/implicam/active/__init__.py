@@ -14,7 +14,7 @@ from implicam.active.acquisition import ACQUISITIONS, Acquisition, acquisition, 
 from implicam.active.loop import Answer, Loop, Oracle, Target, step_of
 from implicam.active.oracles import RecordedOracle, SimulatedOracle
 from implicam.active.outlook import Outlook, Places, Prospect, outlook_of
-from implicam.active.stopping import AtLeast, Below, Budget, Converged, Never, Rule, Step, Time
+from implicam.active.stopping import AtLeast, Below, Budget, Converged, Never, Rule, Step, Time, Within
 from implicam.active.suggest import Suggestion, suggest
 from implicam.active.workspace import Workspace, workspace_from
 
@@ -39,6 +39,7 @@ __all__ = [
     "Suggestion",
     "Target",
     "Time",
+    "Within",
     "Workspace",
     "acquisition",
     "choose",

@@ -126,12 +126,17 @@ def acquisition(name: str) -> Acquisition:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Candidates chosen, in the order in which to go there, the score of each when it was chosen, and the outlook when
-    all are known points."""
+    """Candidates chosen, in the order in which to go there, and the score of each when it was chosen."""
 
     index: list[int]
     scores: list[float]
-    after: Outlook
+    _before_last: tuple[Outlook, int]
+
+    @property
+    def after(self) -> Outlook:
+        """The outlook when all of them are known points."""
+        outlook, last = self._before_last
+        return outlook.after(last)
 
 
 def choose(
@@ -153,6 +158,8 @@ def choose(
     scores: list[float] = []
     place = here
     for _ in range(count):
+        if chosen:
+            outlook = outlook.after(chosen[-1])
         score = np.where(outlook.useful, rule.scores(outlook, rng), np.nan)
         score[chosen] = np.nan
         if not np.isfinite(score).any():
@@ -164,7 +171,6 @@ def choose(
         chosen.append(best)
         scores.append(float(score[best]))
         place = outlook.candidates.xyz[best] if place is not None else None
-        outlook = outlook.after(best)
     if not chosen:
         raise UsageError(
             "no candidate can be used for calibration.",
@@ -172,7 +178,7 @@ def choose(
             fix="give another workspace (--workspace), one that the cameras look at",
         )
     order = _path(outlook.candidates.xyz[chosen], here)
-    return Choice([chosen[k] for k in order], [scores[k] for k in order], outlook)
+    return Choice([chosen[k] for k in order], [scores[k] for k in order], (outlook, chosen[-1]))
 
 
 def _path(xyz: Floats, here: Floats | None) -> list[int]:

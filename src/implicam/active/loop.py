@@ -101,7 +101,7 @@ class Loop:
         self.judged_at: Floats = self.workspace.judged(self.judged, self.seed)
         self._began = time.monotonic()
         self._refused: list[tuple[Floats, str]] = []
-        self._pilot: Calibration | None = None
+        self._pilot: ForwardGPCalibration | None = None
         self._asked = self._from_no_guess = 0
         if self.data is not None:
             self.reset(self.data)
@@ -228,7 +228,7 @@ class Loop:
             if self.acquisition.name == "sobol":
                 candidates = self.workspace.candidates(self.candidates, self.seed)[self.points :]
             candidates = self._not_refused(candidates)
-        return outlook_of(self.calibration, candidates, self.judged_at, self._forward())
+        return outlook_of(self.calibration, candidates, self._judged(), self._forward())
 
     def _unused(self) -> list[int]:
         assert self.pool is not None
@@ -261,16 +261,20 @@ class Loop:
             return None
         if self._pilot is None or len(self.data) >= GROWTH * len(self._pilot.data):
             self._pilot = ForwardGP().fit(self.data)
+            self._judged_by_pilot = Places.predicted(self._pilot, self.judged_at)
         return self._pilot
+
+    def _judged(self) -> Floats | Places:
+        """The judged places; with their pixels where a forward model predicts them, which is costly."""
+        return self.judged_at if self._forward() is None else self._judged_by_pilot
 
     def _step(self) -> Step:
         """What is known now, and the prospect at the judged places."""
         passed = time.monotonic() - self._began
         if self.calibration is None:
             return Step(self.points, seconds=passed)
-        nothing = self.judged_at[:0]
         try:
-            prospect = outlook_of(self.calibration, nothing, self.judged_at, self._forward()).now
+            prospect = outlook_of(self.calibration, self.judged_at[:0], self._judged(), self._forward()).now
         except FitError as error:
             self.problem = error
             return Step(self.points, seconds=passed)

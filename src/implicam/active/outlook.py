@@ -201,10 +201,9 @@ class ForwardOutlook:
             judged = slice(m, None)
             A = total[good] @ np.linalg.solve(S[judged][good], part.slope[judged][good]).swapaxes(1, 2)
             moved = (root * (A @ part.half[judged][good])).reshape(-1, part.half.shape[2])
-            M = moved.T @ moved
-            h = part.half[:m]
+            h = part.half[:m] @ _root(moved.T @ moved)
             observed = S[:m] + self._of_place(part)
-            found += np.einsum("nii->n", np.linalg.solve(observed, (h @ M) @ h.swapaxes(1, 2)))
+            found += np.einsum("nij,nij->n", np.linalg.solve(observed, h), h)
         return np.where(self.useful, found, 0.0)
 
     def information(self) -> Floats:
@@ -233,20 +232,24 @@ class ForwardOutlook:
 
 
 def _masked(part: Sensitivity, seen: Bools) -> Sensitivity:
-    """Zero slope and spread, unit noise, where a camera does not see a place."""
-    there = seen.repeat(2, axis=1)
+    """Zero slope and spread, unit noise, where a camera does not see a place; in place, for these are large."""
+    blind = ~seen.repeat(2, axis=1)
     for values in (part.slope, part.half):
-        there = there & np.isfinite(values).all(axis=2)
-    return part._replace(
-        slope=np.where(there[..., None], part.slope, 0.0),
-        half=np.where(there[..., None], part.half, 0.0),
-        rest=np.where(there, part.rest, 0.0),
-        noise=np.where(there, part.noise, 1.0),
-    )
+        blind |= ~np.isfinite(values).all(axis=2)
+    for values, instead in ((part.slope, 0.0), (part.half, 0.0), (part.rest, 0.0), (part.noise, 1.0)):
+        values[blind] = instead
+    return part
 
 
 def _covariance(part: Sensitivity) -> Floats:
     return part.half @ part.half.swapaxes(1, 2) + _diagonal(part.noise + part.rest)
+
+
+def _root(M: Floats) -> Floats:
+    """(q, k) R with M = R R^T to a billionth, k as small as that allows: few of all unknowns matter."""
+    values, vectors = np.linalg.eigh(M)
+    kept = values > 1e-9 * max(values[-1], 0.0)
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]), dtype=np.float64)
 
 
 def _diagonal(variances: Floats) -> Floats:

@@ -97,6 +97,25 @@ class Below(Rule):
 
 
 @dataclass(frozen=True)
+class Within(Rule):
+    """When, in 95 % of the workspace, a position is at most `times` as uncertain as pixel noise alone would leave it:
+    then more points hardly help, and better pictures would."""
+
+    times: float = 1.2
+
+    def __post_init__(self) -> None:
+        if not 1 < self.times < math.inf:
+            raise UsageError(
+                f"a stop within {self.times} times the noise is never reached.", fix="give more than 1, such as 1.2"
+            )
+
+    def met(self, history: Sequence[Step], unit: str = "") -> str:
+        """How near it is."""
+        now = history[-1].excess if history else math.nan
+        return f"{now:.2f} times what pixel noise alone leaves" if now <= self.times else ""
+
+
+@dataclass(frozen=True)
 class Converged(Rule):
     """When the last `over` points together changed the 95 % uncertainty by less than the part `change` of it."""
 

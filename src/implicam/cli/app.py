@@ -35,6 +35,8 @@ EXAMPLES = {
     "convert": "implicam convert my-rig my-rig.csv",
     "export": "implicam export my-rig.implicam --to aniposelib -o cameras.toml",
     "import": "implicam import cameras.toml -o cameras.implicam",
+    "suggest": "implicam suggest my-rig.implicam -n 5",
+    "acquire": "implicam acquire my-session --cameras 2R --budget 12 --unattended",
     "paper": "implicam paper board --quick",
     "info": "implicam info my-rig.implicam",
 }

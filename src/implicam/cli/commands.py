@@ -13,10 +13,11 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+import implicam.cli.acquire
 import implicam.cli.cameras
 import implicam.cli.compare
 import implicam.cli.paper
-import implicam.cli.simulate  # noqa: F401  the four register their commands
+import implicam.cli.simulate  # noqa: F401  the five register their commands
 from implicam import calibration_file
 from implicam.calibrators import DEFAULT_METHOD, Calibration, Explicit, InverseGP, calibrator, load_calibration
 from implicam.calibrators.explicit.boards import has_boards

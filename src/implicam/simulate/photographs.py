@@ -6,7 +6,7 @@ that the target covers, two by two rays a pixel, and then the optics and the sen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,6 +106,12 @@ class Studio:
     def picture(self, camera: int, shot: int) -> Grey:
         """The photograph of shot number `shot` by camera number `camera`."""
         return self._exposed(self._composed(camera, shot), camera, np.random.default_rng([self.seed, 7, camera, shot]))
+
+    def showing(self, target: Target, *, seed: int) -> Studio:
+        """The same cameras before another target; the costly part, their lines of sight and backgrounds, is shared."""
+        other = replace(self, target=target, seed=seed)
+        other.__dict__["_looks"] = self._looks  # where the cached property keeps it
+        return other
 
     @cached_property
     def jobs(self) -> list[tuple[int, int]]:

@@ -34,7 +34,7 @@ Bools = NDArray[np.bool_]
 MOST = 300
 """Points of one camera that the hyperparameters are found from; more cost time and tell little more."""
 
-MOST_UNCERTAIN = 120
+MOST_UNCERTAIN = 50
 """The same where every point has an error of its own: three unknowns each."""
 
 OUTLIER = 25.0
@@ -82,7 +82,8 @@ class FittedRig:
 
 def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = None) -> FittedRig:
     """Fit every camera that can be fitted. before: a fit in the same working frame to most of these points, from a
-    moment ago: its cameras and hyperparameters are the guess."""
+    moment ago: its cameras and hyperparameters are the guess. Where known positions have declared errors, which make
+    hyperparameters costly, they are kept."""
     progress("fitting", 0, 3)
     guess = {} if before is None else dict(zip(before.cameras, before.posterior.models, strict=True))
 
@@ -101,7 +102,8 @@ def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = Non
     stated = problem.stated[list(cameras)]
     rounds = ROUNDS_WITH_SHOTS if problem.errors is not None and problem.errors.estimated else ROUNDS
     hyper = before.hyperparameters if before is not None and before.cameras == cameras else None
-    state = _Round(hyper, models, None, kept, problem.errors, None, settled=False)
+    tied = problem.errors is not None and not problem.errors.estimated
+    state = _Round(hyper, models, None, kept, problem.errors, None, settled=False, fixed=hyper if tied else None)
     for number in range(rounds):
         state = _round(problem, state, seen, images, stated)
         judged = state.kept
@@ -118,7 +120,8 @@ def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = Non
 
 
 class _Round(NamedTuple):
-    """What a round of the fit hands to the next; errors: those of its posterior, next_errors: more probable ones."""
+    """What a round of the fit hands to the next; errors: those of its posterior, next_errors: more probable ones;
+    fixed: hyperparameters that are kept."""
 
     hyper: Hyperparameters | None
     models: tuple[CameraModel, ...]
@@ -128,6 +131,7 @@ class _Round(NamedTuple):
     label_sd: Floats | None
     settled: bool
     errors: ShotErrors | None = None
+    fixed: Hyperparameters | None = None
 
     @property
     def posterior(self) -> Posterior:
@@ -145,7 +149,7 @@ def _round(
     )
     used = tuple(s.select(k) for s, k in zip(seen, kept, strict=True))
     moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
-    hyper = _hyperparameters(problem, last.models, used, images, stated, last.hyper, moved)
+    hyper = last.fixed or _hyperparameters(problem, last.models, used, images, stated, last.hyper, moved)
     errors = last.next_errors
     posterior = _conditioned(problem, last.models, used, hyper, errors)
     following, label_sd, settled = errors, None, True
@@ -153,7 +157,7 @@ def _round(
         mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
         following, label_sd = errors.updated(mean.reshape(errors.sd.shape), variance.reshape(errors.sd.shape))
         settled = bool(np.allclose(following.sd, errors.sd, rtol=SETTLED))
-    return _Round(hyper, posterior.models, posterior, kept, following, label_sd, settled, errors)
+    return _Round(hyper, posterior.models, posterior, kept, following, label_sd, settled, errors, last.fixed)
 
 
 def without_field(started: Started, image: Image, noise: float = 1.0) -> CameraModel:

@@ -1,0 +1,55 @@
+"""A person with a ruler, a height gauge or a slide: is asked to put the target somewhere, and says where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from implicam.errors import HardwareError
+from implicam.hardware.protocol import Floats, point
+
+
+class Person:
+    """The `Robot` that has hands. ask: shown every wish, a position (3,); sd: of what is typed, in its unit."""
+
+    moves = False
+
+    def __init__(self, ask: Callable[[Floats], None], sd: Sequence[float] = (np.nan, np.nan, np.nan)) -> None:
+        self._ask = ask
+        self.sd = (float(sd[0]), float(sd[1]), float(sd[2]))
+        self._position: Floats | None = None
+
+    def open(self) -> None:
+        """Nothing to connect."""
+
+    def said(self, xyz: Floats) -> None:
+        """The target is at xyz (3,): what was read from the ruler."""
+        self._position = point(xyz)
+
+    def position(self) -> Floats:
+        """What was said last."""
+        if self._position is None:
+            raise HardwareError(
+                "nobody has said yet where the target is.",
+                why="a person's position is known once it is typed",
+                fix="put the target somewhere, measure x, y, z and type them",
+            )
+        return self._position.copy()
+
+    def move(self, xyz: Floats) -> Floats:
+        """Ask for xyz; returns the wish. Where the target ends up is what `said` is told afterwards."""
+        wish = point(xyz)
+        self._position = None  # what was true before is not true while hands move the target
+        self._ask(wish)
+        return wish.copy()
+
+    def stop(self) -> None:
+        """A person stops by themselves."""
+
+    def reachable(self) -> Floats | None:
+        """Anywhere."""
+        return None
+
+    def close(self) -> None:
+        """Nothing to hang up."""

@@ -1,0 +1,123 @@
+"""What a driver is: three small protocols, and what all drivers share. A new driver is one file beside this one.
+
+    FrameSource   one camera: open, frame, close
+    Trigger       the box that exposes all cameras at once: open, fire, close
+    Robot         whatever puts the target somewhere and knows where it is: open, position, move, stop, close
+
+Add the driver to the tables in `hardware/__init__.py` and to the contract test in tests/test_hardware.py, which holds
+every driver to the sentences below. A driver never imports its vendor's library before `open`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from implicam.errors import HardwareError
+from implicam.geometry import Floats
+from implicam.images import Grey
+
+__all__ = ["Floats", "Frame", "FrameSource", "Grey", "Robot", "Trigger", "point", "wait_for"]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture: grey (height, width) from 0 to 1; a number that counts up; when it was taken, as time.time()."""
+
+    picture: Grey
+    number: int
+    taken: float
+
+
+class FrameSource(Protocol):
+    """One camera. Used from one thread at a time; different cameras from different threads."""
+
+    @property
+    def name(self) -> str:
+        """The camera's name in the dataset."""
+
+    def open(self) -> None:
+        """Ready the camera. Opening twice is harmless. HardwareError with the cure."""
+
+    def frame(self, timeout: float = 5.0) -> Frame:
+        """A picture taken after the call (of a file: the next one), within `timeout` seconds.
+
+        HardwareError where none comes in time or the camera is gone. The next call reopens the camera by itself.
+        """
+
+    def close(self) -> None:
+        """Give the camera back. Closing twice is harmless; `open` opens it again."""
+
+
+class Trigger(Protocol):
+    """What exposes all cameras at the same instant."""
+
+    def open(self) -> None:
+        """Say hello to the box. Opening twice is harmless. HardwareError with the cure."""
+
+    def fire(self) -> None:
+        """Expose the cameras once; returns when the box has acknowledged. HardwareError where it does not."""
+
+    def close(self) -> None:
+        """Hang up. Closing twice is harmless."""
+
+
+class Robot(Protocol):
+    """Whatever puts the target somewhere and knows where it is; positions (3,) in the dataset's unit and world frame.
+
+    sd: standard uncertainty of `position` along x, y, z in that unit, (nan, nan, nan) where unknown. moves: False for
+    a person, whom `move` only asks.
+    """
+
+    @property
+    def sd(self) -> tuple[float, float, float]:
+        """Standard uncertainty of `position`."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether `move` puts the target there, or only asks for it."""
+
+    def open(self) -> None:
+        """Connect. Opening twice is harmless. HardwareError with the cure."""
+
+    def position(self) -> Floats:
+        """(3,) where the target is now. HardwareError where that is not known."""
+
+    def move(self, xyz: Floats) -> Floats:
+        """Go to xyz (3,), wait until there, return where it is. HardwareError: stopped, out of the box, refused."""
+
+    def stop(self) -> None:
+        """Stop at once, from any thread. Harmless when it stands still."""
+
+    def reachable(self) -> Floats | None:
+        """(n, 3) the only places it can still go to; None for anywhere in its box."""
+
+    def close(self) -> None:
+        """Disconnect; the robot stays where it is. Closing twice is harmless."""
+
+
+def point(xyz: Floats, what: str = "position") -> Floats:
+    """The numbers as (3,) finite float64, a copy; HardwareError for anything else, before a robot hears of it."""
+    out = np.array(xyz, dtype=np.float64)
+    if out.shape != (3,) or not np.isfinite(out).all():
+        raise HardwareError(
+            f"{xyz} is no {what}.", why="it takes three finite numbers x, y, z", fix="give the place to go to"
+        )
+    return out
+
+
+Value = TypeVar("Value")
+
+
+def wait_for(look: Callable[[], Value | None], timeout: float, pause: float = 0.01) -> Value | None:
+    """The first value that is not None within `timeout` seconds, looking every `pause`; None where none came."""
+    end = time.monotonic() + timeout
+    while True:
+        value = look()
+        if value is not None or time.monotonic() >= end:
+            return value
+        time.sleep(min(pause, max(0.0, end - time.monotonic())))

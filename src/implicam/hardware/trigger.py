@@ -1,0 +1,226 @@
+r"""A trigger box on the network, and one that is only simulated. The paper used Arduinos.
+
+Lines of ASCII text, each ended by \n, over TCP, or one a packet over UDP:
+
+    HELLO          ->  IMPLICAM-TRIGGER 1 <lines>      version of the protocol, number of output lines
+    TRIG <n>       ->  OK <n> <microseconds>           all lines were pulsed; the box's clock at the pulse
+    anything else  ->  ERR <words>
+
+n is a number from 0 to 2147483647. A box that receives the n it pulsed last again answers again, with the same
+microseconds, and does not pulse: over UDP a lost answer cannot be told from a lost question, and the driver asks again.
+"""
+
+from __future__ import annotations
+
+import secrets
+import socket
+import threading
+import time
+from types import TracebackType
+from typing import Self
+from urllib.parse import urlsplit
+
+from implicam.errors import HardwareError, UsageError, did_you_mean
+
+VERSION = "IMPLICAM-TRIGGER 1 "
+HIGHEST = 2**31
+ATTEMPTS = 5
+LONGEST_LINE = 200
+
+
+class NetworkTrigger:
+    """The `Trigger` at "udp://host:port" or "tcp://host:port"; it has `timeout` seconds to acknowledge."""
+
+    def __init__(self, address: str, timeout: float = 1.0) -> None:
+        self.address, self._timeout = address, timeout
+        self._host, self._port, self._udp = _split(address)
+        self._socket: socket.socket | None = None
+        self._buffer = b""
+        self._number = secrets.randbelow(HIGHEST)  # another than the last session's, which the box may remember
+        self.lines = 0
+
+    def open(self) -> None:
+        """Connect and say hello."""
+        if self._socket is not None:
+            return
+        try:
+            kind = socket.SOCK_DGRAM if self._udp else socket.SOCK_STREAM
+            family, *_, place = socket.getaddrinfo(self._host, self._port, type=kind)[0]
+            self._buffer, self._socket = b"", socket.socket(family, kind)
+            self._socket.settimeout(self._timeout)
+            self._socket.connect(place)
+        except OSError as error:
+            self.close()
+            raise self._silent(str(error)) from error
+        answer = self._ask("HELLO", VERSION)
+        self.lines = int(answer) if answer.isdecimal() else 0
+
+    def fire(self) -> None:
+        """Pulse all lines once; asking again after a lost packet does not pulse again."""
+        self.open()
+        self._number = (self._number + 1) % HIGHEST
+        self._ask(f"TRIG {self._number}", f"OK {self._number} ")
+
+    def close(self) -> None:
+        """Hang up."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+    def _ask(self, question: str, begins: str) -> str:
+        """What follows `begins` in the answer; over UDP the question is repeated, over TCP the network does that."""
+        assert self._socket is not None
+        attempts = ATTEMPTS if self._udp else 1
+        why = f"{question!r} was sent {attempts} times, and not answered within {self._timeout:g} s"
+        try:
+            for _ in range(attempts):
+                self._socket.sendall(f"{question}\n".encode())
+                answer = self._answer(begins, time.monotonic() + self._timeout / attempts)
+                if answer is not None:
+                    return answer
+        except OSError as error:
+            why = str(error)
+        except HardwareError:
+            self.close()
+            raise
+        self.close()
+        raise self._silent(why)
+
+    def _answer(self, begins: str, end: float) -> str | None:
+        while (line := self._line(end)) is not None:
+            if line.startswith(begins):
+                return line.removeprefix(begins)
+            if line.startswith("ERR"):
+                raise HardwareError(
+                    f"the trigger box at {self.address} refuses.",
+                    why=line.removeprefix("ERR").strip() or "it does not say why",
+                    fix="load the sketch of docs/hardware.md on it",
+                )
+            # else an answer to an earlier question, which took its time
+        return None
+
+    def _line(self, end: float) -> str | None:
+        assert self._socket is not None
+        while b"\n" not in self._buffer:
+            left = end - time.monotonic()
+            if left <= 0:
+                return None
+            self._socket.settimeout(left)
+            try:
+                data = self._socket.recv(4096)
+            except TimeoutError:
+                return None
+            if not data and not self._udp:
+                raise ConnectionError("it hung up")
+            self._buffer = (self._buffer + data)[-LONGEST_LINE * 20 :]
+        line, _, self._buffer = self._buffer.partition(b"\n")
+        return line.decode("ascii", "replace").strip()
+
+    def _silent(self, why: str) -> HardwareError:
+        return HardwareError(
+            f"the trigger box at {self.address} does not answer.",
+            why=why,
+            fix="check its power, its cable and its address; it must speak the protocol of docs/hardware.md",
+        )
+
+
+def _split(address: str) -> tuple[str, int, bool]:
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or not port or parts.scheme not in ("udp", "tcp"):
+        raise UsageError(
+            f"{address!r} is no address of a trigger box{did_you_mean(address.partition(':')[0], ('udp', 'tcp'))}.",
+            fix="write udp://host:port or tcp://host:port, for example udp://192.168.0.50:4000",
+        )
+    return host, port, parts.scheme == "udp"
+
+
+class TriggerSimulator:
+    """A trigger box without a box, at `address` on this machine: stands in for hardware, and counts its pulses.
+
+    Use it as a context manager. drop_questions, drop_answers: how many of the next packets get lost (UDP). delay:
+    seconds before each answer.
+    """
+
+    def __init__(self, kind: str = "udp", *, lines: int = 4, delay: float = 0.0) -> None:
+        self.lines, self.delay = lines, delay
+        self.fired: list[int] = []
+        self.drop_questions = self.drop_answers = 0
+        self._last = (-1, 0)
+        self._udp = kind == "udp"
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM if self._udp else socket.SOCK_STREAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.05)
+        self.address = f"{kind}://127.0.0.1:{self._socket.getsockname()[1]}"
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._serve_udp if self._udp else self._serve_tcp, daemon=True)
+
+    def __enter__(self) -> Self:
+        if not self._udp:
+            self._socket.listen()
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending.set()
+        self._thread.join()
+        self._socket.close()
+
+    def answer(self, question: str) -> str:
+        """What the box says to one line, and the pulse, if it is one."""
+        word, _, number = question.strip().partition(" ")
+        if word == "HELLO" and not number:
+            return f"{VERSION}{self.lines}\n"
+        if word != "TRIG" or not number.isdecimal() or int(number) >= HIGHEST:
+            return f"ERR {question.strip()[:40]!r} is not understood\n"
+        if int(number) != self._last[0]:
+            self._last = int(number), time.monotonic_ns() // 1000
+            self.fired.append(int(number))
+        return f"OK {number} {self._last[1]}\n"
+
+    def _serve_udp(self) -> None:
+        while not self._ending.is_set():
+            try:
+                data, place = self._socket.recvfrom(LONGEST_LINE)
+            except TimeoutError:
+                continue
+            if self.drop_questions > 0:
+                self.drop_questions -= 1
+                continue
+            answer = self.answer(data.decode("ascii", "replace"))
+            if self.drop_answers > 0:
+                self.drop_answers -= 1
+                continue
+            self._ending.wait(self.delay)
+            self._socket.sendto(answer.encode(), place)
+
+    def _serve_tcp(self) -> None:
+        while not self._ending.is_set():
+            try:
+                connection, _ = self._socket.accept()
+            except TimeoutError:
+                continue
+            with connection:
+                connection.settimeout(0.05)
+                self._talk(connection)
+
+    def _talk(self, connection: socket.socket) -> None:
+        buffer = b""
+        while not self._ending.is_set():
+            try:
+                data = connection.recv(LONGEST_LINE)
+            except TimeoutError:
+                continue
+            except OSError:
+                return
+            if not data:
+                return
+            *lines, buffer = (buffer + data).split(b"\n")
+            for line in lines:
+                self._ending.wait(self.delay)
+                connection.sendall(self.answer(line.decode("ascii", "replace")).encode())

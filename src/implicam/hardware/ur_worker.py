@@ -1,0 +1,119 @@
+"""The library ur-rtde in a process of its own: this file, run as a program, is the far end.
+
+When the robot falls silent, ur-rtde 1.6.5 waits with Python's lock held, reconnects by itself, uploads its program
+again, or aborts the whole process ("pthread_mutex_lock ... Assertion failed", seen when it is closed then). None of
+that may happen to a session, or move a robot that nobody looks at: here the process is ended.
+Questions and answers are JSON lines: [7, "receive", "getTimestamp", []] -> {"id": 7, "value": 12.5} or {"id": 7,
+"error": "..."}. When the session itself dies, the far end stops the robot.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from typing import Any
+
+LIBRARIES = {"receive": ("rtde_receive", "RTDEReceiveInterface"), "control": ("rtde_control", "RTDEControlInterface")}
+
+LAST_WORDS = 5
+"""Seconds that the far end has to stop the robot once the session has died."""
+
+DECELERATION = 2.0
+"""m/s² of a robot that is stopped."""
+
+
+class Worker:
+    """The near end; `call` may be used from several threads, and is a TimeoutError once the far end is gone."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, "-P", __file__]  # -P: our neighbours in this folder are not libraries
+        pipe = subprocess.PIPE
+        # A session of its own: Ctrl-C is for us, who then tell the robot to stop.
+        self._process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, bufsize=0, start_new_session=True
+        )
+        self._asked = 0
+        self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def call(self, thing: str, method: str, *args: object, timeout: float = 2.0) -> Any:
+        """What the method answers. RuntimeError for what it raises; TimeoutError where it does not come back."""
+        with self._lock:
+            self._asked += 1
+            try:
+                assert self._process.stdin is not None
+                self._process.stdin.write((json.dumps([self._asked, thing, method, args]) + "\n").encode())
+                answer = self._answer(self._asked, time.monotonic() + timeout)
+            except (queue.Empty, OSError, ValueError) as error:
+                raise TimeoutError(f"no answer within {timeout:g} s") from error
+        if "error" in answer:
+            raise RuntimeError(answer["error"])
+        return answer["value"]
+
+    def _answer(self, number: int, end: float) -> dict[str, Any]:
+        """The answer to question `number`; one to a question that Ctrl-C interrupted is passed over."""
+        while True:
+            line = self._answers.get(timeout=max(0.0, end - time.monotonic()))
+            if not line:
+                raise OSError("ur-rtde ended")
+            answer: dict[str, Any] = json.loads(line)
+            if answer["id"] == number:
+                return answer
+
+    def end(self) -> None:
+        """Now, whatever it is doing: the connections to the robot end with it."""
+        self._process.kill()
+        self._process.wait()
+        self._reader.join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._answers.put(line)
+        self._answers.put(b"")
+
+
+def _serve() -> None:
+    """The far end: answer until the near end closes the pipe."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the library prints where the answers go
+    things: dict[str, Any] = {}
+    with suppress(BrokenPipeError):  # the near end died before it read the answer
+        for line in sys.stdin:
+            number, thing, method, args = json.loads(line)
+            answers.write(json.dumps({"id": number, **_done(things, thing, method, args)}) + "\n")
+            answers.flush()
+    if hasattr(signal, "alarm"):
+        signal.alarm(LAST_WORDS)  # ends us even where the library waits, with Python's lock, for a robot that is gone
+    if "control" in things:  # nobody is there any more who knows why the robot moves
+        with suppress(Exception):
+            things["control"].stopL(DECELERATION)
+            things["control"].stopScript()
+    os._exit(0)  # without the library's destructors
+
+
+def _done(things: dict[str, Any], thing: str, method: str, args: list[Any]) -> dict[str, Any]:
+    try:
+        if method != "connect":
+            return {"value": getattr(things[thing], method)(*args)}
+        module, name = LIBRARIES[thing]
+        things[thing] = getattr(__import__(module), name)(*args)
+        return {"value": None}
+    except Exception as error:  # the far end has no one else to tell
+        return {"error": str(error) or type(error).__name__}
+
+
+if __name__ == "__main__":
+    _serve()

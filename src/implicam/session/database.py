@@ -1,0 +1,325 @@
+"""session.db: the tables of a guided session, who may open them, and how a point becomes rows and comes back.
+
+    session    one row: name, length_unit; created and opened (the last time), ISO 8601 in UTC as all times here
+    cameras    number, name, width, height (pixels, empty where unknown), more (further entries, TOML)
+    settings   key, value (JSON), time of the last change
+    shots      number (the order of accepting), name, state, time, notes (JSON)
+               state: accepted; undone (taken back, kept); begun (its pictures are being written, it is no point yet)
+    points     one row a point: shot, number (its place in the shot), point, x, y, z, sd_x, sd_y, sd_z, more
+    views      one row a view: shot, point, camera, u, v, sd_u, sd_v, more
+    skipped    number, x, y, z, reason, time
+    events     number, time, what, more (JSON)
+
+World frame, length unit and pixels are those of the dataset (docs/conventions.md). An sd that is not stated is NULL;
+`more` holds the further columns of points.csv and observations.csv as JSON, text by name. The pictures are files,
+images/<camera>/<shot>.png. `PRAGMA user_version` is the version of these tables, `PRAGMA application_id` is 'impc'.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Names, Observations
+from implicam.dataset.folder import POINTS, VIEWS
+from implicam.errors import DatasetError, ImplicamError, UsageError
+from implicam.files import toml_text
+
+DATABASE = "session.db"
+VERSION = 1
+APPLICATION = int.from_bytes(b"impc", "big")
+
+# Numbers have no declared type: a column that is REAL turns -0.0 into 0.0, and what is accepted comes back bit by bit.
+_TABLES = (
+    "CREATE TABLE session (name TEXT, length_unit TEXT, created TEXT, opened TEXT)",
+    "CREATE TABLE cameras (number INTEGER PRIMARY KEY, name TEXT UNIQUE, width INTEGER, height INTEGER, more TEXT)",
+    "CREATE TABLE settings (key TEXT PRIMARY KEY, value TEXT, time TEXT)",
+    "CREATE TABLE shots (number INTEGER PRIMARY KEY, name TEXT UNIQUE,"
+    " state TEXT CHECK (state IN ('begun', 'accepted', 'undone')), time TEXT, notes TEXT)",
+    "CREATE TABLE points (shot TEXT, number INTEGER, point TEXT, x, y, z, sd_x, sd_y, sd_z, more TEXT,"
+    " PRIMARY KEY (shot, number))",
+    "CREATE TABLE views (shot TEXT, point TEXT, camera TEXT, u, v, sd_u, sd_v, more TEXT,"
+    " PRIMARY KEY (shot, point, camera))",
+    "CREATE TABLE skipped (number INTEGER PRIMARY KEY, x, y, z, reason TEXT, time TEXT)",
+    "CREATE TABLE events (number INTEGER PRIMARY KEY, time TEXT, what TEXT, more TEXT)",
+)
+
+
+class Database:
+    """The one connection to a session's database; nobody else can open it until `close`, or the end of the process.
+
+    Every failure is an ImplicamError that says what to do. The caller sees to it that one thread uses it at a time.
+    """
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self._path, self._connection = path, connection
+
+    @classmethod
+    def create(cls, path: Path) -> Database:
+        """An empty one, locked, inside a transaction that `made` ends; UsageError where there is a session."""
+        database = cls._connect(path, "rwc")
+        with database._closing_on_error():
+            database.run("BEGIN EXCLUSIVE")
+            if database.rows("SELECT name FROM sqlite_master"):
+                raise UsageError(
+                    f"{path} is there already.",
+                    why="a session was begun in this folder before",
+                    fix="continue it, or choose another folder",
+                )
+        return database
+
+    def made(self, name: str, length_unit: str, cameras: Sequence[Camera], settings: Mapping[str, str]) -> None:
+        """The tables and what a session begins with, all or nothing."""
+        with self._closing_on_error():
+            for table in _TABLES:
+                self.run(table)
+            self.run("INSERT INTO session VALUES (?, ?, ?, ?)", name, length_unit, now(), now())
+            for number, camera in enumerate(cameras):
+                more = toml_text(camera.extra)
+                self.run(
+                    "INSERT INTO cameras VALUES (?, ?, ?, ?, ?)", number, camera.name, camera.width, camera.height, more
+                )
+            for key, value in settings.items():
+                self.run("INSERT INTO settings VALUES (?, ?, ?)", key, value, now())
+            self.run(f"PRAGMA application_id = {APPLICATION}")
+            self.run(f"PRAGMA user_version = {VERSION}")
+            self.run("COMMIT")
+
+    @classmethod
+    def open(cls, path: Path) -> Database:
+        """What is there, checked and locked. UsageError where it is open elsewhere, DatasetError where it is damaged,
+        another program's or a newer version's; nothing in it was changed then."""
+        if not os.path.isfile(path):  # Path.is_file raises where the folder may not be looked into
+            raise DatasetError(
+                f"{path.parent} is no session.",
+                why=f"it has no {path.name}, or may not be looked into",
+                fix="name the folder of a session, or begin one there",
+            )
+        database = cls._connect(path, "rw")
+        with database._closing_on_error():
+            database.run("BEGIN EXCLUSIVE")
+            database._check()
+            database.run("UPDATE session SET opened = ?", now())  # a disk that takes no writes says so now
+            database.run("COMMIT")
+        return database
+
+    @classmethod
+    def _connect(cls, path: Path, mode: str) -> Database:
+        """The lock is SQLite's own, on the open file: a kill frees it, and no lock file can be left behind.
+
+        On Unix such a lock is also lost when this process opens and closes session.db by any other way than SQLite.
+
+        A rollback journal and no write-ahead log: between two points session.db alone is the whole session, for one
+        who copies it, and a point is committed every few seconds, so a second flush costs nothing that one could feel.
+        EXTRA is FULL, and the folder is flushed too when the journal goes: else a power cut could bring it back, and
+        with it the state before the last point.
+        """
+        try:
+            uri = f"{path.absolute().as_uri()}?mode={mode}"
+            connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
+        except sqlite3.Error as error:
+            raise _explained(path, error) from error
+        database = cls(path, connection)
+        with database._closing_on_error():
+            for setting in ("trusted_schema = OFF", "locking_mode = EXCLUSIVE", "synchronous = EXTRA"):
+                database.run(f"PRAGMA {setting}")
+        return database
+
+    def _check(self) -> None:
+        (application,), (version,) = self.rows("PRAGMA application_id") + self.rows("PRAGMA user_version")
+        if not self.rows("SELECT name FROM sqlite_master"):
+            raise DatasetError(
+                f"{self._path} is empty.",
+                why="the program was stopped while it began the session, or the file was cut off",
+                fix=f"remove it and begin again; where {POINTS} is beside it, keep that, and begin in another folder",
+            )
+        if application != APPLICATION:
+            raise DatasetError(
+                f"{self._path} is no session.", why="another program made this database", fix="choose another folder"
+            )
+        if version > VERSION:
+            raise DatasetError(
+                f"{self._path} was written by a newer implicam.",
+                why=f"its tables have the version {version}; this one knows up to {VERSION}",
+                fix="update implicam: pip install --upgrade implicam",
+            )
+        faults = self.rows("PRAGMA integrity_check(1)")
+        if faults != [("ok",)]:
+            raise damaged(self._path, str(faults[0][0]))
+        (pages,), (page_bytes,) = self.rows("PRAGMA page_count") + self.rows("PRAGMA page_size")
+        if self._path.stat().st_size < pages * page_bytes:  # SQLite would take zeros for the rest of the last page
+            raise damaged(self._path, "its end is cut off")
+
+    def run(self, sql: str, *values: Any) -> None:
+        """Execute one statement."""
+        self.rows(sql, *values)
+
+    def rows(self, sql: str, *values: Any) -> list[tuple[Any, ...]]:
+        """What a query answers."""
+        try:
+            return self._connection.execute(sql, values).fetchall()
+        except sqlite3.Error as error:
+            raise _explained(self._path, error) from error
+        except (UnicodeEncodeError, OverflowError) as error:
+            raise UsageError(
+                "a text or a number cannot be kept in a session.", why=str(error), fix="correct the text or the number"
+            ) from error
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """What is run inside is on disk when this ends, all of it; where anything fails, none of it."""
+        self.run("BEGIN IMMEDIATE")
+        try:
+            yield
+            self.run("COMMIT")
+        except BaseException:
+            with suppress(sqlite3.Error):  # SQLite may have rolled back by itself
+                self._connection.execute("ROLLBACK")
+            raise
+
+    def close(self) -> None:
+        """Free the session for others."""
+        self._connection.close()
+
+    @contextmanager
+    def _closing_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
+
+def _explained(path: Path, error: sqlite3.Error) -> ImplicamError:
+    """SQLite's errors, by their names, as ours."""
+    name, why = getattr(error, "sqlite_errorname", None) or "", str(error)
+    if isinstance(error, sqlite3.ProgrammingError) and "closed" in why:
+        return UsageError(f"the session in {path.parent} is closed.", fix="open it again")
+    if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+        return UsageError(
+            f"the session in {path.parent} is open elsewhere.",
+            why="another program holds session.db, and two would overwrite each other's points",
+            fix="close the other one (a page, a terminal, a database viewer), or choose another folder",
+        )
+    if name.startswith(("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_PERM")):
+        return ImplicamError(
+            f"cannot write {path}.",
+            why=why,
+            fix="check the permissions and the free space; every point accepted before is kept",
+        )
+    return damaged(path, why)
+
+
+def damaged(path: Path, why: str) -> DatasetError:
+    """The error for a database that cannot be trusted."""
+    return DatasetError(
+        f"{path} is damaged, or is no session; nothing in its folder was changed.",
+        why=why,
+        fix=f"bring back a copy of it; or go on without: {POINTS} and {VIEWS} beside it hold the accepted "
+        "points as a dataset, and a new session can begin in another folder",
+    )
+
+
+def now() -> str:
+    """The time as it is stored."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def json_text(value: Any, what: str) -> str:
+    """A value as JSON; UsageError for what has no form in it."""
+    try:
+        text = json.dumps(value, default=_plain, ensure_ascii=False)
+        text.encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise UsageError(
+            f"{what} cannot be kept in a session.",
+            why=str(error),
+            fix="use text, numbers, true or false, None, and lists and tables of these",
+        ) from None
+    return text
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"a value of type {type(value).__name__} has no form in JSON")
+
+
+def read_cameras(database: Database) -> tuple[Camera, ...]:
+    """The cameras in their order."""
+    rows = database.rows("SELECT name, width, height, more FROM cameras ORDER BY number")
+    return tuple(Camera(name, width, height, tomllib.loads(more)) for name, width, height, more in rows)
+
+
+def insert_shot(database: Database, data: Dataset, notes: str) -> None:
+    """The rows of one accepted shot, to be run inside a transaction."""
+    shot = str(data.shots[0])
+    database.run("DELETE FROM shots WHERE name = ? AND state = 'begun'", shot)
+    database.run("INSERT INTO shots (name, state, time, notes) VALUES (?, 'accepted', ?, ?)", shot, now(), notes)
+    known, seen = data.positions, data.observations
+    for i, point in enumerate(data.points.tolist()):
+        more = json_text({key: str(text[i]) for key, text in known.extra.items()}, "a column")
+        numbers = _cells(known.xyz[i], known.sd[i])
+        database.run("INSERT INTO points VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", shot, i, point, *numbers, more)
+    for i, k in np.argwhere(seen.seen):
+        more = json_text({key: str(text[i, k]) for key, text in seen.extra.items()}, "a column")
+        place = shot, str(data.points[i]), data.cameras[k].name
+        numbers = _cells(seen.uv[i, k], seen.sd[i, k])
+        database.run("INSERT INTO views VALUES (?, ?, ?, ?, ?, ?, ?, ?)", *place, *numbers, more)
+
+
+def _cells(*arrays: Floats) -> list[float | None]:
+    """Numbers in a row; NULL for NaN."""
+    return [None if value != value else value for array in arrays for value in array.tolist()]
+
+
+def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
+    """All accepted points in their order, with the name, unit and cameras of `empty`; None where there is none."""
+    of_accepted = "JOIN shots ON shots.name = shot WHERE state = 'accepted' ORDER BY shots.number,"
+    points = database.rows(
+        f"SELECT shot, point, x, y, z, sd_x, sd_y, sd_z, more FROM points {of_accepted} points.number"
+    )
+    views = database.rows(f"SELECT shot, point, camera, u, v, sd_u, sd_v, more FROM views {of_accepted} views.rowid")
+    shots = [name for (name,) in database.rows("SELECT name FROM shots WHERE state = 'accepted' ORDER BY number")]
+    if not (shots == list(dict.fromkeys(row[0] for row in points)) == list(dict.fromkeys(row[0] for row in views))):
+        raise ValueError("an accepted shot has no points, or no views")
+    if not shots:
+        return None
+    names = [point for _, point, *_ in points]
+    numbers = np.array([row[2:8] for row in points], dtype=np.float64)
+    known = KnownPositions(
+        np.array([row[0] for row in points], dtype=np.str_),
+        numbers[:, :3],
+        numbers[:, 3:],
+        _columns(points, (len(points),)),
+    )
+    row_of = {name: i for i, name in enumerate(names)}
+    camera_of = {name: k for k, name in enumerate(empty.observations.camera_names)}
+    i, k = np.array([(row_of[row[1]], camera_of[row[2]]) for row in views], dtype=np.intp).reshape(-1, 2).T
+    table = np.full((len(names), len(camera_of), 4), np.nan)
+    table[i, k] = np.array([row[3:7] for row in views], dtype=np.float64).reshape(-1, 4)
+    extra = _columns(views, table.shape[:2], (i, k))
+    observations = Observations(np.array(names), empty.cameras, table[..., :2], table[..., 2:], extra)
+    return Dataset(empty.name, empty.length_unit, observations, known)
+
+
+def _columns(rows: list[tuple[Any, ...]], shape: tuple[int, ...], at: Any = slice(None)) -> dict[str, Names]:
+    """The further columns, from the last cell of each row, spread over `shape`; empty where a row has none."""
+    cells = [json.loads(row[-1]) for row in rows]
+    columns = {}
+    for key in dict.fromkeys(key for table in cells for key in table):
+        text = np.array([table.get(key, "") for table in cells], dtype=np.str_)
+        columns[key] = np.full(shape, "", dtype=text.dtype)
+        columns[key][at] = text
+    return columns

@@ -1,0 +1,188 @@
+"""The files of a session's folder: its tables, its pictures, and what is no part of it any more."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+
+from implicam.dataset import Camera, Dataset, folder_files
+from implicam.dataset.folder import DESCRIPTION, IMAGES, POINTS, VIEWS, description_text
+from implicam.errors import DatasetError, ImageError, ImplicamError, UsageError
+from implicam.files import replacing
+from implicam.images import Grey, write_picture
+from implicam.session.database import DATABASE
+
+UNDONE = "undone"
+"""The folder of what is no part of the dataset any more: undone/<camera>/<shot>.png, tables edited by hand."""
+
+_PARTIAL = ".*.partial-*"  # what a kill leaves of `files.replacing`
+_LONGEST = 200  # bytes of a name that becomes a file's; most disks take 255, and `replacing` adds some
+
+
+def is_session(folder: Path) -> bool:
+    """Whether a session was begun in the folder. The file is not opened: that could cost its lock (`Database`)."""
+    file = Path(folder) / DATABASE
+    return file.is_file() and file.stat().st_size > 0
+
+
+@contextmanager
+def failing_to_write(folder: Path) -> Iterator[None]:
+    """What the system refuses, as an ImplicamError."""
+    try:
+        yield
+    except OSError as error:
+        raise ImplicamError(
+            f"cannot write into {folder}.", why=str(error), fix="check the permissions and the free space"
+        ) from error
+
+
+def stale_tables(folder: Path, data: Dataset | None, empty: Dataset) -> dict[str, str]:
+    """The dataset's files that say something else than `data`, as they should be: name -> text.
+
+    empty: the same dataset without points, for which there is dataset.toml only.
+    """
+    files = folder_files(data) if data else {DESCRIPTION: description_text(empty)}
+    return {name: text for name, text in files.items() if _content(folder / name) != text.encode()}
+
+
+def write_beside(beside: ExitStack, folder: Path, files: Mapping[str, str]) -> None:
+    """Files that `beside` renames when it closes, the last first.
+
+    A new point so gets its position before its views, and an undone one loses them in the other order: who reads
+    between the two finds a dataset at any time.
+    """
+    for name, text in files.items():
+        temporary = beside.enter_context(replacing(folder / name))
+        temporary.write_text(text, encoding="utf-8", newline="")
+
+
+def rewrite_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
+    """Make the dataset's files say what `data` says, after points were taken away."""
+    with ExitStack() as beside:
+        write_beside(beside, folder, dict(reversed(stale_tables(folder, data, empty).items())))
+    if data is None:
+        for name in (VIEWS, POINTS):
+            (folder / name).unlink(missing_ok=True)
+
+
+def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
+    """Copy a table that someone changed by hand to undone/ before it is written again."""
+    right = stale_tables(folder, data, empty)
+    if data is None:  # these two will be removed
+        right |= {VIEWS: "", POINTS: ""}
+    for name, text in right.items():
+        old = _content(folder / name)
+        if old and not text.encode().startswith(old):  # else only the last points are missing: a kill
+            shutil.copyfile(folder / name, _free(folder / UNDONE / name))
+
+
+def remove_partial(folder: Path, cameras: Sequence[Camera]) -> None:
+    """Delete half-written files, which nobody else can be writing."""
+    for place in [folder, *(folder / IMAGES / camera.name for camera in cameras)]:
+        for partial in list(place.glob(_PARTIAL)):
+            partial.unlink()
+
+
+def write_pictures(folder: Path, shot: str, pictures: Mapping[str, Grey]) -> None:
+    """images/<camera>/<shot>.png each, whole, and on the disk with its name."""
+    for camera, picture in pictures.items():
+        path = folder / IMAGES / camera / f"{shot}.png"
+        write_picture(path, picture, bits=_bits(picture))
+        for place in (path.parent, folder / IMAGES, folder):
+            flush_folder(place)
+
+
+def set_pictures_aside(folder: Path, shots: Iterable[str], cameras: Sequence[Camera]) -> None:
+    """Move the pictures of some shots to undone/."""
+    for shot in shots:
+        for camera in cameras:
+            picture = folder / IMAGES / camera.name / f"{shot}.png"
+            if picture.exists():
+                picture.rename(_free(folder / UNDONE / camera.name / picture.name))
+
+
+def make_folder(folder: Path) -> None:
+    """UsageError where the folder holds something; a session.db that no table was made in is what a kill left."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        found = sorted({entry.name for entry in folder.iterdir()} - {DATABASE, f"{DATABASE}-journal"})
+    except OSError as error:
+        raise ImplicamError(
+            f"cannot make the folder {folder}.", why=str(error), fix="choose a place you may write to"
+        ) from error
+    if is_session(folder):
+        raise UsageError(f"{folder} holds a session already.", fix="continue it, or choose another folder")
+    if found:
+        raise UsageError(
+            f"{folder} is not empty.",
+            why=f"it holds {', '.join(found[:5])}{', ...' if len(found) > 5 else ''}, and a session would mix with it",
+            fix="choose a new or empty folder",
+        )
+
+
+def check_file_name(name: str, what: str) -> None:
+    """DatasetError where no file or folder can have this name on every disk."""
+    if set("/\\") & set(name) or name.startswith(".") or len(name.encode()) > _LONGEST:
+        raise DatasetError(
+            f"the {what} name {name[:60]!r} cannot name a file.",
+            why="its pictures are kept under this name",
+            fix=f"leave out slashes, backslashes and a leading dot; at most {_LONGEST} bytes",
+        )
+
+
+def check_pictures(pictures: Mapping[str, Grey], cameras: Sequence[Camera]) -> None:
+    """DatasetError for an unknown camera, ImageError for what is no whole grey picture of it."""
+    known = {camera.name: camera for camera in cameras}
+    for name, picture in pictures.items():
+        if name not in known:
+            raise DatasetError(f"a picture of {name!r}, which is no camera.", fix=f"the cameras are {', '.join(known)}")
+        if picture.ndim != 2 or not picture.size or not np.isfinite(picture).all():
+            raise ImageError(
+                f"the picture of {name!r} is not grey.",
+                why=f"its shape is {picture.shape}",
+                fix="give finite grey values, (height, width)",
+            )
+        size = known[name].height, known[name].width
+        if None not in size and picture.shape != size:
+            raise ImageError(
+                f"the picture of {name!r} has {picture.shape[1]} x {picture.shape[0]} pixels.",
+                why=f"the session began with {size[1]} x {size[0]}",
+                fix="give the whole picture, as the camera takes it",
+            )
+
+
+def _bits(picture: Grey) -> int:
+    """8 where such a file reads back to the same values, else 16."""
+    if picture.dtype == np.uint8:
+        return 8
+    steps = np.rint(np.clip(picture, 0, 1) * 255).astype(np.float32)
+    return 8 if np.array_equal(steps * np.float32(1 / 255), picture) else 16
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
+
+
+def _free(path: Path) -> Path:
+    """The path, or one with a number where something is there; its folder exists."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    number, free = 1, path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return free
+
+
+def flush_folder(folder: Path) -> None:
+    """Put the names in it on the disk, where system and disk flush folders; Windows and some shares do without."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

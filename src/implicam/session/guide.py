@@ -1,0 +1,451 @@
+"""The guided session: what happens between "put the ball here" and "stop now", without any screen.
+
+    aim -> moving -> shown -> fitting -> aim ...           -> done
+                        \\-> trouble: something failed; nothing is lost, and `retry` goes on
+
+Every method that does something returns when it is done; a page calls them from one worker thread. `state` may be read
+at any time from any thread: it is a frozen value that is replaced, never changed.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from implicam.active import Loop, Prospect, Step, Target
+from implicam.calibrators import Calibration, ForwardGPCalibration
+from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
+from implicam.detect import Detected, Detector, View, centred
+from implicam.errors import HardwareError, ImplicamError, UsageError
+from implicam.hardware import Frame, FrameSource, Robot, Trigger
+from implicam.images import blank
+from implicam.progress import Progress, silent
+from implicam.session.journal import Session
+
+CALIBRATION, REPORT = "calibration.implicam", "report.html"
+
+FAR = 6.0
+"""A detection that is so many standard deviations from where it must be is another thing ..."""
+
+AT_LEAST = 8.0
+"""... if it is so many pixels away, too."""
+
+ARMED = 0.05
+"""Seconds from asking the cameras for a picture until all of them wait for the trigger."""
+
+LEAST_REPORTED = 12
+"""Known points from which a report by cross-validation says anything."""
+
+
+@dataclass(frozen=True, eq=False)
+class Equipment:
+    """What the session works with. radius: of the ball, in the session's length unit, None for no correction."""
+
+    cameras: Sequence[FrameSource]
+    robot: Robot
+    detector: Detector
+    trigger: Trigger | None = None
+    radius: float | None = None
+    timeout: float = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one camera shows: its picture, what was found in it, why nothing was; where the target is expected, (2,)
+    pixels, NaN where nobody knows or it is not in view."""
+
+    camera: str
+    frame: Frame | None
+    found: Detected
+    expected: Floats
+
+    @property
+    def uv(self) -> Floats:
+        """(2,) where the ball is, NaN for nowhere."""
+        return self.found.uv[0] if len(self.found) else np.full(2, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """All that a page shows. phase: starting, aim, moving, shown, fitting, trouble, done.
+
+    message: what to do now, or what went wrong. position: (3,) where the robot says the ball is, or what the person
+    typed; NaN where unknown. looks: the pictures that are being judged (phase shown) or live. stop: why to stop now.
+    """
+
+    phase: str = "starting"
+    message: str = ""
+    target: Target | None = None
+    position: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    looks: tuple[Look, ...] = ()
+    history: tuple[Step, ...] = ()
+    stop: str = ""
+    prospect: Prospect | None = None
+    calibration: Calibration | None = None
+    data: Dataset | None = None
+    problem: ImplicamError | None = None
+    auto: bool = False
+    report: Path | None = None
+    version: int = 0
+
+    @property
+    def seen(self) -> list[str]:
+        """The cameras that see the ball."""
+        return [look.camera for look in self.looks if len(look.found)]
+
+
+class Guide:
+    """One session, its equipment, and the loop that says where to measure next. A context manager: it opens the
+    equipment, and closes it and the session."""
+
+    def __init__(self, session: Session, equipment: Equipment, loop: Loop, *, auto: bool = False) -> None:
+        names = [source.name for source in equipment.cameras]
+        if names != [camera.name for camera in session.cameras]:
+            raise UsageError(
+                f"the session in {session.folder} has the cameras {', '.join(c.name for c in session.cameras)}, and "
+                f"here are {', '.join(names)}.",
+                fix="use the same cameras with the same names, or begin a session in another folder",
+            )
+        self.session, self.equipment, self.loop = session, equipment, loop
+        self.state = State(auto=auto)
+        self._changed = threading.Condition()
+        self._eyes = threading.Lock()  # a camera answers one thread at a time
+        self._pool = ThreadPoolExecutor(max(1, len(names)))
+
+    def __enter__(self) -> Guide:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    # what a page calls
+
+    def start(self) -> None:
+        """Open cameras and robot, take up what the session has already, and name the first target."""
+        with self._working("starting", "connecting to the cameras and the robot"):
+            for device in self._devices():
+                device.open()
+            self._fit()
+            self._aim()
+
+    def go(self) -> None:
+        """Send the robot to the target, or take the ball to be there, and look."""
+        target = self._target()
+        with self._working("moving", "the robot is on its way"):
+            where = self.equipment.robot.move(target.xyz)
+            self._shown(where)
+
+    def arrived(self, xyz: Floats) -> None:
+        """A person says where the ball is (3,), measured with a ruler; then look."""
+        with self._working("moving", "looking"):
+            say = getattr(self.equipment.robot, "said", None)
+            if say is not None:
+                say(np.asarray(xyz, dtype=np.float64))
+            self._shown(self.equipment.robot.position())
+
+    def redo(self) -> None:
+        """Look again, at the same place."""
+        with self._working("moving", "looking again"):
+            self._shown(self.equipment.robot.position())
+
+    def accept(self) -> None:
+        """Keep what is shown: on disk first, then fit again and name the next target."""
+        state = self.state
+        if state.phase != "shown":
+            raise UsageError("there is nothing to accept.", fix="take a picture first")
+        if not state.seen:
+            raise UsageError("no camera found the ball.", fix="redo it, or skip this target")
+        point = self._point(state)
+        pictures = {look.camera: look.frame.picture for look in state.looks if look.frame is not None}
+        with self._working("fitting", "fitting with everything"):
+            self.session.accept(point, pictures=pictures, notes=_notes(state))
+            self._fit()
+            self._aim()
+
+    def skip(self, reason: str = "skipped by hand") -> None:
+        """Leave this target out; it is not proposed again."""
+        target = self._target()
+        with self._working("fitting", "choosing another target"):
+            self.session.skip(target.xyz, reason)
+            self.loop.refuse(target, reason)
+            self._aim()
+
+    def undo(self) -> str | None:
+        """Take the last accepted point back; its name, None where there is none."""
+        with self._working("fitting", "taking the last point back"):
+            name = self.session.undo()
+            self._fit()
+            self._aim(f"point {name} is taken back. " if name else "")
+        return name
+
+    def retry(self) -> None:
+        """After trouble: connect again, and go on where it was."""
+        with self._working("starting", "connecting again"):
+            for device in self._devices():
+                device.open()
+            self._fit()
+            self._aim()
+
+    def stop_robot(self) -> None:
+        """At once, from any thread; nothing goes by itself after that."""
+        self.equipment.robot.stop()
+        self.set_auto(False)
+        self.session.log("robot stopped by hand")
+
+    def set_auto(self, auto: bool) -> None:
+        """Whether good points are accepted, and the next target is gone to, without being asked."""
+        self._show(auto=auto)
+
+    def finish(self) -> Path:
+        """Calibrate with everything, save and report; the calibration's file."""
+        from implicam.report import report_of, write_report
+
+        with self._working("fitting", "calibrating, and writing the report"):
+            if self.loop.calibration is None or self.loop.data is None:
+                raise UsageError(
+                    f"{self.loop.points} known points are too few to calibrate.",
+                    why=str(self.loop.problem.what) if self.loop.problem else "",
+                    fix=f"accept at least {self.loop.start}",
+                )
+            calibration = self.loop.calibrator.fit(self.loop.data)  # from no guess: anybody will find the same
+            path = self.session.folder / CALIBRATION
+            calibration.save(path)
+            report: Path | None = None
+            if len(calibration.data) >= LEAST_REPORTED:
+                report = self.session.folder / REPORT
+                write_report(report, report_of(_judged(calibration), f"{self.session.name}: a guided calibration"))
+            self.session.log("finished", points=self.loop.points)
+            words = f"{self.loop.points} points. Saved: {path}" + (f" and {report}" if report else "")
+            self._show(phase="done", message=words, report=report, target=None, auto=False)
+        return path
+
+    def run(self, progress: Progress = silent) -> Path | None:
+        """By itself until a rule says stop or something fails: the calibration's file, None after trouble."""
+        self.set_auto(True)
+        if self.state.phase == "starting":
+            self.start()
+        while self.state.auto and self.state.phase == "aim" and not self.state.stop and self.state.target is not None:
+            self.step()
+            progress("measuring", self.loop.points, max(self.loop.points, self.loop.start))
+        return self.finish() if self.state.phase == "aim" and self.loop.calibration is not None else None
+
+    def step(self) -> None:
+        """One target, without being asked: go, look, and accept or skip."""
+        self.go()
+        if self.state.phase != "shown":
+            return
+        if self.state.seen:
+            self.accept()
+        else:
+            self.skip("the ball was not found")
+
+    def live(self) -> None:
+        """New pictures of all cameras, for the eye; nothing where the session is busy or a picture is being judged."""
+        if self.state.phase not in ("aim", "done") or not self._eyes.acquire(blocking=False):
+            return
+        try:
+            version = self.state.phase
+            looks = self._looks(self._frames(None))
+            if self.state.phase == version:
+                self._show(looks=looks)
+        except HardwareError as error:
+            self._trouble(error)
+        finally:
+            self._eyes.release()
+
+    def wait(self, version: int, timeout: float) -> State:
+        """The state once it is newer than `version`, or after `timeout` seconds."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.state.version != version, timeout)
+        return self.state
+
+    def close(self) -> None:
+        """Let go of the equipment and the session; harmless twice."""
+        with self._eyes:
+            for device in self._devices():
+                device.close()
+        self._pool.shutdown()
+        self.session.close()
+
+    @property
+    def measured_live(self) -> Floats:
+        """(3,) where the calibration sees the ball in the live pictures; NaN where it cannot."""
+        calibration = self.state.calibration
+        if calibration is None or len(self.state.seen) < 2:
+            return np.full(3, np.nan)
+        return np.asarray(calibration.measure(self._observations("live", self.state.looks)).xyz[0], dtype=np.float64)
+
+    # inside
+
+    def _devices(self) -> Iterator[FrameSource | Robot | Trigger]:
+        yield from self.equipment.cameras
+        yield self.equipment.robot
+        if self.equipment.trigger is not None:
+            yield self.equipment.trigger
+
+    def _target(self) -> Target:
+        if self.state.target is None:
+            raise UsageError("there is no target now.", fix="start the session, or retry after trouble")
+        return self.state.target
+
+    @contextmanager
+    def _working(self, phase: str, message: str) -> Iterator[None]:
+        before = self.state
+        self._show(phase=phase, message=message)
+        try:
+            yield
+        except ImplicamError as error:
+            if isinstance(error, UsageError):  # nothing happened: what was shown is shown again
+                self._show(phase=before.phase, message=before.message)
+                raise
+            self._trouble(error)
+
+    def _trouble(self, error: ImplicamError) -> None:
+        self.session.log("trouble", what=error.what, why=error.why, fix=error.fix)
+        self._show(phase="trouble", message=str(error), problem=error, auto=False)
+
+    def _show(self, **changes: Any) -> None:
+        with self._changed:
+            self.state = replace(self.state, **changes, version=self.state.version + 1)
+            self._changed.notify_all()
+
+    def _fit(self) -> None:
+        data = self.session.data
+        if data is not None and len(data) == 0:
+            data = None
+        if data is not None and self.equipment.radius is not None:
+            data = self._centred(data)
+        self.loop.reset(data)
+        self._show(
+            data=data, calibration=self.loop.calibration, prospect=self.loop.prospect,
+            history=tuple(self.loop.history), stop=self.loop.stop,
+        )  # fmt: skip
+
+    def _centred(self, data: Dataset) -> Dataset:
+        """The pixels of the ball's middle, for those of its outline; by the last calibration, where there is one."""
+        assert self.equipment.radius is not None
+        last = self.loop.calibration
+        return centred(data, self.equipment.radius, last if isinstance(last, ForwardGPCalibration) else None)[0]
+
+    def _aim(self, before: str = "") -> None:
+        """Name the next target; where there is none left, say so."""
+        try:
+            here = self.equipment.robot.position()
+        except HardwareError:
+            here = None
+        try:
+            (target,) = self.loop.ask(here=here)
+        except UsageError as error:
+            self._show(phase="aim", target=None, message=f"{before}{error.what}", looks=())
+            return
+        if len(target.uv) == 0:
+            target = replace(target, uv=np.full((len(self.equipment.cameras), 2), np.nan))
+        moves = self.equipment.robot.moves
+        words = f"{before}point {self.loop.points + 1}: " + (
+            "let the robot go there" if moves else "put the ball there, and type where it is"
+        )
+        self._show(phase="aim", target=replace(target, name=self.session.next_name()), message=words, problem=None)
+
+    def _shown(self, where: Floats) -> None:
+        with self._eyes:
+            frames = self._frames(self.equipment.trigger)
+        looks = _believed(self._looks(frames), where, self.loop.calibration)
+        count = sum(len(look.found) > 0 for look in looks)
+        words = f"found in {count} of {len(looks)} cameras"
+        if not count:
+            words = "the ball was not found in any camera: redo, or skip this target"
+        self._show(phase="shown", looks=looks, position=where, message=words)
+
+    def _frames(self, trigger: Trigger | None) -> list[Frame]:
+        """A new picture of each camera, all of one instant as far as the cameras are triggered."""
+        timeout = self.equipment.timeout
+        waiting = [self._pool.submit(source.frame, timeout) for source in self.equipment.cameras]
+        if trigger is not None:
+            time.sleep(ARMED)
+            trigger.fire()
+        return [one.result() for one in waiting]
+
+    def _looks(self, frames: Sequence[Frame]) -> tuple[Look, ...]:
+        expected = self.state.target.uv if self.state.target is not None else np.full((len(frames), 2), np.nan)
+        names = [source.name for source in self.equipment.cameras]
+        found = list(self._pool.map(self._detected, names, frames))
+        return tuple(Look(n, f, d, e) for n, f, d, e in zip(names, frames, found, expected, strict=True))
+
+    def _detected(self, camera: str, frame: Frame) -> Detected:
+        why = blank(frame.picture)
+        if why:
+            return Detected(reason=f"the picture is {why}")
+        return self.equipment.detector.detect(frame.picture, View(camera, "live"))
+
+    def _point(self, state: State) -> Dataset:
+        """What is shown, as a known point."""
+        assert state.target is not None
+        name = state.target.name
+        observations = self._observations(name, state.looks)
+        sd = np.array([self.equipment.robot.sd], dtype=np.float64)
+        known = KnownPositions(np.array([name]), state.position[None], sd)
+        return Dataset(self.session.name, self.session.length_unit, observations, known)
+
+    def _observations(self, name: str, looks: Sequence[Look]) -> Observations:
+        uv, sd = np.full((1, len(looks), 2), np.nan), np.full((1, len(looks), 2), np.nan)
+        for c, look in enumerate(looks):
+            if len(look.found):
+                uv[0, c], sd[0, c] = look.found.uv[0], look.found.sd[0]
+        cameras: Sequence[Camera] = self.session.cameras
+        return Observations(np.array([name]), tuple(cameras), uv, sd)
+
+
+def _believed(looks: tuple[Look, ...], where: Floats, calibration: Calibration | None) -> tuple[Look, ...]:
+    """The looks without detections far from where a ball at `where` (3,) must be: another thing, then.
+
+    Of several things that might be the ball, the nearest to that place counts.
+    """
+    if not isinstance(calibration, ForwardGPCalibration):
+        return looks
+    xyz = where[None]
+    uv = calibration.predict(xyz)[0]
+    sd = np.full(len(uv), np.nan)
+    for part in calibration.map.sensitivities(xyz):
+        variance = np.einsum("nij,nij->ni", part.half, part.half)[0] + part.rest[0] + part.noise[0]
+        sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))
+    believed = []
+    for look, there, spread in zip(looks, uv, sd, strict=True):
+        far = max(AT_LEAST, FAR * spread) if np.isfinite(spread) else np.inf
+        near = _nearest(look.found, there)
+        if near is None or np.linalg.norm(near.uv[0] - there) <= far or not np.isfinite(there).all():
+            believed.append(replace(look, found=look.found if near is None else near))
+            continue
+        away = float(np.linalg.norm(near.uv[0] - there))
+        reason = f"what was found is {away:.0f} px from where the ball must be: left out"
+        believed.append(replace(look, found=Detected(reason=reason)))
+    return tuple(believed)
+
+
+def _nearest(found: Detected, there: Floats) -> Detected | None:
+    """Of what may be the ball, the nearest to a pixel; None where nothing was found."""
+    options = [one for one in (found, *found.others) if len(one)]
+    if not options or not np.isfinite(there).all():
+        return found if len(found) else None
+    return min(options, key=lambda one: float(np.linalg.norm(one.uv[0] - there)))
+
+
+def _notes(state: State) -> Mapping[str, Any]:
+    target = state.target
+    return {
+        "target": [] if target is None else target.xyz.tolist(),
+        "reasons": {look.camera: look.found.reason for look in state.looks if look.found.reason},
+    }
+
+
+def _judged(calibration: Calibration) -> Any:
+    from implicam.evaluate import cross_validate
+
+    return cross_validate(calibration.refit, calibration.data, min(10, len(calibration.data)))

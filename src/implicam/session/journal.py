@@ -1,0 +1,325 @@
+"""A guided session on disk: a dataset folder, and session.db, which is the truth.
+
+An accepted point is in the database when `accept` returns, and the dataset's files follow. The order makes a kill
+harmless at any moment:
+  1. The new points.csv and observations.csv are written beside the old ones, so that a full disk shows before 2.
+  2. The shot's name is committed as `begun`, then its pictures are written (only where there are pictures).
+  3. The point is committed. From here on it is accepted.
+  4. The files are renamed into place.
+The next opening finishes what was left: pictures of a shot that is no point move to undone/, the dataset's files are
+written again where they do not say what the database says.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from implicam.dataset import Camera, Dataset, Floats, Observations, join
+from implicam.dataset.folder import description_text
+from implicam.errors import DatasetError, ImplicamError, UsageError
+from implicam.images import Grey
+from implicam.session import folder as files
+from implicam.session.database import (
+    DATABASE,
+    Database,
+    damaged,
+    insert_shot,
+    json_text,
+    now,
+    read_accepted,
+    read_cameras,
+)
+
+__all__ = ["Event", "Session", "Skipped"]
+
+
+@dataclass(frozen=True, eq=False)
+class Skipped:
+    """A target that was not measured: where it was to be, (3,) in the world frame, and why not."""
+
+    xyz: Floats
+    reason: str
+    time: datetime
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened, with whatever was said about it."""
+
+    what: str
+    more: Mapping[str, Any]
+    time: datetime
+
+
+class Session:
+    """The points of a session, open for adding; several threads may use it. Made by `create` and `open`."""
+
+    def __init__(self, folder: Path, database: Database) -> None:
+        self._lock = threading.RLock()
+        self._database = database
+        self.folder = folder
+        with self._trusting():
+            ((self.name, self.length_unit),) = database.rows("SELECT name, length_unit FROM session")
+            self.cameras = read_cameras(database)
+            self._empty = _without_points(self.name, self.length_unit, self.cameras)
+            self._data = read_accepted(database, self._empty)
+            self._settings = {key: json.loads(text) for key, text in database.rows("SELECT key, value FROM settings")}
+
+    @classmethod
+    def create(
+        cls, folder: Path, *, name: str, length_unit: str, cameras: Sequence[Camera], settings: Mapping[str, Any]
+    ) -> Session:
+        """Begin a session in a new or empty folder; UsageError where something else is in it."""
+        folder = Path(folder).absolute()
+        description_text(_without_points(name, length_unit, cameras))  # refuses what a dataset cannot hold
+        for camera in cameras:
+            files.check_file_name(camera.name, "camera")
+        values = {key: json_text(value, f"the setting {key!r}") for key, value in settings.items()}
+        files.make_folder(folder)
+        database = Database.create(folder / DATABASE)
+        database.made(name, length_unit, cameras, values)
+        files.flush_folder(folder.parent)
+        return cls._ready(folder, database)
+
+    @classmethod
+    def open(cls, folder: Path) -> Session:
+        """Continue a session with exactly the points that were accepted.
+
+        UsageError where it is open elsewhere; DatasetError where there is none, or where its database is damaged,
+        another program's, or a newer version's; ImplicamError where the folder cannot be written.
+        """
+        folder = Path(folder).absolute()
+        return cls._ready(folder, Database.open(folder / DATABASE))
+
+    @classmethod
+    def _ready(cls, folder: Path, database: Database) -> Session:
+        try:
+            session = cls(folder, database)
+            session._heal()
+        except BaseException:
+            database.close()
+            raise
+        return session
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others open the session; nothing is left to be written."""
+        with self._lock:
+            self._database.close()
+
+    @property
+    def data(self) -> Dataset | None:
+        """All accepted points in order, as `read_dataset(folder)` gives them; None where there is none."""
+        with self._lock:
+            return self._data
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """A copy of the settings as they are stored: tuples are lists, NumPy's numbers plain ones."""
+        with self._lock:
+            return dict(self._settings)
+
+    def accept(self, point: Dataset, *, pictures: Mapping[str, Grey] = {}, notes: Mapping[str, Any] = {}) -> None:
+        """Add one shot, on disk when this returns; where it raises, nothing was added.
+
+        point: the known positions and the views of all cameras, one point of a ball or several of a board, of one
+        shot whose name is new. Its numbers are kept bit by bit, its columns too; its dataset name is not.
+        pictures: grey (height, width) from 0 to 1, by camera; written as 16 bits where 8 would lose something.
+        DatasetError, ImageError or UsageError for what does not fit the session; ImplicamError for a full disk.
+        """
+        with self._lock:
+            shot = self._checked(point)
+            name = str(shot.shots[0])
+            files.check_pictures(pictures, self.cameras)
+            noted = json_text(dict(notes), "a note")
+            data = join(self._data, shot) if self._data else shot
+            try:
+                with self._adding(data):
+                    if pictures:
+                        self._begin(name)
+                        files.write_pictures(self.folder, name, pictures)
+                    with self._database.transaction():
+                        insert_shot(self._database, shot, noted)
+                    self._data = data
+            except BaseException:
+                with suppress(ImplicamError):  # the next opening does it
+                    self._set_aside()
+                raise
+
+    def undo(self) -> str | None:
+        """Take the last accepted shot back: its name, None where there is none. It stays in the database as undone."""
+        with self._lock:
+            if self._data is None:
+                return None
+            last = str(self._data.shots[-1])
+            with self._database.transaction():
+                self._database.run("UPDATE shots SET state = 'undone', time = ? WHERE name = ?", now(), last)
+            self._data = read_accepted(self._database, self._empty)
+            self._afterwards(self._rewrite)
+            self._afterwards(self._set_aside)
+            return last
+
+    def skip(self, xyz: ArrayLike, reason: str) -> None:
+        """Keep that a target at xyz (3,) was not measured, and why."""
+        target = np.asarray(xyz, dtype=np.float64)
+        if target.shape != (3,) or not np.isfinite(target).all():
+            raise UsageError(f"a skipped target {str(target)[:80]} is no position.", fix="give x, y and z, finite")
+        with self._lock, self._database.transaction():
+            sql = "INSERT INTO skipped (x, y, z, reason, time) VALUES (?, ?, ?, ?, ?)"
+            self._database.run(sql, *target.tolist(), reason, now())
+
+    def log(self, what: str, /, **more: Any) -> None:
+        """Keep an event with its time."""
+        text = json_text(more, f"the event {what!r}")
+        with self._lock, self._database.transaction():
+            self._database.run("INSERT INTO events (time, what, more) VALUES (?, ?, ?)", now(), what, text)
+
+    def set(self, key: str, value: Any) -> None:
+        """Change a setting, on disk when this returns."""
+        text = json_text(value, f"the setting {key!r}")
+        with self._lock:
+            with self._database.transaction():
+                self._database.run("INSERT OR REPLACE INTO settings VALUES (?, ?, ?)", key, text, now())
+            self._settings[key] = json.loads(text)
+
+    @property
+    def skipped(self) -> list[Skipped]:
+        """The targets that were not measured, in order."""
+        with self._lock:
+            rows = self._database.rows("SELECT x, y, z, reason, time FROM skipped ORDER BY number")
+        with self._trusting():
+            return [Skipped(np.array(xyz, dtype=float), why, datetime.fromisoformat(time)) for *xyz, why, time in rows]
+
+    @property
+    def events(self) -> list[Event]:
+        """What happened, in order."""
+        with self._lock:
+            rows = self._database.rows("SELECT what, more, time FROM events ORDER BY number")
+        with self._trusting():
+            return [Event(what, json.loads(more), datetime.fromisoformat(time)) for what, more, time in rows]
+
+    def next_name(self) -> str:
+        """p001, p002, ...: one more than the highest number that was ever given, to an undone point too."""
+        with self._lock:
+            rows = self._database.rows("SELECT name FROM shots WHERE state != 'begun' UNION SELECT point FROM points")
+        numbers = [int(name[1:]) for (name,) in rows if re.fullmatch("p[0-9]{1,18}", name)]
+        return f"p{max(numbers, default=0) + 1:03d}"
+
+    def _checked(self, point: Dataset) -> Dataset:
+        """The shot as the session keeps it; DatasetError where it does not fit."""
+        names = sorted(set(point.shots.tolist()))
+        if len(names) != 1:
+            raise DatasetError(f"{len(names)} shots at once: {', '.join(names[:5])}.", fix="accept one after the other")
+        files.check_file_name(names[0], "shot")
+        if self._begun():  # of an `accept` that failed, and could not clean up either
+            self._set_aside()
+        states = self._database.rows("SELECT state FROM shots WHERE name = ?", names[0])
+        if states:
+            raise DatasetError(
+                f"the shot {names[0]!r} is there already ({states[0][0]}).", fix=f"name it {self.next_name()!r}"
+            )
+        if point.length_unit != self.length_unit:
+            raise DatasetError(
+                f"the shot {names[0]!r} is in {point.length_unit!r}, the session in {self.length_unit!r}.",
+                fix=f"give positions and their standard uncertainties in {self.length_unit!r}",
+            )
+        _check_cameras(point.cameras, self.cameras)
+        seen = point.observations.with_cameras(self._empty.observations.camera_names)
+        if not seen.seen.any():
+            raise DatasetError(
+                f"the shot {names[0]!r} was seen by no camera.", fix="take it again, or skip the target and say why"
+            )
+        observations = Observations(seen.points, self.cameras, seen.uv, seen.sd, seen.extra)
+        return Dataset(self.name, self.length_unit, observations, point.positions)
+
+    @contextmanager
+    def _trusting(self) -> Iterator[None]:
+        """Values that cannot be read are a damaged database."""
+        try:
+            yield
+        except (DatasetError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            raise damaged(self.folder / DATABASE, str(error)) from error
+
+    def _begin(self, shot: str) -> None:
+        """Commit that files of this name are about to appear, so that a kill leaves none that nobody knows."""
+        with self._database.transaction():
+            self._database.run("INSERT INTO shots (name, state, time) VALUES (?, 'begun', ?)", shot, now())
+
+    @contextmanager
+    def _adding(self, data: Dataset) -> Iterator[None]:
+        """Write the tables of one point more, let the caller commit, and rename them into place."""
+        with ExitStack() as beside:
+            files.write_beside(beside, self.folder, files.stale_tables(self.folder, data, self._empty))
+            yield
+            self._afterwards(beside.close)
+
+    def _afterwards(self, step: Callable[[], None]) -> None:
+        """What follows a commit. The point is safe, so a failure is an event, and the next opening tries again."""
+        try:
+            step()
+        except (ImplicamError, OSError) as error:
+            with suppress(ImplicamError):
+                self.log("files", problem=str(error))
+
+    def _rewrite(self) -> None:
+        files.rewrite_tables(self.folder, self._data, self._empty)
+
+    def _set_aside(self) -> None:
+        """Move the pictures of shots that are no points to undone/, and forget the shots that were only begun."""
+        shots = [name for (name,) in self._database.rows("SELECT name FROM shots WHERE state != 'accepted'")]
+        with files.failing_to_write(self.folder):
+            files.set_pictures_aside(self.folder, shots, self.cameras)
+        with self._database.transaction():
+            self._database.run("DELETE FROM shots WHERE state = 'begun'")
+
+    def _begun(self) -> list[str]:
+        return [name for (name,) in self._database.rows("SELECT name FROM shots WHERE state = 'begun'")]
+
+    def _heal(self) -> None:
+        """Finish what a kill has interrupted."""
+        for shot in self._begun():
+            self.log("interrupted", shot=shot)
+        with files.failing_to_write(self.folder):
+            files.remove_partial(self.folder, self.cameras)
+            self._set_aside()
+            files.keep_edited_tables(self.folder, self._data, self._empty)
+            self._rewrite()
+
+
+def _without_points(name: str, length_unit: str, cameras: Sequence[Camera]) -> Dataset:
+    none = np.empty((0, len(cameras), 2))
+    return Dataset(name, length_unit, Observations(np.array([], dtype=np.str_), tuple(cameras), none, none))
+
+
+def _check_cameras(given: Sequence[Camera], ours: Sequence[Camera]) -> None:
+    sizes = {camera.name: (camera.width, camera.height) for camera in given}
+    if set(sizes) != {camera.name for camera in ours}:
+        raise DatasetError(
+            f"the point has the cameras {', '.join(sizes)}.",
+            why="a session keeps the cameras that it began with",
+            fix=f"give the views of {', '.join(camera.name for camera in ours)}, NaN where one saw nothing",
+        )
+    for camera in ours:
+        sides = zip(sizes[camera.name], (camera.width, camera.height), strict=True)
+        if any(None not in side and side[0] != side[1] for side in sides):
+            raise DatasetError(
+                f"camera {camera.name!r} now has images of {sizes[camera.name][0]} x {sizes[camera.name][1]} pixels.",
+                why=f"the session began with {camera.width} x {camera.height}",
+                fix="set the camera as it was, or begin a new session",
+            )

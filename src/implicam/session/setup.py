@@ -1,0 +1,249 @@
+"""From words to a guided session: which cameras, robot and rules; kept in the session, so that it can be continued."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition, workspace_from
+from implicam.active.acquisition import DEFAULT
+from implicam.calibrators import DEFAULT_METHOD, METHODS, named
+from implicam.dataset import Camera, Floats
+from implicam.dataset.model import METRES
+from implicam.detect import Ball
+from implicam.errors import UsageError, did_you_mean
+from implicam.hardware import FrameSource, Robot, camera_from, robot_from, simulated_rig, trigger_from
+from implicam.session.guide import Equipment, Guide
+from implicam.session.journal import Session
+from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
+
+SIMULATED, PERSON = "simulated", "person"
+SIMULATED_SPEED = 0.4
+"""m/s of the simulated robot: fast enough not to wait for, slow enough to see it move."""
+
+CANNOT = "mlp"
+"""The method that cannot say where to measure next."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Plain values; lengths in the dataset's unit but where it says so.
+
+    cameras: (name, spec) of real cameras, none for the simulated `rig` (with `rig_cameras` of it, built with `seed`).
+    robot: "" for what goes with the cameras, else a spec of `robot_from`. radius: of the ball, to correct its outline.
+    workspace: words as `workspace_from` takes them, "" for what the robot can reach. below: stop when the 95 %
+    uncertainty is below it everywhere; within: or when it is so many times what pixel noise alone leaves; budget: or
+    after so many points. reach: as in `Loop`. speed: m/s.
+    sd: standard uncertainty of the robot's positions, or of what a person types, None for the robot's own.
+    """
+
+    rig: str = "bar6"
+    rig_cameras: str | None = None
+    cameras: tuple[tuple[str, str], ...] = ()
+    robot: str = ""
+    trigger: str | None = None
+    unit: str = "mm"
+    radius: float | None = None
+    bright: bool = False
+    workspace: str = ""
+    method: str = DEFAULT_METHOD
+    acquisition: str = DEFAULT
+    below: float | None = None
+    within: float = 1.2
+    budget: int = 60
+    reach: float | None = None
+    speed: float | None = None
+    sd: float | None = None
+    dry_run: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cameras", tuple((str(name), str(spec)) for name, spec in self.cameras))
+        if self.unit not in METRES:
+            raise UsageError(
+                f"there is no length unit {self.unit!r}{did_you_mean(self.unit, METRES)}.",
+                fix=f"use {', '.join(METRES)}",
+            )
+        if self.method.partition(":")[0] == CANNOT:
+            raise UsageError(
+                f"{CANNOT} cannot say where to measure next.",
+                fix=f"use one of {', '.join(name for name in METHODS if name != CANNOT)}",
+            )
+        acquisition(self.acquisition)
+        _ = self.rule
+        if self.reach is not None and not self.reach > 0:
+            raise UsageError(f"a reach of {self.reach:g} is no length.", fix="give one greater than zero")
+
+    @classmethod
+    def from_settings(cls, settings: Mapping[str, Any]) -> Setup:
+        """The inverse of `as_settings`; what this version does not know is left out."""
+        known = {field.name for field in fields(cls)}
+        return cls(**{key: value for key, value in settings.items() if key in known})
+
+    def as_settings(self) -> dict[str, Any]:
+        """As plain values, for the session's own table."""
+        return asdict(self)
+
+    @property
+    def simulated(self) -> bool:
+        """Whether there is no hardware."""
+        return not self.cameras
+
+    @property
+    def rule(self) -> Rule:
+        """When to stop."""
+        rule = Within(self.within) | Budget(self.budget)
+        return rule if self.below is None else Below(self.below) | rule
+
+    def built(self) -> Rig:
+        """The simulated rig."""
+        if self.unit not in ("mm", "m"):
+            raise UsageError("a simulated rig has mm or m.", fix="--unit mm")
+        return build_rig(self.rig, seed=self.seed, unit=self.unit, cameras=self.rig_cameras)  # type: ignore[arg-type]
+
+
+def open_guide(folder: Path, setup: Setup | None, *, auto: bool = False, say: Callable[[str], None] = print) -> Guide:
+    """The guide of a new session, or of the one in the folder: with its own setup where `setup` is None.
+
+    Opens no camera and no robot yet but to learn the size of the pictures. UsageError where the folder is in use, or
+    holds something else.
+    """
+    if (folder / "session.db").exists():
+        session = Session.open(folder)
+        try:
+            return _guide(session, _continued(session, setup), auto, say)
+        except BaseException:
+            session.close()
+            raise
+    setup = setup or Setup()
+    eyes, robot, room = _hardware(setup, say)
+    session = Session.create(
+        folder,
+        name=folder.absolute().name,
+        length_unit=setup.unit,
+        cameras=_sized(setup, eyes),
+        settings=setup.as_settings(),
+    )
+    return _made(session, setup, (eyes, robot, room), auto)
+
+
+def _continued(session: Session, setup: Setup | None) -> Setup:
+    """What the session was begun with; another setup replaces it where the rig and the unit stay."""
+    before = Setup.from_settings(session.settings)
+    if setup is None or setup == before:
+        return before
+    same = ("rig", "rig_cameras", "unit", "seed") if before.simulated else ("unit",)
+    for key in same:
+        if getattr(setup, key) != getattr(before, key):
+            raise UsageError(
+                f"the session in {session.folder} was begun with {key} {getattr(before, key)}.",
+                fix="leave the option out, or begin another session in another folder",
+            )
+    if setup.simulated != before.simulated:
+        raise UsageError(f"the session in {session.folder} has other cameras.", fix="begin another in another folder")
+    for key, value in setup.as_settings().items():
+        session.set(key, value)
+    return setup
+
+
+def _guide(session: Session, setup: Setup, auto: bool, say: Callable[[str], None]) -> Guide:
+    return _made(session, setup, _hardware(setup, say), auto)
+
+
+Hardware = tuple[list[FrameSource], Robot, Workspace]
+
+
+def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Guide:
+    eyes, robot, room = hardware
+    trigger = None if setup.trigger is None else trigger_from(setup.trigger)
+    radius = setup.radius
+    if radius is None and setup.simulated:
+        radius = BALL_RADIUS_MM * setup.built().units_per_mm
+    equipment = Equipment(eyes, robot, Ball(bright=setup.bright), trigger, radius)
+    loop = Loop(
+        named(setup.method),
+        room,
+        acquisition(setup.acquisition),
+        setup.rule,
+        reach=np.inf if setup.reach is None else setup.reach,
+        seed=setup.seed,
+    )
+    return Guide(session, equipment, loop, auto=auto)
+
+
+def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
+    if setup.simulated:
+        return _simulated(setup)
+    eyes = [camera_from(name, spec, triggered=setup.trigger is not None) for name, spec in setup.cameras]
+    robot = _robot(setup, say)
+    if setup.workspace:
+        return eyes, robot, workspace_from(setup.workspace, None)
+    robot.open()
+    places = robot.reachable()
+    if places is None:
+        raise UsageError(
+            "there is no workspace.",
+            why="where the target can be put is not known",
+            fix="give it in the dataset's unit: --workspace=x0:x1,y0:y1,z0:z1, or a CSV file of places",
+        )
+    return eyes, robot, Workspace.only(places)
+
+
+def _simulated(setup: Setup) -> Hardware:
+    rig = setup.built()
+    if setup.robot not in ("", SIMULATED):
+        raise UsageError(
+            f"the robot {setup.robot!r} does not move in front of simulated cameras.",
+            fix="give cameras (--camera NAME=WHAT), or leave --robot out",
+        )
+    speed = (setup.speed or SIMULATED_SPEED) / METRES[setup.unit]
+    eyes, robot = simulated_rig(rig, seed=setup.seed, sd=setup.sd or 0.0, speed=speed)
+    room = workspace_from(setup.workspace, None) if setup.workspace else Workspace.of_box(rig.volume)
+    return list(eyes), robot, room
+
+
+def _robot(setup: Setup, say: Callable[[str], None]) -> Robot:
+    kind = setup.robot or PERSON
+    options: dict[str, Any] = {}
+    if kind.startswith("ur:"):
+        options = {
+            "box": _corners(setup),
+            "unit": setup.unit,
+            "dry_run": setup.dry_run,
+            "say": say,
+            **({} if setup.speed is None else {"speed": setup.speed}),
+            **({} if setup.sd is None else {"sd": (setup.sd,) * 3}),
+        }
+    robot = robot_from(kind, ask=lambda _: None, **options)
+    if kind == PERSON and setup.sd is not None:
+        robot.sd = (setup.sd,) * 3  # type: ignore[misc]
+    return robot
+
+
+def _corners(setup: Setup) -> tuple[Floats, Floats] | None:
+    """The box that a robot may move in: that around the workspace."""
+    if not setup.workspace:
+        return None
+    vertices = workspace_from(setup.workspace, None).vertices
+    return vertices.min(axis=0), vertices.max(axis=0)
+
+
+def _sized(setup: Setup, eyes: list[FrameSource]) -> list[Camera]:
+    """The cameras with the size of their pictures: one of each is taken."""
+    if setup.simulated:
+        return [Camera(camera.name, camera.width, camera.height) for camera in setup.built().cameras]
+    cameras = []
+    for source in eyes:
+        source.open()
+        height, width = source.frame(timeout=10.0).picture.shape
+        cameras.append(Camera(source.name, width, height))
+    return cameras
+
+
+def changed(setup: Setup, **given: Any) -> Setup:
+    """The setup with what was given on the command line: everything that is not None."""
+    return replace(setup, **{key: value for key, value in given.items() if value is not None})

@@ -1,0 +1,840 @@
+"""Drivers: one contract over every camera and every robot, then what is special to each.
+
+There is no camera and no robot here. Real are: OpenCV on a film file and on an HTTP stream; folders; sockets; both
+libraries of ur-rtde, which talk to tests/rtde_stand_in.py as to a robot. Stand-ins: the Harvester object of harvesters
+(no software GenTL producer is on the package index), and V4L2, of which only the error is tested.
+"""
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from implicam import hardware
+from implicam.detect import Ball, View
+from implicam.errors import HardwareError, ImplicamError, UsageError
+from implicam.hardware import (
+    CsvPlayer,
+    FolderCamera,
+    GenICamCamera,
+    NetworkTrigger,
+    OpenCVCamera,
+    Person,
+    SimulatedRobot,
+    TriggerSimulator,
+    URRobot,
+    camera_from,
+    robot_from,
+    simulated_rig,
+    trigger_from,
+)
+from implicam.hardware.genicam import to_grey
+from implicam.images import write_picture
+from implicam.simulate import build_rig
+
+BOX = ((0.0, 0.0, 0.0), (600.0, 600.0, 600.0))
+SHAPE = (48, 64)
+
+
+def picture(number: int) -> np.ndarray:
+    """Grey (48, 64): its mean tells the number, up to 25."""
+    return np.full(SHAPE, 10 * (number % 25) + 5, np.uint8)
+
+
+def number_in(frame: hardware.Frame) -> int:
+    return round((float(frame.picture.mean()) * 255 - 5) / 10)
+
+
+@pytest.fixture(autouse=True)
+def nothing_left() -> Iterator[None]:
+    """Threads that a driver started have ended after the test."""
+    before = set(threading.enumerate())
+    yield
+    end = time.monotonic() + 5
+    while (left := set(threading.enumerate()) - before) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert not left
+
+
+# ---- cameras -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Bench:
+    """A camera; how to unplug it and to plug it in again; whether it is live."""
+
+    camera: hardware.FrameSource
+    unplug: Callable[[], None]
+    plug: Callable[[], None]
+    live: bool = True
+
+
+class Stream:
+    """An MJPEG camera on HTTP: 40 pictures a second, each with its number in it."""
+
+    def __init__(self) -> None:
+        self.sent, self.on = 0, True
+        stream = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                if not stream.on:
+                    self.send_error(503)
+                    return
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=b")
+                self.end_headers()
+                try:
+                    while stream.on:
+                        stream.sent += 1
+                        jpeg = cv2.imencode(".jpg", picture(stream.sent))[1].tobytes()
+                        head = f"--b\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                        self.wfile.write(head.encode() + jpeg + b"\r\n")
+                        time.sleep(0.025)
+                except OSError:
+                    return
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.server.daemon_threads = False
+        self.address = f"http://127.0.0.1:{self.server.server_port}/video.mjpg"
+        self.thread = threading.Thread(target=self.server.serve_forever, args=(0.02,))
+        self.thread.start()
+
+    def end(self) -> None:
+        self.on = False
+        self.server.shutdown()
+        self.server.server_close()
+        self.thread.join()
+
+
+def film_bench(tmp_path: Path) -> Iterator[Bench]:
+    path = write_film(tmp_path / "film.avi", 6)
+    away = path.with_suffix(".away")
+    yield Bench(OpenCVCamera("cam1", path), lambda: path.rename(away), lambda: away.rename(path), live=False)
+
+
+def write_film(path: Path, pictures: int) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20.0, SHAPE[::-1])
+    assert writer.isOpened()
+    for number in range(1, pictures + 1):
+        writer.write(cv2.cvtColor(picture(number), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+def stream_bench(tmp_path: Path) -> Iterator[Bench]:
+    stream = Stream()
+    camera = OpenCVCamera("cam1", stream.address)
+
+    def switch(on: bool) -> None:
+        stream.on = on
+
+    yield Bench(camera, lambda: switch(False), lambda: switch(True))
+    camera.close()
+    stream.end()
+
+
+def folder_bench(tmp_path: Path) -> Iterator[Bench]:
+    folder, ending = tmp_path / "shots", threading.Event()
+    folder.mkdir()
+    writes = threading.Event()
+    writes.set()
+
+    def fill() -> None:
+        number = 0
+        while not ending.wait(0.03):
+            if writes.is_set():
+                number += 1
+                write_picture(folder / f"shot{number}.png", picture(number))
+
+    thread = threading.Thread(target=fill)
+    thread.start()
+    yield Bench(FolderCamera("cam1", folder), writes.clear, writes.set)
+    ending.set()
+    thread.join()
+
+
+class StandInHarvester:
+    """Has the methods of harvesters 1.4's Harvester, and of its acquirer and buffers, that the driver calls."""
+
+    on, open_buffers, number = True, 0, 0
+
+    def add_file(self, path: str) -> None:
+        self.file = path
+
+    def update(self) -> None:
+        self.device_info_list = [SimpleNamespace(serial_number="S1")] if StandInHarvester.on else []
+
+    def create(self, which: dict[str, str]) -> "StandInHarvester":
+        assert which == {"serial_number": "S1"}
+        return self
+
+    def start(self) -> None:
+        self.waiting = 2  # old pictures in the buffers
+
+    def stop(self) -> None: ...
+
+    def destroy(self) -> None: ...
+
+    def reset(self) -> None: ...
+
+    def try_fetch(self, timeout: float) -> SimpleNamespace | None:
+        if not StandInHarvester.on:
+            raise OSError("the device is gone")
+        if timeout == 0.0 and self.waiting == 0:
+            return None
+        self.waiting = max(0, self.waiting - 1)
+        StandInHarvester.number += 1
+        StandInHarvester.open_buffers += 1
+        data = picture(StandInHarvester.number).ravel()
+        image = SimpleNamespace(data=data, width=SHAPE[1], height=SHAPE[0], data_format="Mono8")
+
+        def queue() -> None:
+            StandInHarvester.open_buffers -= 1
+
+        return SimpleNamespace(payload=SimpleNamespace(components=[image]), queue=queue)
+
+
+@pytest.fixture
+def harvesters(monkeypatch: pytest.MonkeyPatch) -> type[StandInHarvester]:
+    core = ModuleType("harvesters.core")
+    core.Harvester = StandInHarvester  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "harvesters.core", core)
+    StandInHarvester.on, StandInHarvester.open_buffers, StandInHarvester.number = True, 0, 0
+    return StandInHarvester
+
+
+def genicam_bench(tmp_path: Path) -> Iterator[Bench]:
+    producer = tmp_path / "maker.cti"
+    producer.write_bytes(b"\x7fELF")
+
+    def switch(on: bool) -> None:
+        StandInHarvester.on = on
+
+    yield Bench(GenICamCamera("cam1", "S1", producer), lambda: switch(False), lambda: switch(True))
+    assert StandInHarvester.open_buffers == 0
+
+
+RIG = build_rig("stereo", seed=1)
+ONE = build_rig("stereo", seed=1, cameras="cam1")
+
+
+def simulated_robot(*, sd: float = 0.0, speed: float = 1e5) -> SimulatedRobot:
+    return SimulatedRobot(np.zeros(3), sd=sd, speed=speed, rng=np.random.default_rng(7))
+
+
+def simulated_bench(tmp_path: Path) -> Iterator[Bench]:
+    (camera,), _ = simulated_rig(ONE, seed=2)
+    yield Bench(camera, lambda: camera.fail_for(1), lambda: camera.fail_for(0))
+
+
+BENCHES = [film_bench, stream_bench, folder_bench, genicam_bench, simulated_bench]
+
+
+@pytest.fixture(params=BENCHES, ids=lambda bench: bench.__name__)
+def bench(request: pytest.FixtureRequest, tmp_path: Path, harvesters: object) -> Iterator[Bench]:
+    source = request.param(tmp_path)
+    made = next(source)
+    yield made
+    made.camera.close()
+    assert next(source, None) is None
+
+
+def says_all(error: ImplicamError) -> None:
+    assert error.what
+    assert error.why
+    assert error.fix
+
+
+def test_a_camera_gives_newer_pictures_each_time(bench: Bench) -> None:
+    camera = bench.camera
+    assert camera.name == "cam1"
+    camera.open()
+    camera.open()
+    called, frames = time.time(), [camera.frame() for _ in range(3)]
+    for frame in frames:
+        assert frame.picture.dtype == np.float32
+        assert frame.picture.ndim == 2
+        assert 0 <= frame.picture.min() <= frame.picture.max() <= 1
+        assert called - 0.05 <= frame.taken <= time.time() + 0.05
+    assert [frame.number for frame in frames] == sorted({frame.number for frame in frames})
+    assert not any(np.array_equal(a.picture, b.picture) for a, b in pairwise(frames))
+    camera.close()
+    camera.close()
+    assert camera.frame().number > frames[-1].number  # frame opens by itself
+
+
+def test_a_camera_that_is_unplugged_says_so_and_comes_back(bench: Bench) -> None:
+    bench.camera.frame()
+    if not bench.live:
+        bench.camera.close()  # a film that is open needs no name
+    bench.unplug()
+    with pytest.raises(HardwareError) as caught:
+        [bench.camera.frame(timeout=0.3) for _ in range(50)]  # what was on its way may still arrive
+    says_all(caught.value)
+    assert "cam1" in str(caught.value)
+    bench.plug()
+    assert bench.camera.frame().picture.size > 0
+
+
+def test_a_film_gives_every_picture_in_order_and_ends(tmp_path: Path) -> None:
+    camera = OpenCVCamera("cam1", write_film(tmp_path / "film.avi", 5))
+    assert [number_in(camera.frame()) for _ in range(5)] == [1, 2, 3, 4, 5]
+    for _ in range(2):
+        with pytest.raises(HardwareError, match="is over"):
+            camera.frame()
+    camera.close()
+    assert number_in(camera.frame()) == 1
+    camera.close()
+
+
+def test_a_stream_never_gives_a_picture_of_before_the_call() -> None:
+    stream = Stream()
+    camera = OpenCVCamera("cam1", stream.address)
+    try:
+        for pause in (0.0, 0.3, 0.1):
+            camera.frame()
+            time.sleep(pause)  # 0.3 s is 12 pictures that a driver without a thread would find in its buffer
+            sent = stream.sent
+            ahead = (number_in(camera.frame()) - sent) % 25
+            assert 1 <= ahead < 12
+    finally:
+        camera.close()
+        stream.end()
+
+
+@pytest.mark.parametrize("source", ["/dev/video97", "97", "no-such.avi"])
+def test_what_cannot_be_opened_is_named(source: str) -> None:
+    with pytest.raises(HardwareError, match="cannot be opened") as caught:
+        OpenCVCamera("cam1", source).open()
+    says_all(caught.value)
+
+
+def test_a_film_that_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "text.avi"
+    path.write_text("no film")
+    with pytest.raises(HardwareError, match="cannot be opened"):
+        OpenCVCamera("cam1", path).frame()
+
+
+def test_a_folder_waits_for_the_whole_picture(tmp_path: Path) -> None:
+    write_picture(tmp_path / "old.png", picture(1))
+    whole = cv2.imencode(".png", np.random.default_rng(0).integers(0, 255, SHAPE, np.uint8))[1].tobytes()
+    early = cv2.imencode(".png", picture(2))[1].tobytes()
+    half = tmp_path / "half-written-before-the-call.png"
+    half.write_bytes(early[: len(early) // 2])
+    camera = FolderCamera("cam1", tmp_path)
+
+    def write() -> None:
+        time.sleep(0.1)
+        half.write_bytes(early)  # of before the call: not this one
+        with (tmp_path / "new.png").open("wb") as file:
+            file.write(whole[:500])
+            file.flush()
+            time.sleep(0.2)
+            file.write(whole[500:])
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    frame = camera.frame()
+    thread.join()
+    assert np.array_equal(np.rint(frame.picture * 255), cv2.imdecode(np.frombuffer(whole, np.uint8), 0))
+    with pytest.raises(HardwareError, match="no new picture"):
+        camera.frame(timeout=0.2)
+
+
+def test_a_folder_says_what_stays_cut_off_and_what_is_not_there(tmp_path: Path) -> None:
+    camera = FolderCamera("cam1", tmp_path)
+    timer = threading.Timer(0.1, lambda: (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n"))
+    timer.start()
+    with pytest.raises(HardwareError, match=r"a\.png did not become a whole picture"):
+        camera.frame(timeout=0.4)
+    timer.join()
+    with pytest.raises(HardwareError, match="cannot be watched"):
+        FolderCamera("cam1", tmp_path / "none").open()
+
+
+def test_a_folder_takes_a_picture_that_replaces_another(tmp_path: Path) -> None:
+    write_picture(tmp_path / "latest.png", picture(1))
+    timer = threading.Timer(0.1, lambda: write_picture(tmp_path / "latest.png", picture(2)))
+    timer.start()
+    assert number_in(FolderCamera("cam1", tmp_path, "lat*").frame()) == 2
+    timer.join()
+
+
+def test_genicam_skips_what_waited_in_the_buffers(tmp_path: Path, harvesters: type[StandInHarvester]) -> None:
+    producer = tmp_path / "maker.cti"
+    producer.write_bytes(b"")
+    free = GenICamCamera("cam1", "S1", producer)
+    assert number_in(free.frame()) == 4  # two old ones, and one that may have begun before the call
+    free.close()
+    triggered = GenICamCamera("cam1", "S1", producer, triggered=True)
+    assert number_in(triggered.frame()) == 4 + 3
+    triggered.close()
+    with pytest.raises(HardwareError, match="S1, not S2"):
+        GenICamCamera("cam1", "S2", producer).open()
+    with pytest.raises(HardwareError, match="no GenTL producer"):
+        GenICamCamera("cam1", "S1", tmp_path / "none.cti").open()
+
+
+@pytest.mark.parametrize(("bits", "name"), [(8, "Mono8"), (10, "Mono10"), (12, "Mono12"), (16, "Mono16")])
+def test_grey_formats_keep_every_bit(bits: int, name: str) -> None:
+    values = np.random.default_rng(1).integers(0, 2**bits, SHAPE).astype(np.uint8 if bits == 8 else np.uint16)
+    grey = to_grey(values.ravel(), SHAPE[1], SHAPE[0], name)
+    assert np.array_equal(np.rint(grey.astype(np.float64) * (2**bits - 1)), values)
+
+
+@pytest.mark.parametrize("order", ["RG", "BG", "GR", "GB"])
+def test_a_mosaic_of_one_colour_has_that_colours_grey(order: str) -> None:
+    colour = {"R": 200, "G": 90, "B": 30}
+    second = {"RG": "GB", "BG": "GR", "GR": "BG", "GB": "RG"}[order]
+    tile = np.array([[colour[letter] for letter in row] for row in (order, second)], np.uint8)
+    grey = to_grey(np.tile(tile, (24, 32)).ravel(), 64, 48, f"Bayer{order}8")
+    wanted = (0.299 * 200 + 0.587 * 90 + 0.114 * 30) / 255  # ITU-R BT.601
+    assert np.allclose(grey, wanted, atol=1.5 / 255)
+    rgb = np.broadcast_to(np.array([200, 90, 30], np.uint8), (48, 64, 3))
+    assert np.allclose(to_grey(rgb.ravel(), 64, 48, "RGB8"), wanted, atol=1 / 255)
+    with pytest.raises(HardwareError, match="Mono12p"):
+        to_grey(tile, 2, 2, "Mono12p")
+
+
+# ---- robots --------------------------------------------------------------------------------------------------------
+
+
+class Controller:
+    """The simulated UR controller, in its own process."""
+
+    def __init__(self) -> None:
+        script = Path(__file__).with_name("rtde_stand_in.py")
+        self.process = subprocess.Popen(
+            [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == "ready\n"
+
+    def tell(self, line: str = "state") -> dict[str, object]:
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+        return dict(json.loads(self.process.stdout.readline()))
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.fixture
+def controller() -> Iterator[Controller]:
+    pytest.importorskip("rtde_control", reason="the extra robot is not installed")
+    made = Controller()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def arm(controller: Controller) -> Iterator[URRobot]:
+    robot = URRobot("127.0.0.1", box=BOX, speed=0.25)
+    yield robot
+    robot.close()
+
+
+@pytest.fixture(params=["csv", "person", "simulated", "ur"])
+def robot(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[hardware.Robot]:
+    if request.param == "ur":
+        yield request.getfixturevalue("arm")
+    elif request.param == "simulated":
+        yield simulated_robot(sd=0.1)
+    elif request.param == "csv":
+        path = tmp_path / "places.csv"
+        path.write_text("x,y,z,sd_x,sd_y,sd_z\n300,210,400,1,1,2\n320,200,400,,,\n")
+        yield CsvPlayer(path)
+    else:
+        person = Person(lambda xyz: person.said(xyz))
+        yield person
+
+
+def test_a_robot_goes_where_it_is_told_and_knows_it(robot: hardware.Robot) -> None:
+    robot.open()
+    robot.open()
+    for wish in ([300.0, 210.0, 400.0], [320.0, 200.0, 400.0]):
+        there = robot.move(np.array(wish))
+        assert there.shape == (3,)
+        assert there.dtype == np.float64
+        assert np.allclose(there, wish, atol=0.6)
+        assert np.allclose(robot.position(), there, atol=0.6)
+        there[:] = 0  # the caller's copy
+        assert np.allclose(robot.position(), wish, atol=0.6)
+    assert len(robot.sd) == 3
+    assert all(math.isnan(sd) or sd > 0 for sd in robot.sd)
+    assert robot.moves is (not isinstance(robot, Person))
+    places = robot.reachable()
+    assert places is None or places.shape == (0, 3)
+    robot.stop()
+    robot.close()
+    robot.close()
+
+
+@pytest.mark.parametrize("wish", [[np.nan, 0.0, 0.0], [0.0, 0.0], [np.inf, 1.0, 1.0]])
+def test_no_robot_goes_to_what_is_no_place(robot: hardware.Robot, wish: list[float]) -> None:
+    with pytest.raises(HardwareError) as caught:
+        robot.move(np.array(wish))
+    says_all(caught.value)
+
+
+def test_the_arm_moves_in_metres_with_its_tool_and_orientation(controller: Controller) -> None:
+    robot = URRobot("127.0.0.1", (0.0, 0.0, 50.0), box=BOX, speed=0.2)
+    robot.move(np.array([310.0, 220.0, 410.0]))
+    state = controller.tell()
+    assert np.allclose(state["tcp"], [0, 0, 0.05, 0, 0, 0])
+    assert np.allclose(state["moves"], [[0.31, 0.22, 0.41, 0.0, 3.0, 0.5, 0.2, 0.3, 1]])
+    robot.close()
+    assert controller.tell()["running"] is False  # its program was ended
+    assert robot.sd == pytest.approx((0.1, 0.1, 0.1))
+    assert URRobot("127.0.0.1", box=BOX, unit="m").sd == pytest.approx((1e-4,) * 3)
+
+
+def test_stop_stops_the_arm_on_its_way(controller: Controller, arm: URRobot) -> None:
+    arm.open()
+    timer = threading.Timer(0.3, arm.stop)
+    timer.start()
+    with pytest.raises(HardwareError, match="was stopped at") as caught:
+        arm.move(np.array([500.0, 500.0, 400.0]))
+    timer.join()
+    says_all(caught.value)
+    here = arm.position()
+    assert 0.1 < np.linalg.norm(here - [300, 200, 400]) / np.linalg.norm([200, 300]) < 0.9
+    time.sleep(0.1)
+    assert np.array_equal(arm.position(), here)
+    assert np.allclose(arm.move(np.array([300.0, 200.0, 400.0])), [300, 200, 400], atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("protective 1", "protective stop"),
+        ("emergency 1", "emergency stop"),
+        ("off 1", "no power"),
+        ("silent 1", "connection .* is lost"),
+        ("hang_up", "connection .* is lost"),
+    ],
+)
+def test_what_halts_the_arm_on_its_way_is_named(controller: Controller, arm: URRobot, line: str, words: str) -> None:
+    arm.open()
+    timer = threading.Timer(0.3, lambda: controller.tell(line))
+    timer.start()
+    with pytest.raises(HardwareError, match=words) as caught:
+        arm.move(np.array([500.0, 500.0, 400.0]))
+    timer.join()
+    says_all(caught.value)
+    if "lost" not in words:
+        with pytest.raises(HardwareError, match=words):
+            arm.move(np.array([300.0, 200.0, 400.0]))
+    controller.tell(line.replace("1", "0") if line != "hang_up" else "state")
+    time.sleep(0.1)  # a report of before may be on its way
+    assert np.allclose(arm.move(np.array([300.0, 200.0, 400.0])), [300, 200, 400], atol=0.5)
+
+
+@pytest.mark.parametrize("line", ["short 1", "script_fails 1"])
+def test_an_arm_that_does_not_arrive_is_found_out(
+    controller: Controller, arm: URRobot, line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("implicam.hardware.ur.STUCK", 0.5)
+    controller.tell(line)
+    with pytest.raises(HardwareError, match=r"stands (10|20)\.00 mm from its target"):
+        arm.move(np.array([320.0, 200.0, 400.0]))
+
+
+def test_nothing_is_sent_that_leaves_the_box_or_is_refused(controller: Controller) -> None:
+    asked: list[tuple[list[float], list[float]]] = []
+
+    def confirm(here: np.ndarray, there: np.ndarray) -> bool:
+        asked.append((here.tolist(), there.tolist()))
+        return False
+
+    robot = URRobot("127.0.0.1", box=BOX, confirm=confirm)
+    with pytest.raises(HardwareError, match=r"the target .* is outside of the box"):
+        robot.move(np.array([300.0, 200.0, 600.1]))
+    assert asked == []
+    with pytest.raises(HardwareError, match="was refused"):
+        robot.move(np.array([300.0, 200.0, 500.0]))
+    assert np.allclose(asked, [([300, 200, 400], [300, 200, 500])])
+    robot.close()
+    inside = URRobot("127.0.0.1", box=((0, 0, 0), (600, 600, 300)))  # the arm stands above it
+    with pytest.raises(HardwareError, match=r"the robot .* is outside of the box"):
+        inside.move(np.array([300.0, 200.0, 200.0]))
+    inside.close()
+    assert controller.tell()["moves"] == []
+
+
+def test_a_dry_run_says_what_it_would_do_and_uploads_nothing(controller: Controller) -> None:
+    said: list[str] = []
+    robot = URRobot("127.0.0.1", box=BOX, dry_run=True, say=said.append)
+    assert np.allclose(robot.move(np.array([310.0, 220.0, 400.0])), [300, 200, 400])
+    robot.stop()
+    robot.close()
+    assert said == ["dry run, 127.0.0.1: from (300, 200, 400) to (310, 220, 400) mm at 0.1 m/s"]
+    assert controller.tell() == {"pose": [0.3, 0.2, 0.4, 0, 3, 0.5], "tcp": [0] * 6, "moves": [], "running": False,
+                                 "moving": False}  # fmt: skip
+
+
+def test_an_arm_that_is_not_there_and_options_that_cannot_be() -> None:
+    with pytest.raises(HardwareError, match="does not answer on port 30004") as caught:
+        URRobot("127.0.0.1", box=BOX).open()
+    says_all(caught.value)
+    for options in ({"speed": 0.3}, {"speed": 0.0}, {"unit": "yard"}, {"box": ((0, 0, 0), (1, 1, 0))}, {"box": (1, 2)}):
+        with pytest.raises(UsageError):
+            URRobot("127.0.0.1", **{"box": BOX, **options})  # type: ignore[arg-type]
+
+
+SESSION = """
+import numpy as np
+from implicam.hardware import URRobot
+robot = URRobot("127.0.0.1", box=((0, 0, 0), (600, 600, 600)), speed=0.1)
+robot.open()
+print("ready", flush=True)
+robot.move(np.array([590.0, 590.0, 400.0]))
+"""
+
+
+@pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGKILL])
+def test_the_arm_stops_when_the_session_is_interrupted_or_dies(controller: Controller, kill: signal.Signals) -> None:
+    command = [sys.executable, "-c", SESSION]
+    session = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert session.stdout is not None
+    assert session.stdout.readline() == "ready\n"
+    while not controller.tell()["moving"]:
+        time.sleep(0.01)
+    session.send_signal(kill)
+    session.communicate()
+    end = time.monotonic() + 3
+    while ((state := controller.tell())["moving"] or state["running"]) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert not state["moving"]
+    assert not state["running"]  # its program was ended
+    assert np.linalg.norm(np.array(state["pose"][:2]) - 0.59) > 0.2
+
+
+def test_the_player_goes_to_the_nearest_row_that_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "places.csv"
+    path.write_text("\ufeffname,x,y,z,sd_x,sd_y,sd_z\na,0,0,0,0.1,0.2,0.3\nb,10,0,0,,,\n\nc,20,0,0,,,\n")
+    player = CsvPlayer(path)
+    with pytest.raises(HardwareError, match="at none of its rows"):
+        player.position()
+    assert player.reachable().tolist() == [[0, 0, 0], [10, 0, 0], [20, 0, 0]]
+    assert player.move(np.array([1.0, 5.0, 0.0])).tolist() == [0, 0, 0]
+    assert player.sd == (0.1, 0.2, 0.3)
+    assert player.move(np.array([1.0, 5.0, 0.0])).tolist() == [10, 0, 0]
+    assert np.isnan(player.sd).all()
+    assert player.reachable().tolist() == [[20, 0, 0]]
+    player.move(np.zeros(3))
+    with pytest.raises(HardwareError, match="all 3 rows"):
+        player.move(np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "line 1: there is no single column x, y, z"),
+        ("x,y\n1,2\n", "line 1: there is no single column z"),
+        ("x,y,z,z\n", "no single column z"),
+        ("x,y,z\n", "no row"),
+        ("x,y,z\n1,2,3\n1,,3\n", "line 3: y = ''"),
+        ("x,y,z\n1,2\n", "line 2: 2 cells under 3"),
+        ("x,y,z\n1,2,nan\n", "line 2: z = 'nan'"),
+        ("x,y,z,sd_x\n1,2,3,-1\n", "line 2: sd_x = -1"),
+    ],
+)
+def test_a_bad_table_is_named_with_its_line(tmp_path: Path, text: str, words: str) -> None:
+    path = tmp_path / "places.csv"
+    path.write_text(text)
+    with pytest.raises(HardwareError, match=words):
+        CsvPlayer(path).open()
+    with pytest.raises(HardwareError, match="cannot be read"):
+        CsvPlayer(tmp_path / "none.csv").open()
+
+
+def test_a_person_is_only_asked() -> None:
+    asked: list[list[float]] = []
+    person = Person(lambda xyz: asked.append(xyz.tolist()), (0.5, 0.5, 1.0))
+    with pytest.raises(HardwareError, match="nobody has said"):
+        person.position()
+    assert person.move(np.array([1.0, 2.0, 3.0])).tolist() == [1, 2, 3]
+    assert asked == [[1, 2, 3]]
+    with pytest.raises(HardwareError, match="nobody has said"):
+        person.position()
+    person.said(np.array([1.1, 2.0, 3.0]))
+    assert person.position().tolist() == [1.1, 2.0, 3.0]
+    person.move(np.zeros(3))
+    with pytest.raises(HardwareError):  # what was said before is not where it is now
+        person.position()
+
+
+# ---- the simulated rig ---------------------------------------------------------------------------------------------
+
+
+def test_simulated_cameras_photograph_where_the_robot_is() -> None:
+    cameras, robot = simulated_rig(RIG, seed=5, sd=2.0)
+    rng, seen = np.random.default_rng(6), 0
+    for _ in range(4):
+        parts = rng.uniform(-0.3, 0.3, size=3)
+        robot.move(RIG.volume.world_from_box.apply(parts * RIG.volume.size))
+        for lens, camera in zip(RIG.cameras, cameras, strict=True):
+            true, _ = lens.pixel_from_world(robot.true_position[None])
+            found = Ball().detect(camera.frame().picture, View(camera.name, "now"))
+            seen += len(found) == 1 and bool(np.linalg.norm(found.uv[0] - true[0]) < 0.5)
+            camera.cover()
+            hidden = Ball().detect(camera.frame().picture, View(camera.name, "now"))
+            assert not any(np.linalg.norm(uv - true[0]) < 20 for uv in hidden.uv)
+    assert seen >= 7  # of 8; a look-alike may be taken for it once
+
+
+def test_the_simulated_robot_is_off_by_what_it_says() -> None:
+    robot = simulated_robot(sd=0.5)
+    off = []
+    for i in range(400):
+        reported = robot.move(np.array([float(i), 0.0, 0.0]))
+        off.append(robot.true_position - reported)
+    square = np.sum(np.square(off)) / 0.25  # chi-square with 1200 degrees: 1200 +- 4 * sqrt(2400)
+    assert abs(square - 1200) < 4 * math.sqrt(2400)
+    assert np.all(np.abs(np.mean(off, axis=0)) < 4 * 0.5 / 20)
+
+
+def test_the_simulated_robot_fails_stops_and_takes_its_time() -> None:
+    robot = simulated_robot(speed=100.0)
+    robot.fail_next_move()
+    with pytest.raises(HardwareError, match="stopped on its way"):
+        robot.move(np.array([10.0, 0.0, 0.0]))
+    assert robot.position().tolist() == [5, 0, 0]
+    timer = threading.Timer(0.1, robot.stop)
+    timer.start()
+    with pytest.raises(HardwareError, match="stopped on its way"):
+        robot.move(np.array([5.0, 1000.0, 0.0]))
+    timer.join()
+    assert 5 < robot.position()[1] < 500
+    assert robot.move(robot.position()).shape == (3,)
+
+
+def test_two_simulated_rigs_of_one_seed_take_the_same_pictures() -> None:
+    pictures = [simulated_rig(ONE, seed=seed)[0][0].frame().picture for seed in (9, 9, 10)]
+    assert np.array_equal(pictures[0], pictures[1])
+    assert not np.array_equal(pictures[0], pictures[2])
+
+
+# ---- triggers ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+def test_a_trigger_fires_once_a_call(kind: str) -> None:
+    with TriggerSimulator(kind, lines=6) as box:
+        trigger = trigger_from(box.address)
+        trigger.open()
+        trigger.open()
+        for _ in range(3):
+            trigger.fire()
+        trigger.close()
+        trigger.close()
+        trigger.fire()  # opens by itself
+        trigger.close()
+        assert isinstance(trigger, NetworkTrigger)
+        assert trigger.lines == 6
+    first = box.fired[0]
+    assert box.fired == [(first + i) % 2**31 for i in range(4)]
+
+
+def test_lost_packets_do_not_fire_twice_nor_never() -> None:
+    with TriggerSimulator("udp") as box:
+        trigger = NetworkTrigger(box.address, timeout=0.5)
+        trigger.open()
+        box.drop_answers = 2
+        trigger.fire()
+        assert len(box.fired) == 1
+        box.drop_questions = 2
+        trigger.fire()
+        assert len(box.fired) == 2
+        box.delay = 0.15  # slower than a repeat: late answers of the one question are not taken for the next one's
+        trigger.fire()
+        trigger.fire()
+        assert len(box.fired) == len(set(box.fired)) == 4
+        box.drop_answers = 100
+        with pytest.raises(HardwareError, match="does not answer") as caught:
+            trigger.fire()
+        says_all(caught.value)
+        trigger.close()
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+def test_a_box_that_is_gone(kind: str) -> None:
+    with TriggerSimulator(kind) as box:
+        trigger = NetworkTrigger(box.address, timeout=0.3)
+        trigger.fire()
+    with pytest.raises(HardwareError, match="does not answer"):
+        trigger.fire()
+    with pytest.raises(HardwareError, match="does not answer"):
+        trigger.open()
+    trigger.close()
+
+
+def test_what_a_box_answers() -> None:
+    with TriggerSimulator("udp", lines=2) as box:
+        assert box.answer("HELLO\n") == "IMPLICAM-TRIGGER 1 2\n"
+        assert box.answer("TRIG 7").startswith("OK 7 ")
+        assert box.answer("TRIG 7") == box.answer("TRIG 7")
+        for bad in ("TRIG", "TRIG -1", "TRIG x", "TRIG 2147483648", "", "BANG 1", "TRIG ²"):
+            assert box.answer(bad).startswith("ERR ")
+        assert box.fired == [7]
+
+
+# ---- words of the command line -------------------------------------------------------------------------------------
+
+
+def test_words_name_drivers(tmp_path: Path) -> None:
+    film = write_film(tmp_path / "film.avi", 1)
+    kinds = {
+        "0": OpenCVCamera, "/dev/video2": OpenCVCamera, "rtsp://10.0.0.1/main": OpenCVCamera,
+        "http://10.0.0.1/a.mjpg": OpenCVCamera, str(film): OpenCVCamera, str(tmp_path): FolderCamera,
+        "not-yet/": FolderCamera, "genicam:4711@/opt/maker.cti": GenICamCamera,
+    }  # fmt: skip
+    for spec, kind in kinds.items():
+        camera = camera_from("cam7", spec)
+        assert type(camera) is kind
+        assert camera.name == "cam7"
+    assert isinstance(robot_from("csv:a.csv"), CsvPlayer)
+    assert isinstance(robot_from("ur:10.0.0.2", box=BOX, dry_run=True), URRobot)
+    assert isinstance(robot_from("person", ask=lambda xyz: None), Person)
+
+
+@pytest.mark.parametrize(
+    ("make", "spec", "words"),
+    [
+        (lambda s: camera_from("c", s), "genicm:1@a.cti", "did you mean 'genicam'"),
+        (lambda s: camera_from("c", s), "genicam:1", "genicam:SERIAL@"),
+        (lambda s: camera_from("c", s), "", "names no camera"),
+        (lambda s: camera_from("c", s), "flim.avi", "names no camera"),
+        (robot_from, "ur10", "names no robot"),
+        (robot_from, "persn", "did you mean 'person'"),
+        (robot_from, "ur:10.0.0.2", "needs a box"),
+        (trigger_from, "upd://box:1", "did you mean 'udp'"),
+        (trigger_from, "udp://box", "no address of a trigger box"),
+        (trigger_from, "udp://box:99999", "no address of a trigger box"),
+    ],
+)
+def test_other_words_are_refused_with_a_hint(make: Callable[[str], object], spec: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        make(spec)

@@ -1,0 +1,282 @@
+"""The guided session without its page: every way through it, on simulated hardware that can fail."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+import pytest
+
+from implicam import load_calibration, read_dataset
+from implicam.detect import Ball, Detected
+from implicam.errors import UsageError
+from implicam.hardware import Person
+from implicam.session import Session
+from implicam.session.guide import CALIBRATION, REPORT, Equipment, Guide
+from implicam.session.setup import Setup, changed, open_guide
+
+SETUP = Setup(rig="stereo", budget=12, speed=1e6)
+
+
+@pytest.fixture
+def guide(tmp_path: Path) -> Iterator[Guide]:
+    with open_guide(tmp_path / "session", SETUP) as made:
+        made.start()
+        yield made
+
+
+def measured(guide: Guide, points: int) -> Guide:
+    for _ in range(points):
+        guide.go()
+        guide.accept()
+    return guide
+
+
+def test_a_session_from_start_to_report(guide: Guide) -> None:
+    phases = [guide.state.phase]
+    for i in range(1, 13):
+        assert guide.state.target is not None
+        assert guide.state.message.startswith(f"point {i}")
+        guide.go()
+        phases.append(guide.state.phase)
+        assert guide.state.seen == ["cam1", "cam2"]
+        assert np.allclose(guide.state.position, guide.state.target.xyz)
+        guide.accept()
+        assert guide.session.data is not None
+        assert len(guide.session.data) == i == guide.state.history[-1].points
+    assert set(phases) == {"aim", "shown"}
+    assert guide.state.stop == "all 12 points of the budget are measured"
+    saved = guide.finish()
+    assert guide.state.phase == "done"
+    assert saved == guide.session.folder / CALIBRATION
+    calibration = load_calibration(saved)
+    assert len(calibration.data) == 12
+    assert (guide.session.folder / REPORT).stat().st_size > 10_000
+    on_disk = read_dataset(guide.session.folder)
+    assert np.array_equal(on_disk.xyz, calibration.data.xyz)
+    pictures = sorted(path.name for path in (guide.session.folder / "images" / "cam1").iterdir())
+    assert pictures == [f"p{i:03d}.png" for i in range(1, 13)]
+
+
+def test_the_reticle_is_where_the_ball_will_be(guide: Guide) -> None:
+    measured(guide, 10)
+    guide.go()
+    for look in guide.state.looks:
+        assert np.linalg.norm(look.uv - look.expected) < 5
+
+
+def test_the_live_ball_is_measured(guide: Guide) -> None:
+    assert np.isnan(guide.measured_live).all()  # nothing is known yet
+    measured(guide, 10)
+    guide.live()
+    assert np.linalg.norm(guide.measured_live - guide.equipment.robot.position()) < 2
+
+
+def test_a_covered_camera_costs_one_view(guide: Guide) -> None:
+    guide.equipment.cameras[0].cover()  # type: ignore[attr-defined]
+    guide.go()
+    assert guide.state.seen == ["cam2"]
+    assert guide.state.looks[0].found.reason.startswith("no ball")
+    guide.accept()
+    assert guide.session.data is not None
+    assert guide.session.data.observations.seen.tolist() == [[False, True]]
+
+
+def test_a_ball_that_nobody_finds_cannot_be_accepted(guide: Guide) -> None:
+    for camera in guide.equipment.cameras:
+        camera.cover()  # type: ignore[attr-defined]
+    guide.go()
+    assert guide.state.phase == "shown"
+    assert "not found in any camera" in guide.state.message
+    with pytest.raises(UsageError):
+        guide.accept()
+    assert guide.state.phase == "shown"
+    guide.redo()
+    assert guide.state.seen == ["cam1", "cam2"]
+    guide.accept()
+    assert guide.loop.points == 1
+
+
+def test_a_skipped_target_is_remembered_and_not_asked_for_again(guide: Guide) -> None:
+    first = guide.state.target
+    assert first is not None
+    guide.skip("the arm is in the way")
+    assert guide.state.target is not None
+    assert not np.array_equal(guide.state.target.xyz, first.xyz)
+    (skipped,) = guide.session.skipped
+    assert skipped.reason == "the arm is in the way"
+    assert np.array_equal(skipped.xyz, first.xyz)
+
+
+def test_undo_takes_back_the_last_point_only(guide: Guide) -> None:
+    measured(guide, 9)
+    assert guide.state.calibration is not None
+    assert guide.undo() == "p009"
+    assert [step.points for step in guide.state.history] == list(range(1, 9))
+    assert guide.state.message.startswith("point p009 is taken back. point 9")
+    assert guide.state.target is not None
+    assert guide.state.target.name == "p010"  # a name is never used twice
+    for _ in range(8):
+        guide.undo()
+    assert guide.undo() is None
+    assert guide.session.data is None
+    assert guide.state.phase == "aim"
+
+
+@pytest.mark.parametrize("part", ["camera", "robot"])
+def test_trouble_is_shown_and_the_session_waits(guide: Guide, part: str) -> None:
+    measured(guide, 3)
+    guide.set_auto(True)
+    if part == "camera":
+        guide.equipment.cameras[1].fail_for(1)  # type: ignore[attr-defined]
+    else:
+        guide.equipment.robot.fail_next_move()  # type: ignore[attr-defined]
+    guide.go()
+    state = guide.state
+    assert state.phase == "trouble"
+    assert state.problem is not None
+    assert state.problem.fix
+    assert not state.auto
+    assert guide.loop.points == 3
+    assert guide.session.events[-1].what == "trouble"
+    with pytest.raises(UsageError):
+        guide.accept()
+    guide.retry()
+    assert guide.state.phase == "aim"
+    assert guide.state.problem is None
+    measured(guide, 1)
+    assert guide.loop.points == 4
+
+
+def test_the_robot_stops_at_once_from_another_thread(tmp_path: Path) -> None:
+    with open_guide(tmp_path / "slow", replace(SETUP, speed=0.001)) as guide:
+        guide.start()
+        going = Thread(target=guide.go)
+        going.start()
+        while guide.state.phase != "moving":
+            time.sleep(0.01)
+        time.sleep(0.1)
+        guide.stop_robot()
+        going.join(timeout=10)
+        assert not going.is_alive()
+        assert guide.state.phase == "trouble"
+        assert "stopped" in guide.state.message
+
+
+def test_a_session_goes_on_where_it_was(tmp_path: Path) -> None:
+    with open_guide(tmp_path / "s", SETUP) as guide:
+        guide.start()
+        measured(guide, 9)
+        step, target = guide.state.history[-1], guide.state.target
+    assert target is not None
+    with open_guide(tmp_path / "s", None) as again:
+        again.start()
+        assert again.loop.points == 9
+        assert again.state.history[-1].usual == pytest.approx(step.usual, rel=0.05)
+        assert again.state.target is not None
+        assert again.state.target.name == target.name == "p010"
+
+
+def test_two_sessions_on_one_folder_are_refused(guide: Guide) -> None:
+    with pytest.raises(UsageError, match="open"):
+        open_guide(guide.session.folder, None)
+    measured(guide, 1)  # and the first one does not mind
+
+
+def test_another_rig_is_refused_and_another_budget_is_not(tmp_path: Path) -> None:
+    open_guide(tmp_path / "s", SETUP).close()
+    with pytest.raises(UsageError, match="rig"):
+        open_guide(tmp_path / "s", changed(SETUP, rig="bar6"))
+    with pytest.raises(UsageError, match="cameras"):
+        open_guide(tmp_path / "s", changed(SETUP, cameras=(("a", "0"),)))
+    with open_guide(tmp_path / "s", changed(SETUP, budget=20)):
+        pass
+    with Session.open(tmp_path / "s") as session:
+        assert Setup.from_settings(session.settings) == changed(SETUP, budget=20)
+
+
+def test_by_itself_until_the_rule_says_stop(tmp_path: Path) -> None:
+    with open_guide(tmp_path / "s", replace(SETUP, below=1.0, budget=30)) as guide:
+        guide.equipment.cameras[0].cover(1)  # type: ignore[attr-defined]
+        guide.equipment.cameras[1].cover(1)  # type: ignore[attr-defined]
+        path = guide.run()
+        assert path is not None
+        assert guide.state.stop.endswith("everywhere")
+        assert guide.state.history[-1].worst <= 1.0
+        assert [skipped.reason for skipped in guide.session.skipped] == ["the ball was not found"]
+
+
+def test_finishing_too_early_says_how_many_are_missing(guide: Guide) -> None:
+    measured(guide, 3)
+    with pytest.raises(UsageError, match="too few") as error:
+        guide.finish()
+    assert "at least 8" in error.value.fix
+    assert guide.state.phase == "aim"
+
+
+def test_a_person_types_where_the_ball_is(tmp_path: Path) -> None:
+    """A person is the robot, and the simulated robot holds the ball that the cameras see."""
+    with open_guide(tmp_path / "s", SETUP) as made:
+        hand, person = made.equipment.robot, Person(lambda wish: None, sd=(0.5, 0.5, 0.5))
+        guide = Guide(made.session, replace(made.equipment, robot=person), made.loop)
+        guide.start()
+        assert "type where it is" in guide.state.message
+        assert guide.state.target is not None
+        xyz = hand.move(guide.state.target.xyz + np.array([3.0, -2.0, 1.0]))
+        guide.arrived(xyz)
+        assert guide.state.phase == "shown"
+        guide.accept()
+        data = guide.session.data
+        assert data is not None
+        assert data.xyz.tolist() == [xyz.tolist()]
+        assert (data.positions.sd == 0.5).all()
+
+
+@dataclass(frozen=True)
+class SeesALamp:
+    """The detector of balls, but in one camera a lamp far away looks more like one."""
+
+    found: Ball
+    camera: str
+
+    def options(self) -> dict[str, Any]:
+        return self.found.options()
+
+    def detect(self, picture: Any, view: Any) -> Detected:
+        ball = self.found.detect(picture, view)
+        if view.camera != self.camera or not len(ball):
+            return ball
+        return replace(ball, uv=np.array([[40.0, 50.0]]), others=(replace(ball, others=()),) if self.keeps else ())
+
+    def settle(self, found: Any) -> Any:
+        return found
+
+    keeps: bool = True
+
+
+@pytest.mark.parametrize("keeps", [True, False])
+def test_another_thing_is_not_taken_for_the_ball(guide: Guide, keeps: bool) -> None:
+    measured(guide, 10)
+    lamp = SeesALamp(Ball(), "cam2", keeps)
+    guide.equipment = replace(guide.equipment, detector=lamp)
+    assert isinstance(guide.equipment, Equipment)
+    guide.go()
+    look = guide.state.looks[1]
+    if keeps:  # the ball was second: it is where it must be
+        assert np.linalg.norm(look.uv - look.expected) < 5
+    else:
+        assert guide.state.seen == ["cam1"]
+        assert "px from where the ball must be" in look.found.reason
+
+
+def test_setups_that_cannot_be_say_why() -> None:
+    for wrong in ({"unit": "furlong"}, {"method": "mlp"}, {"acquisition": "best"}, {"below": -1.0}, {"reach": 0.0}):
+        with pytest.raises(UsageError) as error:
+            Setup(**wrong)  # type: ignore[arg-type]
+        assert error.value.fix
+    assert Setup.from_settings({**SETUP.as_settings(), "of a newer version": 1}) == SETUP
