@@ -113,6 +113,41 @@ def test_a_skipped_target_is_remembered_and_not_asked_for_again(guide: Guide) ->
     assert np.array_equal(skipped.xyz, first.xyz)
 
 
+def test_a_skipped_target_stays_skipped_after_a_restart(tmp_path: Path) -> None:
+    with open_guide(tmp_path / "s", SETUP) as guide:
+        guide.start()
+        first = guide.state.target
+        guide.skip("the arm is in the way")
+        second = guide.state.target
+    with open_guide(tmp_path / "s", None) as again:
+        again.start()
+        assert first is not None
+        assert second is not None
+        assert again.state.target is not None
+        assert np.array_equal(again.state.target.xyz, second.xyz)
+
+
+def test_a_library_that_fails_in_its_own_way_does_not_end_the_session(guide: Guide) -> None:
+    class Broken:
+        def detect(self, picture: Any, view: Any) -> Detected:
+            raise ZeroDivisionError("in somebody's code")
+
+    whole = guide.equipment
+    guide.equipment = replace(whole, detector=Broken())  # type: ignore[arg-type]
+    guide.go()
+    assert guide.state.phase == "trouble"
+    assert "ZeroDivisionError" in guide.state.message
+    (unexpected,) = (event for event in guide.session.events if event.what == "unexpected")
+    assert "in somebody's code" in unexpected.more["traceback"]
+    guide.retry()
+    guide.live()
+    assert guide.state.phase == "trouble"
+    guide.equipment = whole
+    guide.retry()
+    measured(guide, 1)
+    assert guide.loop.points == 1
+
+
 def test_undo_takes_back_the_last_point_only(guide: Guide) -> None:
     measured(guide, 9)
     assert guide.state.calibration is not None

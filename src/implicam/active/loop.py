@@ -140,13 +140,13 @@ class Loop:
         data, reason = (answer, "") if isinstance(answer, Dataset) else answer
         if data is None:
             if target is not None:
-                self.refuse(target, reason)
+                self.refuse(target.xyz, reason)
             return
         self.reset(data if self.data is None else join(self.data, data), progress)
 
-    def refuse(self, target: Target, reason: str) -> None:
-        """A target that could not be measured: neither it nor what is near it is asked for again."""
-        self._refused.append((target.xyz, reason))
+    def refuse(self, xyz: Floats, reason: str) -> None:
+        """A place (3,) where no target could be measured: neither it nor what is near it is asked for again."""
+        self._refused.append((xyz, reason))
 
     def reset(self, data: Dataset | None, progress: Progress = silent) -> None:
         """Go on from other known points: some that were there already, or fewer because one was taken back."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import threading
 import time
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -133,6 +134,8 @@ class Guide:
         with self._working("starting", "connecting to the cameras and the robot"):
             for device in self._devices():
                 device.open()
+            for skipped in self.session.skipped:
+                self.loop.refuse(skipped.xyz, skipped.reason)
             self._fit()
             self._aim()
 
@@ -175,7 +178,7 @@ class Guide:
         target = self._target()
         with self._working("fitting", "choosing another target"):
             self.session.skip(target.xyz, reason)
-            self.loop.refuse(target, reason)
+            self.loop.refuse(target.xyz, reason)
             self._aim()
 
     def undo(self) -> str | None:
@@ -258,6 +261,8 @@ class Guide:
                 self._show(looks=looks)
         except HardwareError as error:
             self._trouble(error)
+        except Exception as error:
+            self._surprise(error)
         finally:
             self._eyes.release()
 
@@ -307,6 +312,19 @@ class Guide:
                 self._show(phase=before.phase, message=before.message)
                 raise
             self._trouble(error)
+        except Exception as error:  # a library's own: the session waits, and says so, whatever it was
+            self._surprise(error)
+
+    def _surprise(self, error: Exception) -> None:
+        """An error that nobody foresaw."""
+        self.session.log("unexpected", traceback="".join(traceback.format_exception(error)))
+        self._trouble(
+            ImplicamError(
+                f"something unexpected happened: {type(error).__name__}: {error}.",
+                why="the details are in session.db, in the table of events",
+                fix="retry; what was accepted is on disk",
+            )
+        )
 
     def _trouble(self, error: ImplicamError) -> None:
         self.session.log("trouble", what=error.what, why=error.why, fix=error.fix)

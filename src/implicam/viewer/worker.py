@@ -1,0 +1,76 @@
+"""One thread that does what the buttons ask, one after the other; what it is doing now is the guide's state."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from implicam.errors import ImplicamError
+from implicam.session.guide import Guide
+
+Action = Callable[[], Any]
+
+PAUSE = 0.15
+"""Seconds between two looks at whether the session goes on by itself."""
+
+
+class Worker:
+    """complain: what tells a person that something could not be done."""
+
+    def __init__(self, guide: Guide, complain: Callable[[ImplicamError], None]) -> None:
+        self._guide, self._complain = guide, complain
+        self._jobs: queue.Queue[Action | None] = queue.Queue()
+        self._busy = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="implicam-worker", daemon=True)
+
+    def start(self) -> None:
+        """Begin, with connecting."""
+        self._jobs.put(self._guide.start)
+        self._thread.start()
+
+    def ask(self, action: Action) -> bool:
+        """Have it done, unless something is being done or waiting already: a button that is pressed twice counts once."""
+        if self._busy.locked() or not self._jobs.empty():
+            return False
+        self._jobs.put(action)
+        return True
+
+    def close(self) -> None:
+        """After what it is doing now."""
+        self._jobs.put(None)
+        if self._thread.is_alive():
+            self._thread.join(timeout=60)
+
+    def _run(self) -> None:
+        while True:
+            try:
+                job = self._jobs.get(timeout=PAUSE)
+            except queue.Empty:
+                job = self._by_itself
+            if job is None:
+                return
+            with self._busy:
+                self._do(job)
+
+    def _do(self, job: Action) -> None:
+        try:
+            job()
+        except ImplicamError as error:
+            self._complain(error)
+
+    def _by_itself(self) -> None:
+        """The next step of an automatic session; it ends when a rule says so, or where no place is left."""
+        state = self._guide.state
+        if not state.auto:
+            return
+        if state.phase == "shown":
+            if state.seen:
+                self._guide.accept()
+            else:
+                self._guide.skip("the ball was not found")
+        elif state.phase == "aim" and state.target is not None and not state.stop:
+            self._guide.step()
+        elif state.phase == "aim":
+            self._guide.set_auto(False)
