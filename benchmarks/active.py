@@ -16,6 +16,7 @@ import argparse
 import json
 import multiprocessing
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -176,7 +177,10 @@ def grid(rig: Rig, method: Any, judge: Judge, seed: int, most: int) -> Iterator[
 def report(runs: list[dict[str, Any]]) -> None:
     """The tables, as Markdown, and the figure."""
     curves: dict[Any, Runs] = {}
-    for one in runs:
+    done = Counter(one["seed"] for one in runs)
+    whole = {seed for seed, count in done.items() if count == max(done.values())}
+    print(f"{len(whole)} seeds")
+    for one in (one for one in runs if one["seed"] in whole):
         rows = [dict(zip(COLUMNS, values, strict=True)) for values in zip(*(one[key] for key in COLUMNS), strict=True)]
         curves.setdefault((one["method"], one["rig"], one["rule"]), {})[one["seed"]] = rows
     _within_limit(curves)

@@ -319,7 +319,8 @@ def test_acquire_goes_on_and_refuses_what_it_cannot(cli: Cli) -> None:
     for wrong, why in (
         (["--rig", "bar6"], "begun with rig stereo"),
         (["--camera", "left"], "names no camera"),
-        (["--robot", "ur:10.0.0.1"], "while nobody looks"),
+        (["--camera", "left=0"], "while nobody looks"),
+        (["--sd", "-1"], "sd = -1 is not possible"),
         (["--unit", "furlong"], "length unit"),
         (["--method", "mlp"], "where to measure next"),
     ):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import pytest
 
 from implicam import load_calibration, read_dataset
 from implicam.detect import Ball, Detected
-from implicam.errors import UsageError
+from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.hardware import Person
 from implicam.session import Session
 from implicam.session.guide import CALIBRATION, REPORT, Equipment, Guide
@@ -203,6 +203,137 @@ def test_the_robot_stops_at_once_from_another_thread(tmp_path: Path) -> None:
         assert "stopped" in guide.state.message
 
 
+def test_nothing_moves_after_stop_until_somebody_says_go(guide: Guide) -> None:
+    guide.set_auto(True)
+    guide.stop_robot()
+    assert not guide.state.auto
+    before = guide.equipment.robot.position()
+    guide.step()
+    assert guide.state.phase == "trouble"
+    assert "stopped by hand" in guide.state.message
+    assert np.array_equal(guide.equipment.robot.position(), before)
+    guide.retry()
+    guide.go()
+    assert guide.state.phase == "shown"
+
+
+def test_a_stop_that_fails_still_ends_what_goes_by_itself(guide: Guide, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost() -> None:
+        raise HardwareError("the connection is lost.")
+
+    guide.set_auto(True)
+    monkeypatch.setattr(guide.equipment.robot, "stop", lost)
+    with pytest.raises(HardwareError):
+        guide.stop_robot()
+    assert not guide.state.auto
+
+
+def test_a_robot_that_never_shows_the_ball_gives_up(guide: Guide) -> None:
+    for camera in guide.equipment.cameras:
+        camera.cover(100)  # type: ignore[attr-defined]
+    guide.set_auto(True)
+    for _ in range(20):
+        if guide.state.auto:
+            guide.step()
+    assert guide.state.phase == "trouble"
+    assert "5 targets in a row" in guide.state.message
+    assert len(guide.session.skipped) == 4
+
+
+def test_only_what_moves_alone_goes_by_itself(guide: Guide) -> None:
+    whole = guide.equipment
+    for other in (replace(whole, robot=Person(lambda wish: None)), replace(whole, dry_run=True)):
+        guide.equipment = other
+        with pytest.raises(UsageError, match="by itself"):
+            guide.set_auto(True)
+    guide.equipment = replace(whole, robot=Person(lambda wish: None))
+    with pytest.raises(UsageError, match="but you"):
+        guide.go()
+    guide.equipment = replace(whole, dry_run=True)
+    guide.go()
+    with pytest.raises(UsageError, match="dry run"):
+        guide.accept()
+    assert guide.session.data is None
+
+
+def test_a_full_disk_is_trouble_and_not_the_end(guide: Guide, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*words: Any, **more: Any) -> None:
+        raise ImplicamError("cannot write session.db.", why="no space left on device")
+
+    guide.go()
+    with monkeypatch.context() as broken:
+        broken.setattr(guide.session, "accept", full)
+        broken.setattr(guide.session, "log", full)
+        guide.accept()
+        assert guide.state.phase == "trouble"
+        assert "no space left" in guide.state.message
+    guide.retry()
+    measured(guide, 1)
+
+
+def test_a_camera_that_fails_is_left_alone_until_all_have_answered(guide: Guide) -> None:
+    """A camera answers one thread at a time, also when another one fails meanwhile."""
+    busy, most = 0, 0
+    slow = guide.equipment.cameras[1]
+    plain = slow.frame
+
+    def frame(timeout: float = 5.0) -> Any:
+        nonlocal busy, most
+        busy += 1
+        most = max(most, busy)
+        time.sleep(0.3)
+        busy -= 1
+        return plain(timeout)
+
+    slow.frame = frame  # type: ignore[method-assign]
+    guide.equipment.cameras[0].fail_for(1)  # type: ignore[attr-defined]
+    guide.go()
+    assert guide.state.phase == "trouble"
+    guide.retry()
+    guide.go()
+    assert most == 1
+
+
+class Waits:
+    """A camera that exposes when its trigger fires, and a box that fires it."""
+
+    live = False
+
+    def __init__(self, camera: Any) -> None:
+        self.name, self._camera, self._fired = camera.name, camera, Event()
+
+    def open(self) -> None: ...
+    def close(self) -> None: ...
+
+    def fire(self) -> None:
+        self._fired.set()
+
+    def frame(self, timeout: float = 5.0) -> Any:
+        if not self._fired.wait(timeout):
+            raise HardwareError(f"camera {self.name}: no picture within {timeout} s.")
+        self._fired.clear()
+        return self._camera.frame(timeout)
+
+
+def test_triggered_cameras_are_asked_only_when_the_trigger_fires(guide: Guide) -> None:
+    class Box:
+        def open(self) -> None: ...
+        def close(self) -> None: ...
+
+        def fire(self) -> None:
+            for eye in eyes:
+                eye.fire()
+
+    eyes = [Waits(camera) for camera in guide.equipment.cameras]
+    equipment = replace(guide.equipment, cameras=eyes, trigger=Box(), timeout=2.0)
+    triggered = Guide(guide.session, equipment, guide.loop)
+    triggered.start()
+    triggered.live()
+    assert triggered.state.phase == "aim"
+    triggered.go()
+    assert triggered.state.seen == ["cam1", "cam2"]
+
+
 def test_a_session_goes_on_where_it_was(tmp_path: Path) -> None:
     with open_guide(tmp_path / "s", SETUP) as guide:
         guide.start()
@@ -215,6 +346,7 @@ def test_a_session_goes_on_where_it_was(tmp_path: Path) -> None:
         assert again.state.history[-1].usual == pytest.approx(step.usual, rel=0.05)
         assert again.state.target is not None
         assert again.state.target.name == target.name == "p010"
+        assert [step.points for step in again.state.history] == list(range(1, 10))
 
 
 def test_two_sessions_on_one_folder_are_refused(guide: Guide) -> None:
@@ -229,6 +361,9 @@ def test_another_rig_is_refused_and_another_budget_is_not(tmp_path: Path) -> Non
         open_guide(tmp_path / "s", changed(SETUP, rig="bar6"))
     with pytest.raises(UsageError, match="cameras"):
         open_guide(tmp_path / "s", changed(SETUP, cameras=(("a", "0"),)))
+    with pytest.raises(UsageError, match="workspace"):
+        open_guide(tmp_path / "s", changed(SETUP, workspace="garbage"))
+    open_guide(tmp_path / "s", None).close()  # what was refused was not kept
     with open_guide(tmp_path / "s", changed(SETUP, budget=20)):
         pass
     with Session.open(tmp_path / "s") as session:
@@ -310,7 +445,14 @@ def test_another_thing_is_not_taken_for_the_ball(guide: Guide, keeps: bool) -> N
 
 
 def test_setups_that_cannot_be_say_why() -> None:
-    for wrong in ({"unit": "furlong"}, {"method": "mlp"}, {"acquisition": "best"}, {"below": -1.0}, {"reach": 0.0}):
+    for wrong in (
+        {"unit": "furlong"},
+        {"method": "mlp"},
+        {"acquisition": "best"},
+        {"below": -1.0},
+        {"reach": 0.0},
+        {"budget": 5},
+    ):
         with pytest.raises(UsageError) as error:
             Setup(**wrong)  # type: ignore[arg-type]
         assert error.value.fix

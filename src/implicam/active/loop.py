@@ -10,7 +10,7 @@ while not loop.stop:
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count, islice
 from typing import NamedTuple, Protocol
@@ -48,13 +48,20 @@ class Target:
     score: float = float("nan")
 
 
-def targets_of(places: Places, chosen: Choice, known: int) -> list[Target]:
-    """The candidates chosen, named p<number> after so many known points."""
+def targets_of(places: Places, chosen: Choice, data: Dataset) -> list[Target]:
+    """The candidates chosen, with names that no point of the data has."""
     uv = np.where(places.seen[..., None], places.uv, np.nan)
     return [
-        Target(f"p{known + k + 1:03d}", places.xyz[i], uv[i], score)
-        for k, (i, score) in enumerate(zip(chosen.index, chosen.scores, strict=True))
+        Target(name, places.xyz[i], uv[i], score)
+        for name, i, score in zip(free_names(data), chosen.index, chosen.scores, strict=False)
     ]
+
+
+def free_names(data: Dataset | None) -> Iterator[str]:
+    """p<number>, from the number of points on; none that a point has already."""
+    used = set() if data is None else set(data.points.tolist())
+    names = (f"p{number:03d}" for number in count(len(used) + 1))
+    return (name for name in names if name not in used)
 
 
 class Answer(NamedTuple):
@@ -129,10 +136,17 @@ class Loop:
         self._asked += 1
         if self.calibration is None:
             return self._to_begin(number, here)
-        outlook = self._outlook()
+        try:
+            outlook = self._outlook()
+        except FitError as error:  # the forward model of inverse-gp: more points will help
+            self.problem = error
+            return self._to_begin(number, here)
         rng = np.random.default_rng([self.seed, self._asked, 3])
         chosen = choose(outlook, self.acquisition, rng, count=number, here=here, reach=self.reach)
-        targets = targets_of(outlook.candidates, chosen, self.points)
+        assert self.data is not None
+        targets = targets_of(outlook.candidates, chosen, self.data)
+        if self.pool is None:
+            return targets
         return [replace(target, name=self._name(target.xyz, k)) for k, target in enumerate(targets)]
 
     def tell(self, answer: Answer | Dataset, target: Target | None = None, progress: Progress = silent) -> None:
@@ -213,9 +227,7 @@ class Loop:
     def _name(self, xyz: Floats, k: int) -> str:
         if self.pool is not None:
             return str(self.pool.points[int(np.argmin(np.linalg.norm(self.pool.xyz - xyz, axis=1)))])
-        used = {*(self.data.points.tolist() if self.data is not None else ())}
-        free = (name for number in count(self.points + 1) if (name := f"p{number:03d}") not in used)
-        return next(islice(free, k, None))
+        return next(islice(free_names(self.data), k, None))
 
     def _outlook(self) -> ForwardOutlook | InverseOutlook:
         assert self.calibration is not None

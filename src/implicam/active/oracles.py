@@ -42,20 +42,20 @@ class SimulatedOracle:
 
 @dataclass(frozen=True, eq=False)
 class RecordedOracle:
-    """A dataset that was recorded before; a target is answered by the point nearest to it that was not used yet."""
+    """A dataset that was recorded before; a target is answered by the point nearest to it that was not used yet, of
+    several at one place by the one with its name."""
 
     data: Dataset
     used: set[str] = field(default_factory=set)
 
     def observe(self, target: Target) -> Answer:
-        """The point with the target's name, else the nearest one."""
+        """The nearest point that is left."""
         names = self.data.points.tolist()
         left = [i for i, name in enumerate(names) if name not in self.used]
         if not left:
             return Answer(None, "every recorded point is used")
-        if target.name in names and target.name not in self.used:
-            i = names.index(target.name)
-        else:
-            i = left[int(np.argmin(np.linalg.norm(self.data.xyz[left] - target.xyz, axis=1)))]
+        distance = np.linalg.norm(self.data.xyz[left] - target.xyz, axis=1)
+        nearest = [left[k] for k in np.flatnonzero(distance == distance.min())]
+        i = next((k for k in nearest if names[k] == target.name), nearest[0])
         self.used.add(names[i])
         return Answer(self.data.select([i]))

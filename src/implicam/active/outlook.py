@@ -58,15 +58,20 @@ class Places:
         return cls(data.xyz, data.observations.uv, data.observations.seen)
 
 
+UNTOLD = 0.25
+"""Where nobody told a picture's size, it is taken to reach beyond what was seen by this part of its extent."""
+
+
 def on_image(observations: Observations, uv: Floats) -> Bools:
-    """(n, cameras) which pixels (n, cameras, 2) are in the picture; where its size is not told, among those seen."""
+    """(n, cameras) which pixels (n, cameras, 2) are in the picture; where its size is not told, near those seen."""
     seen = np.zeros(uv.shape[:2], dtype=np.bool_)
     for c, camera in enumerate(observations.cameras):
         if camera.width is not None and camera.height is not None:
             low, high = np.array([-0.5, -0.5]), np.array([camera.width, camera.height]) - 0.5
         elif observations.seen[:, c].any():
             pixels = observations.uv[observations.seen[:, c], c]
-            low, high = pixels.min(axis=0), pixels.max(axis=0)
+            margin = UNTOLD * np.ptp(pixels, axis=0)
+            low, high = pixels.min(axis=0) - margin, pixels.max(axis=0) + margin
         else:
             continue
         seen[:, c] = ((uv[:, c] >= low) & (uv[:, c] <= high)).all(axis=1)
@@ -231,6 +236,19 @@ class ForwardOutlook:
         return replace(self, parts=tuple(parts))
 
 
+def floor_of(rig: RigMap, xyz: Floats, seen: Bools) -> Floats:
+    """(n, 3, 3) what pixel noise alone would leave at positions (n, 3) with the views seen (n, cameras); NaN for fewer
+    than two."""
+    information = np.zeros((len(xyz), 3, 3))
+    for slope, noise, c in rig.slopes(xyz):
+        there = seen[:, c] & np.isfinite(slope).all(axis=(1, 2))
+        information[there] += slope[there].swapaxes(1, 2) @ slope[there] / noise**2
+    floor = np.full_like(information, np.nan)
+    enough = seen[:, rig.cameras].sum(axis=1) >= 2
+    floor[enough] = np.linalg.inv(information[enough])
+    return floor
+
+
 def _masked(part: Sensitivity, seen: Bools) -> Sensitivity:
     """Zero slope and spread, unit noise, where a camera does not see a place; in place, for these are large."""
     blind = ~seen.repeat(2, axis=1)
@@ -260,21 +278,32 @@ def _diagonal(variances: Floats) -> Floats:
 class InverseOutlook:
     """Of three Gaussian processes from pixels to positions, over candidates and judged places, in this order.
 
-    known: per axis V (n, places) with `covariance of places = K - V^T V`, K (m, judged) between candidates and judged;
-    variance, noise and scale: per axis, of the function, of its outputs, and the length unit of one standardised.
+    known: per axis V (n, places), `covariance of places = K - V^T V`. floor: (places, 3, 3) what pixel noise leaves,
+    None for what the processes take for noise.
     """
 
     candidates: Places
     judged: Places
     calibration: InverseGPCalibration
     known: tuple[Floats, ...]
+    floor: Floats | None = None
 
     @classmethod
-    def of(cls, calibration: InverseGPCalibration, candidates: Places, judged: Places) -> InverseOutlook:
-        """The three processes of a calibration at the predicted pixels; only places that every camera sees count."""
+    def of(
+        cls, calibration: InverseGPCalibration, candidates: Places, judged: Places, forward: RigMap | None
+    ) -> InverseOutlook:
+        """The three processes of a calibration at the predicted pixels; only places that every camera sees count.
+
+        forward: knows what pixel noise leaves at each place. Without it that is what the processes take for noise, and
+        with few points they take nearly everything for noise.
+        """
         X = _inputs(calibration, candidates, judged)
         known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp in calibration.processes)
-        return cls(candidates, judged, calibration, known)
+        floor = None
+        if forward is not None:
+            seen = np.concatenate([candidates.seen, judged.seen])
+            floor = floor_of(forward, np.concatenate([candidates.xyz, judged.xyz]), seen)
+        return cls(candidates, judged, calibration, known, floor)
 
     @cached_property
     def _X(self) -> Floats:
@@ -300,8 +329,9 @@ class InverseOutlook:
         scale = self.calibration.positions.scale
         total = (self._variances[part] + self._noise) * scale**2
         total[~seen] = np.nan
-        floor = np.broadcast_to(self._noise * scale**2, total.shape)
-        return Prospect(_diagonal(total), _diagonal(floor))
+        if self.floor is not None:
+            return Prospect(_diagonal(total), self.floor[part])
+        return Prospect(_diagonal(total), _diagonal(np.broadcast_to(self._noise * scale**2, total.shape)))
 
     @property
     def now(self) -> Prospect:
@@ -369,7 +399,8 @@ def outlook_of(
         made = ForwardOutlook.of(calibration.map, places(candidates), places(judged))
         return replace(made, place=_place(calibration.data))
     if isinstance(calibration, InverseGPCalibration):
-        return InverseOutlook.of(calibration, places(candidates), places(judged))
+        rig = forward.map if isinstance(forward, ForwardGPCalibration | ExplicitCalibration) else None
+        return InverseOutlook.of(calibration, places(candidates), places(judged), rig)
     raise UsageError(
         f"{calibration.method} cannot say where to measure next.",
         why="its error bars do not say what one more known point would change",

@@ -71,6 +71,11 @@ class Either(Rule):
         return self.first.met(history, unit) or self.second.met(history, unit)
 
 
+def _where(step: Step) -> str:
+    """Nothing, or which part of the workspace this is about."""
+    return "" if step.measured > 0.995 else f" that enough cameras see ({100 * step.measured:.0f} % of the workspace)"
+
+
 OF = {"worst": "everywhere", "usual": "in 95 % of the workspace", "mean": "on average"}
 
 
@@ -93,7 +98,7 @@ class Below(Rule):
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """The uncertainty now."""
         now = getattr(history[-1], self.of) if history else math.nan
-        return f"{now:.2g} {unit}".strip() + f" {OF[self.of]}" if now <= self.value else ""
+        return f"{now:.2g} {unit}".strip() + f" {OF[self.of]}{_where(history[-1])}" if now <= self.value else ""
 
 
 @dataclass(frozen=True)
@@ -112,7 +117,7 @@ class Within(Rule):
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """How near it is."""
         now = history[-1].excess if history else math.nan
-        return f"{now:.2f} times what pixel noise alone leaves" if now <= self.times else ""
+        return f"{now:.2f} times what pixel noise alone leaves{_where(history[-1])}" if now <= self.times else ""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from implicam.active.stopping import Step
 from implicam.active.workspace import Workspace
 from implicam.calibrators import Calibration, ForwardGP, InverseGPCalibration
 from implicam.dataset import Floats
+from implicam.errors import UsageError
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +43,14 @@ def suggest(
     pilot = ForwardGP().fit(calibration.data) if isinstance(calibration, InverseGPCalibration) else None
     places = workspace.candidates(candidates, seed)
     outlook = outlook_of(calibration, places, workspace.judged(judged, seed), pilot)
+    if not outlook.now.measured.any():
+        raise UsageError(
+            "nowhere in the workspace can a position be measured.",
+            why="no place of it is seen by enough of the calibrated cameras",
+            fix="give another workspace (--workspace), one that the cameras look at",
+        )
     rng = np.random.default_rng([seed, 3])
     chosen = choose(outlook, rule or acquisition(DEFAULT), rng, count=count, here=here, reach=reach)
     known = len(calibration.data)
     then = step_of(chosen.after.now, known + len(chosen.index))
-    return Suggestion(targets_of(outlook.candidates, chosen, known), step_of(outlook.now, known), then)
+    return Suggestion(targets_of(outlook.candidates, chosen, calibration.data), step_of(outlook.now, known), then)

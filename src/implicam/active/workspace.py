@@ -18,6 +18,12 @@ from implicam.simulate import Box
 ON_SURFACE = 5
 """One candidate of so many lies on the surface: the outermost places tell most of a lens."""
 
+HARDLY = 0.05
+"""Where less than this part of a box around it is inside, the box is turned."""
+
+INWARD = 0.9
+"""The places to begin with are so much nearer to the centre than candidates: nobody knows yet what the cameras see."""
+
 EDGE = 1e-9
 """Part of the size by which a point may be outside and still counts as inside."""
 
@@ -94,21 +100,25 @@ class Workspace:
         return np.asarray((xyz @ self.normals.T <= self.offsets + EDGE * self.size).all(axis=1), dtype=np.bool_)
 
     def candidates(self, n: int, seed: int) -> Floats:
-        """(n, 3) where the next target may be, evenly spread; of a list of places all of them, in random order."""
+        """(n, 3) where the next target may be: evenly spread, some of them on the surface, and the corners, where a
+        calibration knows least. Of a list of places at most so many, in random order."""
         if self.places is not None:
-            return self.places[np.random.default_rng(seed).permutation(len(self.places))]
-        found = self._spread(n, seed)
+            return self.places[np.random.default_rng(seed).permutation(len(self.places))[:n]]
+        corners = self._corners(n)
+        found = self._spread(n - len(corners), seed)
         found[::ON_SURFACE] = self._on_surface(found[::ON_SURFACE])
-        return found
+        return self._pulled_in(np.concatenate([found, corners]), 1 - EDGE)
 
     def judged(self, n: int, seed: int = 0) -> Floats:
         """(about n, 3) places at which a calibration is judged: evenly spread, and the corners."""
-        corners = self.vertices if len(self.vertices) <= n // 4 else self.vertices[:: len(self.vertices) * 4 // n]
+        corners = self._corners(n)
         return np.concatenate([corners, self._spread(n - len(corners), [seed, 1])])
 
     def design(self, n: int, seed: int) -> Floats:
         """(n, 3) places to begin with while nothing is known of the cameras: each as far from the others as can be."""
         pool = self.candidates(64 * n, seed)
+        if self.places is None:
+            pool = self._pulled_in(pool, INWARD)
         if len(pool) < n:
             raise UsageError(f"{self.name} are fewer than the {n} that are needed to begin.", fix="add places")
         chosen = [int(np.argmax(np.linalg.norm(pool - self.centre, axis=1)))]
@@ -118,14 +128,26 @@ class Workspace:
             distance = np.minimum(distance, np.linalg.norm(pool - pool[chosen[-1]], axis=1))
         return pool[chosen]
 
+    def _pulled_in(self, xyz: Floats, part: float) -> Floats:
+        """Towards the centre: to `part` of the distance. A billionth less and no rounding puts a point outside."""
+        return np.asarray(self.centre + part * (xyz - self.centre), dtype=np.float64)
+
+    def _corners(self, n: int) -> Floats:
+        """The corners, or as many of them, evenly, as are a quarter of n."""
+        return self.vertices[:: max(1, -(-len(self.vertices) * 4 // n))]
+
     def _spread(self, n: int, seed: int | list[int]) -> Floats:
         """So many points of a scrambled Sobol sequence in it."""
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         sequence = qmc.Sobol(3, rng=np.random.default_rng(seed))
-        found = np.zeros((0, 3))
+        found, axes = np.zeros((0, 3)), np.eye(3)
         while len(found) < n:
-            points = low + sequence.random(1 << max(6, int(np.ceil(np.log2(max(1, n)))))) * (high - low)
-            found = np.concatenate([found, points[self.inside(points)]])
+            along = self.vertices @ axes.T
+            low, high = along.min(axis=0), along.max(axis=0)
+            points = (low + sequence.random(1 << max(6, int(np.ceil(np.log2(max(1, n)))))) * (high - low)) @ axes
+            inside = self.inside(points)
+            found = np.concatenate([found, points[inside]])
+            if inside.mean() < HARDLY:  # a thin slab that lies askew: a box along it holds less that is outside
+                axes = np.linalg.svd(self.vertices - self.centre, full_matrices=False)[2]
         return found[:n]
 
     def _on_surface(self, xyz: Floats) -> Floats:

@@ -15,7 +15,7 @@ from implicam.cli import show
 from implicam.cli.app import Json, Seed, command
 from implicam.dataset import Floats
 from implicam.dataset.folder import csv_text
-from implicam.errors import UsageError
+from implicam.errors import ImplicamError, UsageError
 from implicam.files import write_text
 
 RULES = "random, sobol, variance, excess, integrated, d-optimal"
@@ -56,6 +56,8 @@ def suggest_command(
     from implicam.active.acquisition import DEFAULT
 
     fitted = load_calibration(calibration)
+    if reach is not None and not reach > 0:
+        raise UsageError(f"a reach of {reach:g} is no length.", fix="give one greater than zero")
     room = workspace_from(workspace or "box", fitted.data.xyz)
     place = None if here is None else _place(here)
     found = suggest(
@@ -93,6 +95,10 @@ def suggest_command(
     for words, step in (("now", found.now), (f"then, with all {len(found.targets)}", found.then)):
         times = f"{show.number(step.excess)} times what pixel noise alone leaves"
         show.line(f"  {words:<18} {show.number(step.usual)} {unit}, {times}")
+    if found.now.measured < 0.995:
+        show.note(
+            f"{100 * found.now.measured:.0f} % of the workspace is seen by enough cameras; this is about that part."
+        )
     if output is not None:
         show.line(f"{output}: {len(found.targets)} targets")
 
@@ -164,6 +170,10 @@ def acquire_command(
         float | None,
         typer.Option("--sd", metavar="LENGTH", help="Standard uncertainty of known positions.", rich_help_panel=_REAL),
     ] = None,
+    tool: Annotated[
+        str | None,
+        typer.Option("--tool", metavar="X,Y,Z", help="ur: the ball's centre, from the flange.", rich_help_panel=_REAL),
+    ] = None,
     dry_run: Annotated[
         bool | None,
         typer.Option("--dry-run/--no-dry-run", help="ur: say where it would go; move nothing.", rich_help_panel=_REAL),
@@ -223,7 +233,7 @@ def acquire_command(
     ] = None,
     unattended: Annotated[
         bool,
-        typer.Option("--unattended", help="No page: measure until a rule says stop.", rich_help_panel=_PAGE),
+        typer.Option("--unattended", help="No page: the simulated rig by itself.", rich_help_panel=_PAGE),
     ] = False,
     host: Annotated[
         str, typer.Option("--host", help="Another than localhost asks for a token.", rich_help_panel=_PAGE)
@@ -245,25 +255,29 @@ def acquire_command(
         "rig": rig, "rig_cameras": rig_cameras, "cameras": _cameras(camera), "robot": robot, "trigger": trigger,
         "speed": speed, "sd": sd, "dry_run": dry_run, "radius": radius, "bright": bright, "unit": unit,
         "workspace": workspace, "below": below, "within": within, "budget": budget, "acquisition": acquisition,
-        "reach": reach, "method": method, "seed": seed,
+        "reach": reach, "method": method, "seed": seed, "tool": None if tool is None else tuple(_place(tool)),
     }  # fmt: skip
-    if unattended and (robot or "").startswith("ur:") and not dry_run:
+    before = _stored(folder)
+    setup = changed(before or Setup(), **given)
+    if unattended and not setup.simulated:
         raise UsageError(
-            "a robot is not moved while nobody looks.", fix="use the page (leave --unattended out), or --dry-run"
+            "nothing is moved, and nobody is asked, while nobody looks.",
+            why="--unattended is for the simulated rig",
+            fix="use the page: leave --unattended out",
         )
-    changes = any(value is not None for value in given.values())
-    setup = changed(_stored(folder) or Setup(), **given) if changes else None
-    guide = open_guide(folder, setup, say=show.say)
+    guide = open_guide(folder, None if setup == before else setup, say=show.say)
     if not unattended:
         from implicam.viewer import serve
 
-        serve(guide, host=host, port=port, token=token, open_browser=browser)
+        serve(guide, host=host, port=port, token=token, open_browser=browser, say=show.say)
     with guide:
         if unattended:
             with show.progress(json) as progress:
                 guide.run(progress)
             if guide.state.problem is not None:
                 raise guide.state.problem
+            if guide.state.phase != "done":
+                raise ImplicamError("nothing was calibrated.", why=guide.state.message, fix="run it again to go on")
         _tell(guide, json)
 
 

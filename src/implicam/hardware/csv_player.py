@@ -22,6 +22,7 @@ class CsvPlayer:
     """
 
     moves = True
+    alone = False  # somebody puts the target there; the table says where that is
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)

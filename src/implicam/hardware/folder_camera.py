@@ -27,6 +27,8 @@ class FolderCamera:
     it can be read whole. Of several new ones the first by name is given, and no file twice. pattern: of the file names.
     """
 
+    live = False
+
     def __init__(self, name: str, folder: Path | str, pattern: str = "*") -> None:
         self.name = name
         self.folder, self.pattern = Path(folder), pattern

@@ -29,6 +29,7 @@ class GenICamCamera:
 
     def __init__(self, name: str, serial: str, producer: Path | str, *, triggered: bool = False) -> None:
         self.name, self.serial, self.producer = name, serial, Path(producer)
+        self.live = not triggered
         self._skip = 0 if triggered else 1
         self._number = 0
         self._harvester: Any = None

@@ -44,6 +44,7 @@ class OpenCVCamera:
         self._shown = re.sub("//[^/]*@", "//...@", text)  # no password in a message
         self._device = isinstance(self.source, int) or text.startswith("/dev/")
         self._film = not self._device and not text.startswith(STREAMS)
+        self.live = not (triggered or self._film)
         self._skip = 0 if triggered else SKIP_DEVICE if self._device else SKIP_STREAM
         self._number = 0
         self._capture: Any = None  # of a film

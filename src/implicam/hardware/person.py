@@ -13,7 +13,7 @@ from implicam.hardware.protocol import Floats, point
 class Person:
     """The `Robot` that has hands. ask: shown every wish, a position (3,); sd: of what is typed, in its unit."""
 
-    moves = False
+    moves = alone = False
 
     def __init__(self, ask: Callable[[Floats], None], sd: Sequence[float] = (np.nan, np.nan, np.nan)) -> None:
         self._ask = ask

@@ -40,6 +40,10 @@ class FrameSource(Protocol):
     def name(self) -> str:
         """The camera's name in the dataset."""
 
+    @property
+    def live(self) -> bool:
+        """Whether it has a new picture whenever asked: no film, no folder, nothing that waits for a trigger."""
+
     def open(self) -> None:
         """Ready the camera. Opening twice is harmless. HardwareError with the cure."""
 
@@ -70,7 +74,8 @@ class Robot(Protocol):
     """Whatever puts the target somewhere and knows where it is; positions (3,) in the dataset's unit and world frame.
 
     sd: standard uncertainty of `position` along x, y, z in that unit, (nan, nan, nan) where unknown. moves: False for
-    a person, whom `move` only asks.
+    a person, whom `move` only asks. alone: whether it gets there without anybody's help, so that a session may go on
+    by itself.
     """
 
     @property
@@ -80,6 +85,10 @@ class Robot(Protocol):
     @property
     def moves(self) -> bool:
         """Whether `move` puts the target there, or only asks for it."""
+
+    @property
+    def alone(self) -> bool:
+        """Whether it gets there without anybody's help."""
 
     def open(self) -> None:
         """Connect. Opening twice is harmless. HardwareError with the cure."""

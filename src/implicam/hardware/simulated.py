@@ -25,7 +25,7 @@ class SimulatedRobot:
     The true position is the reported one plus N(0, sd²) along each axis. fail_next_move: the next move stops half way.
     """
 
-    moves = True
+    moves = alone = True
 
     def __init__(self, start: Floats, *, sd: float, speed: float, rng: np.random.Generator) -> None:
         self.sd = (sd, sd, sd) if sd > 0 else (np.nan, np.nan, np.nan)
@@ -90,6 +90,8 @@ class PhotographingCamera:
     fail_for: the next n calls of `frame` fail, as if it were unplugged. cover: the ball is hidden
     in the next n pictures.
     """
+
+    live = True
 
     def __init__(self, studio: Studio, camera: int, robot: SimulatedRobot) -> None:
         self.name = studio.rig.cameras[camera].name

@@ -54,7 +54,7 @@ class URRobot:
     that it does not answer with True is refused. The tool keeps the orientation that it has.
     """
 
-    moves = True
+    moves = alone = True
 
     def __init__(
         self,

@@ -9,13 +9,14 @@ at any time from any thread: it is a frozen value that is replaced, never change
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +43,23 @@ AT_LEAST = 8.0
 ARMED = 0.05
 """Seconds from asking the cameras for a picture until all of them wait for the trigger."""
 
+IN_VAIN = 5
+"""Targets in a row without a ball, after which a session does not go on by itself."""
+
+HALTING = 2.0
+"""Seconds during which a robot that was to stop is told so again."""
+
+HISTORY = "history"
+"""The setting of the session that keeps the curve."""
+
 LEAST_REPORTED = 12
 """Known points from which a report by cross-validation says anything."""
 
 
 @dataclass(frozen=True, eq=False)
 class Equipment:
-    """What the session works with. radius: of the ball, in the session's length unit, None for no correction."""
+    """What the session works with. radius: of the ball, in the session's length unit, None for no correction. timeout:
+    seconds for a picture. dry_run: the robot does not really move, so nothing is kept."""
 
     cameras: Sequence[FrameSource]
     robot: Robot
@@ -56,6 +67,7 @@ class Equipment:
     trigger: Trigger | None = None
     radius: float | None = None
     timeout: float = 10.0
+    dry_run: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +131,11 @@ class Guide:
         self.state = State(auto=auto)
         self._changed = threading.Condition()
         self._eyes = threading.Lock()  # a camera answers one thread at a time
+        self._halted = threading.Event()  # somebody pressed stop: nothing moves until somebody says go
+        self._in_vain = 0
+        self._live = equipment.trigger is None and all(source.live for source in equipment.cameras)
+        for skipped in session.skipped:
+            loop.refuse(skipped.xyz, skipped.reason)
         self._pool = ThreadPoolExecutor(max(1, len(names)))
 
     def __enter__(self) -> Guide:
@@ -134,15 +151,22 @@ class Guide:
         with self._working("starting", "connecting to the cameras and the robot"):
             for device in self._devices():
                 device.open()
-            for skipped in self.session.skipped:
-                self.loop.refuse(skipped.xyz, skipped.reason)
+            self.loop.history = _remembered(self.session)
             self._fit()
             self._aim()
 
     def go(self) -> None:
-        """Send the robot to the target, or take the ball to be there, and look."""
+        """Send the robot to the target, and look. UsageError where a person moves the ball: see `arrived`."""
+        self._halted.clear()
+        self._move()
+
+    def _move(self) -> None:
         target = self._target()
+        if not self.equipment.robot.moves:
+            raise UsageError("nothing moves the ball but you.", fix="put it there, and type where it is")
         with self._working("moving", "the robot is on its way"):
+            if self._halted.is_set():
+                raise HardwareError("the robot was stopped by hand.", fix="press Go when it may move again")
             where = self.equipment.robot.move(target.xyz)
             self._shown(where)
 
@@ -166,10 +190,15 @@ class Guide:
             raise UsageError("there is nothing to accept.", fix="take a picture first")
         if not state.seen:
             raise UsageError("no camera found the ball.", fix="redo it, or skip this target")
+        if self.equipment.dry_run:
+            raise UsageError(
+                "this is a dry run: nothing moves, so nothing is kept.", fix="skip, to see the next target"
+            )
         point = self._point(state)
         pictures = {look.camera: look.frame.picture for look in state.looks if look.frame is not None}
         with self._working("fitting", "fitting with everything"):
             self.session.accept(point, pictures=pictures, notes=_notes(state))
+            self._in_vain = 0
             self._fit()
             self._aim()
 
@@ -198,13 +227,30 @@ class Guide:
             self._aim()
 
     def stop_robot(self) -> None:
-        """At once, from any thread; nothing goes by itself after that."""
-        self.equipment.robot.stop()
-        self.set_auto(False)
-        self.session.log("robot stopped by hand")
+        """At once, from any thread; nothing goes by itself after that, and nothing moves until `go`."""
+        self._halted.set()
+        self._show(auto=False)
+        end = time.monotonic() + HALTING
+        try:
+            self.equipment.robot.stop()
+            while self.state.phase == "moving" and time.monotonic() < end:  # a move may have been about to begin
+                time.sleep(0.05)
+                self.equipment.robot.stop()
+        finally:
+            with suppress(ImplicamError):
+                self.session.log("robot stopped by hand")
 
     def set_auto(self, auto: bool) -> None:
-        """Whether good points are accepted, and the next target is gone to, without being asked."""
+        """Whether good points are accepted, and the next target is gone to, without being asked. UsageError where the
+        ball does not get there without a person's help."""
+        if auto and (not self.equipment.robot.alone or self.equipment.dry_run):
+            raise UsageError(
+                "this session cannot go on by itself.",
+                why="a person puts the ball there" if not self.equipment.dry_run else "it is a dry run",
+                fix="go on target by target",
+            )
+        if auto:
+            self._halted.clear()
         self._show(auto=auto)
 
     def finish(self) -> Path:
@@ -221,13 +267,17 @@ class Guide:
             calibration = self.loop.calibrator.fit(self.loop.data)  # from no guess: anybody will find the same
             path = self.session.folder / CALIBRATION
             calibration.save(path)
-            report: Path | None = None
-            if len(calibration.data) >= LEAST_REPORTED:
-                report = self.session.folder / REPORT
-                write_report(report, report_of(_judged(calibration), f"{self.session.name}: a guided calibration"))
+            report = self.session.folder / REPORT
+            report.unlink(missing_ok=True)  # that of an earlier, other calibration
+            words = f"{self.loop.points} points. Saved: {path}"
+            try:
+                if len(calibration.data) >= LEAST_REPORTED:
+                    write_report(report, report_of(_judged(calibration), f"{self.session.name}: a guided calibration"))
+                    words += f" and {report}"
+            except ImplicamError as error:
+                words += f". No report: {error.what}"
             self.session.log("finished", points=self.loop.points)
-            words = f"{self.loop.points} points. Saved: {path}" + (f" and {report}" if report else "")
-            self._show(phase="done", message=words, report=report, target=None, auto=False)
+            self._show(phase="done", message=words, report=report if report.exists() else None, target=None, auto=False)
         return path
 
     def run(self, progress: Progress = silent) -> Path | None:
@@ -241,28 +291,42 @@ class Guide:
         return self.finish() if self.state.phase == "aim" and self.loop.calibration is not None else None
 
     def step(self) -> None:
-        """One target, without being asked: go, look, and accept or skip."""
-        self.go()
+        """One target, without being asked: go, look, and accept or skip. After some in a row without a ball it gives
+        up: that is no accident."""
+        if self.state.phase == "aim":
+            self._move()
         if self.state.phase != "shown":
             return
         if self.state.seen:
             self.accept()
-        else:
+            return
+        self._in_vain += 1
+        if self._in_vain < IN_VAIN:
             self.skip("the ball was not found")
+            return
+        self._in_vain = 0
+        reasons = "; ".join(f"{look.camera}: {look.found.reason}" for look in self.state.looks)
+        self._trouble(
+            HardwareError(
+                f"the ball was not found at {IN_VAIN} targets in a row.",
+                why=reasons,
+                fix="look at the pictures, and retry",
+            )
+        )
 
     def live(self) -> None:
-        """New pictures of all cameras, for the eye; nothing where the session is busy or a picture is being judged."""
-        if self.state.phase not in ("aim", "done") or not self._eyes.acquire(blocking=False):
+        """New pictures of all cameras, for the eye; nothing where the session is busy, a picture is being judged, or
+        the cameras have none to spare (a film, a folder, a trigger)."""
+        phase = self.state.phase
+        if not self._live or phase not in ("aim", "done") or not self._eyes.acquire(blocking=False):
             return
         try:
-            version = self.state.phase
             looks = self._looks(self._frames(None))
-            if self.state.phase == version:
+            if self.state.phase == phase:
                 self._show(looks=looks)
-        except HardwareError as error:
-            self._trouble(error)
         except Exception as error:
-            self._surprise(error)
+            if self.state.phase == phase:  # else a command is at work, and will find out by itself
+                self._trouble(error) if isinstance(error, HardwareError) else self._surprise(error)
         finally:
             self._eyes.release()
 
@@ -317,7 +381,8 @@ class Guide:
 
     def _surprise(self, error: Exception) -> None:
         """An error that nobody foresaw."""
-        self.session.log("unexpected", traceback="".join(traceback.format_exception(error)))
+        with suppress(ImplicamError):
+            self.session.log("unexpected", traceback="".join(traceback.format_exception(error)))
         self._trouble(
             ImplicamError(
                 f"something unexpected happened: {type(error).__name__}: {error}.",
@@ -327,8 +392,9 @@ class Guide:
         )
 
     def _trouble(self, error: ImplicamError) -> None:
-        self.session.log("trouble", what=error.what, why=error.why, fix=error.fix)
         self._show(phase="trouble", message=str(error), problem=error, auto=False)
+        with suppress(ImplicamError):  # the disk may be what is wrong
+            self.session.log("trouble", what=error.what, why=error.why, fix=error.fix)
 
     def _show(self, **changes: Any) -> None:
         with self._changed:
@@ -342,6 +408,7 @@ class Guide:
         if data is not None and self.equipment.radius is not None:
             data = self._centred(data)
         self.loop.reset(data)
+        self.session.set(HISTORY, [_plain(step) for step in self.loop.history])
         self._show(
             data=data, calibration=self.loop.calibration, prospect=self.loop.prospect,
             history=tuple(self.loop.history), stop=self.loop.stop,
@@ -370,12 +437,26 @@ class Guide:
         words = f"{before}point {self.loop.points + 1}: " + (
             "let the robot go there" if moves else "put the ball there, and type where it is"
         )
-        self._show(phase="aim", target=replace(target, name=self.session.next_name()), message=words, problem=None)
+        self._show(
+            phase="aim",
+            target=replace(target, name=self.session.next_name()),
+            message=words + self._uncalibrated(),
+            problem=None,
+        )
+
+    def _uncalibrated(self) -> str:
+        """Which cameras have not seen enough of the known points yet, in words."""
+        calibration, data = self.loop.calibration, self.loop.data
+        if not isinstance(calibration, ForwardGPCalibration) or data is None:
+            return ""
+        seen = dict(zip(data.observations.camera_names, data.observations.seen.sum(axis=0), strict=True))
+        missing = [name for name in seen if name not in calibration.camera_names]
+        return "".join(f". {name} is not calibrated yet: it has seen {seen[name]} points" for name in missing)
 
     def _shown(self, where: Floats) -> None:
         with self._eyes:
             frames = self._frames(self.equipment.trigger)
-        looks = _believed(self._looks(frames), where, self.loop.calibration)
+        looks = _believed(self._looks(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration)
         count = sum(len(look.found) > 0 for look in looks)
         words = f"found in {count} of {len(looks)} cameras"
         if not count:
@@ -389,6 +470,7 @@ class Guide:
         if trigger is not None:
             time.sleep(ARMED)
             trigger.fire()
+        wait(waiting)  # all of them, before one that failed is told of: a camera answers one thread at a time
         return [one.result() for one in waiting]
 
     def _looks(self, frames: Sequence[Frame]) -> tuple[Look, ...]:
@@ -421,8 +503,10 @@ class Guide:
         return Observations(np.array([name]), tuple(cameras), uv, sd)
 
 
-def _believed(looks: tuple[Look, ...], where: Floats, calibration: Calibration | None) -> tuple[Look, ...]:
-    """The looks without detections far from where a ball at `where` (3,) must be: another thing, then.
+def _believed(
+    looks: tuple[Look, ...], where: Floats, where_sd: Floats, calibration: Calibration | None
+) -> tuple[Look, ...]:
+    """The looks without detections far from where a ball at `where` (3,), known to where_sd, must be: another thing.
 
     Of several things that might be the ball, the nearest to that place counts.
     """
@@ -433,6 +517,7 @@ def _believed(looks: tuple[Look, ...], where: Floats, calibration: Calibration |
     sd = np.full(len(uv), np.nan)
     for part in calibration.map.sensitivities(xyz):
         variance = np.einsum("nij,nij->ni", part.half, part.half)[0] + part.rest[0] + part.noise[0]
+        variance += (part.slope[0] ** 2) @ where_sd**2
         sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))
     believed = []
     for look, there, spread in zip(looks, uv, sd, strict=True):
@@ -461,6 +546,19 @@ def _notes(state: State) -> Mapping[str, Any]:
         "target": [] if target is None else target.xyz.tolist(),
         "reasons": {look.camera: look.found.reason for look in state.looks if look.found.reason},
     }
+
+
+def _plain(step: Step) -> dict[str, float | None]:
+    return {key: value if np.isfinite(value) else None for key, value in asdict(step).items()}
+
+
+def _remembered(session: Session) -> list[Step]:
+    """The curve as far as it was when the session was left; the last point is computed again."""
+    kept = 0 if session.data is None else len(session.data) - 1
+    rows = session.settings.get(HISTORY, [])
+    known: list[dict[str, Any]] = [{key: math.nan if x is None else x for key, x in row.items()} for row in rows]
+    steps = [Step(**row) for row in known]
+    return [step for step in steps if step.points <= kept]
 
 
 def _judged(calibration: Calibration) -> Any:

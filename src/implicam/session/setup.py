@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +19,20 @@ from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
-from implicam.hardware import FrameSource, Robot, camera_from, robot_from, simulated_rig, trigger_from
-from implicam.session.guide import Equipment, Guide
+from implicam.hardware import FrameSource, Robot, Trigger, camera_from, robot_from, simulated_rig, trigger_from
+from implicam.session.guide import ARMED, Equipment, Guide
 from implicam.session.journal import Session
 from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
 
 SIMULATED, PERSON = "simulated", "person"
 SIMULATED_SPEED = 0.4
 """m/s of the simulated robot: fast enough not to wait for, slow enough to see it move."""
+
+PATIENCE = 60.0
+"""Seconds for the next picture of a camera that has none to spare: somebody, or another program, has to take it."""
+
+FEWEST = 8
+"""Known points that a calibration takes."""
 
 CANNOT = "mlp"
 """The method that cannot say where to measure next."""
@@ -38,7 +47,8 @@ class Setup:
     workspace: words as `workspace_from` takes them, "" for what the robot can reach. below: stop when the 95 %
     uncertainty is below it everywhere; within: or when it is so many times what pixel noise alone leaves; budget: or
     after so many points. reach: as in `Loop`. speed: m/s.
-    sd: standard uncertainty of the robot's positions, or of what a person types, None for the robot's own.
+    sd: standard uncertainty of the robot's positions, or of what a person types, None for the robot's own. tool: the
+    ball's centre in the frame of a UR robot's flange, None for the TCP that is set on it.
     """
 
     rig: str = "bar6"
@@ -58,11 +68,13 @@ class Setup:
     reach: float | None = None
     speed: float | None = None
     sd: float | None = None
+    tool: tuple[float, ...] | None = None
     dry_run: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple((str(name), str(spec)) for name, spec in self.cameras))
+        object.__setattr__(self, "tool", None if self.tool is None else tuple(map(float, self.tool)))
         if self.unit not in METRES:
             raise UsageError(
                 f"there is no length unit {self.unit!r}{did_you_mean(self.unit, METRES)}.",
@@ -75,8 +87,14 @@ class Setup:
             )
         acquisition(self.acquisition)
         _ = self.rule
-        if self.reach is not None and not self.reach > 0:
-            raise UsageError(f"a reach of {self.reach:g} is no length.", fix="give one greater than zero")
+        for what in ("reach", "speed", "sd", "radius"):
+            value = getattr(self, what)
+            if value is not None and not 0 < value < np.inf:
+                raise UsageError(f"{what} = {value:g} is not possible.", fix="give a number greater than zero")
+        if self.budget < FEWEST:
+            raise UsageError(f"{self.budget} points are too few to calibrate.", fix=f"a budget of {FEWEST} or more")
+        if self.sd is not None and self.robot.startswith("csv:"):
+            raise UsageError("the table says how well its positions are known.", fix="give it columns sd_x, sd_y, sd_z")
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any]) -> Setup:
@@ -115,7 +133,11 @@ def open_guide(folder: Path, setup: Setup | None, *, auto: bool = False, say: Ca
     if (folder / "session.db").exists():
         session = Session.open(folder)
         try:
-            return _guide(session, _continued(session, setup), auto, say)
+            now = _continued(session, setup)
+            guide = _made(session, now, _hardware(now, say), auto)
+            for key, value in now.as_settings().items():  # once it is known that it works
+                session.set(key, value)
+            return guide
         except BaseException:
             session.close()
             raise
@@ -125,7 +147,7 @@ def open_guide(folder: Path, setup: Setup | None, *, auto: bool = False, say: Ca
         folder,
         name=folder.absolute().name,
         length_unit=setup.unit,
-        cameras=_sized(setup, eyes),
+        cameras=_sized(setup, eyes, say),
         settings=setup.as_settings(),
     )
     return _made(session, setup, (eyes, robot, room), auto)
@@ -134,7 +156,7 @@ def open_guide(folder: Path, setup: Setup | None, *, auto: bool = False, say: Ca
 def _continued(session: Session, setup: Setup | None) -> Setup:
     """What the session was begun with; another setup replaces it where the rig and the unit stay."""
     before = Setup.from_settings(session.settings)
-    if setup is None or setup == before:
+    if setup is None:
         return before
     same = ("rig", "rig_cameras", "unit", "seed") if before.simulated else ("unit",)
     for key in same:
@@ -145,13 +167,7 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
             )
     if setup.simulated != before.simulated:
         raise UsageError(f"the session in {session.folder} has other cameras.", fix="begin another in another folder")
-    for key, value in setup.as_settings().items():
-        session.set(key, value)
     return setup
-
-
-def _guide(session: Session, setup: Setup, auto: bool, say: Callable[[str], None]) -> Guide:
-    return _made(session, setup, _hardware(setup, say), auto)
 
 
 Hardware = tuple[list[FrameSource], Robot, Workspace]
@@ -163,7 +179,8 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Gui
     radius = setup.radius
     if radius is None and setup.simulated:
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
-    equipment = Equipment(eyes, robot, Ball(bright=setup.bright), trigger, radius)
+    timeout = 10.0 if trigger is not None or all(source.live for source in eyes) else PATIENCE
+    equipment = Equipment(eyes, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run)
     loop = Loop(
         named(setup.method),
         room,
@@ -214,6 +231,7 @@ def _robot(setup: Setup, say: Callable[[str], None]) -> Robot:
             "box": _corners(setup),
             "unit": setup.unit,
             "dry_run": setup.dry_run,
+            "tool": setup.tool,
             "say": say,
             **({} if setup.speed is None else {"speed": setup.speed}),
             **({} if setup.sd is None else {"sd": (setup.sd,) * 3}),
@@ -232,16 +250,25 @@ def _corners(setup: Setup) -> tuple[Floats, Floats] | None:
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def _sized(setup: Setup, eyes: list[FrameSource]) -> list[Camera]:
-    """The cameras with the size of their pictures: one of each is taken."""
+def _sized(setup: Setup, eyes: list[FrameSource], say: Callable[[str], None]) -> list[Camera]:
+    """The cameras with the size of their pictures: one of each is taken, and they are closed again."""
     if setup.simulated:
         return [Camera(camera.name, camera.width, camera.height) for camera in setup.built().cameras]
-    cameras = []
-    for source in eyes:
-        source.open()
-        height, width = source.frame(timeout=10.0).picture.shape
-        cameras.append(Camera(source.name, width, height))
-    return cameras
+    trigger = None if setup.trigger is None else trigger_from(setup.trigger)
+    if trigger is None and not all(source.live for source in eyes):
+        say("waiting for one picture of each camera, to learn its size")
+    with ExitStack() as devices, ThreadPoolExecutor(len(eyes)) as pool:
+        needed: list[FrameSource | Trigger] = [*eyes, *([] if trigger is None else [trigger])]
+        for device in needed:
+            devices.callback(device.close)
+            device.open()
+        patience = PATIENCE if trigger is None else 10.0
+        waiting = [pool.submit(source.frame, patience) for source in eyes]
+        if trigger is not None:
+            time.sleep(ARMED)
+            trigger.fire()
+        sizes = [one.result().picture.shape for one in waiting]
+    return [Camera(source.name, width, height) for source, (height, width) in zip(eyes, sizes, strict=True)]
 
 
 def changed(setup: Setup, **given: Any) -> Setup:

@@ -11,7 +11,7 @@ import numpy as np
 from implicam.active import Below, Rule, Step
 from implicam.active.stopping import Both, Either
 from implicam.dataset import Floats
-from implicam.figures.style import ORANGE, SKY, VERMILLION, number
+from implicam.figures.style import ORANGE, SKY, VERMILLION
 from implicam.viewer.space import Scale
 
 U95, EXCESS = "95 % uncertainty", "excess over the limit"
@@ -25,14 +25,15 @@ def legend(scale: Scale, what: str, unit: str) -> str:
     colours = ", ".join(f"rgb({r},{g},{b})" for r, g, b in scale.colours(stops))
     width = np.log(scale.high / scale.low)
     marks = "".join(
-        f"<span style='left:{100 * np.log(tick / scale.low) / width:.1f}%'>{number(tick, 2).rstrip('0').rstrip('.')}</span>"
-        for tick in scale.ticks()
+        f"<span style='left:{100 * np.log(tick / scale.low) / width:.1f}%'>{tick:g}</span>" for tick in scale.ticks()
     )
     unit = unit if what == U95 else "times"
     return (
         f"<div class='legend'><div>{escape(what)}, {escape(unit)}</div>"
         f"<div class='bar' style='background:linear-gradient(to right, {colours})'></div>"
-        f"<div class='marks'>{marks}</div></div>"
+        f"<div class='marks'>{marks}</div>"
+        f"<div>known points <span style='color:white'>●</span> next target <span style='color:{ORANGE}'>●</span> "
+        f"ball <span style='color:{SKY}'>●</span> skipped <span style='color:#7d818a'>◆</span></div></div>"
     )
 
 
@@ -46,22 +47,32 @@ def line(rule: Rule) -> Below | None:
 
 
 def curve(history: Sequence[Step], rule: Rule) -> tuple[Floats, ...]:
-    """Points, worst, usual and the stopping line, (n,) each, of the steps that have an uncertainty; two points at least,
-    so that there is something to draw."""
+    """Points, worst, usual and the stopping line, (n,) each, of the steps that have an uncertainty; two empty ones
+    before there is any."""
     stop = line(rule)
     steps = [step for step in history if np.isfinite(step.usual)]
     table = np.array([[s.points, s.worst, s.usual] for s in steps], dtype=np.float64).reshape(-1, 3)
     if not len(table):
-        table = np.array([[0.0, np.nan, np.nan]])
-    if len(table) == 1:
-        table = np.concatenate([table, table + (1.0, np.nan, np.nan)])
+        table = np.array([[0.0, np.nan, np.nan], [1.0, np.nan, np.nan]])
     return table[:, 0], table[:, 1], table[:, 2], np.full(len(table), np.nan if stop is None else stop.value)
 
 
-def chart(unit: str) -> dict[str, Any]:
-    """How the curve is drawn, in uPlot's words."""
+def across(points: int) -> dict[str, Any]:
+    """Of uPlot, for so many points: x from none to some more than there are, in steps, so that it rarely jumps."""
+    most = next(most for most in (15 * 2**k for k in range(64)) if points < most)
+    return {"x": {"time": False, "range": (0, most)}, "y": {"auto": True, "distr": 3, "log": 10}}
+
+
+def chart(unit: str, rule: Rule) -> dict[str, Any]:
+    """How the curve is drawn, in uPlot's words; the stopping line is the grid of an axis of its own."""
+    stop = line(rule)
     grid = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
     ink = {"stroke": "#aab2c0", "grid": grid, "ticks": grid, "font": "13px system-ui", "labelFont": "13px system-ui"}
+    mark = {"stroke": VERMILLION, "width": 2, "dash": (8, 6)}
+    right = {
+        **ink, "scale": "y", "side": 1, "size": 44, "stroke": VERMILLION, "grid": mark, "ticks": {"show": False},
+        "splits": [] if stop is None else [stop.value],
+    }  # fmt: skip
     return {
         "series": (
             {"label": "points"},
@@ -69,10 +80,11 @@ def chart(unit: str) -> dict[str, Any]:
             {"label": f"in 95 %, {unit}", "stroke": SKY, "width": 3, "points": {"show": True, "size": 6}},
             {"label": "stop", "stroke": VERMILLION, "width": 2, "dash": (8, 6), "points": {"show": False}},
         ),
-        "scales": {"x": {"time": False, "auto": True}, "y": {"auto": True, "distr": 3, "log": 10}},
+        "scales": across(0),
         "axes": (
             {**ink, "label": "known points", "labelSize": 20, "size": 30},
             {**ink, "label": f"95 % uncertainty, {unit}", "labelSize": 20, "size": 52},
+            *([] if stop is None else [right]),
         ),
         "legend": {"show": True, "live": False},
     }

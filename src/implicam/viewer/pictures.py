@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -96,6 +96,14 @@ def trouble_of(state: State, camera: str) -> str:
     return problem.what
 
 
+def current(state: State) -> State:
+    """The state with the reticles of its target: pictures of the point before show where that one was."""
+    target = state.target
+    if state.phase != "aim" or target is None or len(target.uv) != len(state.looks):
+        return state
+    return replace(state, looks=tuple(replace(a, expected=uv) for a, uv in zip(state.looks, target.uv, strict=True)))
+
+
 def away(look: Look) -> float:
     """Pixels from the ball to where the target is expected; NaN where either is not known."""
     return float(np.linalg.norm(look.uv - look.expected))
@@ -103,7 +111,7 @@ def away(look: Look) -> float:
 
 def verdict(state: State, look: Look) -> tuple[str, Colour]:
     """What there is to say of one camera, in a few words, and in which colour."""
-    found, planned = len(look.found) > 0, bool(np.isfinite(look.expected).all())
+    found, planned = len(look.found) > 0, state.target is not None and bool(np.isfinite(look.expected).all())
     if found and planned:
         distance = away(look)
         if state.phase == "shown":
@@ -127,7 +135,7 @@ class _Words:
     rim: int = 0
 
     def moved(self, dx: float, dy: float) -> _Words:
-        return _Words(self.text, self.x + dx, self.y + dy, self.size, self.colour, self.anchor, self.rim)
+        return replace(self, x=self.x + dx, y=self.y + dy)
 
 
 @dataclass
@@ -182,8 +190,9 @@ def _marks(tile: _Tile, state: State, look: Look, scale: float) -> None:
         return
     there = _placed(look.expected, scale)
     _reticle(tile, there, radius)
-    label = there + (radius * 1.2, -radius * 1.1)
-    tile.words.append(_Words("target", float(label[0]), float(label[1]), 0.7 * tile.letters, TARGET, "lm", 3))
+    below = bool(look.uv[1] < there[1])  # away from the ball, or else above
+    x, y = float(there[0] + 0.8 * radius), float(there[1] + (1.2 if below else -1.2) * radius)
+    tile.words.append(_Words("target", x, y, 0.75 * tile.letters, TARGET, "lm", 3))
     if len(look.found) and state.phase == "aim" and away(look) > NEAR:
         _way(tile, _placed(look.uv, scale), there, radius, f"{away(look):.0f} px")
 
@@ -221,6 +230,8 @@ def _way(tile: _Tile, ball: Floats, there: Floats, radius: float, words: str) ->
     side = np.array([-along[1], along[0]])
     head = [tip, tip - along * 0.8 * radius + side * 0.4 * radius, tip - along * 0.8 * radius - side * 0.4 * radius]
     _stroke(tile.canvas, [np.array([start, tip]), np.array([head[1], head[0], head[2]])], WHITE)
+    if length < 6 * radius:
+        return
     middle = (start + tip) / 2 + side * tile.letters * (0.9 if side[1] < 0 else -0.9)
     tile.words.append(_Words(words, float(middle[0]), float(middle[1]), tile.letters, WHITE, "mm", 4))
 

@@ -11,7 +11,7 @@ from implicam.dataset import Floats
 from implicam.images import eight_bit, opencv
 from implicam.session.guide import State
 from implicam.viewer.legend import EXCESS, EXCESS_SCALE, U95, line
-from implicam.viewer.pictures import BALL, GOOD, GREY, TARGET
+from implicam.viewer.pictures import BALL, GREY, TARGET, WHITE
 from implicam.viewer.space import Eye, Placing, Scale, edges, eyes, upwards, vantage
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ class Scene:
         self._drawn: dict[str, Any] = {}
         self.scale: Scale | None = None
         self.shown = U95
+        self.aspect = 0.5  # of the scene's part of the window: browsers tell late when it has changed
         self._scene.configure_default_lights(True)
         self._room()
 
@@ -43,10 +44,10 @@ class Scene:
         with self._server.atomic():
             if self._changed("calibration", state.calibration):
                 self._cameras(state)
-            if self._changed("known", (state.data, len(skipped))):
-                self._points("known", NOTHING if state.data is None else state.data.xyz, GOOD, "circle")
+            if self._changed("known", state.data, len(skipped)):
+                self._points("known", NOTHING if state.data is None else state.data.xyz, WHITE, "circle")
                 self._points("skipped", skipped, GREY, "diamond")
-            if self._changed("prospect", (state.prospect, self.shown)):
+            if self._changed("prospect", state.prospect, self.shown):
                 self._cloud(state)
             if self._changed("target", state.target):
                 self._target(state)
@@ -59,7 +60,7 @@ class Scene:
     def aim(self, client: viser.ClientHandle) -> None:
         """Turn a person's view so that everything is in it."""
         camera = client.camera
-        position, at = vantage(self._eyes, self._placing, max(0.2, camera.aspect), camera.fov)
+        position, at = vantage(self._eyes, self._loop.workspace.vertices, self._placing, self.aspect, camera.fov)
         with client.atomic():
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.position = position
@@ -69,11 +70,15 @@ class Scene:
         """Draw everything at the next `draw`."""
         self._drawn.clear()
 
-    def _changed(self, what: str, value: Any) -> bool:
-        before = self._drawn.get(what, self)
-        same = before is value or (isinstance(value, tuple | bytes) and isinstance(before, type(value)) and before == value)
-        self._drawn[what] = value
-        return not same
+    def _changed(self, what: str, *values: Any) -> bool:
+        """Whether these are others than the last time; arrays and their like are others when they are new."""
+        before = self._drawn.get(what, ())
+        self._drawn[what] = values
+        plain = (int, str, bytes)
+        return len(before) != len(values) or not all(
+            a is b or (isinstance(a, plain) and isinstance(b, plain) and a == b)
+            for a, b in zip(before, values, strict=True)
+        )
 
     def _room(self) -> None:
         """The workspace's edges, and which way x, y and z go."""
@@ -86,10 +91,9 @@ class Scene:
         ends = corner + arm * np.eye(3)
         arrows = self._placing.place(np.stack([np.broadcast_to(corner, (3, 3)), ends], axis=1))
         colours = np.array([(230, 90, 80), (90, 200, 110), (100, 150, 255)], np.uint8)
-        self._scene.add_arrows("/axes", arrows, np.repeat(colours[:, None], 2, axis=1)[:, 0],
-                               shaft_radius=0.008, head_radius=0.022, head_length=0.05)  # fmt: skip
+        self._scene.add_arrows("/axes", arrows, colours, shaft_radius=0.008, head_radius=0.022, head_length=0.05)
         for axis, end in zip("xyz", self._placing.place(corner + 1.2 * arm * np.eye(3)), strict=True):
-            self._scene.add_label(f"/axis/{axis}", axis, position=end)
+            self._scene.add_label(f"/axis/{axis}", axis, position=end, font_screen_scale=0.8)
 
     def _cameras(self, state: State) -> None:
         """New frusta; the first time, everybody's view too."""
@@ -98,7 +102,7 @@ class Scene:
         if self._eyes and not before:
             self._placing = Placing.of(self._loop.workspace, upwards(self._eyes))
             self.redraw()
-            self._drawn["calibration"] = state.calibration
+            self._drawn["calibration"] = (state.calibration,)
             self._room()
             for client in self._server.get_clients().values():
                 self.aim(client)
@@ -119,7 +123,7 @@ class Scene:
             f"/cameras/{eye.name}", eye.fov, eye.aspect, scale=0.22, thickness=2.0, thickness_units="screen",
             color=(190, 200, 215), position=place, wxyz=turned, cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
-        self._scene.add_label(f"/cameras/{eye.name}/name", eye.name, position=(0.0, -0.12, 0.0))
+        self._scene.add_label(f"/cameras/{eye.name}/name", eye.name, position=(0.0, -0.12, 0.0), font_screen_scale=0.8)
 
     def _pictures(self, state: State) -> None:
         cv2 = opencv()
@@ -148,7 +152,7 @@ class Scene:
         u95 = state.prospect.u95
         if self.scale is None and np.isfinite(u95).any():
             stop = line(self._loop.rule)
-            self.scale = Scale.around(stop.value if stop is not None else 0.5 * float(np.nanmedian(u95)))
+            self.scale = Scale.around(stop.value / 2 if stop is not None else 0.5 * float(np.nanmedian(u95)))
         if self.scale is None:
             return
         colours = EXCESS_SCALE.colours(state.prospect.excess) if self.shown == EXCESS else self.scale.colours(u95)
@@ -165,13 +169,10 @@ class Scene:
         self._scene.add_frame("/target", show_axes=False, position=self._placing.place(state.target.xyz))
         self._scene.add_icosphere("/target/ball", 0.05, color=TARGET, cast_shadow=False)
         self._scene.add_icosphere("/target/halo", 0.11, color=TARGET, opacity=0.3, cast_shadow=False)
-        self._scene.add_label("/target/name", "target", position=(0.0, 0.0, 0.16))
+        self._scene.add_label("/target/name", "target", position=(0.0, 0.0, 0.16), font_screen_scale=0.9)
 
     def _ball(self, here: Floats) -> None:
         if not np.isfinite(here).all():
             self._scene.remove_by_name("/ball")
             return
         self._scene.add_icosphere("/ball", 0.04, color=BALL, position=self._placing.place(here), cast_shadow=False)
-
-
-__all__ = ["Scene"]

@@ -16,6 +16,9 @@ Colours = NDArray[np.uint8]
 WIDEST = np.radians(100.0)
 """A frustum is drawn no wider: a fisheye's would hide the workspace."""
 
+FILLED = 0.86
+"""Part of the window that the scene fills: names stand beside the cameras."""
+
 UNMEASURED = (120, 124, 132)
 
 _VIRIDIS = np.array([
@@ -27,7 +30,7 @@ _VIRIDIS = np.array([
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """From the world to the scene, where the workspace is two units across and z is up: scale * rotation @ (x - centre)."""
+    """From the world to the scene, where the workspace is two units across and z is up: scale * rotation @ (x - c)."""
 
     centre: Floats
     scale: float
@@ -87,7 +90,7 @@ def eyes(calibration: Calibration | None) -> list[Eye]:
 
 
 def _eye(name: str, centre: Floats, rays: Floats, ahead: Floats, aspect: float) -> Eye | None:
-    """Of seven lines of sight: the middle, left and right of it, above and below, top, bottom. None where it has none."""
+    """Of seven lines of sight: middle, left and right of it, above and below, top, bottom. None where it has none."""
     rays = rays * np.sign(rays[:1] @ ahead)[:, None]  # a projective camera does not know which end is the front
     if not np.isfinite(rays[:5]).all():
         return None
@@ -120,21 +123,32 @@ def upwards(seen: list[Eye]) -> Floats:
     return np.asarray(axes[int(np.argmax(axes @ up))])
 
 
-def vantage(seen: list[Eye], placing: Placing, aspect: float, fov: float) -> tuple[Floats, Floats]:
-    """Where to look from, (3,), and at what, (3,), in the scene, so that everything is in view: over the cameras'
-    shoulders and a little from above. aspect: of the window, width over height; fov: its vertical angle, radians."""
-    places = [placing.place(eye.centre) for eye in seen]
-    middle = np.mean([np.zeros(3), *places], axis=0) if places else np.zeros(3)
-    radius = max([1.0 + float(np.linalg.norm(middle)), *(float(np.linalg.norm(p - middle)) + 0.25 for p in places)])
-    behind = np.mean(places, axis=0) if places else np.zeros(3)
+def vantage(seen: list[Eye], corners: Floats, placing: Placing, aspect: float, fov: float) -> tuple[Floats, Floats]:
+    """Where to look from, (3,), and at what, (3,), in the scene, so that everything is in view and as large as can be.
+
+    From behind the cameras and a little above, more or less from the side. corners: (n, 3) of the workspace, world;
+    aspect: of the window, width over height; fov: its vertical angle, radians.
+    """
+    places = placing.place(np.array([*corners, *(eye.centre for eye in seen)]))
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2
+    behind = np.mean([placing.place(eye.centre) for eye in seen], axis=0) if seen else np.zeros(3)
     behind[2] = 0
     length = float(np.linalg.norm(behind))
     back = behind / length if length > 0.3 else np.array([-0.55, -0.83, 0.0])
     side = np.array([-back[1], back[0], 0.0])
-    direction = back + 0.75 * side + np.array([0, 0, 0.6])
-    narrowest = min(fov, 2 * float(np.arctan(np.tan(fov / 2) * aspect)))
-    distance = 0.92 * radius / np.sin(narrowest / 2)  # a sphere around everything has empty corners
-    return middle + direction / np.linalg.norm(direction) * distance, middle
+    ways = [back + across * side + np.array([0, 0, 0.55]) for across in (-1.5, -1.0, -0.6, 0.6, 1.0, 1.5)]
+    reach = np.tan(fov / 2) * FILLED * np.array([aspect, 1.0])
+    views = [(_distance(places - middle, way / np.linalg.norm(way), reach), way / np.linalg.norm(way)) for way in ways]
+    distance, way = min(views, key=lambda view: view[0])
+    return middle + distance * way, middle
+
+
+def _distance(places: Floats, way: Floats, reach: Floats) -> float:
+    """From how far along `way` (3,) all places (n, 3) are in view. reach: (2,) tangents of half the window's angles."""
+    right = np.cross([0.0, 0.0, 1.0], way)
+    right = right / np.linalg.norm(right)
+    across = np.abs(places @ np.column_stack([right, np.cross(way, right)]))
+    return float((across / reach + (places @ way)[:, None]).max())
 
 
 def edges(workspace: Workspace) -> Floats:
@@ -148,7 +162,7 @@ def edges(workspace: Workspace) -> Floats:
         for i, j in zip(*np.nonzero(np.triu(shared, 1) >= 2), strict=True)
         if np.linalg.matrix_rank(planes[on[i] & on[j], :3], tol=1e-4) >= 2
     ]
-    return corners[np.array(pairs, dtype=int).reshape(-1, 2)]
+    return np.asarray(corners[np.array(pairs, dtype=int).reshape(-1, 2)], dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -160,11 +174,11 @@ class Scale:
 
     @classmethod
     def around(cls, value: float) -> Scale:
-        """About a value: from 1, 2 or 5 below it to ten times as much."""
+        """About a value: from 1, 2 or 5 below it to twenty times as much."""
         exponent = np.floor(np.log10(value))
         step = max(s for s in (1.0, 2.0, 5.0) if s <= value / 10**exponent * (1 + 1e-9))
         low = float(step * 10**exponent)
-        return cls(low, 10 * low)
+        return cls(low, float(f"{20 * low:.6g}"))
 
     def colours(self, values: Floats) -> Colours:
         """(n, 3) red, green, blue of values (n,); grey for NaN."""

@@ -61,13 +61,13 @@ def _aim(state: State, point: str, moves: bool) -> Headline:
 def way(here: Floats, there: Floats, unit: str) -> str:
     """The way that is left from here to there, both (3,): along each axis, with its sign; HTML."""
     step = there - here
+    length = float(np.linalg.norm(step))
+    digits = int(np.clip(1 - np.floor(np.log10(max(length, 1e-9))), 0, 4))  # two digits of the whole way
     cells = "".join(
-        f"<td style='padding-right:28px'><span style='color:#9aa3b2'>{axis}</span> "
-        f"{'+' if d >= 0 else '−'}{number(abs(float(d)), 2)} {escape(unit)}</td>"
+        f"<span><i>{axis}</i> {'+' if d >= 0 else '−'}{abs(float(d)):.{digits}f} {escape(unit)}</span>"
         for axis, d in zip("xyz", step, strict=True)
     )
-    far = number(float(np.linalg.norm(step)), 2)
-    return f"<table class='way'><tr><td style='padding-right:28px'><b>{far} {escape(unit)}</b> to go</td>{cells}</tr></table>"
+    return f"<div class='way'><span><b>{length:.{digits}f} {escape(unit)}</b> to go</span>{cells}</div>"
 
 
 def to_go(state: State, measured: Floats, unit: str) -> str:
@@ -75,12 +75,14 @@ def to_go(state: State, measured: Floats, unit: str) -> str:
     if state.target is None or state.phase not in ("aim", "moving", "shown"):
         return ""
     here = state.position if state.phase == "shown" else measured
+    if state.phase == "shown" and np.isfinite(here).all():
+        return f"<div class='detail'>ball at {escape(place(here, unit))}</div>"
     if np.isfinite(here).all():
         return way(here, state.target.xyz, unit)
     offs = [float(np.linalg.norm(look.uv - look.expected)) for look in state.looks]
     offs = [off for off in offs if np.isfinite(off)]
     if offs:
-        return f"<table class='way'><tr><td><b>{np.mean(offs):.0f} px</b> to go</td></tr></table>"
+        return f"<div class='way'><b>{np.mean(offs):.0f} px</b> to go</div>"
     return ""
 
 

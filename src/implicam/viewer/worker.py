@@ -22,7 +22,7 @@ class Worker:
     def __init__(self, guide: Guide, complain: Callable[[ImplicamError], None]) -> None:
         self._guide, self._complain = guide, complain
         self._jobs: queue.Queue[Action | None] = queue.Queue()
-        self._busy = threading.Lock()
+        self._lock, self._taken = threading.Lock(), True
         self._thread = threading.Thread(target=self._run, name="implicam-worker", daemon=True)
 
     def start(self) -> None:
@@ -31,8 +31,8 @@ class Worker:
         self._thread.start()
 
     def ask(self, action: Action) -> bool:
-        """Have it done, unless something is being done or waiting already: a button that is pressed twice counts once."""
-        if self._busy.locked() or not self._jobs.empty():
+        """Have it done, unless something is being done or waiting already: a button pressed twice counts once."""
+        if not self._take():
             return False
         self._jobs.put(action)
         return True
@@ -48,29 +48,34 @@ class Worker:
             try:
                 job = self._jobs.get(timeout=PAUSE)
             except queue.Empty:
+                if not self._take():
+                    continue
                 job = self._by_itself
             if job is None:
                 return
-            with self._busy:
-                self._do(job)
+            self._do(job)
+
+    def _take(self) -> bool:
+        """Whether nothing is being done; then something is from now on."""
+        with self._lock:
+            free, self._taken = not self._taken, True
+        return free
 
     def _do(self, job: Action) -> None:
         try:
             job()
         except ImplicamError as error:
             self._complain(error)
+        finally:
+            with self._lock:
+                self._taken = False
 
     def _by_itself(self) -> None:
         """The next step of an automatic session; it ends when a rule says so, or where no place is left."""
         state = self._guide.state
         if not state.auto:
             return
-        if state.phase == "shown":
-            if state.seen:
-                self._guide.accept()
-            else:
-                self._guide.skip("the ball was not found")
-        elif state.phase == "aim" and state.target is not None and not state.stop:
+        if state.phase == "shown" or (state.phase == "aim" and state.target is not None and not state.stop):
             self._guide.step()
         elif state.phase == "aim":
             self._guide.set_auto(False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -108,6 +109,13 @@ class RigMap:
             return parts
         together = (np.concatenate([part[i] for part in parts], axis=1) for i in range(1, len(Sensitivity._fields)))
         return [Sensitivity(self.cameras, *together)]
+
+    def slopes(self, xyz: Floats) -> Iterator[tuple[Floats, float, int]]:
+        """For positions (n, 3), per calibrated camera: the derivative of its pixels (n, 2, 3) per length unit, its
+        noise in pixels, and its number in the dataset."""
+        points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        for c, model in zip(self.cameras, self.posterior.models, strict=True):
+            yield model.predict(points)[1] / self.frame.scale, model.noise, c
 
     def centres(self) -> dict[str, Floats]:
         """Where the calibrated cameras are: name -> (3,) in the world."""

@@ -117,4 +117,4 @@ class Shots:
         lever = rigid * sd.reshape(6, -1)[:, 0]
         lever[:, :, 3:] *= within[:, None, None]
         left = (1 - holds**2)[:, None, None] * (lever @ lever.swapaxes(1, 2))
-        return known.reshape(n, 3, -1) * sd, left
+        return known.reshape(n, 3, len(sd)) * sd, left
