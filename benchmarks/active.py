@@ -2,6 +2,7 @@
 
     python benchmarks/active.py            every table, the figure and benchmarks/results/active.json
     python benchmarks/active.py --quick    two seeds, fewer points: does it run?
+    python benchmarks/active.py --only inverse-gp:excess        these again, the other runs of the file stay
     python benchmarks/active.py --draw     tables and figure again from the file
 
 Every run starts from 8 (forward-gp) or 20 (inverse-gp) random positions of the simulated rig's working volume, and then
@@ -58,9 +59,11 @@ def main() -> None:
     parser.add_argument("--draw", action="store_true")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", metavar="METHOD:RULE,...", default="")
     options = parser.parse_args()
     if not options.draw:
-        measure(2 if options.quick else options.seeds, options.jobs, options.quick)
+        only = [tuple(pair.split(":")) for pair in options.only.split(",") if pair]
+        measure(2 if options.quick else options.seeds, options.jobs, options.quick, only)
     if not options.quick:
         report(json.loads(RESULTS.read_text())["runs"])
 
@@ -69,10 +72,10 @@ def wanted(method: str, rig: str, rule: str) -> bool:
     """Which combinations are run: the second pair of cameras shows that the first is no exception."""
     if rig == "2 cameras (stereo)":
         return method == "forward-gp" and rule in ("random", "variance", "excess", "integrated")
-    return method == "forward-gp" or rule != "own start"
+    return method == "forward-gp" or rule in ("random", "variance", "excess", "integrated", "grid")
 
 
-def measure(seeds: int, jobs: int, quick: bool) -> None:
+def measure(seeds: int, jobs: int, quick: bool, only: list[tuple[str, ...]]) -> None:
     """Every run, seed by seed; the file is written again after each, so that a part of it is of use."""
     every = [
         (rig, method, rule, seed, quick)
@@ -80,14 +83,18 @@ def measure(seeds: int, jobs: int, quick: bool) -> None:
         for method in METHODS
         for rig in RIGS
         for rule in (*RULES, "own start", "grid")
-        if wanted(method, rig, rule)
+        if wanted(method, rig, rule) and (not only or (method, rule) in only)
     ]
-    began, runs = time.perf_counter(), []
+    began, runs, before = time.perf_counter(), [], 0.0
+    if only:
+        file = json.loads(RESULTS.read_text())
+        kept = (one for one in file["runs"] if wanted(one["method"], one["rig"], one["rule"]))
+        before, runs = file["seconds"], [one for one in kept if (one["method"], one["rule"]) not in only]
     with multiprocessing.get_context("spawn").Pool(jobs) as pool:
         for found in pool.imap_unordered(run, every):
             runs.append(found)
             if not quick:
-                seconds = time.perf_counter() - began
+                seconds = before + time.perf_counter() - began
                 runs.sort(key=lambda one: (one["method"], one["rig"], one["rule"], one["seed"]))
                 text = ",\n".join(json.dumps(one) for one in runs)
                 RESULTS.write_text(f'{{"seconds": {seconds:.0f}, "runs": [\n{text}\n]}}\n')
@@ -194,10 +201,8 @@ Runs = dict[int, list[dict[str, Any]]]
 
 
 def _first(run: list[dict[str, Any]], key: str, value: float) -> float:
-    """Points from which on a curve is below a value, for good; infinity for never."""
-    above = [row["points"] for row in run if not (row[key] or np.inf) <= value]
-    later = [row["points"] for row in run if row["points"] > max(above, default=0)]
-    return min(later, default=np.inf)
+    """Points at which a curve is first at or below a value; infinity for never."""
+    return min((row["points"] for row in run if (row[key] or np.inf) <= value), default=np.inf)
 
 
 def _within_limit(curves: dict[Any, Runs]) -> None:
@@ -230,7 +235,8 @@ def _errors(curves: dict[Any, Runs]) -> None:
     print("\n| errors at other positions | points | rmse / limit, mean ± se | coverage of the 95 % ellipsoid |")
     print("|---|---|---|---|")
     for (method, rig, rule), runs in curves.items():
-        counts = (175,) if rule == "grid" else (16, 36) if method == "forward-gp" else (60, 120)
+        counts = (87, 120, 175) if method == "inverse-gp" else (16, 20, 36)
+        counts = (175,) if rule == "grid" else counts
         for n in counts:
             errors, coverage = _mean_se(runs, n, "rmse_over_limit"), _mean_se(runs, n, "coverage")
             print(f"| {method}, {rig}, {rule} | {n} | {errors} | {coverage} |")
@@ -242,7 +248,7 @@ def _draw(curves: dict[Any, Runs]) -> None:
     def panel(method: str, rig: str, key: str, ylabel: str, line: tuple[float, str] | None) -> Panel:
         rules = {}
         for (m, r, rule), runs in curves.items():
-            if (m, r) == (method, rig):
+            if (m, r) == (method, rig) and wanted(method, rig, rule):
                 counts = sorted(
                     set.intersection(*({row["points"] for row in run if row[key]} for run in runs.values()))
                 )

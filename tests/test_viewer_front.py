@@ -7,8 +7,10 @@ handshake. The real viser is behind the door in the last tests, with websockets'
 
 import asyncio
 import contextlib
+import gc
 import re
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -549,6 +551,17 @@ def test_a_client_that_hangs_up_in_the_head_is_forgotten(front, behind):
     assert len(behind.heads) == 1
 
 
+def test_clients_that_reset_the_connection_leave_no_trace(front, caplog):
+    for start in (b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n", b"x\r\n\r\n") * 10:
+        with connect(front) as line:
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close() sends RST
+            line.sendall(start)
+    assert get(front)[0] == 200
+    front.close()
+    gc.collect()  # where asyncio would log an exception that nobody took
+    assert caplog.records == []
+
+
 def test_a_body_that_does_not_come_ends_in_time(front, monkeypatch):
     monkeypatch.setattr(door, "PATIENCE", 0.3)
     monkeypatch.setattr(door, "ANSWER", 0.3)
@@ -683,6 +696,19 @@ def test_close_hangs_up_frees_the_port_and_ends_the_thread(behind, caplog):
     with opened(behind, port=port) as again:
         assert again.port == port
         assert get(again)[0] == 200
+
+
+def test_whoever_connects_while_it_closes_is_hung_up_on(behind):
+    for count in range(30):
+        front = Front(host="127.0.0.1", port=0, behind=behind.address, token=None, files={})
+        front.start()
+        with contextlib.ExitStack() as stack:
+            lines = [stack.enter_context(connect(front)) for _ in range(count % 5)]
+            front.close()
+            for line in lines:
+                with contextlib.suppress(ConnectionResetError):
+                    assert line.recv(1) == b""
+    gc.collect()  # a socket that was forgotten warns, and a warning is an error
 
 
 def test_both_families_where_the_machine_has_them(behind):

@@ -21,14 +21,21 @@ from implicam.active.acquisition import DEFAULT, Acquisition, Choice, acquisitio
 from implicam.active.outlook import ForwardOutlook, InverseOutlook, Places, Prospect, outlook_of
 from implicam.active.stopping import Never, Rule, Step
 from implicam.active.workspace import Workspace
-from implicam.calibrators import Calibration, Calibrator, ForwardGP, ForwardGPCalibration, InverseGP
+from implicam.calibrators import (
+    Calibration,
+    Calibrator,
+    ForwardGP,
+    ForwardGPCalibration,
+    InverseGP,
+    InverseGPCalibration,
+)
 from implicam.dataset import Dataset, Floats, join
 from implicam.errors import FitError, ImplicamError, UsageError
 from implicam.progress import Progress, silent
 
 GROWTH = 1.25
-"""Between two fits from no guess the points grow by this factor at most: forward-gp, and the forward model that
-predicts pixels for inverse-gp."""
+"""Between two fits from no guess the points grow by this factor at most; also of the forward model that predicts pixels
+for inverse-gp."""
 
 FEW = 16
 """So few points say little of where the best fit is: each fit is one from no guess."""
@@ -84,7 +91,8 @@ class Loop:
 
     calibrator: the method; workspace: where targets can be and where the calibration has to be good. start: so many
     points before the first fit, evenly spread. candidates, judged: numbers of places. reach: the distance that costs
-    as much as one measurement. pool: a recorded dataset that the targets are chosen from, its own pixels known. data:
+    as much as one measurement. growth: a fit begins from no guess when the points have grown by this factor, from the
+    last result between; 1 for always from no guess, as the paper does. pool: a recorded dataset that the targets are chosen from, its own pixels known. data:
     what is known already.
     """
 
@@ -97,6 +105,7 @@ class Loop:
     judged: int = 400
     reach: float = np.inf
     seed: int = 0
+    growth: float = GROWTH
     pool: Dataset | None = None
     data: Dataset | None = None
 
@@ -193,11 +202,14 @@ class Loop:
         return self
 
     def _fitted(self, before: Calibration | None, data: Dataset, progress: Progress) -> Calibration:
-        """A fit with everything; of forward-gp from the last one's result while the points have not grown by much."""
-        grown = FEW < len(data) < GROWTH * self._from_no_guess
-        if grown and isinstance(before, ForwardGPCalibration) and len(before.data) < len(data):
-            return before.grown(data, progress)
-        self._from_no_guess = len(data)
+        """A fit with everything, from the last one's result; from no guess, too, when the points have grown by much."""
+        if self.growth <= 1:
+            return self.calibrator.fit(data, progress)
+        anew = not FEW < len(data) < self.growth * self._from_no_guess
+        if anew:
+            self._from_no_guess = len(data)
+        if isinstance(before, ForwardGPCalibration | InverseGPCalibration) and len(before.data) < len(data):
+            return before.grown(data, progress, anew=anew)
         return self.calibrator.fit(data, progress)
 
     def _to_begin(self, number: int, here: Floats | None) -> list[Target]:

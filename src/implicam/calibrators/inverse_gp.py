@@ -12,9 +12,9 @@ GPs know nothing of each other.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -35,7 +35,7 @@ from implicam.calibrators.protocol import (
 )
 from implicam.dataset import Dataset, Floats, Names, Observations
 from implicam.errors import UsageError, did_you_mean
-from implicam.gp import SHAPES, GaussianProcess, Kernel, maximise_each
+from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, maximise_each
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
@@ -103,11 +103,14 @@ class InverseGP:
 
     def fit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
         """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
-        usable, unused = seen_by_all(data, self.method)
         if self.preset == "paper":
             from implicam.calibrators.paper_preset import train
         else:
             train = _train
+        return self._fitted(data, train, progress)
+
+    def _fitted(self, data: Dataset, train: Train, progress: Progress) -> InverseGPCalibration:
+        usable, unused = seen_by_all(data, self.method)
         inputs, outputs = pixels_of(usable), usable.xyz
         pixels, positions = Scaling.of(inputs), Scaling.of(outputs)
         if self.preset == "paper":  # it never standardised its positions: they are in metres, from the robot's origin
@@ -139,7 +142,13 @@ def pixels_of(data: Dataset) -> Floats:
     return data.observations.uv.reshape(len(data), -1)
 
 
-def _train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperparameters, ...]:
+Train = Callable[[InverseGP, Floats, Floats, Progress], tuple[Hyperparameters, ...]]
+"""Hyperparameters of three outputs (n, 3) at inputs (n, d), both standardised."""
+
+
+def _train(
+    method: InverseGP, X: Floats, Y: Floats, progress: Progress, starts: Sequence[Fit] = (), anew: bool = True
+) -> tuple[Hyperparameters, ...]:
     """Our own fit, the three outputs side by side."""
     fits = maximise_each(
         X,
@@ -148,6 +157,8 @@ def _train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple
         shortest=method.shortest_lengthscale,
         seed=method.seed,
         done=lambda done, of: progress("fitting", done, of),
+        starts=starts,
+        anew=anew,
     )
     return tuple(Hyperparameters(fit.kernel, fit.noise_variance) for fit in fits)
 
@@ -213,6 +224,19 @@ class InverseGPCalibration:
     def refit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
         """The same method with the same options on other data."""
         return self.calibrator.fit(data, progress)
+
+    def grown(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> InverseGPCalibration:
+        """As `refit`, starting from what is known, for some points more; with `anew` from no guess as well, and the
+        more probable of both counts. The paper's preset always starts from its defaults."""
+        if self.calibrator.preset == "paper":
+            return self.refit(data, progress)
+        usable, _ = seen_by_all(data, self.method)
+        ratio = self.pixels.scale / Scaling.of(pixels_of(usable)).scale  # lengthscales are in standard deviations
+        starts = [
+            Fit(replace(h.kernel, lengthscale=h.kernel.lengthscale * ratio), h.noise_variance, 0.0)
+            for h in self.hyperparameters
+        ]
+        return self.calibrator._fitted(data, partial(_train, starts=starts, anew=anew), progress)
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""

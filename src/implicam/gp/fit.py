@@ -14,7 +14,7 @@ See docs/decisions/0003-gp-fit.md for what was tried.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -145,13 +145,23 @@ def maximise_each(
     shortest: float = SHORTEST,
     seed: int = 0,
     done: Callable[[int, int], None] = lambda done, of: None,
+    starts: Sequence[Fit] = (),
+    anew: bool = True,
 ) -> list[Fit]:
-    """The same for every column of Y (n, m), all searches side by side; `done(k, of)` is told when one has ended."""
-    ended: list[int] = []
-    tasks = [(y, way) for way in _ways(len(X)) for y in np.asarray(Y).T]
+    """The same for every column of Y (n, m), all searches side by side; `done(k, of)` is told when one has ended.
 
-    def one(task: tuple[Floats, str]) -> Fit:
-        fit = _search(X, task[0], shape, task[1], shortest, None, seed)
+    starts: earlier fits, one a column, that searches go on from, too; without `anew` only from them. Of several
+    searches the most probable result is taken.
+    """
+    ended: list[int] = []
+    columns = np.asarray(Y).T
+    ways = _ways(len(X)) if anew or not starts else ()
+    tasks: list[tuple[Floats, str, Fit | None]] = [(y, way, None) for way in ways for y in columns]
+    tasks += [(y, "continued", start) for y, start in zip(columns, starts, strict=False)]
+
+    def one(task: tuple[Floats, str, Fit | None]) -> Fit:
+        y, way, start = task
+        fit = _search(X, y, shape, way, shortest, start, seed)
         ended.append(1)
         done(len(ended), len(tasks))
         return fit

@@ -25,6 +25,7 @@ import re
 import secrets
 import socket
 import threading
+import time
 from asyncio import StreamReader, StreamWriter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -255,8 +256,7 @@ class Front:
         listening = _listen(self.host, self.port)
         self.port = listening.getsockname()[1]
         ready = threading.Event()
-        serving = self._serve(listening, ready)
-        self._thread = threading.Thread(target=asyncio.run, args=(serving,), name="implicam-front", daemon=True)
+        self._thread = threading.Thread(target=self._run, args=(listening, ready), name="implicam-front", daemon=True)
         self._thread.start()
         ready.wait()
 
@@ -276,31 +276,51 @@ class Front:
     ) -> None:
         self.close()
 
+    def _run(self, listening: socket.socket, ready: threading.Event) -> None:
+        with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:  # Windows' own loop has no add_reader
+            runner.run(self._serve(listening, ready))
+
     async def _serve(self, listening: socket.socket, ready: threading.Event) -> None:
+        """Accept until told to hang up.
+
+        Not by asyncio's Server: up to Python 3.11 one that is closed forgets the sockets it has just accepted.
+        """
         loop, closing = asyncio.get_running_loop(), asyncio.Event()
-        server = await asyncio.start_server(self._client, sock=listening, limit=HEAD_BYTES)
+        listening.setblocking(False)
+        loop.add_reader(listening, self._accept, loop, listening)
         self._hang_up = lambda: _call_soon(loop, closing.set)
         ready.set()
         await closing.wait()
-        server.close()
+        loop.remove_reader(listening)
+        listening.close()
         clients = list(self._clients)
         for client in clients:
             client.cancel()
         await asyncio.gather(*clients, return_exceptions=True)
 
-    async def _client(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """One connection from its first byte to its last."""
-        task = asyncio.current_task()
-        assert task is not None
-        self._clients.add(task)
+    def _accept(self, loop: asyncio.AbstractEventLoop, listening: socket.socket) -> None:
         try:
-            await self._answer(reader, writer)
-            await _finish(reader, writer)
-        except (OSError, TimeoutError, asyncio.CancelledError):
-            pass  # they hung up, or stopped reading, or we close: the task ends here, and asyncio need not log it
-        finally:
-            self._clients.discard(task)
-            writer.transport.abort()
+            line, _ = listening.accept()
+        except BlockingIOError:
+            return  # who knocked is gone
+        except OSError:
+            time.sleep(0.05)  # no file descriptor is left: nothing can be done, but not at full speed
+            return
+        line.setblocking(False)
+        client = loop.create_task(self._client(line))
+        self._clients.add(client)
+        client.add_done_callback(self._clients.discard)
+        client.add_done_callback(lambda _: line.close())  # nobody else does where it is cancelled before it begins
+
+    async def _client(self, line: socket.socket) -> None:
+        """One connection from its first byte to its last."""
+        with suppress(OSError, TimeoutError):  # they hung up, or stopped reading
+            reader, writer = await asyncio.open_connection(sock=line, limit=HEAD_BYTES)
+            try:
+                await self._answer(reader, writer)
+                await _finish(reader, writer)
+            finally:
+                writer.transport.abort()
 
     async def _answer(self, reader: StreamReader, writer: StreamWriter) -> None:
         head = None

@@ -48,7 +48,7 @@ class Worker:
             try:
                 job = self._jobs.get(timeout=PAUSE)
             except queue.Empty:
-                if not self._take():
+                if not self._guide.state.auto or not self._take():
                     continue
                 job = self._by_itself
             if job is None:
@@ -73,7 +73,7 @@ class Worker:
     def _by_itself(self) -> None:
         """The next step of an automatic session; it ends when a rule says so, or where no place is left."""
         state = self._guide.state
-        if not state.auto:
+        if not state.auto:  # somebody has just switched it off
             return
         if state.phase == "shown" or (state.phase == "aim" and state.target is not None and not state.stop):
             self._guide.step()
