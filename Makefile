@@ -2,6 +2,7 @@
 # make check  all that CI checks                        make bench  speed against the limits
 # make real   the table of docs/real-data.md            make rigs   the tables of docs/choose.md on forward-gp
 # make methods   all methods side by side, the first table of docs/choose.md
+# make active   the tables and the figure of docs/active.md
 # make paper  the paper's experiments, 21 minutes; docs/reproduce.md
 # make clean  start over
 PYTHON ?= python3
@@ -9,7 +10,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-slow check lint bench real rigs methods paper clean
+.PHONY: demo test test-slow check lint bench real rigs methods active paper clean
 
 demo: $(VENV)/.demo
 	$(BIN)/implicam demo
@@ -31,6 +32,7 @@ lint: $(VENV)/.dev
 bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/gp_fit.py
 	$(BIN)/python benchmarks/forward_speed.py
+	$(BIN)/python benchmarks/active_speed.py
 
 rigs: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/forward.py --rigs 16
@@ -40,6 +42,9 @@ real: $(VENV)/.dev
 
 methods: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/methods.py ../shared/real
+
+active: $(VENV)/.dev
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/active.py
 
 paper: $(VENV)/.dev
 	$(BIN)/implicam paper all
@@ -57,7 +62,7 @@ $(VENV)/bin/python:
 
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
 	@echo "Setting up (once) ..."
-	@$(PIP) --editable ".[report,images]"
+	@$(PIP) --editable ".[report,images,viewer]"
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python

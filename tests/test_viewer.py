@@ -413,12 +413,10 @@ def test_viser_itself_takes_nobody_who_did_not_come_by_the_front_door() -> None:
     pytest.importorskip("viser")
     from implicam.viewer.page import _handshake, _inner_server
 
-    server, origins = _inner_server()
+    server, origin = _inner_server()
     try:
-        assert _handshake(server.get_port(), "http://localhost:8090") == 403
-        origins[:] = [re.compile("http://localhost:8090")]
-        assert _handshake(server.get_port(), "http://localhost:8090") == 101
-        for other in ("http://evil.example", "http://localhost:8090.evil.example", "null", ""):
+        assert _handshake(server.get_port(), origin) == 101
+        for other in ("http://localhost", f"http://localhost:{server.get_port()}", "http://evil.example", "null", ""):
             assert _handshake(server.get_port(), other) == 403
         assert server.request_share_url() is None
     finally:
@@ -543,7 +541,7 @@ def test_a_whole_session_in_a_browser(tmp_path: Path, chromium: dict[str, Any]) 
                 visitor.reads("all 12 points of the budget are measured")
                 visitor.presses("Stop now")
                 visitor.reads("Done: the rig is calibrated")
-                report = page.request.get(f"{command.url}report.html")
+                report = page.request.get(f"{command.url}report.html").text()
                 saved = page.request.get(f"{command.url}calibration.implicam").body()
                 visitor.presses("Close the session")
                 assert command.end() == 0
@@ -554,8 +552,7 @@ def test_a_whole_session_in_a_browser(tmp_path: Path, chromium: dict[str, Any]) 
             browser.close()
     assert not errors
     assert len(kept) >= 10
-    assert report.status == 200
-    assert "a guided calibration" in report.text()
+    assert "a guided calibration" in report
     calibration = load_calibration(folder / "calibration.implicam")
     assert saved == (folder / "calibration.implicam").read_bytes()
     assert len(calibration.data) == 12

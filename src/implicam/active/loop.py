@@ -92,8 +92,8 @@ class Loop:
     calibrator: the method; workspace: where targets can be and where the calibration has to be good. start: so many
     points before the first fit, evenly spread. candidates, judged: numbers of places. reach: the distance that costs
     as much as one measurement. growth: a fit begins from no guess when the points have grown by this factor, from the
-    last result between; 1 for always from no guess, as the paper does. pool: a recorded dataset that the targets are chosen from, its own pixels known. data:
-    what is known already.
+    last result between; 1 for always from no guess, as the paper does. pool: a recorded dataset that the targets are
+    chosen from, its own pixels known. data: what is known already.
     """
 
     calibrator: Calibrator

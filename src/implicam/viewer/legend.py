@@ -32,8 +32,8 @@ def legend(scale: Scale, what: str, unit: str) -> str:
         f"<div class='legend'><div>{escape(what)}, {escape(unit)}</div>"
         f"<div class='bar' style='background:linear-gradient(to right, {colours})'></div>"
         f"<div class='marks'>{marks}</div>"
-        f"<div>known points <span style='color:white'>●</span> next target <span style='color:{ORANGE}'>●</span> "
-        f"ball <span style='color:{SKY}'>●</span> skipped <span style='color:#7d818a'>◆</span></div></div>"
+        f"<div><span style='color:white'>●</span> known points &nbsp;<span style='color:{ORANGE}'>●</span> target "
+        f"&nbsp;<span style='color:{SKY}'>●</span> ball &nbsp;<span style='color:#7d818a'>◆</span> skipped</div></div>"
     )
 
 
@@ -78,7 +78,7 @@ def chart(unit: str, rule: Rule) -> dict[str, Any]:
             {"label": "points"},
             {"label": f"everywhere, {unit}", "stroke": ORANGE, "width": 3, "points": {"show": True, "size": 6}},
             {"label": f"in 95 %, {unit}", "stroke": SKY, "width": 3, "points": {"show": True, "size": 6}},
-            {"label": "stop", "stroke": VERMILLION, "width": 2, "dash": (8, 6), "points": {"show": False}},
+            {"label": "stop", "stroke": VERMILLION, "width": 0, "points": {"show": False}},
         ),
         "scales": across(0),
         "axes": (

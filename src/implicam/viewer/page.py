@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import re
+import secrets
 import socket
 import threading
 import time
@@ -31,7 +31,7 @@ REASONS = ("the place cannot be reached", "something is in the way", "the camera
 SHARPNESS = 1.5
 """Pixels of the montage per pixel of the page: type stays crisp on dense screens."""
 
-HEAD = 250
+HEAD = 265
 """Pixels of the page above the pictures: tabs and banner."""
 
 SETTLED = 1.5
@@ -50,7 +50,7 @@ class Page:
     def __init__(self, guide: Guide) -> None:
         self._guide, self.closed = guide, threading.Event()
         self._unit, self._moves = guide.session.length_unit, guide.equipment.robot.moves
-        self.server, self._origins = _inner_server()
+        self.server, self.origin = _inner_server()
         self._window = (900, 620)  # pixels of the page: width and height of the pictures
         self._left = LEFT
         self._worker = Worker(guide, self._complain)
@@ -68,12 +68,6 @@ class Page:
     def port(self) -> int:
         """The port of viser, on this machine only."""
         return self.server.get_port()
-
-    def admit(self, host: str, port: int) -> None:
-        """Let the pages connect that came by the front door on host and port, and no others."""
-        names = ["localhost", r"127(?:\.[0-9]{1,3}){3}", r"\[::1\]"]
-        names += ["[^/]+"] if host in ("", "0.0.0.0", "::") else [re.escape(host), rf"\[{re.escape(host)}\]"]
-        self._origins[:] = [re.compile(rf"https?://(?:{'|'.join(names)})(?::{port})?")]
 
     def start(self) -> None:
         """Begin the session."""
@@ -214,7 +208,7 @@ class Page:
     def _fit(self, width: int, height: int) -> None:
         self._left = int(np.clip(SHARE * (width - RIGHT), LEFT, 2000))
         self._panel.set_width(self._left)
-        self._window = max(200, self._left - 46), max(200, height - HEAD)
+        self._window = max(200, self._left - 18), max(200, height - HEAD)
         self._scene.aspect = max(120, width - self._left - RIGHT) / height
 
     def _complain(self, error: ImplicamError) -> None:
@@ -307,16 +301,16 @@ def _set(handle: Any, name: str, value: Any) -> None:
         setattr(handle, name, value)
 
 
-def _inner_server() -> tuple[viser.ViserServer, list[re.Pattern[str]]]:
-    """A viser on a free port of this machine, and the Origins whose WebSockets it takes: a list to fill, none at first.
+def _inner_server() -> tuple[viser.ViserServer, str]:
+    """A viser on a free port of this machine, and the one Origin whose WebSockets it takes: a secret.
 
-    The front door checks who comes in, but a web page could also try viser's own port. viser has no option for Origins,
-    so the `serve` of its library is given one while viser starts; a refused handshake proves it.
+    The front door checks who comes in, and names that Origin; a web page that tries viser's own port cannot. viser has
+    no option for Origins, so the `serve` of its library is given one while viser starts; a refused handshake proves it.
     """
     library = import_extra("viser", "viewer", "the page of implicam acquire")
     sockets: Any = import_extra("websockets.asyncio.server", "viewer", "the page of implicam acquire")
-    origins, plain = [re.compile("(?!)")], sockets.serve
-    sockets.serve = functools.partial(plain, origins=origins)
+    origin, plain = f"http://{secrets.token_hex(16)}.invalid", sockets.serve
+    sockets.serve = functools.partial(plain, origins=[origin])
     try:
         with redirect_stdout(StringIO()):  # it prints the address that nobody is to use
             server: viser.ViserServer = library.ViserServer(host="127.0.0.1", port=0, verbose=False)
@@ -330,7 +324,7 @@ def _inner_server() -> tuple[viser.ViserServer, list[re.Pattern[str]]]:
             why="it lets any web page connect",
             fix='install the one that implicam was tested with: pip install "viser>=1.1,<2"',
         )
-    return server, origins
+    return server, origin
 
 
 def _handshake(port: int, origin: str) -> int:
@@ -361,10 +355,9 @@ def serve(
     page = Page(guide)
     folder = guide.session.folder
     files = {"/report.html": folder / REPORT, "/calibration.implicam": folder / CALIBRATION}
-    front = Front(host=host, port=port, behind=("127.0.0.1", page.port), token=token, files=files)
+    front = Front(host=host, port=port, behind=("127.0.0.1", page.port), token=token, files=files, origin=page.origin)
     try:
         front.start()
-        page.admit(front.host, front.port)
         page.start()
         say(f"The session is at {front.url}   (Ctrl-C ends it; nothing is lost)")
         if open_browser:

@@ -190,7 +190,7 @@ def _marks(tile: _Tile, state: State, look: Look, scale: float) -> None:
         return
     there = _placed(look.expected, scale)
     _reticle(tile, there, radius)
-    below = bool(look.uv[1] < there[1])  # away from the ball, or else above
+    below = bool(look.uv[1] < look.expected[1])  # away from the ball, or else above
     x, y = float(there[0] + 0.8 * radius), float(there[1] + (1.2 if below else -1.2) * radius)
     tile.words.append(_Words("target", x, y, 0.75 * tile.letters, TARGET, "lm", 3))
     if len(look.found) and state.phase == "aim" and away(look) > NEAR:

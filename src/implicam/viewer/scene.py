@@ -152,7 +152,7 @@ class Scene:
         u95 = state.prospect.u95
         if self.scale is None and np.isfinite(u95).any():
             stop = line(self._loop.rule)
-            self.scale = Scale.around(stop.value / 2 if stop is not None else 0.5 * float(np.nanmedian(u95)))
+            self.scale = Scale.around(stop.value / 3 if stop is not None else 0.5 * float(np.nanmedian(u95)))
         if self.scale is None:
             return
         colours = EXCESS_SCALE.colours(state.prospect.excess) if self.shown == EXCESS else self.scale.colours(u95)
