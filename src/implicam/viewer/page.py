@@ -31,8 +31,11 @@ REASONS = ("the place cannot be reached", "something is in the way", "the camera
 SHARPNESS = 1.5
 """Pixels of the montage per pixel of the page: type stays crisp on dense screens."""
 
-HEAD = 265
-"""Pixels of the page above the pictures: tabs and banner."""
+HEAD, LOW_HEAD = 265, 218
+"""Pixels of the page above the pictures: tabs and banner; in windows so narrow that its type is smaller."""
+
+NARROW = 1450
+"""Pixels: width of these windows, as in the style sheet."""
 
 SETTLED = 1.5
 """Seconds until a browser has laid the panels out."""
@@ -208,7 +211,7 @@ class Page:
     def _fit(self, width: int, height: int) -> None:
         self._left = int(np.clip(SHARE * (width - RIGHT), LEFT, 2000))
         self._panel.set_width(self._left)
-        self._window = max(200, self._left - 18), max(200, height - HEAD)
+        self._window = max(200, self._left - 18), max(200, height - (HEAD if width > NARROW else LOW_HEAD))
         self._scene.aspect = max(120, width - self._left - RIGHT) / height
 
     def _complain(self, error: ImplicamError) -> None:
