@@ -223,7 +223,7 @@ def _as_good_as_the_grid(curves: dict[Any, Runs]) -> None:
     print("|---|---|---|---|")
     for (method, rig, rule), runs in curves.items():
         whole = curves.get((method, rig, "grid"))
-        if rule == "grid" or whole is None:
+        if rule == "grid" or whole is None or method == "forward-gp":  # which stops at 36 points
             continue
         goal = {seed: run[-1]["worst"] for seed, run in whole.items()}
         needed = [_first(run, "worst", goal[seed]) for seed, run in runs.items()]
@@ -235,7 +235,7 @@ def _errors(curves: dict[Any, Runs]) -> None:
     print("\n| errors at other positions | points | rmse / limit, mean ± se | coverage of the 95 % ellipsoid |")
     print("|---|---|---|---|")
     for (method, rig, rule), runs in curves.items():
-        counts = (87, 120, 175) if method == "inverse-gp" else (16, 20, 36)
+        counts = (88, 120) if method == "inverse-gp" else (16, 20, 36)
         counts = (175,) if rule == "grid" else counts
         for n in counts:
             errors, coverage = _mean_se(runs, n, "rmse_over_limit"), _mean_se(runs, n, "coverage")

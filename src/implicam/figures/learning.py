@@ -68,8 +68,8 @@ def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
         value, words = panel.line
         axes.axhline(value, color="0.3", lw=1)
         axes.annotate(
-            words, (1, value), xycoords=("axes fraction", "data"), xytext=(-2, 3), textcoords="offset points",
-            ha="right", fontsize=8, color="0.3",
+            words, (0, value), xycoords=("axes fraction", "data"), xytext=(3, 3), textcoords="offset points",
+            ha="left", fontsize=8, color="0.3",
         )  # fmt: skip
     axes.set_title(panel.title, fontsize=10, loc="left")
     axes.set(xlabel="known points", ylabel=panel.ylabel)
