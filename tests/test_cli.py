@@ -251,6 +251,7 @@ def test_json_is_json_and_nothing_else(command: str, made: Path, cli: Cli) -> No
     assert ran.err == ""
 
 
+@pytest.mark.slow
 def test_json_of_the_demo(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "SETS", {"2R": "2 cameras"})
     monkeypatch.setattr(demo, "HELD_OUT", 8)

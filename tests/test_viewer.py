@@ -29,7 +29,8 @@ from implicam.detect import Detected
 from implicam.errors import HardwareError, UsageError
 from implicam.geometry import rotation_from_vector
 from implicam.hardware import Frame
-from implicam.session.guide import Look, State
+from implicam.session.guide import State
+from implicam.session.looks import Look
 from implicam.simulate import Target as Shown
 from implicam.simulate import build_rig, simulate
 from implicam.viewer import words

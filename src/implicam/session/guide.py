@@ -31,14 +31,9 @@ from implicam.hardware import Frame, FrameSource, Robot, Trigger
 from implicam.images import blank
 from implicam.progress import Progress, silent
 from implicam.session.journal import Session
+from implicam.session.looks import Look, believed
 
 CALIBRATION, REPORT = "calibration.implicam", "report.html"
-
-FAR = 6.0
-"""A detection that is so many standard deviations from where it must be is another thing ..."""
-
-AT_LEAST = 8.0
-"""... if it is so many pixels away, too."""
 
 ARMED = 0.05
 """Seconds from asking the cameras for a picture until all of them wait for the trigger."""
@@ -68,22 +63,6 @@ class Equipment:
     radius: float | None = None
     timeout: float = 10.0
     dry_run: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """What one camera shows: its picture, what was found in it, why nothing was; where the target is expected, (2,)
-    pixels, NaN where nobody knows or it is not in view."""
-
-    camera: str
-    frame: Frame | None
-    found: Detected
-    expected: Floats
-
-    @property
-    def uv(self) -> Floats:
-        """(2,) where the ball is, NaN for nowhere."""
-        return self.found.uv[0] if len(self.found) else np.full(2, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,7 +435,7 @@ class Guide:
     def _shown(self, where: Floats) -> None:
         with self._eyes:
             frames = self._frames(self.equipment.trigger)
-        looks = _believed(self._looks(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration)
+        looks = believed(self._looks(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration)
         count = sum(len(look.found) > 0 for look in looks)
         words = f"found in {count} of {len(looks)} cameras"
         if not count:
@@ -501,43 +480,6 @@ class Guide:
                 uv[0, c], sd[0, c] = look.found.uv[0], look.found.sd[0]
         cameras: Sequence[Camera] = self.session.cameras
         return Observations(np.array([name]), tuple(cameras), uv, sd)
-
-
-def _believed(
-    looks: tuple[Look, ...], where: Floats, where_sd: Floats, calibration: Calibration | None
-) -> tuple[Look, ...]:
-    """The looks without detections far from where a ball at `where` (3,), known to where_sd, must be: another thing.
-
-    Of several things that might be the ball, the nearest to that place counts.
-    """
-    if not isinstance(calibration, ForwardGPCalibration):
-        return looks
-    xyz = where[None]
-    uv = calibration.predict(xyz)[0]
-    sd = np.full(len(uv), np.nan)
-    for part in calibration.map.sensitivities(xyz):
-        variance = np.einsum("nij,nij->ni", part.half, part.half)[0] + part.rest[0] + part.noise[0]
-        variance += (part.slope[0] ** 2) @ where_sd**2
-        sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))
-    believed = []
-    for look, there, spread in zip(looks, uv, sd, strict=True):
-        far = max(AT_LEAST, FAR * spread) if np.isfinite(spread) else np.inf
-        near = _nearest(look.found, there)
-        if near is None or np.linalg.norm(near.uv[0] - there) <= far or not np.isfinite(there).all():
-            believed.append(replace(look, found=look.found if near is None else near))
-            continue
-        away = float(np.linalg.norm(near.uv[0] - there))
-        reason = f"what was found is {away:.0f} px from where the ball must be: left out"
-        believed.append(replace(look, found=Detected(reason=reason)))
-    return tuple(believed)
-
-
-def _nearest(found: Detected, there: Floats) -> Detected | None:
-    """Of what may be the ball, the nearest to a pixel; None where nothing was found."""
-    options = [one for one in (found, *found.others) if len(one)]
-    if not options or not np.isfinite(there).all():
-        return found if len(found) else None
-    return min(options, key=lambda one: float(np.linalg.norm(one.uv[0] - there)))
 
 
 def _notes(state: State) -> Mapping[str, Any]:

@@ -1,0 +1,71 @@
+"""What the cameras show of the ball, and which of it can be believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from implicam.calibrators import Calibration, ForwardGPCalibration
+from implicam.dataset import Floats
+from implicam.detect import Detected
+from implicam.hardware import Frame
+
+FAR = 6.0
+"""A detection that is so many standard deviations from where it must be is another thing ..."""
+
+AT_LEAST = 8.0
+"""... if it is so many pixels away, too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What one camera shows: its picture, what was found in it, why nothing was; where the target is expected, (2,)
+    pixels, NaN where nobody knows or it is not in view."""
+
+    camera: str
+    frame: Frame | None
+    found: Detected
+    expected: Floats
+
+    @property
+    def uv(self) -> Floats:
+        """(2,) where the ball is, NaN for nowhere."""
+        return self.found.uv[0] if len(self.found) else np.full(2, np.nan)
+
+
+def believed(
+    looks: tuple[Look, ...], where: Floats, where_sd: Floats, calibration: Calibration | None
+) -> tuple[Look, ...]:
+    """The looks without detections far from where a ball at `where` (3,), known to where_sd, must be: another thing.
+
+    Of several things that might be the ball, the nearest to that place counts.
+    """
+    if not isinstance(calibration, ForwardGPCalibration):
+        return looks
+    xyz = where[None]
+    uv = calibration.predict(xyz)[0]
+    sd = np.full(len(uv), np.nan)
+    for part in calibration.map.sensitivities(xyz):
+        variance = np.einsum("nij,nij->ni", part.half, part.half)[0] + part.rest[0] + part.noise[0]
+        variance += (part.slope[0] ** 2) @ where_sd**2
+        sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))
+    believed = []
+    for look, there, spread in zip(looks, uv, sd, strict=True):
+        far = max(AT_LEAST, FAR * spread) if np.isfinite(spread) else np.inf
+        near = _nearest(look.found, there)
+        if near is None or np.linalg.norm(near.uv[0] - there) <= far or not np.isfinite(there).all():
+            believed.append(replace(look, found=look.found if near is None else near))
+            continue
+        away = float(np.linalg.norm(near.uv[0] - there))
+        reason = f"what was found is {away:.0f} px from where the ball must be: left out"
+        believed.append(replace(look, found=Detected(reason=reason)))
+    return tuple(believed)
+
+
+def _nearest(found: Detected, there: Floats) -> Detected | None:
+    """Of what may be the ball, the nearest to a pixel; None where nothing was found."""
+    options = [one for one in (found, *found.others) if len(one)]
+    if not options or not np.isfinite(there).all():
+        return found if len(found) else None
+    return min(options, key=lambda one: float(np.linalg.norm(one.uv[0] - there)))
