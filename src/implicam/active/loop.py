@@ -32,6 +32,7 @@ from implicam.calibrators import (
 from implicam.dataset import Dataset, Floats, join
 from implicam.errors import FitError, ImplicamError, UsageError
 from implicam.progress import Progress, silent
+from implicam.threads import blas_threads
 
 GROWTH = 1.25
 """Between two fits from no guess the points grow by this factor at most; also of the forward model that predicts pixels
@@ -145,13 +146,14 @@ class Loop:
         self._asked += 1
         if self.calibration is None:
             return self._to_begin(number, here)
+        rng = np.random.default_rng([self.seed, self._asked, 3])
         try:
-            outlook = self._outlook()
+            with blas_threads(1):  # thousands of small matrices: two threads would wait for each other
+                outlook = self._outlook()
+                chosen = choose(outlook, self.acquisition, rng, count=number, here=here, reach=self.reach)
         except FitError as error:  # the forward model of inverse-gp: more points will help
             self.problem = error
             return self._to_begin(number, here)
-        rng = np.random.default_rng([self.seed, self._asked, 3])
-        chosen = choose(outlook, self.acquisition, rng, count=number, here=here, reach=self.reach)
         assert self.data is not None
         targets = targets_of(outlook.candidates, chosen, self.data)
         if self.pool is None:
@@ -298,7 +300,8 @@ class Loop:
         if self.calibration is None:
             return Step(self.points, seconds=passed)
         try:
-            prospect = outlook_of(self.calibration, self.judged_at[:0], self._judged(), self._forward()).now
+            with blas_threads(1):
+                prospect = outlook_of(self.calibration, self.judged_at[:0], self._judged(), self._forward()).now
         except FitError as error:
             self.problem = error
             return Step(self.points, seconds=passed)

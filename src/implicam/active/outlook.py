@@ -10,9 +10,10 @@ where the point is, not on what the cameras will see. Both kinds of methods answ
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol, Self
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,12 +79,19 @@ def on_image(observations: Observations, uv: Floats) -> Bools:
     return seen
 
 
-class Prospect(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Prospect:
     """What measuring at n places would be worth: total (n, 3, 3) the covariance of a position measured there; floor
-    (n, 3, 3) what pixel noise alone would leave, however well the cameras are known. NaN where nothing is measured."""
+    (n, 3, 3) what pixel noise alone would leave, however well the cameras are known. NaN where nothing is measured.
+    make_floor: called when somebody asks for it, for it can cost as much as all the rest."""
 
     total: Floats
-    floor: Floats
+    make_floor: Callable[[], Floats]
+
+    @cached_property
+    def floor(self) -> Floats:
+        """(n, 3, 3) what pixel noise alone would leave."""
+        return self.make_floor()
 
     @property
     def measured(self) -> Bools:
@@ -177,7 +185,7 @@ class ForwardOutlook:
             ever += Dt @ (part.slope / part.noise[..., None])
         total, floor = np.full((n, 3, 3), np.nan), np.full((n, 3, 3), np.nan)
         total[seen], floor[seen] = np.linalg.inv(now[seen]), np.linalg.inv(ever[seen])
-        return Prospect(total, floor)
+        return Prospect(total, lambda: floor)
 
     @cached_property
     def _covariances(self) -> tuple[Floats, ...]:
@@ -187,12 +195,14 @@ class ForwardOutlook:
     @property
     def now(self) -> Prospect:
         """At the judged places."""
-        return Prospect(*(values[len(self.candidates) :] for values in self._prospect))
+        m = len(self.candidates)
+        return Prospect(self._prospect.total[m:], lambda: self._prospect.floor[m:])
 
     @property
     def there(self) -> Prospect:
         """At the candidates."""
-        return Prospect(*(values[: len(self.candidates)] for values in self._prospect))
+        m = len(self.candidates)
+        return Prospect(self._prospect.total[:m], lambda: self._prospect.floor[:m])
 
     def gain(self, weights: Floats) -> Floats:
         """(m,) the expected reduction: a position is off by `A (error of the pixels)`, A = T D^T S^-1, and one more
@@ -278,15 +288,15 @@ def _diagonal(variances: Floats) -> Floats:
 class InverseOutlook:
     """Of three Gaussian processes from pixels to positions, over candidates and judged places, in this order.
 
-    known: per axis V (n, places), `covariance of places = K - V^T V`. floor: (places, 3, 3) what pixel noise leaves,
-    None for what the processes take for noise.
+    known: per axis V (n, places), `covariance of places = K - V^T V`. forward: knows what pixel noise leaves at
+    each place; None for what the processes take for noise.
     """
 
     candidates: Places
     judged: Places
     calibration: InverseGPCalibration
     known: tuple[Floats, ...]
-    floor: Floats | None = None
+    forward: RigMap | None = None
 
     @classmethod
     def of(
@@ -299,11 +309,7 @@ class InverseOutlook:
         """
         X = _inputs(calibration, candidates, judged)
         known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp in calibration.processes)
-        floor = None
-        if forward is not None:
-            seen = np.concatenate([candidates.seen, judged.seen])
-            floor = floor_of(forward, np.concatenate([candidates.xyz, judged.xyz]), seen)
-        return cls(candidates, judged, calibration, known, floor)
+        return cls(candidates, judged, calibration, known, forward)
 
     @cached_property
     def _X(self) -> Floats:
@@ -325,23 +331,27 @@ class InverseOutlook:
     def _noise(self) -> Floats:
         return np.array([h.noise_variance for h in self.calibration.hyperparameters])
 
-    def _prospect(self, part: slice, seen: Bools) -> Prospect:
+    def _prospect(self, part: slice, places: Places) -> Prospect:
         scale = self.calibration.positions.scale
         total = (self._variances[part] + self._noise) * scale**2
-        total[~seen] = np.nan
-        if self.floor is not None:
-            return Prospect(_diagonal(total), self.floor[part])
-        return Prospect(_diagonal(total), _diagonal(np.broadcast_to(self._noise * scale**2, total.shape)))
+        total[~places.seen.all(axis=1)] = np.nan
+
+        def floor() -> Floats:
+            if self.forward is not None:
+                return floor_of(self.forward, places.xyz, places.seen)
+            return _diagonal(np.broadcast_to(self._noise * scale**2, total.shape))
+
+        return Prospect(_diagonal(total), floor)
 
     @property
     def now(self) -> Prospect:
         """At the judged places."""
-        return self._prospect(slice(len(self.candidates), None), np.asarray(self.judged.seen.all(axis=1)))
+        return self._prospect(slice(len(self.candidates), None), self.judged)
 
     @property
     def there(self) -> Prospect:
         """At the candidates."""
-        return self._prospect(slice(len(self.candidates)), self.useful)
+        return self._prospect(slice(len(self.candidates)), self.candidates)
 
     def gain(self, weights: Floats) -> Floats:
         """(m,) the expected reduction, in closed form: covariance squared over the variance of a new output."""
