@@ -14,7 +14,7 @@ import pytest
 
 from implicam import load_calibration, read_dataset
 from implicam.detect import Ball, Detected
-from implicam.errors import HardwareError, ImplicamError, UsageError
+from implicam.errors import FitError, HardwareError, ImplicamError, UsageError
 from implicam.hardware import Person
 from implicam.session import Session
 from implicam.session.guide import CALIBRATION, REPORT, Equipment, Guide
@@ -387,6 +387,20 @@ def test_finishing_too_early_says_how_many_are_missing(guide: Guide) -> None:
         guide.finish()
     assert "at least 8" in error.value.fix
     assert guide.state.phase == "aim"
+
+
+def test_a_fit_that_fails_at_the_end_is_trouble(guide: Guide, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured(guide, 8)
+
+    def fails(*words: Any) -> None:
+        raise FitError("the known points do not fix the rig.")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(type(guide.loop.calibrator), "fit", fails)
+        guide.finish()
+        assert guide.state.phase == "trouble"
+    guide.retry()
+    assert guide.finish().exists()
 
 
 def test_a_person_types_where_the_ball_is(tmp_path: Path) -> None:

@@ -113,6 +113,7 @@ class Guide:
         self._halted = threading.Event()  # somebody pressed stop: nothing moves until somebody says go
         self._in_vain = 0
         self._live = equipment.trigger is None and all(source.live for source in equipment.cameras)
+        loop.history = _remembered(session)
         for skipped in session.skipped:
             loop.refuse(skipped.xyz, skipped.reason)
         self._pool = ThreadPoolExecutor(max(1, len(names)))
@@ -130,7 +131,6 @@ class Guide:
         with self._working("starting", "connecting to the cameras and the robot"):
             for device in self._devices():
                 device.open()
-            self.loop.history = _remembered(self.session)
             self._fit()
             self._aim()
 
@@ -233,9 +233,10 @@ class Guide:
         self._show(auto=auto)
 
     def finish(self) -> Path:
-        """Calibrate with everything, save and report; the calibration's file."""
+        """Calibrate with everything, save and report; the calibration's file, which is not there after trouble."""
         from implicam.report import report_of, write_report
 
+        path = self.session.folder / CALIBRATION
         with self._working("fitting", "calibrating, and writing the report"):
             if self.loop.calibration is None or self.loop.data is None:
                 raise UsageError(
@@ -243,8 +244,7 @@ class Guide:
                     why=str(self.loop.problem.what) if self.loop.problem else "",
                     fix=f"accept at least {self.loop.start}",
                 )
-            calibration = self.loop.calibrator.fit(self.loop.data)  # from no guess: anybody will find the same
-            path = self.session.folder / CALIBRATION
+            calibration = self.loop.calibrator.fit(self.loop.data)  # from no guess, whatever way led here
             calibration.save(path)
             report = self.session.folder / REPORT
             report.unlink(missing_ok=True)  # that of an earlier, other calibration
