@@ -243,7 +243,8 @@ def _errors(curves: dict[Any, Runs]) -> None:
 
 
 def _draw(curves: dict[Any, Runs]) -> None:
-    from implicam.figures.learning import Panel, learning, mean_and_error
+    from implicam.compare import mean_and_error
+    from implicam.figures.learning import Panel, learning
 
     def panel(method: str, rig: str, key: str, ylabel: str, line: tuple[float, str] | None) -> Panel:
         rules = {}
@@ -254,8 +255,9 @@ def _draw(curves: dict[Any, Runs]) -> None:
                 )
                 if method == "forward-gp":
                     counts = [n for n in counts if n <= METHODS[method][2]]
-                table = [[row[key] for row in run if row["points"] in counts] for run in runs.values()]
-                rules[rule] = (np.array(counts), *mean_and_error(table))
+                table = np.array([[row[key] for row in run if row["points"] in counts] for run in runs.values()])
+                mean, error = np.array([mean_and_error(column) for column in table.T]).T
+                rules[rule] = (np.array(counts), mean, error)
         return Panel(f"{method}, {rig}", ylabel, rules, line)
 
     forward = [

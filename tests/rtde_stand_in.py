@@ -1,4 +1,4 @@
-"""A UR controller that is only simulated, so that the real ur-rtde libraries connect to it: python rtde_stand_in.py.
+"""A simulated UR controller, to which the real ur-rtde libraries connect: python rtde_stand_in.py ADDRESS.
 
 It speaks RTDE protocol 2 (port 30004), the dashboard (29999) and takes scripts (30001 to 30003). Of the script that
 ur-rtde uploads it runs nothing: it plays what the script does with the registers for moveL, stopL and setTcp (the
@@ -113,7 +113,7 @@ class Arm:
 def listen(port: int, talk: object) -> None:
     server = socket.socket()
     server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    server.bind(("127.0.0.1", port))
+    server.bind((sys.argv[1], port))
     server.listen()
 
     def loop() -> None:

@@ -7,6 +7,7 @@ libraries of ur-rtde, which talk to tests/rtde_stand_in.py as to a robot. Stand-
 
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -417,13 +418,17 @@ def test_a_mosaic_of_one_colour_has_that_colours_grey(order: str) -> None:
 # ---- robots --------------------------------------------------------------------------------------------------------
 
 
+HOST = f"127.{os.getpid() >> 16 & 63}.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
+"""The ports of a controller are fixed, so that each process of the tests has an address of its own on the loopback."""
+
+
 class Controller:
     """The simulated UR controller, in its own process."""
 
     def __init__(self) -> None:
         script = Path(__file__).with_name("rtde_stand_in.py")
         self.process = subprocess.Popen(
-            [sys.executable, str(script)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            [sys.executable, str(script), HOST], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "ready\n"
@@ -450,7 +455,7 @@ def controller() -> Iterator[Controller]:
 
 @pytest.fixture
 def arm(controller: Controller) -> Iterator[URRobot]:
-    robot = URRobot("127.0.0.1", box=BOX, speed=0.25)
+    robot = URRobot(HOST, box=BOX, speed=0.25)
     yield robot
     robot.close()
 
@@ -499,7 +504,7 @@ def test_no_robot_goes_to_what_is_no_place(robot: hardware.Robot, wish: list[flo
 
 
 def test_the_arm_moves_in_metres_with_its_tool_and_orientation(controller: Controller) -> None:
-    robot = URRobot("127.0.0.1", (0.0, 0.0, 50.0), box=BOX, speed=0.2)
+    robot = URRobot(HOST, (0.0, 0.0, 50.0), box=BOX, speed=0.2)
     robot.move(np.array([310.0, 220.0, 410.0]))
     state = controller.tell()
     assert np.allclose(state["tcp"], [0, 0, 0.05, 0, 0, 0])
@@ -507,7 +512,7 @@ def test_the_arm_moves_in_metres_with_its_tool_and_orientation(controller: Contr
     robot.close()
     assert controller.tell()["running"] is False  # its program was ended
     assert robot.sd == pytest.approx((0.1, 0.1, 0.1))
-    assert URRobot("127.0.0.1", box=BOX, unit="m").sd == pytest.approx((1e-4,) * 3)
+    assert URRobot(HOST, box=BOX, unit="m").sd == pytest.approx((1e-4,) * 3)
 
 
 def test_stop_stops_the_arm_on_its_way(controller: Controller, arm: URRobot) -> None:
@@ -568,7 +573,7 @@ def test_nothing_is_sent_that_leaves_the_box_or_is_refused(controller: Controlle
         asked.append((here.tolist(), there.tolist()))
         return False
 
-    robot = URRobot("127.0.0.1", box=BOX, confirm=confirm)
+    robot = URRobot(HOST, box=BOX, confirm=confirm)
     with pytest.raises(HardwareError, match=r"the target .* is outside of the box"):
         robot.move(np.array([300.0, 200.0, 600.1]))
     assert asked == []
@@ -576,7 +581,7 @@ def test_nothing_is_sent_that_leaves_the_box_or_is_refused(controller: Controlle
         robot.move(np.array([300.0, 200.0, 500.0]))
     assert np.allclose(asked, [([300, 200, 400], [300, 200, 500])])
     robot.close()
-    inside = URRobot("127.0.0.1", box=((0, 0, 0), (600, 600, 300)))  # the arm stands above it
+    inside = URRobot(HOST, box=((0, 0, 0), (600, 600, 300)))  # the arm stands above it
     with pytest.raises(HardwareError, match=r"the robot .* is outside of the box"):
         inside.move(np.array([300.0, 200.0, 200.0]))
     inside.close()
@@ -585,28 +590,29 @@ def test_nothing_is_sent_that_leaves_the_box_or_is_refused(controller: Controlle
 
 def test_a_dry_run_says_what_it_would_do_and_uploads_nothing(controller: Controller) -> None:
     said: list[str] = []
-    robot = URRobot("127.0.0.1", box=BOX, dry_run=True, say=said.append)
+    robot = URRobot(HOST, box=BOX, dry_run=True, say=said.append)
     assert np.allclose(robot.move(np.array([310.0, 220.0, 400.0])), [300, 200, 400])
     robot.stop()
     robot.close()
-    assert said == ["dry run, 127.0.0.1: from (300, 200, 400) to (310, 220, 400) mm at 0.1 m/s"]
+    assert said == [f"dry run, {HOST}: from (300, 200, 400) to (310, 220, 400) mm at 0.1 m/s"]
     assert controller.tell() == {"pose": [0.3, 0.2, 0.4, 0, 3, 0.5], "tcp": [0] * 6, "moves": [], "running": False,
                                  "moving": False}  # fmt: skip
 
 
 def test_an_arm_that_is_not_there_and_options_that_cannot_be() -> None:
     with pytest.raises(HardwareError, match="does not answer on port 30004") as caught:
-        URRobot("127.0.0.1", box=BOX).open()
+        URRobot(HOST, box=BOX).open()
     says_all(caught.value)
     for options in ({"speed": 0.3}, {"speed": 0.0}, {"unit": "yard"}, {"box": ((0, 0, 0), (1, 1, 0))}, {"box": (1, 2)}):
         with pytest.raises(UsageError):
-            URRobot("127.0.0.1", **{"box": BOX, **options})  # type: ignore[arg-type]
+            URRobot(HOST, **{"box": BOX, **options})  # type: ignore[arg-type]
 
 
 SESSION = """
+import sys
 import numpy as np
 from implicam.hardware import URRobot
-robot = URRobot("127.0.0.1", box=((0, 0, 0), (600, 600, 600)), speed=0.1)
+robot = URRobot(sys.argv[1], box=((0, 0, 0), (600, 600, 600)), speed=0.1)
 robot.open()
 print("ready", flush=True)
 robot.move(np.array([590.0, 590.0, 400.0]))
@@ -615,7 +621,7 @@ robot.move(np.array([590.0, 590.0, 400.0]))
 
 @pytest.mark.parametrize("kill", [signal.SIGINT, signal.SIGKILL])
 def test_the_arm_stops_when_the_session_is_interrupted_or_dies(controller: Controller, kill: signal.Signals) -> None:
-    command = [sys.executable, "-c", SESSION]
+    command = [sys.executable, "-c", SESSION, HOST]
     session = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert session.stdout is not None
     assert session.stdout.readline() == "ready\n"

@@ -54,7 +54,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path`; on leaving without error, rename it into place."""
     path = Path(path)
     parent = _existing_folder(path.parent)
-    with _failing_to_write(path):
+    with failing_to_write(str(path)):
         handle, name = tempfile.mkstemp(prefix=_partial_prefix(path), dir=parent)
         os.close(handle)
         temporary = Path(name)
@@ -84,7 +84,7 @@ def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             fix="choose another name, remove it, or add --overwrite",
         )
     parent = _existing_folder(path.parent)
-    with _failing_to_write(path):
+    with failing_to_write(str(path)):
         temporary = Path(tempfile.mkdtemp(prefix=_partial_prefix(path), dir=parent))
         try:
             yield temporary
@@ -144,13 +144,12 @@ def left_behind(path: Path) -> Path | None:
 
 
 @contextmanager
-def _failing_to_write(path: Path) -> Iterator[None]:
+def failing_to_write(what: str, check: str = "the name, the permissions and the free space") -> Iterator[None]:
+    """What the system refuses while it writes `what`, as an ImplicamError that says what to check."""
     try:
         yield
     except OSError as error:
-        raise ImplicamError(
-            f"cannot write {path}.", why=str(error), fix="check the name, the permissions and the free space"
-        ) from error
+        raise ImplicamError(f"cannot write {what}.", why=str(error), fix=f"check {check}") from error
 
 
 def _existing_folder(parent: Path) -> Path:

@@ -29,6 +29,7 @@ from implicam.calibrators import (
     InverseGP,
     InverseGPCalibration,
 )
+from implicam.calibrators.forward_gp.start import FEWEST
 from implicam.dataset import Dataset, Floats, join
 from implicam.errors import FitError, ImplicamError, UsageError
 from implicam.progress import Progress, silent
@@ -101,7 +102,7 @@ class Loop:
     workspace: Workspace
     acquisition: Acquisition = field(default_factory=lambda: acquisition(DEFAULT))
     rule: Rule = field(default_factory=Never)
-    start: int = 8
+    start: int = FEWEST
     candidates: int = 1500
     judged: int = 400
     reach: float = np.inf

@@ -288,13 +288,14 @@ def _diagonal(variances: Floats) -> Floats:
 class InverseOutlook:
     """Of three Gaussian processes from pixels to positions, over candidates and judged places, in this order.
 
-    known: per axis V (n, places), `covariance of places = K - V^T V`. forward: knows what pixel noise leaves at
-    each place; None for what the processes take for noise.
+    X: (places, 2 cameras) standardised pixels. known: per axis V (n, places), `covariance of places = K - V^T V`.
+    forward: knows what pixel noise leaves at each place; None for what the processes take for noise.
     """
 
     candidates: Places
     judged: Places
     calibration: InverseGPCalibration
+    X: Floats
     known: tuple[Floats, ...]
     forward: RigMap | None = None
 
@@ -309,11 +310,7 @@ class InverseOutlook:
         """
         X = _inputs(calibration, candidates, judged)
         known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp in calibration.processes)
-        return cls(candidates, judged, calibration, known, forward)
-
-    @cached_property
-    def _X(self) -> Floats:
-        return _inputs(self.calibration, self.candidates, self.judged)
+        return cls(candidates, judged, calibration, X, known, forward)
 
     @property
     def useful(self) -> Bools:
@@ -359,7 +356,7 @@ class InverseOutlook:
         good = np.isfinite(weights) & self.judged.seen.all(axis=1)
         found = np.zeros(m)
         for k, (gp, V) in enumerate(zip(self.calibration.processes, self.known, strict=True)):
-            covariance = gp.kernel(self._X[:m], self._X[m:][good]) - V[:, :m].T @ V[:, m:][:, good]
+            covariance = gp.kernel(self.X[:m], self.X[m:][good]) - V[:, :m].T @ V[:, m:][:, good]
             found += scale[k] ** 2 * (covariance**2 @ weights[good]) / (self._variances[:m, k] + self._noise[k])
         return np.where(self.useful, found, 0.0)
 
@@ -373,7 +370,7 @@ class InverseOutlook:
         """Candidate i known too: V gets one more row."""
         rows = []
         for k, (gp, V) in enumerate(zip(self.calibration.processes, self.known, strict=True)):
-            row = gp.kernel(self._X[i : i + 1], self._X)[0] - V[:, i] @ V
+            row = gp.kernel(self.X[i : i + 1], self.X)[0] - V[:, i] @ V
             rows.append(np.concatenate([V, row[None] / np.sqrt(self._variances[i, k] + self._noise[k])]))
         return replace(self, known=tuple(rows))
 

@@ -12,7 +12,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.stats import qmc
 
 from implicam.dataset import Floats
-from implicam.errors import UsageError
+from implicam.errors import HardwareError, UsageError
+from implicam.hardware.csv_player import read_positions
 from implicam.simulate import Box
 
 ON_SURFACE = 5
@@ -184,22 +185,7 @@ def workspace_from(text: str, xyz: Floats | None) -> Workspace:
 
 def read_places(path: Path) -> Floats:
     """(n, 3) the positions in a CSV file with columns x, y and z; UsageError with the line of what cannot be read."""
-    import csv
-
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UsageError(f"{path} cannot be read.", why=str(error), fix="give a CSV file with columns x,y,z") from error
-    found = []
-    for number, row in enumerate(rows, start=2):
-        try:
-            place = [float(row[axis]) for axis in "xyz"]
-        except (KeyError, TypeError, ValueError) as error:
-            raise UsageError(
-                f"{path}, line {number}: no position.", why=str(error), fix="write x,y,z in the first line, and numbers"
-            ) from error
-        if not np.isfinite(place).all():
-            raise UsageError(f"{path}, line {number}: {place} is not finite.", fix="remove the line")
-        found.append(place)
-    return np.array(found, dtype=np.float64).reshape(-1, 3)
+        return read_positions(path)[:, :3]
+    except HardwareError as error:
+        raise UsageError(error.what, why=error.why, fix=error.fix) from error

@@ -15,8 +15,9 @@ from implicam.cli import show
 from implicam.cli.app import Json, Seed, command
 from implicam.dataset import Floats
 from implicam.dataset.folder import csv_text
-from implicam.errors import ImplicamError, UsageError
+from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.files import write_text
+from implicam.images import opencv
 
 RULES = "random, sobol, variance, excess, integrated, d-optimal"
 Room = Annotated[
@@ -265,13 +266,15 @@ def acquire_command(
             why="--unattended is for the simulated rig",
             fix="use the page: leave --unattended out",
         )
-    guide = open_guide(folder, None if setup == before else setup, say=show.say)
+    opencv()  # what is missing is said before anything is begun
     if not unattended:
-        from implicam.viewer import serve
+        import_extra("viser", "viewer", "the page of implicam acquire")
+    with open_guide(folder, None if setup == before else setup, say=show.say) as guide:
+        if not unattended:
+            from implicam.viewer import serve
 
-        serve(guide, host=host, port=port, token=token, open_browser=browser, say=show.say)
-    with guide:
-        if unattended:
+            serve(guide, host=host, port=port, token=token, open_browser=browser, say=show.say)
+        else:
             with show.progress(json) as progress:
                 guide.run(progress)
             if guide.state.problem is not None:
@@ -303,9 +306,11 @@ def _cameras(words: list[str] | None) -> tuple[tuple[str, str], ...] | None:
 
 
 def _tell(guide: Any, json: bool) -> None:
+    from implicam.session.guide import CALIBRATION
+
     state, folder = guide.state, guide.session.folder
     step = state.history[-1] if state.history else None
-    saved = folder / "calibration.implicam"
+    saved = folder / CALIBRATION
     if json:
         show.emit_json({
             "session": str(folder), "points": step.points if step else 0, "stopped": state.stop,

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from implicam.dataset import Floats
 from implicam.figures.printed import blank, plain_log, quiet
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
@@ -76,10 +74,3 @@ def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
     plain_log(axes.yaxis, name="y")
     axes.set_xlim(left=0)
     return handles
-
-
-def mean_and_error(values: Sequence[Sequence[float]]) -> tuple[Floats, Floats]:
-    """Mean and its standard error over the rows of (runs, k)."""
-    table = np.array(values, dtype=np.float64)
-    error = table.std(axis=0, ddof=1) / np.sqrt(len(table)) if len(table) > 1 else np.zeros(table.shape[1])
-    return table.mean(axis=0), np.asarray(error, dtype=np.float64)

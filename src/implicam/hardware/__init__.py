@@ -17,7 +17,7 @@ from implicam.hardware.folder_camera import FolderCamera
 from implicam.hardware.genicam import GenICamCamera
 from implicam.hardware.opencv_camera import STREAMS, OpenCVCamera
 from implicam.hardware.person import Person
-from implicam.hardware.protocol import Frame, FrameSource, Robot, Trigger
+from implicam.hardware.protocol import Frame, FrameSource, Robot, Trigger, exposed
 from implicam.hardware.simulated import PhotographingCamera, SimulatedRobot, simulated_rig
 from implicam.hardware.trigger import NetworkTrigger, TriggerSimulator
 from implicam.hardware.ur import URRobot
@@ -38,6 +38,7 @@ __all__ = [
     "TriggerSimulator",
     "URRobot",
     "camera_from",
+    "exposed",
     "robot_from",
     "simulated_rig",
     "trigger_from",

@@ -43,7 +43,7 @@ class CsvPlayer:
         """Read the file; the second time nothing happens, and the rows that were used stay used."""
         if self._is_open:
             return
-        rows = _rows(self.path)
+        rows = read_positions(self.path)
         self._xyz, self._sd = rows[:, :3], rows[:, 3:]
         self._left = np.ones(len(rows), dtype=np.bool_)
         self._is_open = True
@@ -85,8 +85,8 @@ class CsvPlayer:
         self._here = None
 
 
-def _rows(path: Path) -> Floats:
-    """(n, 6): x, y, z and their standard uncertainties, NaN where the file has none."""
+def read_positions(path: Path) -> Floats:
+    """(n, 6): x, y, z and their standard uncertainties, NaN where the file has none; HardwareError with the line."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise HardwareError(f"{path} is larger than 200 MB.", fix="give a table of positions, one row a shot")

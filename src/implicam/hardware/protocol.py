@@ -11,7 +11,8 @@ every driver to the sentences below. A driver never imports its vendor's library
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, wait
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
@@ -21,7 +22,7 @@ from implicam.errors import HardwareError
 from implicam.geometry import Floats
 from implicam.images import Grey
 
-__all__ = ["Floats", "Frame", "FrameSource", "Grey", "Robot", "Trigger", "point", "wait_for"]
+__all__ = ["Floats", "Frame", "FrameSource", "Grey", "Robot", "Trigger", "exposed", "point", "wait_for"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +118,21 @@ def point(xyz: Floats, what: str = "position") -> Floats:
             f"{xyz} is no {what}.", why="it takes three finite numbers x, y, z", fix="give the place to go to"
         )
     return out
+
+
+ARMED = 0.05
+"""Seconds from asking the cameras for a picture until all of them wait for the trigger."""
+
+
+def exposed(cameras: Sequence[FrameSource], trigger: Trigger | None, timeout: float, pool: Executor) -> list[Frame]:
+    """A new picture of each camera, all of one instant as far as they are triggered; each is asked in a thread of
+    `pool`. HardwareError once all have answered: a camera answers one thread at a time, not two."""
+    waiting = [pool.submit(camera.frame, timeout) for camera in cameras]
+    if trigger is not None:
+        time.sleep(ARMED)
+        trigger.fire()
+    wait(waiting)
+    return [one.result() for one in waiting]
 
 
 Value = TypeVar("Value")

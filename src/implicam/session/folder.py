@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from implicam.dataset import Camera, Dataset, folder_files
 from implicam.dataset.folder import DESCRIPTION, IMAGES, POINTS, VIEWS, description_text
 from implicam.errors import DatasetError, ImageError, ImplicamError, UsageError
-from implicam.files import replacing
+from implicam.files import failing_to_write, replacing
 from implicam.images import Grey, write_picture
 from implicam.session.database import DATABASE
 
@@ -30,15 +30,9 @@ def is_session(folder: Path) -> bool:
     return file.is_file() and file.stat().st_size > 0
 
 
-@contextmanager
-def failing_to_write(folder: Path) -> Iterator[None]:
+def writing_into(folder: Path) -> AbstractContextManager[None]:
     """What the system refuses, as an ImplicamError."""
-    try:
-        yield
-    except OSError as error:
-        raise ImplicamError(
-            f"cannot write into {folder}.", why=str(error), fix="check the permissions and the free space"
-        ) from error
+    return failing_to_write(f"into {folder}", "the permissions and the free space")
 
 
 def stale_tables(folder: Path, data: Dataset | None, empty: Dataset) -> dict[str, str]:

@@ -14,7 +14,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -27,16 +27,13 @@ from implicam.calibrators import Calibration, ForwardGPCalibration
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.detect import Detected, Detector, View, centred
 from implicam.errors import HardwareError, ImplicamError, UsageError
-from implicam.hardware import Frame, FrameSource, Robot, Trigger
+from implicam.hardware import Frame, FrameSource, Robot, Trigger, exposed
 from implicam.images import blank
 from implicam.progress import Progress, silent
 from implicam.session.journal import Session
 from implicam.session.looks import Look, believed
 
 CALIBRATION, REPORT = "calibration.implicam", "report.html"
-
-ARMED = 0.05
-"""Seconds from asking the cameras for a picture until all of them wait for the trigger."""
 
 IN_VAIN = 5
 """Targets in a row without a ball, after which a session does not go on by itself."""
@@ -443,14 +440,7 @@ class Guide:
         self._show(phase="shown", looks=looks, position=where, message=words)
 
     def _frames(self, trigger: Trigger | None) -> list[Frame]:
-        """A new picture of each camera, all of one instant as far as the cameras are triggered."""
-        timeout = self.equipment.timeout
-        waiting = [self._pool.submit(source.frame, timeout) for source in self.equipment.cameras]
-        if trigger is not None:
-            time.sleep(ARMED)
-            trigger.fire()
-        wait(waiting)  # all of them, before one that failed is told of: a camera answers one thread at a time
-        return [one.result() for one in waiting]
+        return exposed(self.equipment.cameras, trigger, self.equipment.timeout, self._pool)
 
     def _looks(self, frames: Sequence[Frame]) -> tuple[Look, ...]:
         expected = self.state.target.uv if self.state.target is not None else np.full((len(frames), 2), np.nan)

@@ -283,7 +283,7 @@ class Session:
     def _set_aside(self) -> None:
         """Move the pictures of shots that are no points to undone/, and forget the shots that were only begun."""
         shots = [name for (name,) in self._database.rows("SELECT name FROM shots WHERE state != 'accepted'")]
-        with files.failing_to_write(self.folder):
+        with files.writing_into(self.folder):
             files.set_pictures_aside(self.folder, shots, self.cameras)
         with self._database.transaction():
             self._database.run("DELETE FROM shots WHERE state = 'begun'")
@@ -295,7 +295,7 @@ class Session:
         """Finish what a kill has interrupted."""
         for shot in self._begun():
             self.log("interrupted", shot=shot)
-        with files.failing_to_write(self.folder):
+        with files.writing_into(self.folder):
             files.remove_partial(self.folder, self.cameras)
             self._set_aside()
             files.keep_edited_tables(self.folder, self._data, self._empty)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -15,12 +14,14 @@ import numpy as np
 from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition, workspace_from
 from implicam.active.acquisition import DEFAULT
 from implicam.calibrators import DEFAULT_METHOD, METHODS, named
+from implicam.calibrators.forward_gp.start import FEWEST
 from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
-from implicam.hardware import FrameSource, Robot, Trigger, camera_from, robot_from, simulated_rig, trigger_from
-from implicam.session.guide import ARMED, Equipment, Guide
+from implicam.hardware import FrameSource, Robot, Trigger, camera_from, exposed, robot_from, simulated_rig, trigger_from
+from implicam.session.folder import is_session
+from implicam.session.guide import Equipment, Guide
 from implicam.session.journal import Session
 from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
 
@@ -30,9 +31,6 @@ SIMULATED_SPEED = 0.4
 
 PATIENCE = 60.0
 """Seconds for the next picture of a camera that has none to spare: somebody, or another program, has to take it."""
-
-FEWEST = 8
-"""Known points that a calibration takes."""
 
 CANNOT = "mlp"
 """The method that cannot say where to measure next."""
@@ -130,13 +128,15 @@ def open_guide(folder: Path, setup: Setup | None, *, auto: bool = False, say: Ca
     Opens no camera and no robot yet but to learn the size of the pictures. UsageError where the folder is in use, or
     holds something else.
     """
-    if (folder / "session.db").exists():
+    if is_session(folder):
         session = Session.open(folder)
         try:
             now = _continued(session, setup)
             guide = _made(session, now, _hardware(now, say), auto)
+            kept = session.settings
             for key, value in now.as_settings().items():  # once it is known that it works
-                session.set(key, value)
+                if key not in kept or kept[key] != value:
+                    session.set(key, value)
             return guide
         except BaseException:
             session.close()
@@ -262,12 +262,8 @@ def _sized(setup: Setup, eyes: list[FrameSource], say: Callable[[str], None]) ->
         for device in needed:
             devices.callback(device.close)
             device.open()
-        patience = PATIENCE if trigger is None else 10.0
-        waiting = [pool.submit(source.frame, patience) for source in eyes]
-        if trigger is not None:
-            time.sleep(ARMED)
-            trigger.fire()
-        sizes = [one.result().picture.shape for one in waiting]
+        frames = exposed(eyes, trigger, PATIENCE if trigger is None else 10.0, pool)
+        sizes = [frame.picture.shape for frame in frames]
     return [Camera(source.name, width, height) for source, (height, width) in zip(eyes, sizes, strict=True)]
 
 
