@@ -5,7 +5,7 @@ The order of docs/method.md, section "Fit".
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -13,18 +13,29 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from implicam.calibrators.forward_gp.choose_camera import (
+    Candidate,
+    Scene,
+    as_started,
+    candidate_again,
+    candidates,
+    choose,
+)
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, Hyperparameters, RigEvidence
-from implicam.calibrators.forward_gp.lens import Floats, Image
+from implicam.calibrators.forward_gp.lens import Floats, Image, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import (
+    CameraFailedError,
     CameraModel,
+    DepthScale,
     Posterior,
     ShotErrors,
     Sightings,
     condition,
     empty_field,
+    field_coordinates,
     spread,
 )
-from implicam.calibrators.forward_gp.start import FEWEST, Started, start_again, start_camera
+from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
 from implicam.errors import FitError
 from implicam.progress import Progress
 from implicam.threads import side_by_side
@@ -40,11 +51,14 @@ MOST_UNCERTAIN = 50
 OUTLIER = 25.0
 """Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
 
-TOLERABLE = {"central": 0.05, "none": 0.3}
+TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
 """Median error of a start, in half the extent of the pixels, beyond which it is none."""
 
-TOLERANCE = {"central": 1e-6, "none": 1e-9}
+TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
+
+AUTO = "auto"
+"""The kind of each camera is chosen by the data."""
 
 ROUNDS, ROUNDS_WITH_SHOTS = 6, 18
 SETTLED = 0.1
@@ -54,7 +68,7 @@ SETTLED = 0.1
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Known points (n, 3) in the working frame; per camera what it saw (all of it), its image, and its stated noise in
-    pixels or NaN; how the points may be off; lens: "central" or "none"."""
+    pixels or NaN; how the points may be off; lens: "auto", "central" or "none"."""
 
     points: Floats
     names: tuple[str, ...]
@@ -85,14 +99,68 @@ def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = Non
     moment ago: its cameras and hyperparameters are the guess. Where known positions have declared errors, which make
     hyperparameters costly, they are kept."""
     progress("fitting", 0, 3)
+    started, blind = _started(problem, before)
+    while True:
+        try:
+            return _fit_started(problem, progress, before, started, blind)
+        except CameraFailedError as error:  # one bad camera never takes the rig down
+            failed = list(started)[error.number]
+            blind.append((failed, f"its equations have no solution: {error}."))
+            del started[failed]
+            _require_two(problem, started, blind)
+
+
+def _started(problem: Problem, before: FittedRig | None) -> tuple[dict[int, Started], list[tuple[int, str]]]:
     guess = {} if before is None else dict(zip(before.cameras, before.posterior.models, strict=True))
+    if problem.lens == AUTO:
+        return choose_cameras(problem, guess)
 
     def start(c: int, points: Floats, uv: Floats) -> Started:
         if c in guess:
             return start_again(guess[c].camera, points, uv, problem.images[c], problem.lens)
         return start_camera(points, uv, problem.images[c], problem.lens)
 
-    started, blind = start_rig(problem, start)
+    return start_rig(problem, start)
+
+
+def choose_cameras(
+    problem: Problem, guess: Mapping[int, CameraModel]
+) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    """The kind of each camera, and where it starts; guess: cameras that fitted most of the points a moment ago."""
+
+    def scene(c: int) -> Scene:
+        seen = problem.sightings[c]
+        return Scene(problem.points[seen.rows], seen.uv, seen.relative, problem.images[c], float(problem.stated[c]))
+
+    def look(c: int) -> list[Candidate] | FitError:
+        try:
+            known = candidate_again(scene(c), guess[c].camera, guess[c].family) if c in guess else None
+            return [known] if known is not None else candidates(scene(c))
+        except FitError as error:
+            return error
+        except np.linalg.LinAlgError as error:
+            return FitError(f"its equations have no solution: {error}.")
+
+    found = side_by_side(look, range(len(problem.sightings)))
+    seeing = [c for c, some in enumerate(found) if not isinstance(some, FitError)]
+    chosen = dict(zip(seeing, choose([some for some in found if not isinstance(some, FitError)]), strict=True))
+
+    def start(c: int, points: Floats, uv: Floats) -> Started:
+        some = found[c]
+        if isinstance(some, FitError):
+            raise some
+        return as_started(chosen[c], scene(c))
+
+    return start_rig(problem, start)
+
+
+def _fit_started(
+    problem: Problem,
+    progress: Progress,
+    before: FittedRig | None,
+    started: dict[int, Started],
+    blind: list[tuple[int, str]],
+) -> FittedRig:
     cameras = tuple(started)
     seen = tuple(problem.sightings[c] for c in cameras)
     images = tuple(problem.images[c] for c in cameras)
@@ -163,7 +231,10 @@ def _round(
 def without_field(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
     """A camera model that is nothing but the camera; noise in pixels."""
     field = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
-    return CameraModel(started.camera, started.camera, started.prior, image, field, 0.0, noise, np.zeros((1, 2)))
+    none = np.zeros((1, 2))
+    return CameraModel(
+        started.camera, started.camera, started.prior, image, field, 0.0, noise, none, family=started.family
+    )
 
 
 def start_rig(
@@ -189,24 +260,29 @@ def start_rig(
             blind.append((c, found.what))
         else:
             started[c] = found
+    _require_two(problem, started, blind)
+    return started, blind
+
+
+def _require_two(problem: Problem, started: dict[int, Started], blind: list[tuple[int, str]]) -> None:
     if len(started) < 2:
         raise FitError(
             f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
             why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
             fix="show the cameras more known points, in the whole volume",
         )
-    return started, blind
 
 
 def _check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:
     error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.kept]
-    half = float(np.ptp(uv, axis=0).max()) / 2
+    low, high = pixel_extent(uv)
+    half = float((high - low).max()) / 2
     if len(error) < FEWEST:
         raise FitError(
             f"{len(error)} of its {len(uv)} views agree on one camera, and it takes {FEWEST}.",
             fix="add known points, or look for wrong detections",
         )
-    if not np.median(error) < TOLERABLE[problem.lens] * half:
+    if not np.median(error) < TOLERABLE[started.camera.kind] * half:
         raise FitError(
             f"no camera sees the known points at these pixels: the best of all fits leaves {np.median(error):.3g} px."
         )
@@ -221,13 +297,26 @@ def _hyperparameters(
     before: Hyperparameters | None,
     moved: Floats | None,
 ) -> Hyperparameters:
-    evidence = [_evidence(problem, model, seen, moved) for model, seen in zip(models, used, strict=True)]
-    half = np.array([image.half for image in images])
-    rig = RigEvidence(evidence, half, stated, problem.lens, TOLERANCE[problem.lens])
-    found = rig.maximise(before)
+    found = Hyperparameters(np.ones((len(models), 2)), np.ones(len(models)), np.ones(len(models)))
+    groups = []
+    for numbers in _alike(models):
+        evidence = [_evidence(problem, models[c], used[c], moved) for c in numbers]
+        half = np.array([images[c].half for c in numbers])
+        kind = models[numbers[0]].camera.kind
+        rig = RigEvidence(evidence, half, stated[numbers], kind, TOLERANCE[kind])
+        guess = None if before is None else Hyperparameters(*(values[numbers] for values in before))
+        for values, part in zip(found, rig.maximise(guess), strict=True):
+            values[numbers] = part
+        groups.append((numbers, rig))
     if problem.errors is None or problem.errors.estimated:
         return found
-    return _joint_sizes(problem, models, used, found, rig)
+    return _joint_sizes(problem, models, used, found, groups)
+
+
+def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
+    """The numbers of cameras whose fields are of one kind: what a lens model leaves, or a linear projection."""
+    none = [c for c, model in enumerate(models) if model.camera.kind == ProjectiveCamera.kind]
+    return [group for group in ([c for c in range(len(models)) if c not in none], none) if group]
 
 
 def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floats | None) -> CameraEvidence:
@@ -250,7 +339,7 @@ def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floa
         precision = np.eye(len(off))
         precision[:-extra, :-extra] = prior.precision
         prior = prior._replace(mean=off, precision=precision)
-    return CameraEvidence(seen.uv - view.uv, X, off, prior, model.coordinates(view), seen.relative)
+    return CameraEvidence(seen.uv - view.uv, X, off, prior, field_coordinates(view, model.image), seen.relative)
 
 
 def _thinned(seen: Sightings, most: int) -> Sightings:
@@ -296,10 +385,13 @@ def _sized(
         model = models[c]
         points = problem.points[used[c].rows]
         view = model.camera.view(points[:: max(1, len(points) // 4000)])
-        field = empty_field(hyper.lengthscale, model.coordinates(view), TOLERANCE[problem.lens])
+        depth = DepthScale.of(view)
+        tolerance = TOLERANCE[model.camera.kind]
+        field = empty_field(hyper.lengthscale[c], field_coordinates(view, model.image, depth), tolerance)
         return replace(
             model,
             ruler=model.camera,
+            depth=depth,
             field=field,
             signal=float(hyper.signal[c]),
             noise=float(hyper.noise[c]),
@@ -314,7 +406,7 @@ def _joint_sizes(
     models: tuple[CameraModel, ...],
     used: tuple[Sightings, ...],
     hyper: Hyperparameters,
-    rig: RigEvidence,
+    groups: list[tuple[list[int], RigEvidence]],
 ) -> Hyperparameters:
     """Signal and noise from all cameras at once, where positions have errors of their own.
 
@@ -330,7 +422,8 @@ def _joint_sizes(
         signal, noise = np.exp(z)
         sized = tuple(replace(m, signal=m.signal * signal, noise=m.noise * noise) for m in laid_out)
         evidence = condition(sized, problem.points, some, problem.errors).evidence
-        return rig.penalty(hyper.signal * signal, hyper.noise * noise) - evidence
+        penalties = (rig.penalty(hyper.signal[c] * signal, hyper.noise[c] * noise) for c, rig in groups)
+        return float(sum(penalties)) - evidence
 
     first = min((np.array([0.0, noise]) for noise in (0.0, 1.0, 2.0)), key=loss)
     simplex = first + np.array([[0, 0], [0.4, 0], [0, 0.4]])
