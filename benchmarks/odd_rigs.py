@@ -12,17 +12,29 @@ within the time limit, or "not usable". Right values: coverage of the 95 % ellip
 
 from __future__ import annotations
 
+import argparse
+import importlib
+import json
+import signal
+import time
+import warnings
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from implicam.calibrators import Explicit, ForwardGP, InverseGP
 from implicam.cameras import BrownConrady, KannalaBrandt
+from implicam.coverage import assess
 from implicam.dataset import Camera, Observations
+from implicam.errors import ImplicamError
+from implicam.files import write_text
 from implicam.geometry import Pose, look_at, rotation_from_vector
 from implicam.simulate import Box, Rig, SimulatedCamera, Target, Window, simulate, views
 from implicam.simulate.camera import random_error
+from implicam.threads import blas_threads
 
 RANGES = {
     "ordinary": "fields of 8-45 degrees half angle, lens errors as our own rigs",
@@ -138,7 +150,7 @@ def attempted(kind, seed, rng):
             f"noise {noise:.2g} px" + ("" if stated else " (not stated)"),
             f"lens errors {lens_error:.2g} px, missing {missing:.2f}" + ("" if sized else ", sizes not stated"),
             *([f"length scale {scale:g}"] if scale != 1 else []),
-            "/".join(described(wish) for wish in wishes),
+            *in_runs([described(wish) for wish in wishes]),
         ]
     )
     return OddRig(kind, seed, rig, *data, noise, about)
@@ -155,7 +167,20 @@ def described(wish):
         words.append(f"{np.degrees(np.hypot(*wish.tilt)):.1f} deg")
     if wish.window is not None:
         words.append(f"{np.degrees(wish.window[0]):.0f} deg")
+    if wish.kind == "mirror" and not wish.mirrored:
+        words = ["straight"]
     return " ".join(words)
+
+
+def in_runs(words):
+    """Words in their order, neighbours that are the same as one with their number."""
+    runs = []
+    for word in words:
+        if runs and runs[-1][0] == word:
+            runs[-1][1] += 1
+        else:
+            runs.append([word, 1])
+    return [word if n == 1 else f"{n} {word}" for word, n in runs]
 
 
 def drawn_size(kind, rng):
@@ -408,3 +433,250 @@ def as_reported(data, rounded, stated, sized, unit):
     sd = o.sd if stated else np.full_like(o.sd, np.nan)
     cameras = o.cameras if sized else tuple(Camera(camera.name) for camera in o.cameras)
     return replace(data, length_unit=unit, observations=Observations(o.points, cameras, uv, sd, o.extra))
+
+
+# Judging a calibration of it.
+
+
+def judged(job):
+    """One rig drawn, fitted and judged: a row of plain values, for a line of JSON."""
+    kind, seed, method, seconds, fit_only = job
+    odd = draw(kind, seed)
+    row = {
+        "kind": kind,
+        "seed": seed,
+        "cameras": len(odd.rig.cameras),
+        "points": len(odd.known),
+        "noise": odd.noise,
+        "about": odd.about,
+        "refused": "",
+        "verdict": "",
+    }
+    signal.signal(signal.SIGALRM, _too_long)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    start = time.perf_counter()
+    try:
+        with warnings.catch_warnings(record=True) as told, blas_threads(1):
+            warnings.simplefilter("always")
+            calibration = METHODS[method]().fit(odd.known)
+            row["fit_seconds"] = time.perf_counter() - start
+            row |= of_known_points(odd, calibration)
+            row["verdict"] = verdict_of(calibration)
+            if not fit_only:
+                row |= of_new_points(odd, calibration)
+    except ImplicamError as error:
+        row["refused"] = " ".join(str(error).split())
+    except TimeoutError:
+        row["refused"] = f"time limit: more than {seconds:g} s"
+    except Exception as error:
+        row["refused"] = f"CRASH {type(error).__name__}: {error}"
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    row.setdefault("fit_seconds", time.perf_counter() - start)
+    row["warnings"] = sorted({f"{w.category.__name__}: {w.message}" for w in told if w.category is not UserWarning})
+    if row["verdict"] == "not usable":
+        row["refused"] = "not usable"
+    row["wrong"] = is_wrong(row)
+    return row
+
+
+def _too_long(_signal, _frame):
+    raise TimeoutError
+
+
+def of_known_points(odd, calibration):
+    """Which cameras are not calibrated, and how far the others are off their own known points, over the noise."""
+    names = odd.known.observations.camera_names
+    there = getattr(calibration, "camera_names", names)
+    row = {"blind": [name for name in names if name not in there], "off": {}}
+    if hasattr(calibration, "predict"):
+        uv = calibration.predict(odd.known.truth.xyz)
+        true_uv = np.stack([odd.known.observations.extra[k] for k in ("true_u", "true_v")], axis=-1)
+        seen = odd.known.observations.seen
+        for c, name in enumerate(names):
+            if name in there:
+                error = np.linalg.norm(uv[seen[:, c], c] - true_uv[seen[:, c], c].astype(float), axis=1)
+                error = np.nan_to_num(error, nan=1e6)  # no pixel where the camera has one: as far off as can be
+                row["off"][name] = float(np.median(error)) / odd.noise
+    return row
+
+
+def of_new_points(odd, calibration):
+    """How well 200 new points are measured, against their true positions."""
+    start = time.perf_counter()
+    m = calibration.measure(odd.new.observations)
+    row = {
+        "measure_seconds": time.perf_counter() - start,
+        "new": int((odd.new.observations.seen.sum(axis=1) >= 2).sum()),
+    }
+    truth = odd.new.truth
+    row["measured"] = int(m.measured.sum())
+    if not m.measured.any():
+        return row
+    overall = assess(m.xyz - truth.xyz, m.cov, limit=truth.limit).overall
+    return row | {
+        "nees": overall.nees.value,
+        "in_ellipsoid": overall.level(0.95).ellipsoid.value,
+        "rmse_over_limit": overall.rmse_over_limit,
+        "sharpness": overall.stated_rms / overall.rmse,
+        "contradict": float(np.mean(m.consistency[m.measured] < 1e-4)),
+    }
+
+
+def verdict_of(calibration):
+    """ "usable", "doubtful" or "not usable", where calibrations have a verdict; else nothing."""
+    verdict = getattr(calibration, "verdict", None)
+    if verdict is None:
+        try:
+            module = importlib.import_module("implicam.verdict")
+        except ImportError:
+            return ""
+        judge = next(
+            (getattr(module, name) for name in ("judge", "verdict_of", "verdict") if hasattr(module, name)), None
+        )
+        verdict = judge(calibration) if judge else None
+    if callable(verdict):
+        verdict = verdict()
+    for name in ("word", "level", "verdict", "value"):
+        verdict = getattr(verdict, name, verdict)
+    text = str(verdict or "").lower().replace("_", " ")
+    return next((word for word in ("not usable", "doubtful", "usable") if word in text), "")
+
+
+def is_wrong(row):
+    """Whether a camera is off its own known points, or the error bars of new points lie by far."""
+    return max(row.get("off", {}).values(), default=0) > WRONG_CAMERA or row.get("nees", 0) > WRONG_NEES
+
+
+def is_silent(row):
+    """Whether it is wrong and nothing was said."""
+    return bool(row["wrong"]) and not row["refused"] and row["verdict"] in ("", "usable")
+
+
+def line(row):
+    """One rig in one line."""
+    head = f"{row['kind']:10s} {row['seed']:4d}: {row['cameras']:2d} cam {row['points']:4d} pts"
+    head += f" {row['fit_seconds']:5.1f} s"
+    if row["refused"]:
+        return f"{head}  REFUSED {row['refused'][:150]}  [{row['about']}]"
+    off = row["off"]
+    bad = {name: round(x, 1) for name, x in off.items() if x > WRONG_CAMERA}
+    parts = [f"off {max(off.values(), default=np.nan):.2g}"]
+    if "nees" in row:
+        parts.append(
+            f"NEES {row['nees']:.3g} in 95 % {100 * row['in_ellipsoid']:.0f} % rmse/limit {row['rmse_over_limit']:.3g}"
+        )
+    if row.get("measured", 0) < row.get("new", 0):
+        parts.append(f"{row['measured']} of {row['new']} measured")
+    if row["blind"]:
+        parts.append(f"blind {','.join(row['blind'])}")
+    parts += [row["verdict"]] if row["verdict"] else []
+    parts += [f"WRONG {bad or ''}"] if row["wrong"] else []
+    parts += row["warnings"]
+    return f"{head}  {'; '.join(parts)}  [{row['about']}]"
+
+
+COLUMNS = (
+    "kind", "rigs", "refused", "silently wrong", "wrong with a word", "cameras calibrated", "in the 95 % ellipsoids",
+    "median NEES", "median rmse / limit", "doubtful among right", "warnings", "median and slowest fit (s)",
+)  # fmt: skip
+
+
+def table(rows):
+    """The table per kind, with a last row of all."""
+    yield f"| {' | '.join(COLUMNS)} |"
+    yield "|---" * len(COLUMNS) + "|"
+    kinds = list(dict.fromkeys(row["kind"] for row in rows))
+    for kind in kinds:
+        yield table_row(kind, [row for row in rows if row["kind"] == kind])
+    yield table_row("**all**", rows)
+
+
+def table_row(label, rows):
+    kept = [row for row in rows if not row["refused"]]
+    right = [row for row in kept if not row["wrong"]]
+    judged_points = [row for row in kept if "nees" in row]
+    points = sum(row["measured"] for row in judged_points)
+    inside = sum(row["measured"] * row["in_ellipsoid"] for row in judged_points)
+    calibrated = sum(row["cameras"] - len(row["blind"]) for row in kept)
+    seconds = [row["fit_seconds"] for row in rows]
+    silent = [row for row in kept if is_silent(row)]
+    cells = [
+        label,
+        len(rows),
+        len(rows) - len(kept),
+        len(silent),
+        sum(bool(row["wrong"]) for row in kept) - len(silent),
+        f"{100 * calibrated / sum(row['cameras'] for row in rows):.1f} %",
+        f"{100 * inside / points:.1f} %" if points else "",
+        median(judged_points, "nees"),
+        median(judged_points, "rmse_over_limit"),
+        f"{sum(row['verdict'] == 'doubtful' for row in right)} of {len(right)}",
+        sum(bool(row["warnings"]) for row in rows),
+        f"{np.median(seconds):.2g}, {max(seconds):.2g}",
+    ]
+    return f"| {' | '.join(map(str, cells))} |"
+
+
+def median(rows, key):
+    return f"{np.median([row[key] for row in rows]):.3g}" if rows else ""
+
+
+def options_of():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rigs", type=int, default=23, help="of each kind")
+    parser.add_argument("--kinds", default=",".join(RANGES), help="separated by commas")
+    parser.add_argument("--seed0", type=int, default=0, help="the first seed")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--method", choices=METHODS, default="forward-gp")
+    parser.add_argument("--limit", type=float, default=120, help="seconds for a rig")
+    parser.add_argument("--fit-only", action="store_true", help="no new points are measured")
+    parser.add_argument("-v", "--verbose", action="store_true", help="a line for every rig")
+    parser.add_argument("--lines", type=Path, help="write the rows as lines of JSON")
+    parser.add_argument("-o", "--output", type=Path, help="write the table")
+    options = parser.parse_args()
+    unknown = set(options.kinds.split(",")) - set(RANGES)
+    if unknown:
+        parser.error(f"no kind {', '.join(sorted(unknown))}; there are {', '.join(RANGES)}")
+    return options
+
+
+def main():
+    options = options_of()
+    kinds = options.kinds.split(",")
+    last = options.seed0 + options.rigs
+    jobs = [
+        (kind, seed, options.method, options.limit, options.fit_only)
+        for seed in range(options.seed0, last)
+        for kind in kinds
+    ]
+    rows = []
+    start = time.perf_counter()
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for row in pool.map(judged, jobs):
+            rows.append(row)
+            if options.verbose:
+                print(line(row), flush=True)
+            if options.lines:
+                with options.lines.open("w" if len(rows) == 1 else "a") as out:
+                    out.write(json.dumps(row) + "\n")
+    rows.sort(key=lambda row: kinds.index(row["kind"]))
+    text = [
+        f"{options.method}, seeds {options.seed0} to {last - 1} of each kind; {COMMON}.",
+        "",
+        *(f"- {kind}: {RANGES[kind]}" for kind in kinds),
+        "",
+        *table(rows),
+        "",
+        "Refused or wrong:",
+        "",
+        *(f"- {line(row)}" for row in rows if row["refused"] or row["wrong"]),
+    ]
+    print("\n".join(text), flush=True)
+    print(f"\n{time.perf_counter() - start:.0f} s with {options.jobs} processes")
+    if options.output:
+        write_text(options.output, "\n".join(text) + "\n")
+
+
+if __name__ == "__main__":
+    main()
