@@ -393,9 +393,7 @@ def in_world(rig, world_from_bench, scale):
     cameras = []
     for camera in rig.cameras:
         pose = camera.camera_from_world @ bench_from_world
-        window = camera.window
-        if window is not None:
-            window = replace(window, distance=window.distance * scale, thickness=window.thickness * scale)
+        window = None if camera.window is None else camera.window.scaled(scale)
         cameras.append(replace(camera, camera_from_world=Pose(pose.rotation, pose.translation * scale), window=window))
     box = world_from_bench @ rig.volume.world_from_box
     box = Box(Pose(box.rotation, box.translation * scale), rig.volume.size * scale)

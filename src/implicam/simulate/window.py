@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,10 @@ class Window:
     thickness: float
     glass: float = GLASS
     water: float = WATER
+
+    def scaled(self, scale: float) -> Window:
+        """The same window in another unit of length."""
+        return replace(self, distance=self.distance * scale, thickness=self.thickness * scale)
 
     def apparent(self, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """(n, 3) points where those of the water (n, 3) seem to be, all of it in air, and (n,) where they are in it.
