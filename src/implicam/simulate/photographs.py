@@ -94,7 +94,7 @@ class Studio:
         if self.target.board is not None and any(camera.mirrored for camera in self.rig.cameras):
             raise UsageError(
                 "a board in a mirror cannot be photographed.",
-                why="a checkerboard does not show that it is mirrored: its corners would be numbered the wrong way round",
+                why="a checkerboard does not show that it is mirrored, and its corners would be numbered wrongly",
                 fix="leave out --images or --mirror, or show the ball",
             )
 
