@@ -478,7 +478,9 @@ def judged(job):
             calibration = METHODS[method]().fit(odd.known)
             row["fit_seconds"] = time.perf_counter() - start
             row |= of_known_points(odd, calibration)
+            begin = time.perf_counter()
             row["verdict"] = verdict_of(calibration)
+            row["verdict_seconds"] = time.perf_counter() - begin
             if not fit_only:
                 row |= of_new_points(odd, calibration)
     except ImplicamError as error:
@@ -534,7 +536,8 @@ def of_new_points(odd, calibration):
     return row | {
         "nees": overall.nees.value,
         "in_ellipsoid": overall.level(0.95).ellipsoid.value,
-        "rmse_over_limit": overall.rmse_over_limit,
+        # the limit knows of the noise, and not that it was rounded
+        "rmse_over_limit": overall.rmse_over_limit * odd.rig.cameras[0].noise_sd / odd.noise,
         "sharpness": overall.stated_rms / overall.rmse,
         "contradict": float(np.mean(m.consistency[m.measured] < 1e-4)),
     }
