@@ -22,7 +22,7 @@ LENGTHSCALE = np.log([1.0, 2.0])
 """Prior medians: across the image in half its longer side, and in log distance. Optics vary smoothly across the image;
 refraction and the entrance pupil vary with the distance as 1 / distance does."""
 LENGTHSCALE_SD = np.array([0.7, 1.0])
-SHORTEST = np.log([0.15, 0.1])
+SHORTEST = np.log([0.5, 0.1])
 LONGEST = np.log([30.0, 100.0])
 
 GRID = ((0.6, 1.5, 4.0), (0.15, 0.5, 2.0))

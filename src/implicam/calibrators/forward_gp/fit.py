@@ -22,7 +22,8 @@ from implicam.calibrators.forward_gp.choose_camera import (
     choose,
 )
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, Hyperparameters, RigEvidence
-from implicam.calibrators.forward_gp.lens import Floats, Image, ProjectiveCamera
+from implicam.calibrators.forward_gp.general_camera import AnyCamera
+from implicam.calibrators.forward_gp.lens import Floats, Image, Prior, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import (
     CameraFailedError,
     CameraModel,
@@ -37,7 +38,7 @@ from implicam.calibrators.forward_gp.posterior import (
 )
 from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
 from implicam.errors import FitError
-from implicam.progress import Progress
+from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
 
 Bools = NDArray[np.bool_]
@@ -56,6 +57,27 @@ TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
 
 TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
+
+MAX_SETTLING_STEPS = 15
+"""Gauss-Newton steps of the cameras; ordinary ones take one to four."""
+
+MAX_MISFIT_VIEWS = 1000
+"""Views that say whether a step is for the better."""
+
+MISFIT_TOLERANCE = 1e-3
+"""By how much a step may worsen minus twice the log posterior: rounding and what is left out of the views."""
+
+FAR_OFF = 4.0
+"""Median error of a fitted camera at its own views, in its noise, beyond which the fit has failed."""
+
+FEWEST_WITHOUT_LENS = 40
+"""Views that a camera without a lens model takes: its field must learn what a lens would say."""
+
+LARGE_FIELD = 3e-3
+"""A field's sd, in half the longer side, that makes an ordinary camera doubtful: 2 px in 1280."""
+
+CLEAR_NATS = 3.0
+"""By how much left-out views must at least be more probable without a lens model."""
 
 AUTO = "auto"
 """The kind of each camera is chosen by the data."""
@@ -100,14 +122,104 @@ def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = Non
     hyperparameters costly, they are kept."""
     progress("fitting", 0, 3)
     started, blind = _started(problem, before)
+    fitted = _fit_without_failures(problem, progress, before, started, blind)
+    return _with_projections(problem, fitted, started) if problem.lens == AUTO else fitted
+
+
+def _fit_without_failures(
+    problem: Problem,
+    progress: Progress,
+    before: FittedRig | None,
+    started: dict[int, Started],
+    blind: list[tuple[int, str]],
+) -> FittedRig:
+    """One bad camera never takes the rig down: it goes on without a lens model, or is left out. Changes `started` and
+    `blind`."""
     while True:
         try:
             return _fit_started(problem, progress, before, started, blind)
-        except CameraFailedError as error:  # one bad camera never takes the rig down
+        except CameraFailedError as error:
             failed = list(started)[error.number]
-            blind.append((failed, f"its equations have no solution: {error}."))
+            again = None
+            if problem.lens == AUTO and started[failed].family != "none":
+                again = _without_lens(problem, failed)
+            if again is not None:
+                started[failed] = again
+                continue
+            blind.append((failed, f"no camera model fits its views: {error}."))
             del started[failed]
             _require_two(problem, started, blind)
+
+
+def _without_lens(problem: Problem, c: int) -> Started | None:
+    """Camera c as a linear projection with a field; None where it saw too little for one."""
+    seen = problem.sightings[c]
+    if len(seen.rows) < FEWEST_WITHOUT_LENS:
+        return None
+    try:
+        found = start_camera(problem.points[seen.rows], seen.uv, problem.images[c], "none")
+        _check_start(found, problem.points[seen.rows], seen.uv, problem)
+    except FitError:
+        return None
+    return found
+
+
+def _with_projections(problem: Problem, fitted: FittedRig, started: dict[int, Started]) -> FittedRig:
+    """The rig with those cameras as linear projections that clearly predict left-out views better so."""
+    tried = {}
+    for number, c in enumerate(fitted.cameras):
+        model = fitted.posterior.models[number]
+        odd = model.family in ("free", "crop") or model.signal > LARGE_FIELD * model.image.half
+        if odd and model.family != "none" and c in started:
+            found = _without_lens(problem, c)
+            if found is not None:
+                tried[c] = found
+    if not tried:
+        return fitted
+    blind = list(fitted.blind)
+    try:
+        other = _fit_started(problem, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, blind)
+    except np.linalg.LinAlgError:
+        return fitted
+    better = {
+        c for number, c in enumerate(fitted.cameras) if c in tried and _predicts_better(problem, other, fitted, number)
+    }
+    if better == set(tried) or not better:
+        return other if better else fitted
+    mixed = {c: tried[c] if c in better else started[c] for c in fitted.cameras}
+    try:
+        return _fit_started(problem, silent, None, mixed, blind)
+    except np.linalg.LinAlgError:
+        return fitted
+
+
+def _predicts_better(problem: Problem, one: FittedRig, other: FittedRig, number: int) -> bool:
+    """Whether a camera's left-out views are clearly more probable in one fit than in another."""
+    gain = _left_out_log_densities(problem, one, number) - _left_out_log_densities(problem, other, number)
+    clearly = 2 * float(np.std(gain)) * np.sqrt(len(gain))
+    return bool(np.sum(gain) > max(clearly, CLEAR_NATS))
+
+
+def _left_out_log_densities(problem: Problem, fitted: FittedRig, number: int) -> Floats:
+    """(n,) of each view of a camera, predicted from all others; a wrong view costs what a view just rejected does."""
+    seen, kept = problem.sightings[fitted.cameras[number]], fitted.kept[number]
+    residual, covariance = left_out(fitted.posterior, number, problem.points, seen, kept)
+    distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
+    distance = np.where(np.isfinite(distance), distance, OUTLIER)
+    return np.asarray(-0.5 * np.minimum(distance, OUTLIER) - 0.5 * np.linalg.slogdet(covariance)[1], dtype=np.float64)
+
+
+def _check_fitted(problem: Problem, state: _Round, seen: tuple[Sightings, ...]) -> None:
+    """A camera that ends far off its own known points is no camera, whatever its covariance says."""
+    points = problem.points
+    if state.posterior.displacement is not None:
+        points = points + state.posterior.displacement
+    for number, (model, views, kept) in enumerate(zip(state.posterior.models, seen, state.kept, strict=True)):
+        rows = views.rows[kept]
+        error = np.linalg.norm(model.predict(points[rows])[0] - views.uv[kept], axis=1) / views.relative[kept]
+        if len(rows) < FEWEST or not np.median(error) < FAR_OFF * model.noise:
+            off = float(np.median(error)) if len(rows) else np.nan
+            raise CameraFailedError(number, f"it ends {off:.3g} px off its own known points")
 
 
 def _started(problem: Problem, before: FittedRig | None) -> tuple[dict[int, Started], list[tuple[int, str]]]:
@@ -184,6 +296,7 @@ def _fit_started(
             state = state._replace(kept=judged)
     progress("fitting", 3, 3)
     assert state.hyper is not None
+    _check_fitted(problem, state, seen)
     return FittedRig(state.posterior, cameras, tuple(blind), state.kept, state.hyper, state.errors, state.label_sd)
 
 
@@ -365,13 +478,19 @@ def settle(
     models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...], errors: ShotErrors | None
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
-    for _ in range(4):
+    misfits: list[_Misfit] = []
+    for _ in range(MAX_SETTLING_STEPS):
         posterior = condition(models, points, used, errors)
+        steps = posterior.steps
+        small = [_small(step, posterior.root(c)) for c, step in enumerate(steps)]
+        if not misfits and not all(small):
+            where = points if posterior.displacement is None else points + posterior.displacement
+            misfits = [_Misfit.of(model, where, seen) for model, seen in zip(models, used, strict=True)]
         models = tuple(
-            _in_front(before, after, step, points[seen.rows])
-            for before, after, step, seen in zip(models, posterior.models, posterior.steps, used, strict=True)
+            _downhill(models[c], posterior.models[c], steps[c], points[used[c].rows], None if small[c] else misfits[c])
+            for c in range(len(models))
         )
-        if all(_small(step, posterior.root(c)) for c, step in enumerate(posterior.steps)):
+        if all(small):
             break
     return replace(posterior, models=models)
 
@@ -436,11 +555,49 @@ def _joint_sizes(
     return Hyperparameters(hyper.lengthscale, hyper.signal * signal, hyper.noise * noise)
 
 
-def _in_front(before: CameraModel, after: CameraModel, step: Floats, points: Floats) -> CameraModel:
-    """A camera never steps so far that it loses a point it saw: half the step, then, or half of that."""
+class _Misfit(NamedTuple):
+    """How badly a camera fits, with the field that then fits best: what Gauss-Newton must not increase.
+
+    prior; points (n, 3), pixels (n, 2) and sd (n,) of at most MAX_MISFIT_VIEWS views; phi (n, m) the field's features
+    over sd, and the Cholesky factor (m, m) of I + phi^T phi.
+    """
+
+    prior: Prior
+    points: Floats
+    uv: Floats
+    sd: Floats
+    phi: Floats
+    factor: Floats
+
+    @classmethod
+    def of(cls, model: CameraModel, points: Floats, seen: Sightings) -> _Misfit:
+        """Of the camera's present field."""
+        seen = _thinned(seen, MAX_MISFIT_VIEWS)
+        where = points[seen.rows]
+        sd = model.noise * seen.relative
+        phi = model.rows(where).phi / sd[:, None]
+        factor = np.asarray(np.linalg.cholesky(np.eye(phi.shape[1]) + phi.T @ phi), dtype=np.float64)
+        return cls(model.prior, where, seen.uv, sd, phi, factor)
+
+    def __call__(self, camera: AnyCamera) -> float:
+        """Minus twice the log posterior, up to a constant; infinite where the camera loses a point."""
+        y = (self.uv - camera.pixel(self.points)) / self.sd[:, None]
+        if not (camera.sane and np.isfinite(y).all()):
+            return np.inf
+        off = self.prior.mean - camera.parameters
+        field = np.linalg.solve(self.factor, self.phi.T @ y)
+        return float(np.sum(y**2) - np.sum(field**2) + off @ self.prior.precision @ off)
+
+
+def _downhill(
+    before: CameraModel, after: CameraModel, step: Floats, points: Floats, misfit: _Misfit | None
+) -> CameraModel:
+    """A camera never steps so far that it loses a point it saw, or fits worse: half the step, then, or half of that."""
+    now = np.inf if misfit is None else misfit(before.camera)
     for halvings in range(20):
         camera = after.camera if halvings == 0 else before.camera.moved(step * 0.5**halvings)
-        if camera.sane and np.isfinite(camera.pixel(points)).all():
+        fits = misfit is None or misfit(camera) <= now + MISFIT_TOLERANCE
+        if fits and camera.sane and np.isfinite(camera.pixel(points)).all():
             return after if halvings == 0 else replace(after, camera=camera)
     return before
 
