@@ -678,7 +678,7 @@ def test_simulate_refuses_to_overwrite_unless_told(cli: Cli) -> None:
 def test_the_default_method_is_forward_gp(made: Path, cli: Cli) -> None:
     assert "forward-gp from 40 points" in cli("calibrate", made / "rig", "-o", "x.implicam").out
     told = cli("info", "x.implicam", "--json").json
-    assert (told["method"], told["options"]["lens"]) == ("forward-gp", "central")
+    assert (told["method"], told["options"]["lens"]) == ("forward-gp", "auto")
     assert "(default forward-gp)" in " ".join(cli("calibrate", "--help").out.replace("│", " ").split())
     assert cli("evaluate", made / "rig", "--cv", "3", "--json").json["method"] == "forward-gp"
     # an option that only the other method has means that method
@@ -691,8 +691,8 @@ def test_the_lens_is_an_option_of_forward_gp(made: Path, cli: Cli) -> None:
     assert "forward-gp from 40 points" in ran.out
     assert cli("info", "none.implicam", "--json").json["options"]["lens"] == "none"
     assert cli("measure", "none.implicam", made / "rig" / "check").out.startswith("measured.csv: 30 rows, 30 measured")
-    assert cli("calibrate", made / "rig", "-o", "central.implicam", "--lens", "central").code == 0
-    assert Path("central.implicam").read_bytes() == (made / "rig.implicam").read_bytes()
+    assert cli("calibrate", made / "rig", "-o", "auto.implicam", "--lens", "auto").code == 0
+    assert Path("auto.implicam").read_bytes() == (made / "rig.implicam").read_bytes()
     by_lens = [cli("evaluate", made / "rig", "--cv", "3", "--lens", lens, "--json") for lens in ("central", "none")]
     assert [ran.code for ran in by_lens] == [0, 0]
     assert by_lens[0].json["rows"] != by_lens[1].json["rows"]

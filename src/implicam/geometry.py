@@ -277,13 +277,13 @@ class Resection(NamedTuple):
     kept: Bools
 
 
-def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None) -> Resection:
+def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, subsets: bool = True) -> Resection:
     """Place a camera with an unknown lens; no starting guess.
 
     Known points (n, 3), their pixels (n, 2), NaN where not seen. Pixels become rays by the equidistant and the
     pinhole model for a ladder of focal lengths about `middle` (where the axis meets the image; else the middle of the
     pixels), a linear resection follows, and the best wins. Views far off are then left out and it is done again; where
-    that is not enough, it starts from random subsets (RANSAC) too, which bears a third of wrong detections. At most
+    that is not enough, it starts from random `subsets` (RANSAC) too, which bears a third of wrong detections. At most
     `ENOUGH` points are used, drawn at random but always the same. Fails as `resect`.
     """
     there = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
@@ -296,7 +296,7 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None) ->
     found, errors, keep = _trimmed(points, offset, np.ones(len(rows), dtype=np.bool_))
     bad = float(np.median(errors))
     tolerable = POOR * float(np.median(np.linalg.norm(offset, axis=1)))
-    if bad > tolerable or np.mean(errors > max(SUSPECT * bad, tolerable)) > FEW_SUSPECTS:
+    if subsets and (bad > tolerable or np.mean(errors > max(SUSPECT * bad, tolerable)) > FEW_SUSPECTS):
         for start in _by_subsets(points, offset):
             again = _trimmed(points, offset, start)
             if np.median(again[1]) < np.median(errors):

@@ -73,7 +73,9 @@ Preset = Annotated[
 Lens = Annotated[
     str | None,
     typer.Option(
-        "--lens", metavar="NAME", help="forward-gp: central or none; explicit: auto, brown-conrady, kannala-brandt."
+        "--lens",
+        metavar="NAME",
+        help="forward-gp: auto, central or none; explicit: auto, brown-conrady, kannala-brandt.",
     ),
 ]
 Boards = Annotated[

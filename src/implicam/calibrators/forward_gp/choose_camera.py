@@ -41,8 +41,14 @@ QUICK_NATS = 3.0
 MAX_START_VIEWS = 80
 """Views that starts are refined with."""
 
-SHORT_STEPS, LONG_STEPS, FINAL_STEPS = 8, 25, 60
-"""Steps of refinement: of every start, of the best of them, of each kind."""
+SHORT_STEPS, PROBE_STEPS, LONG_STEPS, FINAL_STEPS = 8, 10, 25, 60
+"""Steps of refinement: of every start, of the freer camera beside an ordinary one, of the best starts, of each kind."""
+
+ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-7
+"""The part of its misfit that a step must gain for another to follow, while starts are compared and in the end."""
+
+FAR_BEHIND = 10.0
+"""A start whose errors are so many times the best camera's is no start for the kinds."""
 
 BEST_STARTS = 3
 """Starts of each sign that go on."""
@@ -93,9 +99,13 @@ def candidates(whole: Scene) -> list[Candidate]:
     """The kinds of camera that explain the views; one where it is ordinary. FitError where there is none."""
     if len(whole.points) < FEWEST:
         raise FitError(f"{len(whole.points)} known points are seen; a camera needs at least {FEWEST}.")
-    ladder = _from_ladder(whole, mirrored=False)
+    ladder = _from_ladder(whole, mirrored=False, subsets=False)
+    linear = _from_dlt(whole)
+    # subsets are for wrong views; where a linear projection does well without them, it is the camera that is odd
+    if linear is None or ladder is None or _score(whole, linear[0]) > QUICK_GAIN * _score(whole, ladder[0]):
+        ladder = _from_ladder(whole, mirrored=False)
     quick = _quick(whole, ladder) if ladder is not None else None
-    return [quick] if quick is not None else _thorough(whole, ladder)
+    return [quick] if quick is not None else _thorough(whole, ladder, linear)
 
 
 def choose(rig: Sequence[list[Candidate]]) -> list[Candidate]:
@@ -123,13 +133,15 @@ def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate |
     return Candidate(found, family, kept, 0.0)
 
 
-def as_started(one: Candidate, whole: Scene) -> Started:
-    """What the fit starts from."""
+def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> Started:
+    """What the fit starts from; some: all candidates of the camera."""
     prior = family_prior(one.camera, one.family, whole.image, _widest(one.camera, whole.points[one.kept]))
     if one.family == "free":
         prior = near_prior(one.camera, prior, whole.image)
     kept = one.kept & np.isfinite(whole.error(one.camera))
-    return Started(one.camera, prior, kept, one.family, one.camera.mirrored)
+    ordinary = [float(np.median(whole.error(other.camera))) for other in some if other.kind == ("ordinary", False)]
+    left = ordinary[0] if ordinary and one.kind != ("ordinary", False) else float("nan")
+    return Started(one.camera, prior, kept, one.family, one.camera.mirrored, left)
 
 
 def _weight(one: Candidate, others: list[tuple[str, bool]]) -> float:
@@ -149,7 +161,7 @@ def _widest(camera: GeneralCamera, points: Floats) -> float:
 
 
 def _refined(
-    camera: GeneralCamera, family: str, scene: Scene, kept: Bools, steps: int, rounds: int = 1
+    camera: GeneralCamera, family: str, scene: Scene, kept: Bools, steps: int, rounds: int = 1, gain: float = FINE_GAIN
 ) -> tuple[GeneralCamera, Bools]:
     """The camera of that kind that explains the views kept, and those that it then explains."""
     for _ in range(rounds):
@@ -161,7 +173,7 @@ def _refined(
         error = scene.error(camera)
         usual = float(np.median(error[rows]))
         sd = max(usual if np.isfinite(usual) else scene.image.half, 1e-5 * scene.image.half)
-        found = levenberg_marquardt(camera, prior, points, uv, sd, steps)
+        found = levenberg_marquardt(camera, prior, points, uv, sd, steps, gain)
         assert isinstance(found, GeneralCamera)
         camera = found
         inside = scene.near(scene.error(camera), kept)
@@ -171,12 +183,12 @@ def _refined(
     return camera, kept
 
 
-def _from_ladder(scene: Scene, *, mirrored: bool) -> tuple[GeneralCamera, Bools] | None:
+def _from_ladder(scene: Scene, *, mirrored: bool, subsets: bool = True) -> tuple[GeneralCamera, Bools] | None:
     uv, middle = scene.uv, scene.image.centre
     if mirrored:
         uv = uv * [-1.0, 1.0] + [2 * middle[0], 0.0]
     try:
-        found = resect_any_lens(scene.points, uv, middle=middle)
+        found = resect_any_lens(scene.points, uv, middle=middle, subsets=subsets)
     except FitError:
         if not mirrored:
             raise
@@ -202,7 +214,7 @@ def _quick(scene: Scene, ladder: tuple[GeneralCamera, Bools]) -> Candidate | Non
     median = float(np.median(error[kept]))
     if kept.sum() < FEWEST or not median < QUICK_MEDIAN * scene.image.half or camera.rho < 4 * SMALLEST_RHO:
         return None
-    free, free_kept = _refined(camera, "free", scene, kept, LONG_STEPS)
+    free, free_kept = _refined(camera, "free", scene, kept, PROBE_STEPS, gain=ROUGH_GAIN)
     free_error = scene.error(free)
     # what seventeen free numbers gain over eleven by chance is no reason
     by_chance = np.sqrt(max(2 * kept.sum() - 17, 0) / (2 * kept.sum() - 11))
@@ -215,14 +227,16 @@ def _quick(scene: Scene, ladder: tuple[GeneralCamera, Bools]) -> Candidate | Non
     return Candidate(camera, "ordinary", kept, tight)
 
 
-def _thorough(scene: Scene, ladder: tuple[GeneralCamera, Bools] | None) -> list[Candidate]:
+def _thorough(
+    scene: Scene, ladder: tuple[GeneralCamera, Bools] | None, linear: tuple[GeneralCamera, Bools] | None
+) -> list[Candidate]:
     """Every start, the best few of each sign, and each kind from them."""
-    starts = list(_starts(scene, ladder))
+    starts = list(_starts(scene, ladder, linear))
     if not starts:
         raise FitError("no camera sees the known points at these pixels.", fix="look for wrong detections")
     best: dict[bool, list[tuple[float, GeneralCamera, Bools]]] = {False: [], True: []}
     for camera, kept in starts:
-        found, explained = _refined(camera, "free", scene, kept, SHORT_STEPS)
+        found, explained = _refined(camera, "free", scene, kept, SHORT_STEPS, gain=ROUGH_GAIN)
         best[camera.mirrored].append((_score(scene, found), found, explained))
     for sign, some in best.items():
         some.sort(key=lambda one: one[0])
@@ -248,12 +262,13 @@ def _kinds(
 ) -> Iterator[Candidate]:
     """Each kind, from the best free camera and from the ladder."""
     _, free, kept = best
-    ladder = next((camera for camera, _ in starts if camera.mirrored == sign), free)
+    others = [camera for camera, _ in starts if camera.mirrored == sign][:1]  # the ladder's
     for family, kind in FAMILIES.items():
         shape = free.shape if kind.p > 0.01 else np.zeros(2)
         tilt = free.tilt if kind.tilt > 0.01 else np.zeros(2)
         some = []
-        for camera in (free.with_shape(shape, tilt), ladder):
+        near = [one for one in others if family == "ordinary" or _score(scene, one) < FAR_BEHIND * best[0]]
+        for camera in (free.with_shape(shape, tilt), *near):
             found, explained = _refined(camera, family, scene, kept, FINAL_STEPS, rounds=2)
             some.append(Candidate(found, family, explained, _evidence(found, family, views)))
         yield max(some, key=lambda one: one.evidence)
@@ -277,22 +292,28 @@ def _evidence(camera: GeneralCamera, family: str, views: Views) -> float:
     return log_evidence(camera, prior, views)
 
 
-def _starts(scene: Scene, ladder: tuple[GeneralCamera, Bools] | None) -> Iterator[tuple[GeneralCamera, Bools]]:
-    if ladder is not None:
-        yield ladder
-    mirrored = _from_ladder(scene, mirrored=True)
-    if mirrored is not None:
-        yield mirrored
+def _from_dlt(scene: Scene) -> tuple[GeneralCamera, Bools] | None:
     try:
         P, kept = resect_robustly(scene.points, scene.uv)
-        camera = _from_linear(P)
-        if camera is not None:
-            yield camera, kept
-            farther = np.zeros(camera.size)
-            farther[RHO] = -0.7 * camera.rho
-            yield camera.moved(farther), kept  # its perspective is what noise disturbs first
     except FitError:
-        pass
+        return None
+    camera = _from_linear(P)
+    return None if camera is None else (camera, kept)
+
+
+def _starts(
+    scene: Scene, ladder: tuple[GeneralCamera, Bools] | None, linear: tuple[GeneralCamera, Bools] | None
+) -> Iterator[tuple[GeneralCamera, Bools]]:
+    if ladder is not None:
+        yield ladder
+    mirrored = _from_ladder(scene, mirrored=True, subsets=linear is None or not linear[0].mirrored)
+    if mirrored is not None:
+        yield mirrored
+    if linear is not None:
+        yield linear
+        farther = np.zeros(linear[0].size)
+        farther[RHO] = -0.7 * linear[0].rho
+        yield linear[0].moved(farther), linear[1]  # its perspective is what noise disturbs first
     yield from _from_affine(scene)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import FittedRig, left_out
 from implicam.calibrators.forward_gp.posterior import Sightings
 from implicam.calibrators.forward_gp.problem import Frame, sightings_of, stated_noise
@@ -94,10 +95,10 @@ class Diagnosis:
         }
 
     def notes(self) -> list[str]:
-        """Cameras that could not be calibrated, and views that contradict the others."""
+        """Cameras that could not be calibrated or are not ordinary, and views that contradict the others."""
         names = self.data.observations.camera_names
         blind = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in self.fitted.blind]
-        return [*blind, *self._rejected_notes()]
+        return [*blind, *kind_notes(self.fitted, [names[c] for c in self.fitted.cameras]), *self._rejected_notes()]
 
     def noise_notes(self) -> list[str]:
         """Cameras whose noise is not what the observations state."""

@@ -105,7 +105,7 @@ class Problem:
 class FittedRig:
     """cameras: numbers of those that could be fitted, in order, as posterior.models. blind: (number, why) of others.
     kept: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are; label_sd
-    (1, k) its estimated sds, for error bars."""
+    (1, k) its estimated sds, for error bars. ordinary_px: per fitted camera, see `Started`."""
 
     posterior: Posterior
     cameras: tuple[int, ...]
@@ -114,6 +114,11 @@ class FittedRig:
     hyperparameters: Hyperparameters
     errors: ShotErrors | None
     label_sd: Floats | None
+    ordinary_px: tuple[float, ...] = ()
+
+    def left_by_ordinary(self, number: int) -> float:
+        """The median error, px, that an ordinary camera would leave in fitted camera `number`; NaN if it is one."""
+        return self.ordinary_px[number] if self.ordinary_px else float("nan")
 
 
 def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = None) -> FittedRig:
@@ -144,7 +149,7 @@ def _fit_without_failures(
             if problem.lens == AUTO and started[failed].family != "none":
                 again = _without_lens(problem, failed)
             if again is not None:
-                started[failed] = again
+                started[failed] = again._replace(ordinary_px=started[failed].ordinary_px)
                 continue
             blind.append((failed, f"no camera model fits its views: {error}."))
             del started[failed]
@@ -173,7 +178,7 @@ def _with_projections(problem: Problem, fitted: FittedRig, started: dict[int, St
         if odd and model.family != "none" and c in started:
             found = _without_lens(problem, c)
             if found is not None:
-                tried[c] = found
+                tried[c] = found._replace(ordinary_px=started[c].ordinary_px)
     if not tried:
         return fitted
     blind = list(fitted.blind)
@@ -261,7 +266,7 @@ def choose_cameras(
         some = found[c]
         if isinstance(some, FitError):
             raise some
-        return as_started(chosen[c], scene(c))
+        return as_started(chosen[c], scene(c), some)
 
     return start_rig(problem, start)
 
@@ -297,7 +302,10 @@ def _fit_started(
     progress("fitting", 3, 3)
     assert state.hyper is not None
     _check_fitted(problem, state, seen)
-    return FittedRig(state.posterior, cameras, tuple(blind), state.kept, state.hyper, state.errors, state.label_sd)
+    ordinary_px = tuple(one.ordinary_px for one in started.values())
+    return FittedRig(
+        state.posterior, cameras, tuple(blind), state.kept, state.hyper, state.errors, state.label_sd, ordinary_px
+    )
 
 
 class _Round(NamedTuple):

@@ -55,12 +55,12 @@ class GeneralCamera:
     kind: ClassVar[str] = "general"
     size: ClassVar[int] = len(PARAMETERS)
 
-    @property
+    @cached_property
     def rho(self) -> float:
         """1 / distance of the working frame's origin."""
         return 1 / float(np.linalg.norm(self.pose.translation))
 
-    @property
+    @cached_property
     def parameters(self) -> Floats:
         """(17,) what the prior is about; the rotation has no prior and is zero here."""
         rho = self.rho
@@ -112,7 +112,7 @@ class GeneralCamera:
         bent, _ = self._lens.pixel_from_camera_point(there)
         uv, y, w = self._image(bent)
         sign = np.array([-1.0 if self.mirrored else 1.0, 1.0])
-        B, by_p, by_q = _pixel_shape(self.shape)
+        B, by_p, by_q = self._pixels
         by_y = self.focal * B
         # y by m: (I - y tilt^T) / w
         by_m = (by_y @ (np.eye(2) - y[:, :, None] * self.tilt)) / w[:, None, None] * sign
@@ -141,7 +141,7 @@ class GeneralCamera:
 
     def lines(self, uv: Floats) -> tuple[Floats, Floats]:
         """The lines of sight of pixels (n, 2): the camera's centre (3,) and unit directions (n, 3), NaN for none."""
-        y = np.linalg.solve(self.focal * _pixel_shape(self.shape)[0], (uv - self.centre).T).T
+        y = np.linalg.solve(self.focal * self._pixels[0], (uv - self.centre).T).T
         w = 1 - y @ self.tilt
         m = y / np.where(w > 0, w, np.nan)[:, None]
         if self.mirrored:
@@ -201,6 +201,10 @@ class GeneralCamera:
         return CentralCamera(lens, self.pose)
 
     @cached_property
+    def _pixels(self) -> tuple[Floats, Floats, Floats]:
+        return _pixel_shape(self.shape)
+
+    @cached_property
     def _lens(self) -> KannalaBrandt:
         return KannalaBrandt(1.0, 1.0, 0.0, 0.0, *self.k.tolist())
 
@@ -210,7 +214,7 @@ class GeneralCamera:
         w = 1 + m @ self.tilt
         w = np.where(w > 0, w, np.nan)
         y = m / w[:, None]
-        return self.centre + self.focal * (y @ _pixel_shape(self.shape)[0].T), y, w
+        return self.centre + self.focal * (y @ self._pixels[0].T), y, w
 
     def _translation_slopes(self) -> tuple[Floats, Floats]:
         """How the translation depends on where the origin is across the axis (3, 2), and on rho (3,)."""

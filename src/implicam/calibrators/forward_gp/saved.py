@@ -26,7 +26,7 @@ def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict
     table = {
         "calibrated": [names[c] for c in fitted.cameras],
         "not_calibrated": {names[c]: why for c, why in fitted.blind},
-        "cameras": [_described(names[c], model) for c, model in zip(fitted.cameras, posterior.models, strict=True)],
+        "cameras": [_described(fitted, number, names[c]) for number, c in enumerate(fitted.cameras)],
     }
     arrays: dict[str, NDArray[Any]] = {
         "lengthscale": np.asarray(fitted.hyperparameters.lengthscale),
@@ -57,11 +57,15 @@ CAMERAS: dict[str, type[CentralCamera] | type[GeneralCamera] | type[ProjectiveCa
 """Name in a file -> camera model."""
 
 
-def _described(name: str, model: CameraModel) -> dict[str, Any]:
-    """The readable entry of one camera: its model, its lens by name, its kind, and whether it is mirrored."""
+def _described(fitted: FittedRig, number: int, name: str) -> dict[str, Any]:
+    """The readable entry of one camera: its model, its lens by name, its kind, whether it is mirrored, and what an
+    ordinary camera would have left."""
+    model = fitted.posterior.models[number]
     mirrored = isinstance(model.camera, GeneralCamera) and model.camera.mirrored
     lens = "none" if isinstance(model.camera, ProjectiveCamera) else "kannala-brandt"
-    return {"name": name, "model": model.camera.kind, "lens": lens, "kind": model.family, "mirrored": mirrored}
+    table = {"name": name, "model": model.camera.kind, "lens": lens, "kind": model.family, "mirrored": mirrored}
+    left = fitted.left_by_ordinary(number)
+    return table | ({"ordinary_would_leave_px": left} if np.isfinite(left) else {})
 
 
 def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays) -> FittedRig:
@@ -91,7 +95,8 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
     posterior = _posterior(data, arrays, tuple(models), tuple(alone))
     errors, label_sd = _shot_errors(data, points, arrays, posterior)
     hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
-    return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd)
+    ordinary = tuple(float(one.get("ordinary_would_leave_px", np.nan)) for one in described)
+    return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd, ordinary)
 
 
 def _shot_errors(

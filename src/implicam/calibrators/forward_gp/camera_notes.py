@@ -1,0 +1,45 @@
+"""What kind of camera each one is, in words: one line for every camera that is not ordinary."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.fit import FittedRig
+from implicam.calibrators.forward_gp.general_camera import GeneralCamera
+from implicam.calibrators.forward_gp.posterior import CameraModel
+
+
+def kind_notes(fitted: FittedRig, names: Sequence[str]) -> list[str]:
+    """names: of the fitted cameras."""
+    models = fitted.posterior.models
+    mirrored = [isinstance(model.camera, GeneralCamera) and model.camera.mirrored for model in models]
+    notes = []
+    if all(mirrored):
+        notes.append("All pictures are mirrored: v is counted from below, or the world is left-handed.")
+    for number, (name, model) in enumerate(zip(names, models, strict=True)):
+        words = _kind(model)
+        if mirrored[number] and not all(mirrored):
+            words = ["its pictures are mirrored: it looks through a mirror, or v is counted from below", *words]
+        if not words:
+            continue
+        left = fitted.left_by_ordinary(number)
+        without = f". An ordinary camera would leave {left:.2g} px" if np.isfinite(left) else ""
+        notes.append(f"{name}: {'; '.join(words)}{without}.")
+    return notes
+
+
+def _kind(model: CameraModel) -> list[str]:
+    camera = model.camera
+    if model.family == "none":
+        return ["no lens model predicts its views as well as a linear projection and a smooth field do"]
+    if not isinstance(camera, GeneralCamera) or model.family == "ordinary":
+        return []
+    aspect = float(np.exp(-2 * camera.shape[0]))
+    off = float(np.linalg.norm(camera.centre - model.image.centre))
+    if model.family == "aspect":
+        return [f"its pixels are not square, fy / fx = {aspect:.4g}"]
+    if model.family == "crop":
+        return [f"its lens looks past the middle of the image, by {off:.0f} px"]
+    return [f"tilted sensor or oblique window (fy / fx = {aspect:.3g}, principal point {off:.0f} px off the middle)"]
