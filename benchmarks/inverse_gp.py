@@ -48,7 +48,7 @@ def row(label, outcomes, seconds):
 
 
 HEAD = (
-    "| data, known points, method | rmse, mm | rmse / limit | 95 % per axis | of the ellipsoid | NEES | not measured | fit, s |\n"
+    "| data, known points, method | rmse, mm | rmse / limit | 95 % per axis | ellipsoid | NEES | not measured | s |\n"
     "|---|---|---|---|---|---|---|---|"
 )
 

@@ -22,7 +22,6 @@ from scipy.stats import chi2
 from implicam.calibrators import Calibration, ExplicitCalibration, ForwardGPCalibration, InverseGPCalibration
 from implicam.calibrators.forward_gp.rig_map import RigMap, Sensitivity
 from implicam.calibrators.inverse_maps import Part
-from implicam.calibrators.pixel_cloud import FAR
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
 from implicam.gp.linalg import solve_lower
@@ -291,8 +290,8 @@ class InverseOutlook:
     """Of Gaussian processes from pixels to positions, over candidates and judged places, in this order.
 
     X: (places, d) what the processes take. Per process known: V (n, places), and drift: W (p, places), with
-    `covariance of places = K + W^T W - V^T V`. beside: (places, 3, 3) what else is uncertain, whatever is added. widened:
-    (places,) the factor of the covariance away from what was learned, NaN where nothing is measured.
+    `covariance of places = K + W^T W - V^T V`. beside: (places, 3, 3) what else is uncertain, whatever is added.
+    widened: (places,) the factor of the covariance away from what was learned, NaN where nothing is measured.
     forward: knows what pixel noise leaves at each place; None for what the processes take for noise.
     """
 
@@ -320,7 +319,7 @@ class InverseOutlook:
         known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp, *_ in learned.parts)
         drift = tuple(learned.drift(pixels, known))
         far = calibration.farness(pixels * calibration.pixels.scale + calibration.pixels.offset)
-        widened = np.where(far > FAR, np.nan, far**2)
+        widened = np.where(far > calibration.farthest, np.nan, far**2)
         return cls(candidates, judged, calibration, X, known, drift, learned.uncertain(pixels), widened, forward)
 
     @property

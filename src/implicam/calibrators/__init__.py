@@ -55,9 +55,9 @@ def named(name: str) -> Calibrator:
     """The calibrator of a name, `method` or `method:variant`, as tables and sweeps name them.
 
     The variant is `paper` or `plain` (inverse-gp: its preset) or `no-dropout` (mlp); any other is a kernel of
-    inverse-gp, or a lens of the other methods: `inverse-gp:matern-5/2`, `forward-gp:none`, `explicit:kannala-brandt`. What the name
-    does not say is at its default. UsageError where the method or the variant is not known; MissingExtraError where
-    its library (`NEEDED`) is not installed.
+    inverse-gp, or a lens of the other methods: `inverse-gp:matern-5/2`, `forward-gp:none`, `explicit:kannala-brandt`.
+    What the name does not say is at its default. UsageError where the method or the variant is not known;
+    MissingExtraError where its library (`NEEDED`) is not installed.
     """
     method, _, variant = name.partition(":")
     if name in NEEDED:

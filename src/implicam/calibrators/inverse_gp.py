@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from implicam import calibration_file
 from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_principal, learn_smooth
-from implicam.calibrators.pixel_cloud import FAR, PixelCloud
+from implicam.calibrators.pixel_cloud import FAR, FAR_FROM_A_PLANE, PixelCloud
 from implicam.calibrators.protocol import (
     FLAT,
     Arrays,
@@ -48,6 +48,8 @@ FORMER_PRESETS = {"standardised": "plain"}
 """Name in earlier versions -> name now."""
 AXES = "xyz"
 EXTENT = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
+THIN = 0.25
+"""Errors of known points across their plane, over their thickness, at which little is learned of that direction."""
 SUSPECT = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
 LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
@@ -233,7 +235,7 @@ class InverseGPCalibration:
 
     def farness(self, uv: Floats) -> Floats:
         """(k,) the factor by which error bars at pixels (k, d) grow away from those learned from: 1 among them; what
-        is beyond FAR is not measured. The paper's presets know nothing of it."""
+        is beyond `farthest` is not measured. The paper's presets know nothing of it."""
         if self.smoothness is None:
             return np.ones(len(uv))
         return np.maximum(self.cloud.farness(uv), 1.0)
@@ -259,8 +261,8 @@ class InverseGPCalibration:
         xyz, cov = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
         uv = observations.uv[complete].reshape(-1, 2 * len(observations.cameras))
         far = self.farness(uv)
-        reason[complete[far > FAR]] = [unlike_reason(f) for f in far[far > FAR]]
-        complete, uv, far = complete[far <= FAR], uv[far <= FAR], far[far <= FAR]
+        reason[complete[far > self.farthest]] = [unlike_reason(f) for f in far[far > self.farthest]]
+        complete, uv, far = complete[far <= self.farthest], uv[far <= self.farthest], far[far <= self.farthest]
         mean, covariance = self.map.predict(self.pixels.apply(uv))
         scale, offset = self.positions.scale, self.positions.offset
         xyz[complete] = mean * scale + offset
@@ -297,7 +299,35 @@ class InverseGPCalibration:
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*flat_note(self.data), *lattice_note(self.data, self.method), *self._suspects()]
+        flat = flat_note(self.data) or self._thin_note()
+        return [*flat, *lattice_note(self.data, self.method), *self._suspects()]
+
+    @cached_property
+    def _thickness(self) -> tuple[float, float]:
+        """Rms thickness of the known positions, whichever way they lie flat, and the rms leave-one-out error there."""
+        xyz = self._usable.xyz
+        normal = np.linalg.svd(xyz - xyz.mean(axis=0))[2][-1]
+        errors, _ = self.map.leave_one_out()
+        across = (errors * self.positions.scale) @ normal
+        return float(np.std(xyz @ normal)), float(np.sqrt(np.mean(across**2)))
+
+    @cached_property
+    def farthest(self) -> float:
+        """How far pixels may be and still be measured: less where the known positions are nearly in one plane."""
+        thickness, error = self._thickness
+        return FAR if error < THIN * thickness else FAR_FROM_A_PLANE
+
+    def _thin_note(self) -> list[str]:
+        """A note on known points that are no thicker than what the pixels tell of them."""
+        thickness, error = self._thickness
+        if error < THIN * thickness:
+            return []
+        unit = self.data.length_unit
+        return [
+            f"The known positions lie nearly in one plane: {thickness:.2g} {unit} (rms) thick, of which the pixels "
+            f"tell to {error:.2g} {unit}. Positions off it are not measured but guessed: add known points in front of "
+            "it and behind."
+        ]
 
     def _suspects(self) -> list[str]:
         """Known points that the others contradict: a wrong detection, a wrong position."""

@@ -8,6 +8,7 @@ priors that prefer long ranges. See docs/decisions/0017-inverse-gp.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.gp import GaussianProcess, Kriging, LengthscalePrior, Smoothness, most_probable
-from implicam.threads import side_by_side
+from implicam.threads import blas_threads, cores, side_by_side
 
 DEGREES_OF_FREEDOM = 3
 """Of a position, and so of the pixels of any number of cameras."""
@@ -28,6 +29,10 @@ COMMON_SD, OWN_SD = 1.0, 0.5
 """Prior sd of the log lengthscales: of all together, and of each beside."""
 LEAST_RESIDUALS = 8
 """The mean is not given a function more unless so many points are left to learn the covariance from."""
+
+
+SMALL = 1000
+"""Points up to which a matrix of them gains nothing from several threads."""
 
 
 class Part(NamedTuple):
@@ -116,7 +121,8 @@ class SmoothMap:
     def condition(cls, smoothness: Smoothness, basis: Floats, spread: Floats, X: Floats, Y: Floats) -> SmoothMap:
         """On known points: standardised pixels X (n, d), whose standard deviations in pixels are spread (d,)."""
         axes = _mean_axes(X, spread)
-        return cls(Kriging.condition(smoothness, X @ basis, Y, _with_one(X @ axes)), basis, axes)
+        with few_threads(len(X)):
+            return cls(Kriging.condition(smoothness, X @ basis, Y, _with_one(X @ axes)), basis, axes)
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -142,7 +148,8 @@ class SmoothMap:
 
     def _at(self, X: Floats, block: int = 2000) -> tuple[Floats, Floats, Floats]:
         pieces = [X[i : i + block] for i in range(0, max(1, len(X)), block)]
-        found = [self.kriging.predict(self.inputs(x), _with_one(x @ self.axes)) for x in pieces]
+        with few_threads(len(self.kriging)):
+            found = [self.kriging.predict(self.inputs(x), _with_one(x @ self.axes)) for x in pieces]
         mean, factor, moved = (np.concatenate(values) for values in zip(*found, strict=True))
         return mean, factor, moved
 
@@ -218,8 +225,14 @@ def learn_smooth(
     wanted = range(len(bases))
     if start is not None and not anew:
         wanted = range(0, 1) if start[1] or len(bases) == 1 else range(1, 2)
-    found = side_by_side(one, wanted)
+    with few_threads(len(X)):
+        found = [one(number) for number in wanted]
     return min(found, key=lambda pair: pair[0].value)
+
+
+def few_threads(points: int) -> AbstractContextManager[None]:
+    """One BLAS thread for matrices of so few points, on which several only wait for each other (threads.py)."""
+    return blas_threads(1 if points <= SMALL else cores())
 
 
 def is_principal(basis: Floats) -> bool:

@@ -17,6 +17,8 @@ from implicam.dataset import Floats
 FAR = 8.0
 """So many times as far as the farthest known point is from the others: nothing learned says what is there. In 36
 simulated rigs no point within the volume of 17 to 157 known points was beyond 6.6."""
+FAR_FROM_A_PLANE = 2.0
+"""The same where known positions lie nearly in one plane: across it nothing is learned but noise."""
 LEADING = 2
 MARGIN = 8
 """Points to spare before the sheet may be curved."""

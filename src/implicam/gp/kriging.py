@@ -5,8 +5,8 @@ Model, for outputs Y (n, m) at inputs X (n, d):
     Y = H B + F + E,    columns of F and E:  cov(F) = R (x) Sigma,  cov(E) = rho I (x) Sigma
 
 R is the correlation matrix of an ARD kernel, H (n, p) the functions of the mean, B (p, m) their coefficients with a
-flat prior, Sigma (m, m) the covariance of the outputs with the Jeffreys prior. B and Sigma are integrated out: what is left
-is the restricted likelihood of the lengthscales and of rho (Patterson & Thompson 1971), and a prediction whose
+flat prior, Sigma (m, m) the covariance of the outputs with the Jeffreys prior. B and Sigma are integrated out: what is
+left is the restricted likelihood of the lengthscales and of rho (Patterson & Thompson 1971), and a prediction whose
 covariance is that of a matrix-t distribution. Lengthscales have a log-normal prior. What is uncertain of them enters
 the predictions to first order (Zimmerman & Cressie 1992), from the curvature at the optimum.
 """
