@@ -31,8 +31,8 @@ LEAST_RESIDUALS = 8
 """The mean is not given a function more unless so many points are left to learn the covariance from."""
 
 
-SMALL = 1000
-"""Points up to which a matrix of them gains nothing from several threads."""
+SMALL = 3000
+"""Points up to which several BLAS threads may lose more by waiting for each other than they gain."""
 
 
 class Part(NamedTuple):
