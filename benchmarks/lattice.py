@@ -24,7 +24,7 @@ def ratio(cameras, lattice, shortest, seed):
     if lattice:
         known = known.split(157, seed=0)[0]
     held_out = simulate(rig, random_positions(rig, 300, np.random.default_rng(2)), seed=2)
-    calibration = InverseGP(shortest_lengthscale=shortest).fit(known)
+    calibration = InverseGP(preset="plain", shortest_lengthscale=shortest).fit(known)
     return evaluate(calibration, held_out, regions=False).coverage.overall.rmse_over_limit
 
 

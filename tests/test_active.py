@@ -39,8 +39,10 @@ from implicam.active import (
 from implicam.active.acquisition import IntegratedVariance
 from implicam.active.outlook import K95, ForwardOutlook, InverseOutlook
 from implicam.calibrators import ForwardGP, InverseGP
+from implicam.calibrators.inverse_maps import SmoothMap
 from implicam.dataset import Camera, Dataset, join
 from implicam.errors import UsageError
+from implicam.gp import Kriging
 from implicam.simulate import Rig, ball_grid, build_rig, moving_board, random_positions, simulate
 
 RNG = np.random.default_rng(7)
@@ -202,13 +204,33 @@ def test_an_inverse_outlook_states_what_measuring_states(rig: Rig, known: Datase
 def test_one_more_point_of_an_inverse_outlook_is_a_gp_with_one_more_point(rig: Rig, known: Dataset) -> None:
     """Against conditioning anew: the hyperparameters are kept, only the data grow."""
     new = simulate(rig, random_positions(rig, 30, np.random.default_rng(5)), seed=5)
-    calibration = InverseGP().fit(known)
+    calibration = InverseGP(preset="plain").fit(known)
     places = Places.recorded(new)
     after = outlook_of(calibration, places, places).after(4)
     grown = replace(calibration, data=join(known, renamed(new).select([4])))
     # what is left is the difference of two numbers as large as the signal's variance
     signal = max(gp.kernel.signal_variance for gp in calibration.processes) * calibration.positions.scale.max() ** 2
     assert np.allclose(after.now.total, grown.measure(new.observations).cov, rtol=1e-8, atol=1e-13 * signal)
+
+
+def test_one_more_point_of_a_smooth_outlook_is_kriging_with_one_more_point(rig: Rig, known: Dataset) -> None:
+    """The factor of the covariance; what else it holds (Sigma, lengthscales) depends on what will be seen."""
+    new = simulate(rig, random_positions(rig, 30, np.random.default_rng(5)), seed=5)
+    calibration = InverseGP().fit(known)
+    places = Places.recorded(new)
+    after = outlook_of(calibration, places, places).after(4)
+    assert isinstance(after, InverseOutlook)
+    assert isinstance(calibration.map, SmoothMap)
+    X = calibration.pixels.apply(new.observations.uv.reshape(len(new), -1))
+    axes = calibration.map.axes  # the mean of both: its axes move with the data
+    H = np.column_stack([np.ones(len(X)), X @ axes])
+    old = calibration.map.kriging
+    more = Kriging.condition(
+        old.smoothness, np.vstack([old.X, X[4:5] @ calibration.basis]), np.vstack([old.Y, np.zeros(3)]),
+        np.vstack([old.H, H[4:5]]),
+    )  # fmt: skip
+    expected = more.predict(X @ calibration.basis, H)[1]
+    assert np.allclose(after._variances[30:, 0], expected, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("robot_noise", [0.0, 0.2])
@@ -546,7 +568,10 @@ def test_a_grown_inverse_fit_is_never_less_probable(rig: Rig) -> None:
     """From no guess a search can end in a poor optimum; with the last result beside it, it cannot."""
     data = simulate(rig, random_positions(rig, 60, np.random.default_rng(8)), seed=8)
     few = InverseGP().fit(data.select(np.arange(40)))
-    fresh, grown, both = InverseGP().fit(data), few.grown(data), few.grown(data, anew=True)
+    values = [f.smoothness.value for f in (InverseGP().fit(data), few.grown(data), few.grown(data, anew=True))]  # type: ignore[union-attr]
+    assert values[2] <= min(values[:2]) + 1e-6
+    few = InverseGP(preset="plain").fit(data.select(np.arange(40)))
+    fresh, grown, both = InverseGP(preset="plain").fit(data), few.grown(data), few.grown(data, anew=True)
     for k in range(3):
         a, b, c = (fit.processes[k].log_marginal_likelihood() for fit in (fresh, grown, both))
         assert c >= max(a, b) - 1e-6
@@ -564,7 +589,7 @@ def test_the_papers_experiment_is_one_configuration_of_the_loop() -> None:
     data = simulate(rig, ball_grid(rig, (4, 4, 4)), seed=0)
     mask = np.isin(np.arange(len(data)), np.random.default_rng(2).permutation(len(data))[:13])
     loop = Loop(
-        InverseGP(),
+        InverseGP(preset="plain"),
         Workspace.of_box(rig.volume),
         acquisition("variance"),
         Budget(19),
@@ -574,7 +599,7 @@ def test_the_papers_experiment_is_one_configuration_of_the_loop() -> None:
     )
     loop.run(RecordedOracle(data, set(data.points[mask].tolist())))
     for name in loop.data.points[13:]:  # type: ignore[union-attr]
-        _, sd = _of_the_rest(InverseGP().fit(data.select(mask)), data, mask)
+        _, sd = _of_the_rest(InverseGP(preset="plain").fit(data.select(mask)), data, mask)
         sd[mask] = -np.inf
         # `mask` keeps the order of the data and the loop that of time: the fits differ in their last digits
         best = np.argsort(-sd)

@@ -396,18 +396,27 @@ def test_array_edits(edit: str, saved: Path, tmp_path: Path) -> None:
     assert time.perf_counter() - start < 5
 
 
+PRESET_NUMBERS = {
+    "smooth": (["lengthscale", "noise_ratio"], ["basis", "uncertainty"]),
+    "plain": (["lengthscale", "signal_variance", "noise_variance"], ["mean"]),
+}
+"""Preset -> the arrays of its file that must be positive, and those that must be finite."""
+
+
+@pytest.mark.parametrize("preset", PRESET_NUMBERS)
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, -1.0, 0.0])
-def test_bad_numbers(bad: float, saved: Path, tmp_path: Path) -> None:
-    table, members = contents(saved)
-    positive = ["pixel_scale", "position_scale", "lengthscale", "signal_variance", "noise_variance"]
-    finite = ["pixel_offset", "position_offset", "mean"]
+def test_bad_numbers(bad: float, preset: str, tmp_path: Path) -> None:
+    InverseGP(preset=preset).fit(known_points()).save(tmp_path / "good.implicam")
+    table, members = contents(tmp_path / "good.implicam")
+    positive = ["pixel_scale", "position_scale", *PRESET_NUMBERS[preset][0]]
+    finite = ["pixel_offset", "position_offset", *PRESET_NUMBERS[preset][1]]
     names = [f"method/{n}.npy" for n in positive + ([] if math.isfinite(bad) else finite)]
     names += [] if math.isfinite(bad) else ["data/xyz.npy"]
     names += ["data/uv.npy"] if math.isinf(bad) else []
     names += ["data/xyz_sd.npy"] if bad < 0 or math.isinf(bad) else []
     for name in names:
         array = np.load(io.BytesIO(members[name])).copy()
-        array.flat[1] = bad
+        array.flat[-1] = bad
         fails(forge(tmp_path / "x.implicam", table, zipped({**members, name: npy(array)})))
 
 

@@ -56,6 +56,7 @@ CASES = [
     Case("explicit", (("lens", "kannala-brandt"),), 1.0, 0.05),
     Case("inverse-gp", (), 1.5, 0.05),
     Case("inverse-gp", (("kernel", "matern-5/2"),), 2.0, 0.05),
+    Case("inverse-gp", (("preset", "plain"),), 1.5, 0.05),
     Case("inverse-gp", (("preset", "paper"),), 20.0, 1e-3),
     Case("mlp", (), 25.0, 1e-3),
 ]
@@ -397,6 +398,7 @@ def test_options_are_checked_by_name() -> None:
     ("explicit:kannala-brandt", {"lens": "kannala-brandt"}),
     ("inverse-gp", {}),
     ("inverse-gp:matern-5/2", {"kernel": "matern-5/2"}),
+    ("inverse-gp:plain", {"preset": "plain"}),
     ("inverse-gp:paper", {"preset": "paper"}),
     ("mlp", {}),
     ("mlp:no-dropout", {"dropout": 0.0}),
@@ -434,7 +436,7 @@ def test_it_predicts_what_scikit_learn_predicts(kernel: str) -> None:
     sklearn = pytest.importorskip("sklearn.gaussian_process")
     kernels = sklearn.kernels
     data, held_out = complete(sets()[0]), complete(sets()[1])
-    calibration = inverse_gp(data, kernel=kernel)
+    calibration = inverse_gp(data, kernel=kernel, preset="plain")
     measured = calibration.measure(held_out.observations)
     for axis, h in enumerate(calibration.hyperparameters):
         scale, offset = calibration.positions.scale[axis], calibration.positions.offset[axis]
@@ -450,7 +452,7 @@ def test_it_predicts_what_scikit_learn_predicts(kernel: str) -> None:
 
 
 def test_the_covariance_holds_the_noise_and_is_diagonal() -> None:
-    calibration, held_out = inverse_gp(sets()[0]), complete(sets()[1])
+    calibration, held_out = inverse_gp(sets()[0], preset="plain"), complete(sets()[1])
     measured = calibration.measure(held_out.observations)
     for axis, (gp, h) in enumerate(zip(calibration.processes, calibration.hyperparameters, strict=True)):
         _, of_function = gp.predict(inputs(calibration, held_out))
@@ -484,8 +486,11 @@ def test_too_few_complete_points_say_which_camera_misses_them() -> None:
 def test_no_lengthscale_is_shorter_than_asked() -> None:
     data = complete(sets()[0])
     for shortest in (0.05, 3.0, 50.0):
-        for h in inverse_gp(data, shortest_lengthscale=shortest).hyperparameters:
+        for h in inverse_gp(data, preset="plain", shortest_lengthscale=shortest).hyperparameters:
             assert h.kernel.lengthscale.min() >= shortest * (1 - 1e-9)
+        smoothness = inverse_gp(data, shortest_lengthscale=shortest).smoothness
+        assert smoothness is not None
+        assert smoothness.lengthscale.min() >= shortest * (1 - 1e-9)
 
 
 def test_error_bars_are_honest_on_random_positions() -> None:

@@ -462,7 +462,7 @@ def test_where_there_is_no_inner_plane_there_is_nothing_to_leave_out() -> None:
 
 def test_a_random_split_flatters_what_learns_planes_and_the_planes_show_it() -> None:
     """Without its bound of lengthscales inverse-gp learns the planes themselves (docs/decisions/0004)."""
-    methods = {"forward-gp": ForwardGP(), "unbounded": InverseGP(shortest_lengthscale=0.05)}
+    methods = {"forward-gp": ForwardGP(), "unbounded": InverseGP(preset="plain", shortest_lengthscale=0.05)}
     two = build_rig("bar6", seed=1, cameras="2R")
     known = complete(simulate(two, ball_grid(two), seed=1))
     splits = random_splits(known, [100], seeds=2)

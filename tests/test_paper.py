@@ -168,7 +168,7 @@ def test_a_run_of_the_ball_is_a_fit_and_its_rms_error() -> None:
     rows = ball.learn(source.options, BALL, "2R", GP, 35, 2)["rows"]
     assert [(row["run"], row["judged"]) for row in rows] == [(0, BALL), (0, CHECK), (1, BALL), (1, CHECK)]
     train, rest = source.data(BALL, "2R").split(35, seed=1)
-    fit = InverseGP().fit(train)
+    fit = InverseGP(preset="plain").fit(train)
     for row, held_out in zip(rows[2:], (rest, source.data(CHECK, "2R")), strict=True):
         found = fit.measure(held_out.observations)
         error = np.sqrt(((found.xyz - held_out.truth.xyz) ** 2).sum(axis=1).mean())
@@ -212,7 +212,7 @@ def test_each_added_point_is_the_least_certain_one() -> None:
     mask = np.isin(np.arange(len(data)), np.random.default_rng([1, 2]).permutation(len(data))[:20])
     for row in rows:
         assert row["known"] == mask.sum()
-        fit = InverseGP().fit(data.select(mask))
+        fit = InverseGP(preset="plain").fit(data.select(mask))
         sd = fit.measure(data.select(~mask).observations).sd.mean(axis=1)
         assert row["max_sd"] == pytest.approx(sd.max(), rel=1e-9)
         assert row["mean_sd"] == pytest.approx(sd.mean(), rel=1e-9)
@@ -225,7 +225,7 @@ def test_between_two_fits_a_gaussian_process_keeps_its_hyperparameters() -> None
     rows = active.grow(source.options, "2R2W", GP, [0], 20, 2, 2)["rows"]
     assert [row["added"] for row in rows] == [0, 1, 2]
     mask = np.isin(np.arange(len(data)), np.random.default_rng([0, 2]).permutation(len(data))[:20])
-    fit = InverseGP().fit(data.select(mask))
+    fit = InverseGP(preset="plain").fit(data.select(mask))
     sd = fit.measure(data.select(~mask).observations).sd.mean(axis=1)
     mask[np.flatnonzero(~mask)[np.argmax(sd)]] = True
     grown = replace(fit, data=data.select(mask))

@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from implicam.calibrators import Calibration, ExplicitCalibration, ForwardGPCalibration, InverseGPCalibration
 from implicam.calibrators.forward_gp.rig_map import RigMap, Sensitivity
+from implicam.calibrators.inverse_maps import Part
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
 from implicam.gp.linalg import solve_lower
@@ -286,9 +287,11 @@ def _diagonal(variances: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class InverseOutlook:
-    """Of three Gaussian processes from pixels to positions, over candidates and judged places, in this order.
+    """Of Gaussian processes from pixels to positions, over candidates and judged places, in this order.
 
-    X: (places, 2 cameras) standardised pixels. known: per axis V (n, places), `covariance of places = K - V^T V`.
+    X: (places, d) what the processes take. Per process known: V (n, places), and drift: W (p, places), with
+    `covariance of places = K + W^T W - V^T V`. beside: (places, 3, 3) what else is uncertain, whatever is added.
+    widened: (places,) the factor of the covariance away from what was learned, NaN where nothing is measured.
     forward: knows what pixel noise leaves at each place; None for what the processes take for noise.
     """
 
@@ -297,6 +300,9 @@ class InverseOutlook:
     calibration: InverseGPCalibration
     X: Floats
     known: tuple[Floats, ...]
+    drift: tuple[Floats, ...]
+    beside: Floats
+    widened: Floats
     forward: RigMap | None = None
 
     @classmethod
@@ -308,9 +314,13 @@ class InverseOutlook:
         forward: knows what pixel noise leaves at each place. Without it that is what the processes take for noise, and
         with few points they take nearly everything for noise.
         """
-        X = _inputs(calibration, candidates, judged)
-        known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp in calibration.processes)
-        return cls(candidates, judged, calibration, X, known, forward)
+        pixels, learned = _inputs(calibration, candidates, judged), calibration.map
+        X = learned.inputs(pixels)
+        known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp, *_ in learned.parts)
+        drift = tuple(learned.drift(pixels, known))
+        far = calibration.farness(pixels * calibration.pixels.scale + calibration.pixels.offset)
+        widened = np.where(far > calibration.farthest, np.nan, far**2)
+        return cls(candidates, judged, calibration, X, known, drift, learned.uncertain(pixels), widened, forward)
 
     @property
     def useful(self) -> Bools:
@@ -318,27 +328,49 @@ class InverseOutlook:
         return np.asarray(self.candidates.seen.all(axis=1))
 
     @cached_property
+    def _parts(self) -> tuple[Part, ...]:
+        return self.calibration.map.parts
+
+    def _covariance(self, k: int, a: slice | Bools | NDArray[np.int64], b: slice | Bools | NDArray[np.int64]) -> Floats:
+        """Of process k, between places a and b."""
+        V, W = self.known[k], self.drift[k]
+        return np.asarray(
+            self._parts[k].process.kernel(self.X[a], self.X[b]) + W[:, a].T @ W[:, b] - V[:, a].T @ V[:, b]
+        )
+
+    @cached_property
     def _variances(self) -> Floats:
-        """(places, 3) of the functions, standardised."""
-        signal = [gp.kernel.signal_variance for gp in self.calibration.processes]
-        columns = [s - np.einsum("ij,ij->j", V, V) for s, V in zip(signal, self.known, strict=True)]
+        """(places, processes) of the functions, in their units."""
+        columns = [
+            part.process.kernel.signal_variance + np.einsum("ij,ij->j", W, W) - np.einsum("ij,ij->j", V, V)
+            for part, V, W in zip(self._parts, self.known, self.drift, strict=True)
+        ]
         return np.asarray(np.maximum(np.stack(columns, axis=1), 0.0), dtype=np.float64)
 
     @cached_property
     def _noise(self) -> Floats:
-        return np.array([h.noise_variance for h in self.calibration.hyperparameters])
+        return np.array([part.process.noise_variance for part in self._parts])
+
+    @cached_property
+    def _shares(self) -> Floats:
+        """(processes, 3, 3) of the covariance of a position, in the world's unit."""
+        scale = self.calibration.positions.scale
+        return np.stack([part.share * np.outer(scale, scale) for part in self._parts])
 
     def _prospect(self, part: slice, places: Places) -> Prospect:
         scale = self.calibration.positions.scale
-        total = (self._variances[part] + self._noise) * scale**2
+        total = np.einsum("nk,kij->nij", self._variances[part] + self._noise, self._shares)
+        total += self.beside[part] * np.outer(scale, scale)
+        total *= self.widened[part, None, None]
         total[~places.seen.all(axis=1)] = np.nan
 
         def floor() -> Floats:
             if self.forward is not None:
                 return floor_of(self.forward, places.xyz, places.seen)
-            return _diagonal(np.broadcast_to(self._noise * scale**2, total.shape))
+            noise = np.einsum("k,kij->ij", self._noise, self._shares)
+            return np.broadcast_to(noise, total.shape)
 
-        return Prospect(_diagonal(total), floor)
+        return Prospect(total, floor)
 
     @property
     def now(self) -> Prospect:
@@ -352,26 +384,29 @@ class InverseOutlook:
 
     def gain(self, weights: Floats) -> Floats:
         """(m,) the expected reduction, in closed form: covariance squared over the variance of a new output."""
-        m, scale = len(self.candidates), self.calibration.positions.scale
+        m = len(self.candidates)
+        weights = weights * self.widened[m:]
         good = np.isfinite(weights) & self.judged.seen.all(axis=1)
+        judged = m + np.flatnonzero(good)
         found = np.zeros(m)
-        for k, (gp, V) in enumerate(zip(self.calibration.processes, self.known, strict=True)):
-            covariance = gp.kernel(self.X[:m], self.X[m:][good]) - V[:, :m].T @ V[:, m:][:, good]
-            found += scale[k] ** 2 * (covariance**2 @ weights[good]) / (self._variances[:m, k] + self._noise[k])
+        for k, size in enumerate(np.trace(self._shares, axis1=1, axis2=2)):
+            covariance = self._covariance(k, slice(m), judged)
+            found += size * (covariance**2 @ weights[good]) / (self._variances[:m, k] + self._noise[k])
         return np.where(self.useful, found, 0.0)
 
     def information(self) -> Floats:
         """(m,) half the log of the variance of a new output over that of its noise, all three axes."""
         m = len(self.candidates)
-        found = 0.5 * np.log1p(self._variances[:m] / self._noise).sum(axis=1)
+        outputs = np.array([part.outputs for part in self._parts])
+        found = 0.5 * np.log1p(self._variances[:m] / self._noise) @ outputs
         return np.where(self.useful, found, 0.0)
 
     def after(self, i: int) -> InverseOutlook:
         """Candidate i known too: V gets one more row."""
         rows = []
-        for k, (gp, V) in enumerate(zip(self.calibration.processes, self.known, strict=True)):
-            row = gp.kernel(self.X[i : i + 1], self.X)[0] - V[:, i] @ V
-            rows.append(np.concatenate([V, row[None] / np.sqrt(self._variances[i, k] + self._noise[k])]))
+        for k, V in enumerate(self.known):
+            row = self._covariance(k, slice(i, i + 1), slice(None))
+            rows.append(np.concatenate([V, row / np.sqrt(self._variances[i, k] + self._noise[k])]))
         return replace(self, known=tuple(rows))
 
 

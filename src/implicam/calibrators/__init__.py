@@ -9,7 +9,7 @@ from typing import Any
 from implicam import calibration_file
 from implicam.calibrators.explicit import Explicit, ExplicitCalibration
 from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
-from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
+from implicam.calibrators.inverse_gp import PRESETS, InverseGP, InverseGPCalibration
 from implicam.calibrators.mlp import MLP, MLPCalibration
 from implicam.calibrators.protocol import Calibration, Calibrator, Rejected, Unused
 from implicam.errors import CalibrationFileError, UsageError, did_you_mean, import_extra
@@ -54,17 +54,17 @@ def calibrator(method: str, **options: Any) -> Calibrator:
 def named(name: str) -> Calibrator:
     """The calibrator of a name, `method` or `method:variant`, as tables and sweeps name them.
 
-    The variant is `paper` (inverse-gp: its preset) or `no-dropout` (mlp); any other is a kernel of inverse-gp, or a
-    lens of the other methods: `inverse-gp:matern-5/2`, `forward-gp:none`, `explicit:kannala-brandt`. What the name
-    does not say is at its default. UsageError where the method or the variant is not known; MissingExtraError where
-    its library (`NEEDED`) is not installed.
+    The variant is `paper` or `plain` (inverse-gp: its preset) or `no-dropout` (mlp); any other is a kernel of
+    inverse-gp, or a lens of the other methods: `inverse-gp:matern-5/2`, `forward-gp:none`, `explicit:kannala-brandt`.
+    What the name does not say is at its default. UsageError where the method or the variant is not known;
+    MissingExtraError where its library (`NEEDED`) is not installed.
     """
     method, _, variant = name.partition(":")
     if name in NEEDED:
         import_extra(*NEEDED[name], name)  # now, so that no fit is charged for it
     if not variant:
         return calibrator(method)
-    if (method, variant) == (InverseGP.method, "paper"):
+    if method == InverseGP.method and variant in PRESETS:
         return calibrator(method, preset=variant)
     if (method, variant) == (MLP.method, "no-dropout"):
         return calibrator(method, dropout=0.0)

@@ -1,13 +1,14 @@
-"""inverse-gp, the paper's method: three independent GPs from the pixels of all cameras to x, y and z.
+"""inverse-gp: Gaussian processes from the pixels of all cameras to x, y and z.
 
-De Boi et al., "Implicit Multi-Camera System Calibration Using Gaussian Processes", section "Implicit Camera
-Calibration": inputs u1, v1, u2, v2, ...; exact GPs with an ARD squared-exponential kernel; maximum marginal likelihood.
-Inputs and outputs are standardised here. `preset="paper"` trains with the paper's software and its defaults instead
-(paper_preset.py).
+Three presets. `smooth`, the default: one process for all three coordinates, a linear mean, priors on how smooth optics
+are, and error bars that hold what is uncertain of all that (inverse_maps.py, docs/decisions/0017-inverse-gp.md).
+`plain`, the paper's model: De Boi et al., "Implicit Multi-Camera System Calibration Using Gaussian Processes", section
+"Implicit Camera Calibration": inputs u1, v1, u2, v2, ...; three exact GPs with an ARD squared-exponential kernel;
+maximum marginal likelihood. `paper`: the same, trained with the paper's software and its defaults (paper_preset.py).
 
-The stated covariance is that of a new noisy output: the function's variance plus the noise variance, since a pixel
-error of the measurement moves the position as much as one in the training data did. It is diagonal, because the three
-GPs know nothing of each other.
+The stated covariance is that of a new noisy output: the function's plus the noise, since a pixel error of the
+measurement moves the position as much as one in the training data did. Of `plain` and `paper` it is diagonal, because
+the three GPs know nothing of each other.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam import calibration_file
+from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_principal, learn_smooth
+from implicam.calibrators.pixel_cloud import FAR, FAR_FROM_A_PLANE, PixelCloud
 from implicam.calibrators.protocol import (
     FLAT,
     Arrays,
@@ -35,14 +38,18 @@ from implicam.calibrators.protocol import (
 )
 from implicam.dataset import Dataset, Floats, Names, Observations
 from implicam.errors import UsageError, did_you_mean
-from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, maximise_each
+from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
 
-PRESETS = ("standardised", "paper")
+PRESETS = ("smooth", "plain", "paper")
+FORMER_PRESETS = {"standardised": "plain"}
+"""Name in earlier versions -> name now."""
 AXES = "xyz"
 EXTENT = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
+THIN = 0.25
+"""Errors of known points across their plane, over their thickness, at which little is learned of that direction."""
 SUSPECT = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
 LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
@@ -76,20 +83,21 @@ class Hyperparameters:
 
 @dataclass(frozen=True)
 class InverseGP:
-    """The paper's method. kernel: `squared-exponential` or `matern-5/2`; preset: `standardised` or `paper`.
+    """kernel: `squared-exponential` or `matern-5/2`; preset: `smooth`, `plain` or `paper`.
 
     shortest_lengthscale: bound of every lengthscale, in standard deviations of the pixels. Optics are smooth across
     the image, so by default it is the extent of the pixels themselves (docs/decisions/0004-lattices.md).
     """
 
     kernel: str = "squared-exponential"
-    preset: str = "standardised"
+    preset: str = "smooth"
     seed: int = 0
     shortest_lengthscale: float = EXTENT
 
     method: ClassVar[str] = "inverse-gp"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "preset", FORMER_PRESETS.get(self.preset, self.preset))
         for what, value, known in (("kernel", self.kernel, SHAPES), ("preset", self.preset, PRESETS)):
             if value not in known:
                 raise UsageError(
@@ -103,6 +111,8 @@ class InverseGP:
 
     def fit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
         """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
+        if self.preset == "smooth":
+            return self._fitted_smooth(data, progress)
         if self.preset == "paper":
             from implicam.calibrators.paper_preset import train
         else:
@@ -117,6 +127,20 @@ class InverseGP:
             positions = Scaling(np.zeros(3), np.full(3, 1.0 / data.metres_per_unit))
         hyper = train(self, pixels.apply(inputs), positions.apply(outputs), progress)
         return InverseGPCalibration(self, data, unused, pixels, positions, hyper)
+
+    def _fitted_smooth(
+        self, data: Dataset, progress: Progress, start: tuple[Smoothness, bool] | None = None, anew: bool = True
+    ) -> InverseGPCalibration:
+        usable, unused = seen_by_all(data, self.method)
+        inputs, outputs = pixels_of(usable), usable.xyz
+        pixels, positions = Scaling.of(inputs), Scaling.of(outputs)
+        X, Y = pixels.apply(inputs), positions.apply(outputs)
+        progress("fitting", 0, 1)
+        found = learn_smooth(
+            X, Y, pixels.scale, self.kernel, self.shortest_lengthscale, self.seed, start=start, anew=anew
+        )
+        progress("fitting", 1, 1)
+        return InverseGPCalibration(self, data, unused, pixels, positions, (), *found)
 
 
 def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
@@ -165,7 +189,10 @@ def _train(
 
 @dataclass(frozen=True, eq=False)
 class InverseGPCalibration:
-    """Three GPs conditioned on the known points that every camera saw."""
+    """GPs conditioned on the known points that every camera saw.
+
+    hyperparameters: of the three of `plain` and `paper`; smoothness and basis: of the one of `smooth`.
+    """
 
     calibrator: InverseGP
     data: Dataset
@@ -173,6 +200,8 @@ class InverseGPCalibration:
     pixels: Scaling
     positions: Scaling
     hyperparameters: tuple[Hyperparameters, ...] = field(repr=False)
+    smoothness: Smoothness | None = field(default=None, repr=False)
+    basis: Floats | None = field(default=None, repr=False)
 
     method: ClassVar[str] = "inverse-gp"
 
@@ -183,41 +212,68 @@ class InverseGPCalibration:
 
     @cached_property
     def processes(self) -> tuple[GaussianProcess, ...]:
-        """The three conditioned GPs, in standardised units."""
-        usable = self.data.select(self.data.observations.seen.all(axis=1))
-        X, Y = self.pixels.apply(pixels_of(usable)), self.positions.apply(usable.xyz)
+        """The three conditioned GPs of `plain` and `paper`, in standardised units; none of `smooth`."""
+        X, Y = self._known
 
         def one(pair: tuple[Hyperparameters, Floats]) -> GaussianProcess:
             h, y = pair
             return GaussianProcess.condition(h.kernel, h.noise_variance, X, y, h.mean)
 
-        return tuple(side_by_side(one, list(zip(self.hyperparameters, Y.T, strict=True))))
+        return tuple(side_by_side(one, list(zip(self.hyperparameters, Y.T, strict=False))))
+
+    @cached_property
+    def map(self) -> Map:
+        """From standardised pixels to standardised positions."""
+        if self.smoothness is None or self.basis is None:
+            return ThreeMaps(self.processes)
+        return SmoothMap.condition(self.smoothness, self.basis, self.pixels.scale, *self._known)
+
+    @cached_property
+    def cloud(self) -> PixelCloud:
+        """The pixels that it has learned from."""
+        return PixelCloud.of(pixels_of(self._usable))
+
+    def farness(self, uv: Floats) -> Floats:
+        """(k,) the factor by which error bars at pixels (k, d) grow away from those learned from: 1 among them; what
+        is beyond `farthest` is not measured. The paper's presets know nothing of it."""
+        if self.smoothness is None:
+            return np.ones(len(uv))
+        return np.maximum(self.cloud.farness(uv), 1.0)
+
+    @property
+    def _usable(self) -> Dataset:
+        return self.data.select(self.data.observations.seen.all(axis=1))
+
+    @property
+    def _known(self) -> tuple[Floats, Floats]:
+        """Standardised pixels (n, d) and positions (n, 3)."""
+        usable = self._usable
+        return self.pixels.apply(pixels_of(usable)), self.positions.apply(usable.xyz)
 
     def measure(self, observations: Observations) -> Measurement:
-        """Measure the points that every camera saw; the others keep their row, with a reason."""
+        """Measure the points that every camera saw, and whose pixels are like those learned from (`smooth`); the
+        others keep their row, with a reason."""
         observations = same_cameras(self.data.observations, observations)
         seen = observations.seen
-        complete = seen.all(axis=1)
+        reason = blind_reasons(seen, observations.camera_names, self.method).astype(object)
+        complete = np.flatnonzero(seen.all(axis=1))
         n = len(observations)
         xyz, cov = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
-        X = self.pixels.apply(observations.uv[complete].reshape(-1, 2 * len(observations.cameras)))
-
-        def one(pair: tuple[GaussianProcess, Hyperparameters]) -> tuple[Floats, Floats]:
-            mean, variance = pair[0].predict(X)
-            return mean, variance + pair[1].noise_variance
-
-        answers = side_by_side(one, list(zip(self.processes, self.hyperparameters, strict=True)))
+        uv = observations.uv[complete].reshape(-1, 2 * len(observations.cameras))
+        far = self.farness(uv)
+        reason[complete[far > self.farthest]] = [unlike_reason(f) for f in far[far > self.farthest]]
+        complete, uv, far = complete[far <= self.farthest], uv[far <= self.farthest], far[far <= self.farthest]
+        mean, covariance = self.map.predict(self.pixels.apply(uv))
         scale, offset = self.positions.scale, self.positions.offset
-        xyz[complete] = np.stack([mean for mean, _ in answers], axis=1) * scale + offset
-        variances = np.stack([variance for _, variance in answers], axis=1) * scale**2
-        cov[complete] = variances[:, :, None] * np.eye(3)
+        xyz[complete] = mean * scale + offset
+        cov[complete] = covariance * np.outer(scale, scale) * far[:, None, None] ** 2
         return Measurement(
             observations.points,
             xyz,
             cov,
             seen.sum(axis=1),
             np.full(n, np.nan),  # a map from all pixels to a position cannot ask whether the views agree
-            blind_reasons(seen, observations.camera_names, self.method),
+            reason.astype(np.str_),
             self.data.length_unit,
         )
 
@@ -230,6 +286,9 @@ class InverseGPCalibration:
         more probable of both counts. The paper's preset always starts from its defaults."""
         if self.calibrator.preset == "paper":
             return self.refit(data, progress)
+        if self.smoothness is not None and self.basis is not None:
+            known = self.smoothness, is_principal(self.basis)
+            return self.calibrator._fitted_smooth(data, progress, known, anew)
         usable, _ = seen_by_all(data, self.method)
         ratio = self.pixels.scale / Scaling.of(pixels_of(usable)).scale  # lengthscales are in standard deviations
         starts = [
@@ -240,15 +299,40 @@ class InverseGPCalibration:
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*flat_note(self.data), *lattice_note(self.data, self.method), *self._suspects()]
+        flat = flat_note(self.data) or self._thin_note()
+        return [*flat, *lattice_note(self.data, self.method), *self._suspects()]
+
+    @cached_property
+    def _thickness(self) -> tuple[float, float]:
+        """Rms thickness of the known positions, whichever way they lie flat, and the rms leave-one-out error there."""
+        xyz = self._usable.xyz
+        normal = np.linalg.svd(xyz - xyz.mean(axis=0))[2][-1]
+        errors, _ = self.map.leave_one_out()
+        across = (errors * self.positions.scale) @ normal
+        return float(np.std(xyz @ normal)), float(np.sqrt(np.mean(across**2)))
+
+    @cached_property
+    def farthest(self) -> float:
+        """How far pixels may be and still be measured: less where the known positions are nearly in one plane."""
+        thickness, error = self._thickness
+        return FAR if error < THIN * thickness else FAR_FROM_A_PLANE
+
+    def _thin_note(self) -> list[str]:
+        """A note on known points that are no thicker than what the pixels tell of them."""
+        thickness, error = self._thickness
+        if error < THIN * thickness:
+            return []
+        unit = self.data.length_unit
+        return [
+            f"The known positions lie nearly in one plane: {thickness:.2g} {unit} (rms) thick, of which the pixels "
+            f"tell to {error:.2g} {unit}. Positions off it are not measured but guessed: add known points in front of "
+            "it and behind."
+        ]
 
     def _suspects(self) -> list[str]:
         """Known points that the others contradict: a wrong detection, a wrong position."""
-        errors = []
-        for gp in self.processes:
-            mean, variance = gp.leave_one_out()
-            errors.append(np.abs(gp.y - mean) / np.sqrt(variance))
-        worst = np.max(errors, axis=0)
+        errors, variances = self.map.leave_one_out()
+        worst = np.max(np.abs(errors) / np.sqrt(variances), axis=1)
         names = self.data.points[self.data.observations.seen.all(axis=1)]
         found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > SUSPECT]
         if not found:
@@ -261,17 +345,14 @@ class InverseGPCalibration:
 
     def residuals(self) -> dict[str, Any]:
         """Leave-one-out errors per axis, in the dataset's unit (closed form, hyperparameters kept)."""
-        errors, sds = [], []
-        for gp, scale in zip(self.processes, self.positions.scale, strict=True):
-            mean, variance = gp.leave_one_out()
-            errors.append((gp.y - mean) * scale)
-            sds.append(np.sqrt(variance) * scale)
-        rms = np.sqrt(np.mean(np.square(errors), axis=1))
+        errors, variances = self.map.leave_one_out()
+        rms = np.sqrt(np.mean(errors**2, axis=0)) * self.positions.scale
+        sds = np.sqrt(variances) * self.positions.scale
         return {
-            "points_used": len(self.processes[0]),
+            "points_used": len(errors),
             "points_unused": len(self.unused),
             "leave_one_out_rms": dict(zip(AXES, map(float, rms), strict=True)),
-            "leave_one_out_mean_sd": dict(zip(AXES, map(float, np.mean(sds, axis=1)), strict=True)),
+            "leave_one_out_mean_sd": dict(zip(AXES, map(float, np.mean(sds, axis=0)), strict=True)),
         }
 
     def save(self, path: str | Path) -> None:
@@ -282,6 +363,14 @@ class InverseGPCalibration:
         """Options, and the hyperparameters in standardised units with the scaling."""
         h = self.hyperparameters
         table = asdict(self.calibrator)
+        if self.smoothness is not None and self.basis is not None:
+            return table, {
+                **scaling_arrays(self.pixels, self.positions),
+                "basis": self.basis,
+                "lengthscale": self.smoothness.lengthscale,
+                "noise_ratio": np.array([self.smoothness.noise_ratio]),
+                "uncertainty": self.smoothness.root,
+            }
         arrays = {
             **scaling_arrays(self.pixels, self.positions),
             "lengthscale": np.stack([x.kernel.lengthscale for x in h]),
@@ -300,6 +389,16 @@ class InverseGPCalibration:
         _, unused = seen_by_all(data, cls.method)
         d = 2 * len(data.cameras)
         pixels, positions = scalings(arrays, data)
+        if calibrator.preset == "smooth":
+            smoothness = Smoothness(
+                calibrator.kernel,
+                finite_column(arrays, "lengthscale", (d,), positive=True),
+                float(finite_column(arrays, "noise_ratio", (1,), positive=True)[0]),
+                finite_column(arrays, "uncertainty", (d + 1, d + 1)),
+            )
+            return cls(
+                calibrator, data, unused, pixels, positions, (), smoothness, finite_column(arrays, "basis", (d, d))
+            )
         lengthscale = finite_column(arrays, "lengthscale", (3, d), positive=True)
         signal = finite_column(arrays, "signal_variance", (3,), positive=True)
         noise, mean = finite_column(arrays, "noise_variance", (3,), positive=True), finite_column(arrays, "mean", (3,))
@@ -337,6 +436,14 @@ def blind_reasons(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) 
     """(n,) why a point was not measured, from seen (n, cameras); empty where every camera saw it."""
     reasons = ["" if row.all() else why_not_all_seen(row, names, method) for row in seen]
     return np.array(reasons, dtype=np.str_)
+
+
+def unlike_reason(far: float) -> str:
+    """Why pixels so far from all known points are not measured."""
+    return (
+        f"pixels unlike any it has learned: {far:.0f} times as far from the known points' as the farthest of these "
+        "(a wrong match, or a place away from where known points are)"
+    )
 
 
 def flat_note(data: Dataset) -> list[str]:

@@ -67,7 +67,9 @@ Kernel = Annotated[
 Preset = Annotated[
     str | None,
     typer.Option(
-        "--preset", metavar="NAME", help='inverse-gp: standardised, or "paper" for the paper\'s own software.'
+        "--preset",
+        metavar="NAME",
+        help='inverse-gp: smooth; "plain", the paper\'s model; "paper", its own software.',
     ),
 ]
 Lens = Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-GP, PAPER, NETWORK, EXPLICIT, FORWARD = "inverse-gp", "inverse-gp:paper", "mlp", "explicit", "forward-gp"
+GP, PAPER, NETWORK, EXPLICIT, FORWARD = "inverse-gp:plain", "inverse-gp:paper", "mlp", "explicit", "forward-gp"
 METHODS = (PAPER, GP, NETWORK, EXPLICIT, FORWARD)
 """The paper's Gaussian process with its own software, and with our fit; its network; explicit; ours."""
 LEARNERS = (PAPER, GP, NETWORK, FORWARD)

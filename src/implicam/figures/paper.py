@@ -4,7 +4,7 @@ Rows are mappings, one per run; a number that is None or NaN is not drawn. Lengt
 figures share:
 
     set      the set of cameras, "2R", "2R2W" or "2R4W": a panel or a line each, in alphabetical order
-    method   "inverse-gp", "inverse-gp:paper", "mlp", "forward-gp", "explicit" or any other word
+    method   "inverse-gp", "inverse-gp:plain", "inverse-gp:paper", "mlp", "forward-gp", "explicit" or any other word
     known    training points
     rmse     root mean square of the distances from the truth, over the test points
     mean_sd  stated standard deviation, averaged over x, y, z and the test points, as in the paper

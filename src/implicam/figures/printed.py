@@ -15,6 +15,7 @@ PURPOSE = "a figure for print"
 # Marker and dash differ wherever the colour does, so that methods are told apart in grey too.
 _LOOKS: dict[str, dict[str, Any]] = {
     "inverse-gp": {"color": BLUE, "marker": "o", "ls": "-"},
+    "inverse-gp:plain": {"color": BLUE, "marker": "h", "ls": (0, (5, 1, 1, 1))},
     "inverse-gp:paper": {"color": SKY, "marker": "s", "ls": "--"},
     "mlp": {"color": PURPLE, "marker": "^", "ls": "-."},
     "forward-gp": {"color": BLACK, "marker": "D", "ls": ":"},

@@ -1,0 +1,240 @@
+"""What inverse-gp learns, in standardised units: one smooth map for all three coordinates, or the paper's three maps.
+
+The smooth map has a mean that is linear in the three leading principal components of the pixels (a position has three
+degrees of freedom, and so has what the cameras see of it), one kernel for x, y and z with a joint covariance, and
+priors that prefer long ranges. See docs/decisions/0017-inverse-gp.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.gp import GaussianProcess, Kriging, LengthscalePrior, Smoothness, most_probable
+from implicam.threads import blas_threads, cores, side_by_side
+
+DEGREES_OF_FREEDOM = 3
+"""Of a position, and so of the pixels of any number of cameras."""
+EVERY_BASIS = 100
+"""Up to so many points both bases are tried, for both cost little; beyond, principal axes were always as good."""
+MEDIAN_ALONG_AXES, MEDIAN_PER_PIXEL = 6.0, 12.0
+"""Median lengthscales: in standard deviations of a principal component, and of a pixel coordinate. A map that is
+linear up to a tenth over the image has about the first; the second only says the same of more coordinates."""
+COMMON_SD, OWN_SD = 1.0, 0.5
+"""Prior sd of the log lengthscales: of all together, and of each beside."""
+LEAST_RESIDUALS = 8
+"""The mean is not given a function more unless so many points are left to learn the covariance from."""
+
+
+SMALL = 3000
+"""Points up to which several BLAS threads may lose more by waiting for each other than they gain."""
+
+
+class Part(NamedTuple):
+    """A Gaussian process whose variance, its noise included, times `share` (3, 3) is part of a position's covariance,
+    in standardised units; outputs: how many it stands for."""
+
+    process: GaussianProcess | Kriging
+    share: Floats
+    outputs: int
+
+
+class Map(Protocol):
+    """From standardised pixels to standardised positions."""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """Its Gaussian processes."""
+
+    def inputs(self, X: Floats) -> Floats:
+        """(k, d) what the processes take, from standardised pixels (k, d)."""
+
+    def drift(self, X: Floats, explained: Sequence[Floats]) -> list[Floats]:
+        """Of each part (p, k): what is uncertain of its mean."""
+
+    def uncertain(self, X: Floats) -> Floats:
+        """(k, 3, 3) what is in the covariance beside the parts, from standardised pixels."""
+
+    def predict(self, X: Floats) -> tuple[Floats, Floats]:
+        """Mean (k, 3) and covariance (k, 3, 3) of a new noisy position, from standardised pixels (k, d)."""
+
+    def leave_one_out(self) -> tuple[Floats, Floats]:
+        """Errors (n, 3) of the known points, each predicted from all others, and their variances (n, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThreeMaps:
+    """Three Gaussian processes that know nothing of each other: the paper's."""
+
+    processes: tuple[GaussianProcess, ...]
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """One an axis."""
+        return tuple(Part(gp, np.outer(e, e), 1) for gp, e in zip(self.processes, np.eye(3), strict=True))
+
+    def inputs(self, X: Floats) -> Floats:
+        """The pixels themselves."""
+        return X
+
+    def drift(self, X: Floats, explained: Sequence[Floats]) -> list[Floats]:
+        """Nothing: their mean is known."""
+        return [np.zeros((0, len(X))) for _ in explained]
+
+    def uncertain(self, X: Floats) -> Floats:
+        """Nothing: hyperparameters are taken as known."""
+        return np.zeros((len(X), 3, 3))
+
+    def predict(self, X: Floats) -> tuple[Floats, Floats]:
+        """The axes side by side; the covariance is diagonal."""
+
+        def one(gp: GaussianProcess) -> tuple[Floats, Floats]:
+            mean, variance = gp.predict(X)
+            return mean, variance + gp.noise_variance
+
+        answers = side_by_side(one, self.processes)
+        variances = np.stack([variance for _, variance in answers], axis=1)
+        return np.stack([mean for mean, _ in answers], axis=1), variances[:, :, None] * np.eye(3)
+
+    def leave_one_out(self) -> tuple[Floats, Floats]:
+        """In closed form, hyperparameters kept."""
+        pairs = [(gp.y, *gp.leave_one_out()) for gp in self.processes]
+        errors = np.stack([y - mean for y, mean, _ in pairs], axis=1)
+        return errors, np.stack([variance for *_, variance in pairs], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothMap:
+    """One process for all three coordinates. basis (d, d): the process takes `pixels @ basis`; axes (d, q): the mean
+    is linear in `pixels @ axes`."""
+
+    kriging: Kriging
+    basis: Floats
+    axes: Floats
+
+    @classmethod
+    def condition(cls, smoothness: Smoothness, basis: Floats, spread: Floats, X: Floats, Y: Floats) -> SmoothMap:
+        """On known points: standardised pixels X (n, d), whose standard deviations in pixels are spread (d,)."""
+        axes = _mean_axes(X, spread)
+        with few_threads(len(X)):
+            return cls(Kriging.condition(smoothness, X @ basis, Y, _with_one(X @ axes)), basis, axes)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """A single one."""
+        return (Part(self.kriging, self.kriging.sigma, 3),)
+
+    def inputs(self, X: Floats) -> Floats:
+        """In the basis that was chosen."""
+        return X @ self.basis
+
+    def drift(self, X: Floats, explained: Sequence[Floats]) -> list[Floats]:
+        """Of the linear mean."""
+        return [self.kriging.drift(_with_one(X @ self.axes), explained[0])]
+
+    def uncertain(self, X: Floats) -> Floats:
+        """What is not known of the lengthscales."""
+        return self._at(X)[2]
+
+    def predict(self, X: Floats) -> tuple[Floats, Floats]:
+        """With the covariance of all three coordinates."""
+        mean, factor, moved = self._at(X)
+        return mean, self.kriging.sigma * (factor + self.kriging.noise_variance)[:, None, None] + moved
+
+    def _at(self, X: Floats, block: int = 2000) -> tuple[Floats, Floats, Floats]:
+        pieces = [X[i : i + block] for i in range(0, max(1, len(X)), block)]
+        with few_threads(len(self.kriging)):
+            found = [self.kriging.predict(self.inputs(x), _with_one(x @ self.axes)) for x in pieces]
+        mean, factor, moved = (np.concatenate(values) for values in zip(*found, strict=True))
+        return mean, factor, moved
+
+    def leave_one_out(self) -> tuple[Floats, Floats]:
+        """In closed form, lengthscales kept."""
+        errors, factor = self.kriging.leave_one_out()
+        return errors, factor[:, None] * np.diag(self.kriging.sigma)
+
+
+def _with_one(X: Floats) -> Floats:
+    return np.column_stack([np.ones(len(X)), X])
+
+
+def _principal(X: Floats, spread: Floats) -> tuple[Floats, Floats]:
+    """Directions (d, d) of the pixels as they are, unscaled, for their noise is alike in all of them; for standardised
+    X. And the standard deviations (d,) along them, in that of a middling pixel coordinate."""
+    weights = spread / np.sqrt(np.mean(spread**2))
+    _, sizes, directions = np.linalg.svd(X * weights)
+    sd = np.zeros(X.shape[1])
+    sd[: len(sizes)] = sizes / np.sqrt(len(X))
+    return weights[:, None] * directions.T, sd
+
+
+def _mean_axes(X: Floats, spread: Floats) -> Floats:
+    """(d, q) what the mean is linear in: up to three principal components, of unit size; fewer with few points."""
+    directions, sd = _principal(X, spread)
+    q = min(DEGREES_OF_FREEDOM, int(np.sum(sd > 1e-9 * sd[0])), max(0, len(X) - 1 - LEAST_RESIDUALS))
+    return directions[:, :q] / sd[:q]
+
+
+def _bases(X: Floats, spread: Floats, shortest: float) -> list[tuple[Floats, LengthscalePrior]]:
+    """The coordinates that lengthscales are given in, and their priors. Principal axes: what is a small difference of
+    large pixels (depth, for two cameras) has a size of its own. Pixel by pixel: with few points of many cameras it is
+    cameras that differ in what they are worth."""
+    d = X.shape[1]
+    directions, sd = _principal(X, spread)
+    q = min(DEGREES_OF_FREEDOM, d)
+    unit = np.full(d, sd[q - 1])
+    unit[:q] = sd[:q]
+    leading = np.arange(d) < q
+    rest = ~leading
+    covariance = np.diag(np.where(leading, COMMON_SD**2, OWN_SD**2)) + COMMON_SD**2 * np.outer(rest, rest)
+    principal = directions / np.maximum(unit, 1e-9 * sd[0])
+    found = [(principal, LengthscalePrior(np.full(d, MEDIAN_ALONG_AXES), covariance, shortest))]
+    if len(X) <= EVERY_BASIS:
+        alike = COMMON_SD**2 * np.ones((d, d)) + OWN_SD**2 * np.eye(d)
+        found.append((np.eye(d), LengthscalePrior(np.full(d, MEDIAN_PER_PIXEL), alike, shortest)))
+    return found
+
+
+def learn_smooth(
+    X: Floats,
+    Y: Floats,
+    spread: Floats,
+    shape: str,
+    shortest: float,
+    seed: int,
+    start: tuple[Smoothness, bool] | None = None,
+    anew: bool = True,
+) -> tuple[Smoothness, Floats]:
+    """The more probable of the bases (d, d) and its smoothness, for standardised X (n, d) and Y (n, 3).
+
+    start: an earlier smoothness, and whether it was along principal axes; without `anew` only that is gone on from.
+    """
+    bases = _bases(X, spread, shortest)
+    H = _with_one(X @ _mean_axes(X, spread))
+
+    def one(number: int) -> tuple[Smoothness, Floats]:
+        basis, prior = bases[number]
+        known = start[0] if start is not None and start[1] == (number == 0) else None
+        return most_probable(X @ basis, Y, H, shape, prior, start=known, anew=anew, seed=seed), basis
+
+    wanted = range(len(bases))
+    if start is not None and not anew:
+        wanted = range(0, 1) if start[1] or len(bases) == 1 else range(1, 2)
+    with few_threads(len(X)):
+        found = [one(number) for number in wanted]
+    return min(found, key=lambda pair: pair[0].value)
+
+
+def few_threads(points: int) -> AbstractContextManager[None]:
+    """One BLAS thread for matrices of so few points, on which several only wait for each other (threads.py)."""
+    return blas_threads(1 if points <= SMALL else cores())
+
+
+def is_principal(basis: Floats) -> bool:
+    """Whether a basis is that of principal axes, not that of the pixels."""
+    return not np.array_equal(basis, np.eye(len(basis)))
