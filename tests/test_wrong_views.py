@@ -100,6 +100,7 @@ class Counted:
     points: _Seen
     solved_rows: list[np.ndarray] = field(default_factory=list)
     linear_rows: list[np.ndarray] = field(default_factory=list)
+    degrees: float | None = None
 
     def lines(self, rows):
         return self.points.lines(rows)
@@ -145,6 +146,8 @@ def dense(linear: Linear, i: int, kept: np.ndarray) -> float:
 
 class Given:
     """Points that are linear."""
+
+    degrees = None
 
     def __init__(self, linear: Linear) -> None:
         self.given = linear

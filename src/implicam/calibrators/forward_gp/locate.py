@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from implicam.calibrators.forward_gp.heavy_tails import consistency, refined, taken_as_normal
 from implicam.calibrators.forward_gp.lens import Floats
 from implicam.calibrators.forward_gp.posterior import CHUNK, Posterior, Unknowns, spread
 from implicam.calibrators.forward_gp.shots import Shots
@@ -22,6 +23,9 @@ Bools = NDArray[np.bool_]
 ITERATIONS = 12
 CONVERGED = 1e-3
 """Of a step, in standard deviations of the position."""
+
+REWEIGHTED = 3
+"""Times that the views of tied cameras are weighted, where their noise has heavy tails."""
 
 MENDED, HOPELESS = 3, 1e4
 """Steps after which chi-squared beyond this, at the end of the next step, will not come down to what is possible."""
@@ -50,19 +54,21 @@ class Labels(NamedTuple):
     unknowns: Unknowns
 
 
-def locate(posterior: Posterior, uv: Floats, noise: Floats, labels: Labels | None = None) -> Located:
-    """Points from pixels uv (n, C, 2), NaN where not seen, with noise (n, C) in pixels."""
+def locate(
+    posterior: Posterior, uv: Floats, noise: Floats, labels: Labels | None = None, degrees: float | None = None
+) -> Located:
+    """Points from pixels uv (n, C, 2), NaN where not seen, with noise (n, C) in pixels: normal, or the scale of a t
+    with so many degrees of freedom."""
     if len(uv) == 0:
         return Located(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(uv.shape[:2], dtype=np.bool_))
     parts = [slice(i, i + CHUNK) for i in range(0, len(uv), CHUNK)]
-    found = side_by_side(lambda part: _locate(posterior, uv[part], noise[part], labels), parts)
+    found = side_by_side(lambda part: _locate(_Seen(posterior, uv[part], noise[part], labels, degrees)), parts)
     return Located(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
-def _locate(posterior: Posterior, uv: Floats, noise: Floats, labels: Labels | None) -> Located:
-    points = _Seen(posterior, uv, noise, labels)
-    seen = np.asarray(np.isfinite(uv).all(axis=2))
-    xyz, cov, p = points.solved(np.arange(len(uv)), seen)
+def _locate(points: _Seen) -> Located:
+    seen = np.asarray(np.isfinite(points.uv).all(axis=2))
+    xyz, cov, p = points.solved(np.arange(len(seen)), seen)
     left_out = np.zeros_like(seen)
     bad = np.flatnonzero((seen.sum(axis=1) >= 3) & ~(p >= DISAGREE))
     for some in np.split(bad, range(CHUNK // 16, len(bad), CHUNK // 16)):
@@ -81,13 +87,41 @@ class _Seen:
     posterior: Posterior
     uv: Floats
     noise: Floats
-    labels: Labels | None
+    labels: Labels | None = None
+    degrees: float | None = None
 
     def solved(self, rows: NDArray[np.int64], seen: Bools) -> tuple[Floats, Floats, Floats]:
         """Positions, covariances and p-values of points from the views `seen` alone."""
         start = _start(*self.lines(rows), seen)
-        xyz, cov, chi2 = _solve(self.posterior, start, self.uv[rows], self.noise[rows], seen, self.labels)
-        return xyz, cov, _p_value(chi2, seen.sum(axis=1))
+        found = _solve(self.posterior, start, self.uv[rows], self.noise[rows], seen, self.labels)
+        if self.degrees is None:
+            return found.xyz, found.cov, _p_value(found.chi2, seen.sum(axis=1))
+        return self._by_t(found, rows, seen, self.degrees)
+
+    def _by_t(
+        self, found: _Solved, rows: NDArray[np.int64], seen: Bools, degrees: float
+    ) -> tuple[Floats, Floats, Floats]:
+        """The same with noise that is a t, from the solution with normal noise of the same scale."""
+        good = np.flatnonzero(np.isfinite(found.x).all(axis=1))
+        xyz, cov, p = found.xyz, found.cov, _p_value(found.chi2, seen.sum(axis=1))
+        if not len(good):
+            return xyz, cov, p
+        rows, seen = rows[good], seen[good]
+        linear = self.linear(rows, found.x[good], seen)
+        if linear.joint is None:
+            better = refined(linear, degrees)
+            xyz[good], cov[good] = found.x[good] + better.step, better.cov
+            p[good] = consistency(better.distance, seen, degrees)
+            return xyz, cov, p
+        for _ in range(REWEIGHTED):
+            distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
+            noise = taken_as_normal(self.noise[rows], distance, seen, degrees)
+            again = _solve(self.posterior, found.x[good], self.uv[rows], noise, seen, self.labels)
+            linear = self.linear(rows, again.x, seen, linear)
+        xyz[good], cov[good] = again.xyz, again.cov
+        distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
+        p[good] = consistency(distance, seen, degrees)
+        return xyz, cov, p
 
     def linear(self, rows: NDArray[np.int64], x: Floats, seen: Bools, before: Linear | None = None) -> Linear:
         """The views about x (n, 3)."""
@@ -110,12 +144,10 @@ def _p_value(chi2: Floats, views: NDArray[np.int64]) -> Floats:
     return np.where((views >= 2) & np.isfinite(chi2), chdtrc(degrees, chi2), np.nan)
 
 
-def _solve(
-    posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Bools, labels: Labels | None
-) -> tuple[Floats, Floats, Floats]:
-    """Position, covariance and chi-squared (n,) of points with the views `seen` (n, C), from x (n, 3); NaN where there
-    is none."""
+def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Bools, labels: Labels | None) -> _Solved:
+    """Points with the views `seen` (n, C), from x (n, 3)."""
     n = len(uv)
+    before = np.full((n, 3), np.nan)
     xyz, cov, chi2 = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
     rows = np.flatnonzero(np.isfinite(x).all(axis=1))
     x, uv, noise, seen = x[rows], uv[rows], noise[rows], seen[rows]
@@ -145,6 +177,7 @@ def _solve(
     covariance = _inverted(H)
     found &= np.isfinite(covariance).all(axis=(1, 2))
     x = x + step
+    before[rows[found]] = x[found]
     if labels is not None:
         x, covariance = _as_labelled(weights, labels, x, covariance, seen)
     kept = rows[found]
@@ -152,7 +185,17 @@ def _solve(
     cov[kept] = covariance[found]
     chi2[kept] = (squares - np.einsum("ni,ni->n", g, step))[found]
     chi2[rows[hopeless]] = HOPELESS
-    return xyz, cov, chi2
+    return _Solved(xyz, cov, chi2, before)
+
+
+class _Solved(NamedTuple):
+    """Positions (n, 3), covariances and chi-squared (n,) of points, NaN where there is none; x (n, 3): the positions
+    before labels are taken into account."""
+
+    xyz: Floats
+    cov: Floats
+    chi2: Floats
+    x: Floats
 
 
 def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen: Bools) -> tuple[Floats, Floats]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.evidence import Hyperparameters, field_kernel
 from implicam.calibrators.forward_gp.fit import FittedRig
+from implicam.calibrators.forward_gp.heavy_tails import Tails
 from implicam.calibrators.forward_gp.lens import LENSES, CentralCamera, Image, Prior
 from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, ShotErrors, Unknowns
 from implicam.calibrators.forward_gp.shots import Shots
@@ -38,6 +39,9 @@ def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict
             f"{number}/kept": fitted.kept[number],
             f"{number}/root": posterior.alone[number],
         }
+    if fitted.tails is not None:
+        arrays["tails"] = np.array([fitted.tails.degrees])
+        arrays |= {f"{number}/tail_weights": w for number, w in enumerate(fitted.tails.weights)}
     if posterior.joint is not None:
         arrays["joint"] = posterior.joint
     if posterior.displacement is not None:
@@ -72,7 +76,21 @@ def restored(lens: str, data: Dataset, points: Floats, table: Mapping[str, Any],
     posterior = _posterior(data, arrays, tuple(models), tuple(alone))
     errors, label_sd = _shot_errors(data, points, arrays, posterior)
     hyper = Hyperparameters(lengthscale, sizes[:, 0], sizes[:, 1])
-    return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd)
+    tails = _tails(arrays, kept)
+    return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd, tails)
+
+
+def _tails(arrays: Arrays, kept: Sequence[NDArray[np.bool_]]) -> Tails | None:
+    """None where the noise is normal, as in files from before there were tails."""
+    if "tails" not in arrays:
+        return None
+    degrees = float(finite_column(arrays, "tails", (1,))[0])
+    if degrees <= 2:
+        raise ValueError("noise with two degrees of freedom or fewer has no variance")
+    weights = (
+        finite_column(arrays, f"{number}/tail_weights", used.shape, positive=True) for number, used in enumerate(kept)
+    )
+    return Tails(degrees, tuple(weights))
 
 
 def _shot_errors(

@@ -68,6 +68,10 @@ class Linear(NamedTuple):
 class Points(Protocol):
     """Points whose views are asked about, by their rows."""
 
+    @property
+    def degrees(self) -> float | None:
+        """Degrees of freedom of the noise, None where it is normal."""
+
     def lines(self, rows: Ints) -> tuple[Floats, Floats]:
         """Centres (C, 3) of the cameras and directions (n, C, 3) of the lines of sight, NaN for none."""
 
@@ -181,6 +185,7 @@ class _Choices(NamedTuple):
     inverse: Floats
     squares: Floats
     distance: Floats
+    degrees: float | None
 
     @classmethod
     def about(cls, points: Points, rows: Ints, seen: Bools) -> _Choices:
@@ -196,12 +201,18 @@ class _Choices(NamedTuple):
         u = Wr - np.einsum("ncij,nj->nci", B, step)
         squares = np.sum(r * Wr, axis=(1, 2)) - np.einsum("ni,ni->n", g, step)
         distance = np.where(seen, np.einsum("nci,ncij,ncj->nc", r, linear.each, r), -1.0)
-        return cls(seen, linear, u, B, inverse, squares, distance)
+        return cls(seen, linear, u, B, inverse, squares, distance, points.degrees)
 
     @property
     def clearly_off(self) -> Ints:
         """(n,) how many views are far from the place."""
-        return np.asarray((chdtrc(2, np.maximum(self.distance, 0)) < DISAGREE).sum(axis=1), dtype=np.int64)
+        return np.asarray((chdtrc(2, self._as_normal) < DISAGREE).sum(axis=1), dtype=np.int64)
+
+    @property
+    def _as_normal(self) -> Floats:
+        """(n, C) the squared distances that are as rare with normal noise, eq. (T5)."""
+        distance = np.maximum(self.distance, 0)
+        return distance if self.degrees is None else self.degrees * np.log1p(distance / self.degrees)
 
     def two_best(self, some: Ints, size: int) -> tuple[_Groups, _Groups]:
         """Of points (some) the two groups of `size` views whose absence leaves the smallest chi-squared."""
@@ -221,10 +232,18 @@ class _Choices(NamedTuple):
 
     def hopeful(self, some: Ints, best: _Groups, second: _Groups, size: int) -> Bools:
         """Which of the points are worth solving again."""
-        degrees = np.maximum(2 * (self.seen[some].sum(axis=1) - size) - 3, 1)
-        p = [np.where(np.isfinite(g.chi2), chdtrc(degrees, np.maximum(g.chi2, 0)), 0) for g in (best, second)]
+        free = np.maximum(2 * (self.seen[some].sum(axis=1) - size) - 3, 1)
+        p = [np.where(np.isfinite(g.chi2), chdtrc(free, self._misfit(some, g)), 0) for g in (best, second)]
         known = (best.group >= 0).all(axis=1) & (second.group >= 0).all(axis=1)
         return np.asarray(known & (p[0] * SLACK > AGREE) & (p[0] * SLACK > CLEARLY * p[1]))
+
+    def _misfit(self, some: Ints, without: _Groups) -> Floats:
+        """(n,) chi-squared without a group of views; with heavy tails, at the place instead of the best one."""
+        if self.degrees is None:
+            return np.maximum(without.chi2, 0)
+        others = self._as_normal[some]
+        np.put_along_axis(others, np.maximum(without.group, 0), 0.0, axis=1)
+        return np.asarray(others.sum(axis=1), dtype=np.float64)
 
     def _without(self, some: Ints, others: Ints) -> Floats:
         """(n, C) chi-squared without the views `others` (n, k) and each single one more; inf where there is none."""
