@@ -2,7 +2,7 @@
 
 Detections are mostly good to a tenth of a pixel and sometimes off by a whole one. Taken for normal, such noise either
 bends the result or makes all error bars those of the bad views. Here a view's error is a bivariate t with `degrees`
-degrees of freedom; where the data do not say so clearly it is normal, and nothing changes. Eqs. (T1) to (T6) of
+degrees of freedom; where the data do not say so clearly it is normal, and nothing changes. Eqs. (T1) to (T5) of
 docs/method.md; docs/decisions/0016.
 """
 
@@ -53,6 +53,16 @@ FEWEST = 60
 DRAWS = 512
 """Places at which the posterior of a position is looked up: its sds are then good to a few per cent."""
 
+FEW_VIEWS = 4
+"""Up to so many, the posterior may have a second mode, without one of them."""
+
+AMBIGUOUS = 8.0
+"""How many times larger an error bar may be than that of views that agree: beyond, there are two places, and nothing
+says which."""
+
+TO_MODE = 10
+"""Times that views are weighted to find a mode."""
+
 AT_ONCE = 256
 """Views whose positions are integrated at once, so that all fits in the processor's cache."""
 
@@ -67,7 +77,7 @@ WIDER = 1.5
 
 
 class Tails(NamedTuple):
-    """degrees: of freedom. weights: per camera (n seen,), how much each of its views counts, eq. (T2)."""
+    """degrees: of freedom. weights: per camera (n seen,), how much each of its views counts, eq. (T3)."""
 
     degrees: float
     weights: tuple[Floats, ...]
@@ -141,7 +151,7 @@ def consistency(distance: Floats, seen: Bools, degrees: float) -> Floats:
 
 
 def taken_as_normal(noise: Floats, distance: Floats, seen: Bools, degrees: float) -> Floats:
-    """(n, C) noise of normal views that tell as much as these: by their distances, eqs. (T2) and (T3); of two views,
+    """(n, C) noise of normal views that tell as much as these: by their distances, eq. (T3); of two views,
     where nothing says which is the worse, the standard deviation."""
     weighted = information_loss(degrees) / weights_of(distance, degrees)
     plain = degrees / (degrees - 2)
@@ -150,8 +160,8 @@ def taken_as_normal(noise: Floats, distance: Floats, seen: Bools, degrees: float
 
 
 class Refined(NamedTuple):
-    """The posterior of n positions: step (n, 3) from where the views were linearised, covariance (n, 3, 3), and squared
-    distances (n, C) of the views at the most probable place."""
+    """The posterior of n positions: step (n, 3) from where the views were linearised, covariance (n, 3, 3), NaN where
+    two places are likely; and squared distances (n, C) of the views at the most probable one."""
 
     step: Floats
     cov: Floats
@@ -162,22 +172,65 @@ def refined(linear: Linear, degrees: float) -> Refined:
     """Mean and covariance of the position under t noise, from views linearised near it, eq. (T4)."""
     A, b = whitened(linear)
     n, C = b.shape[:2]
-    size = max(1, AT_ONCE // C)
-    parts = [_integrated(A[i : i + size], b[i : i + size], degrees) for i in range(0, n, size)]
-    return Refined(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    out = Refined(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, C)))
+    there = np.any(A != 0, axis=(2, 3))
+    views = there.sum(axis=1)
+    order = np.argsort(~there, axis=1, kind="stable")
+    for V in np.unique(views):
+        alike = np.flatnonzero(views == V)
+        size = max(1, AT_ONCE // int(V))
+        for some in np.split(alike, range(size, len(alike), size)):
+            chosen = order[some, :V]
+            found = _integrated(A[some[:, None], chosen], b[some[:, None], chosen], degrees)
+            out.step[some], out.cov[some] = found.step, found.cov
+            out.distance[some[:, None], chosen] = found.distance
+    return out
 
 
 def _integrated(A: Floats, b: Floats, degrees: float) -> Refined:
-    step, left, spread = _about_mode(A, b, degrees)
+    """By importance sampling, from a mixture of spherical t about every place that may be a mode: with few views, each
+    of them may be the wrong one."""
+    n = len(b)
+    modes = [_about_mode(A, b, degrees, start) for start in _starts(A, b)]
     z, log_density = _draws(DRAWS)
-    away = z @ spread.swapaxes(1, 2)  # (n, DRAWS, 3)
-    log_weight = -0.5 * (degrees + 2) * _bent(A, left, away, degrees) - log_density
+    centre = np.stack([mode.step for mode in modes], axis=1)  # (n, K, 3)
+    spread = np.stack([mode.spread for mode in modes], axis=1)
+    K = len(modes)
+    own = np.arange(DRAWS) % K  # the component that each draw belongs to
+    x = centre[:, own] + (spread[:, own] @ z[None, :, :, None])[..., 0]  # (n, DRAWS, 3)
+    log_weight = -0.5 * (degrees + 2) * _bent(A, b, x, degrees)
+    if K == 1:
+        log_weight = log_weight - log_density
+    else:
+        back = np.linalg.inv(spread)
+        away = (x[:, None] - centre[:, :, None]) @ back.swapaxes(2, 3)  # (n, K, DRAWS, 3)
+        sizes = np.linalg.slogdet(back)[1][..., None]
+        log_weight = log_weight - logsumexp(sizes - 3.5 * np.log1p(np.sum(away**2, axis=3) / 4), axis=1)
     weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
     weight /= weight.sum(axis=1, keepdims=True)
-    mean = np.einsum("nk,nki->ni", weight, away)
-    about = away - mean[:, None]
+    mean = np.einsum("nk,nki->ni", weight, x)
+    about = x - mean[:, None]
     cov = np.einsum("nk,nki,nkj->nij", weight, about, about)
-    return Refined(step + mean, cov, np.sum(left**2, axis=2))
+    agreeing = information_loss(degrees) * np.linalg.inv(np.einsum("ncij,ncik->njk", A, A))
+    larger = np.linalg.eigvals(np.linalg.solve(agreeing, cov)).real.max(axis=1)
+    mean[larger > AMBIGUOUS**2], cov[larger > AMBIGUOUS**2] = np.nan, np.nan
+    left = np.stack([mode.left for mode in modes], axis=1)
+    distance = np.sum(left**2, axis=3)  # (n, K, V)
+    best = np.argmin(np.sum(np.log1p(distance / degrees), axis=2), axis=1)
+    return Refined(mean, cov, distance[np.arange(n), best])
+
+
+def _starts(A: Floats, b: Floats) -> list[Floats]:
+    """Least squares (n, 3), and with few views, without each of them."""
+    N = A.swapaxes(2, 3) @ A
+    g = (A.swapaxes(2, 3) @ b[..., None])[..., 0]
+    H, pull = N.sum(axis=1), g.sum(axis=1)
+    starts = [np.linalg.solve(H, pull[..., None])[..., 0]]
+    V = b.shape[1]
+    if 3 <= V <= FEW_VIEWS:
+        held = 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        starts += [np.linalg.solve(H - N[:, c] + held, (pull - g[:, c])[..., None])[..., 0] for c in range(V)]
+    return starts
 
 
 def whitened(linear: Linear) -> tuple[Floats, Floats]:
@@ -188,7 +241,7 @@ def whitened(linear: Linear) -> tuple[Floats, Floats]:
 
 def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
     """Degrees of freedom of the noise from what cameras say of the same points, wherever these are: from views (n, C)
-    whitened as above, the position of each point integrated out, eq. (T6). None where the noise is normal.
+    whitened as above, the position of each point integrated out, eq. (T2). None where the noise is normal.
 
     A known position that is off by itself looks like heavy tails in every single camera; here it does not count. And
     where cameras agree among themselves much better than with the known positions, the errors are mostly of these:
@@ -232,21 +285,28 @@ def _most_likely(A: Floats, b: Floats, views: Ints, degrees: float, usual: float
 
 def _evidence(A: Floats, b: Floats, views: Ints, degrees: float) -> float:
     """Log density of the views of unit scale (those not there are zero), each point's position integrated out."""
-    _, left, spread = _about_mode(A, b, degrees)
+    mode = _about_mode(A, b, degrees)
     z, log_density = _draws(FEW_DRAWS)
-    log_weight = -0.5 * (degrees + 2) * _bent(A, left, z @ spread.swapaxes(1, 2), degrees) - log_density
-    sizes = np.linalg.slogdet(spread)[1] - views * np.log(2 * np.pi)
+    log_weight = -0.5 * (degrees + 2) * _bent(A, mode.left, z @ mode.spread.swapaxes(1, 2), degrees) - log_density
+    sizes = np.linalg.slogdet(mode.spread)[1] - views * np.log(2 * np.pi)
     return float(np.sum(logsumexp(log_weight, axis=1) - np.log(len(z)) + sizes))
 
 
-def _about_mode(A: Floats, b: Floats, degrees: float) -> tuple[Floats, Floats, Floats]:
-    """The most probable step (n, 3), residuals there (n, C, 2), and a root (n, 3, 3) of a covariance larger than the
-    posterior's."""
-    step = _mode(A, b, degrees)
+class _Mode(NamedTuple):
+    """Of n points the most probable step (n, 3) near a start, residuals there (n, C, 2), and a root (n, 3, 3) of a
+    covariance larger than the posterior's."""
+
+    step: Floats
+    left: Floats
+    spread: Floats
+
+
+def _about_mode(A: Floats, b: Floats, degrees: float, start: Floats | None = None) -> _Mode:
+    step = _mode(A, b, degrees, np.zeros((len(A), 3)) if start is None else start)
     left = b - np.einsum("ncij,nj->nci", A, step)
     w = weights_of(np.sum(left**2, axis=2), degrees)
     H = np.einsum("nc,ncij,ncik->njk", w, A, A)
-    return step, left, WIDER * np.sqrt(information_loss(degrees)) * _inverse_root(H)
+    return _Mode(step, left, WIDER * np.sqrt(information_loss(degrees)) * _inverse_root(H))
 
 
 def _bent(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
@@ -257,11 +317,9 @@ def _bent(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
     return np.asarray(np.sum(np.log1p(squares / degrees), axis=1), dtype=np.float64)
 
 
-def _mode(A: Floats, b: Floats, degrees: float, steps: int = 12) -> Floats:
-    """(n, 3) the most probable step: least squares, weighted again and again."""
-    n = len(A)
-    step = np.zeros((n, 3))
-    for _ in range(steps):
+def _mode(A: Floats, b: Floats, degrees: float, step: Floats) -> Floats:
+    """(n, 3) the most probable step near a start: least squares, weighted again and again."""
+    for _ in range(TO_MODE):
         left = b - np.einsum("ncij,nj->nci", A, step)
         w = weights_of(np.sum(left**2, axis=2), degrees)
         H = np.einsum("nc,ncij,ncik->njk", w, A, A)
