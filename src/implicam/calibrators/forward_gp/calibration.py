@@ -82,8 +82,15 @@ class ForwardGPCalibration:
     @cached_property
     def map(self) -> RigMap:
         """The cameras, and how they measure."""
+        tails = self.fitted.tails
         return RigMap(
-            self.data.observations, self.data.length_unit, self.frame, self.fitted.cameras, self.posterior, self._labels
+            self.data.observations,
+            self.data.length_unit,
+            self.frame,
+            self.fitted.cameras,
+            self.posterior,
+            self._labels,
+            degrees=None if tails is None else tails.degrees,
         )
 
     @property

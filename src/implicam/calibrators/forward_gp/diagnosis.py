@@ -98,7 +98,18 @@ class Diagnosis:
         """Cameras that could not be calibrated or are not ordinary, and views that contradict the others."""
         names = self.data.observations.camera_names
         blind = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in self.fitted.blind]
-        return [*blind, *kind_notes(self.fitted, [names[c] for c in self.fitted.cameras]), *self._rejected_notes()]
+        kinds = kind_notes(self.fitted, [names[c] for c in self.fitted.cameras])
+        return [*blind, *kinds, *self._rejected_notes(), *self._tail_notes()]
+
+    def _tail_notes(self) -> list[str]:
+        if self.fitted.tails is None:
+            return []
+        noise = float(np.median([model.noise for model in self.fitted.posterior.models]))
+        return [
+            f"The pixel noise has heavy tails: most views are good to {noise:.2g} px, some are off by many times that "
+            f"(Student's t with {self.fitted.tails.degrees:.2g} degrees of freedom). The farther a view is off, the "
+            "less it counts, in the fit and in every measurement."
+        ]
 
     def noise_notes(self) -> list[str]:
         """Cameras whose noise is not what the observations state."""
@@ -133,7 +144,13 @@ class Diagnosis:
 
     @cached_property
     def _sightings(self) -> tuple[Sightings, ...]:
-        return sightings_of(self.data.observations, stated_noise(self.data.observations))
+        found = list(sightings_of(self.data.observations, stated_noise(self.data.observations)))
+        if self.fitted.tails is not None:
+            calibrated = self.fitted.cameras
+            weighted = self.fitted.tails.weighted(tuple(found[c] for c in calibrated), told=True)
+            for c, sightings in zip(calibrated, weighted, strict=True):
+                found[c] = sightings
+        return tuple(found)
 
     @cached_property
     def _used(self) -> NDArray[np.bool_]:

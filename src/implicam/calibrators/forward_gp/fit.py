@@ -23,6 +23,16 @@ from implicam.calibrators.forward_gp.choose_camera import (
 )
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, Hyperparameters, RigEvidence
 from implicam.calibrators.forward_gp.general_camera import AnyCamera
+from implicam.calibrators.forward_gp.heavy_tails import (
+    DEGREES,
+    MOST_VIEWS,
+    Tails,
+    degrees_of_agreement,
+    looks_heavy,
+    outlier_distance,
+    weights_of,
+    whitened,
+)
 from implicam.calibrators.forward_gp.lens import Floats, Image, Prior, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import (
     CameraFailedError,
@@ -37,6 +47,7 @@ from implicam.calibrators.forward_gp.posterior import (
     spread,
 )
 from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
+from implicam.calibrators.forward_gp.wrong_views import Linear
 from implicam.errors import FitError
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
@@ -83,6 +94,9 @@ AUTO = "auto"
 """The kind of each camera is chosen by the data."""
 
 ROUNDS, ROUNDS_WITH_SHOTS = 6, 18
+REWEIGHTED = 3
+"""Rounds more where the noise has heavy tails."""
+
 SETTLED = 0.1
 """Relative change of the shots' errors between two rounds below which they are found."""
 
@@ -105,7 +119,8 @@ class Problem:
 class FittedRig:
     """cameras: numbers of those that could be fitted, in order, as posterior.models. blind: (number, why) of others.
     kept: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are; label_sd
-    (1, k) its estimated sds, for error bars. ordinary_px: per fitted camera, see `Started`."""
+    (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. ordinary_px: per fitted
+    camera, see `Started`."""
 
     posterior: Posterior
     cameras: tuple[int, ...]
@@ -114,6 +129,7 @@ class FittedRig:
     hyperparameters: Hyperparameters
     errors: ShotErrors | None
     label_sd: Floats | None
+    tails: Tails | None = None
     ordinary_px: tuple[float, ...] = ()
 
     def left_by_ordinary(self, number: int) -> float:
@@ -299,13 +315,107 @@ def _fit_started(
         progress("fitting", 2, 3)
         if number < rounds - 1:  # the last round's views stay those of its posterior
             state = state._replace(kept=judged)
+    state = _with_heavy_tails(problem, state, seen, images, stated)
     progress("fitting", 3, 3)
     assert state.hyper is not None
     _check_fitted(problem, state, seen)
     ordinary_px = tuple(one.ordinary_px for one in started.values())
     return FittedRig(
-        state.posterior, cameras, tuple(blind), state.kept, state.hyper, state.errors, state.label_sd, ordinary_px
+        state.posterior,
+        cameras,
+        tuple(blind),
+        state.kept,
+        state.hyper,
+        state.errors,
+        state.label_sd,
+        state.tails,
+        ordinary_px,
     )
+
+
+def _with_heavy_tails(
+    problem: Problem, state: _Round, seen: tuple[Sightings, ...], images: tuple[Image, ...], stated: Floats
+) -> _Round:
+    """A few rounds more with views weighted by a t, where the noise of the fit so far clearly is one; else as it is."""
+    for _ in range(REWEIGHTED):
+        found = _tails(problem, state, seen, images)
+        if found is None:
+            return state
+        tails, kept = found
+        state = _round(problem, state._replace(tails=tails, kept=kept), seen, images, stated)
+    return state
+
+
+def _tails(
+    problem: Problem, state: _Round, seen: tuple[Sightings, ...], images: tuple[Image, ...]
+) -> tuple[Tails, tuple[Bools, ...]] | None:
+    """Degrees of freedom of the noise, from how far all views are from what the others predict; the weight of each view
+    by how far it is from what all say; and the views to use. None where the noise is normal."""
+    weighted = state.weighted(seen, told=True)
+
+    def one(c: int, most: int) -> _Predicted:
+        some = _some(len(seen[c].rows), most)
+        return _Predicted.of(
+            state.posterior, c, problem.points, seen[c].select(some), weighted[c].select(some), state.kept[c][some]
+        )
+
+    if state.tails is None:
+        few = [one(c, MOST_VIEWS) for c in range(len(seen))]
+        areas = [(2 * image.half) ** 2 for image in images]
+        background = [2 * np.pi * f.variance / area for f, area in zip(few, areas, strict=True)]
+        if not looks_heavy(np.concatenate([f.distance for f in few]), np.concatenate(background)):
+            return None
+        degrees = degrees_of_agreement(*_agreement(state.posterior, problem.points, few))
+    else:
+        degrees = state.tails.degrees
+    if degrees is None:
+        return None
+    every = [one(c, len(problem.points)) for c in range(len(seen))]
+    limit = outlier_distance(degrees, OUTLIER)
+    return Tails(degrees, tuple(weights_of(p.own, degrees) for p in every)), tuple(p.distance <= limit for p in every)
+
+
+class _Predicted(NamedTuple):
+    """Of one camera's views: rows of the points, residual (n, 2) from what the others predict, and its scale matrix in
+    covariance (n, 2, 2); the squared distance (n,) by these; own: the expected one from what all say; variance (n,) of
+    the noise, the scale squared, px^2."""
+
+    rows: NDArray[np.int64]
+    residual: Floats
+    covariance: Floats
+    distance: Floats
+    own: Floats
+    variance: Floats
+
+    @classmethod
+    def of(
+        cls, posterior: Posterior, c: int, points: Floats, seen: Sightings, weighted: Sightings, kept: Bools
+    ) -> _Predicted:
+        at = _residuals(posterior, c, points, weighted)
+        variance = (posterior.models[c].noise * seen.relative) ** 2
+        residual, covariance = _left_out(at, kept)
+        covariance = covariance - (at.sd**2 - variance)[:, None, None] * np.eye(2)
+        distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
+        sound = np.isfinite(distance) & (covariance[:, 0, 0] > 0) & (np.linalg.det(covariance) > 0)
+        distance = np.where(sound, distance, np.inf)
+        expected = (np.sum(at.residual**2, axis=1) + np.trace(at.reach, axis1=1, axis2=2)) / variance
+        return cls(seen.rows, residual, covariance, distance, np.where(kept, expected, distance), variance)
+
+
+def _agreement(posterior: Posterior, points: Floats, predicted: list[_Predicted]) -> tuple[Floats, Floats, Bools]:
+    """Of points, slopes and residuals of their views in the scale of the noise, and which there are: not those that are
+    wrong even with heavy tails."""
+    limit = outlier_distance(min(DEGREES), OUTLIER)
+    n, C = len(points), len(predicted)
+    each = np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy()
+    r, D, there = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3)), np.zeros((n, C), dtype=np.bool_)
+    for c, view in enumerate(predicted):
+        good = view.distance <= limit
+        rows = view.rows[good]
+        each[rows, c] = np.linalg.inv(view.covariance[good])
+        r[rows, c], there[rows, c] = view.residual[good], True
+        D[rows, c] = posterior.models[c].predict(points[rows])[1]
+    return *whitened(Linear(r, D, each, None)), there
 
 
 class _Round(NamedTuple):
@@ -321,6 +431,11 @@ class _Round(NamedTuple):
     settled: bool
     errors: ShotErrors | None = None
     fixed: Hyperparameters | None = None
+    tails: Tails | None = None
+
+    def weighted(self, seen: tuple[Sightings, ...], *, told: bool) -> tuple[Sightings, ...]:
+        """The sightings with their weights as noise; told: as much as they tell, for what is known of the cameras."""
+        return seen if self.tails is None else self.tails.weighted(seen, told=told)
 
     @property
     def posterior(self) -> Posterior:
@@ -336,17 +451,20 @@ def _round(
         k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
         for k, m, s in zip(last.kept, last.models, seen, strict=True)
     )
-    used = tuple(s.select(k) for s, k in zip(seen, kept, strict=True))
+    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=False), kept, strict=True))
     moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
     hyper = last.fixed or _hyperparameters(problem, last.models, used, images, stated, last.hyper, moved)
     errors = last.next_errors
+    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=True), kept, strict=True))
     posterior = _conditioned(problem, last.models, used, hyper, errors)
     following, label_sd, settled = errors, None, True
     if errors is not None and posterior.unknowns is not None:
         mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
         following, label_sd = errors.updated(mean.reshape(errors.sd.shape), variance.reshape(errors.sd.shape))
         settled = bool(np.allclose(following.sd, errors.sd, rtol=SETTLED))
-    return _Round(hyper, posterior.models, posterior, kept, following, label_sd, settled, errors, last.fixed)
+    return _Round(
+        hyper, posterior.models, posterior, kept, following, label_sd, settled, errors, last.fixed, last.tails
+    )
 
 
 def without_field(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
@@ -464,11 +582,15 @@ def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floa
 
 
 def _thinned(seen: Sightings, most: int) -> Sightings:
-    if len(seen.rows) <= most:
-        return seen
-    keep = np.zeros(len(seen.rows), dtype=np.bool_)
-    keep[np.random.default_rng(0).choice(len(keep), most, replace=False)] = True
-    return seen.select(keep)
+    return seen if len(seen.rows) <= most else seen.select(_some(len(seen.rows), most))
+
+
+def _some(n: int, most: int) -> Bools:
+    """At most so many of n, at random."""
+    keep = np.full(n, n <= most)
+    if n > most:
+        keep[np.random.default_rng(0).choice(n, most, replace=False)] = True
+    return keep
 
 
 def _conditioned(
@@ -625,20 +747,35 @@ def squared_distances(posterior: Posterior, c: int, points: Floats, seen: Sighti
 
 def left_out(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> tuple[Floats, Floats]:
     """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px."""
+    return _left_out(_residuals(posterior, c, points, seen), kept)
+
+
+class _Residuals(NamedTuple):
+    """Of one camera's views: residual (n, 2) from the posterior mean, reach (n, 2, 2) its covariance, rest (n,) what
+    the features leave out, sd (n,) of the noise."""
+
+    residual: Floats
+    reach: Floats
+    rest: Floats
+    sd: Floats
+
+
+def _residuals(posterior: Posterior, c: int, points: Floats, seen: Sightings) -> _Residuals:
     model = posterior.models[c]
-    sd = model.noise * seen.relative
     where = points[seen.rows]
     if posterior.displacement is not None:
         where = where + posterior.displacement[seen.rows]
     rows = model.rows(where)
     half = spread(rows, posterior.alone[c])
-    reach = half @ half.swapaxes(1, 2)
-    residual = seen.uv - rows.mean
-    smooth = reach / (sd**2)[:, None, None]
+    return _Residuals(seen.uv - rows.mean, half @ half.swapaxes(1, 2), rows.rest, model.noise * seen.relative)
+
+
+def _left_out(at: _Residuals, kept: Bools) -> tuple[Floats, Floats]:
+    smooth = at.reach / (at.sd**2)[:, None, None]
     inside = np.linalg.inv(np.where(kept[:, None, None], np.eye(2) - smooth, np.eye(2)))
-    residual = np.einsum("nij,nj->ni", inside, residual)
-    extra = np.where(kept[:, None, None], 0, reach)
-    return residual, inside * (sd**2)[:, None, None] + extra + rows.rest[:, None, None] * np.eye(2)
+    residual = np.einsum("nij,nj->ni", inside, at.residual)
+    extra = np.where(kept[:, None, None], 0, at.reach)
+    return residual, inside * (at.sd**2)[:, None, None] + extra + at.rest[:, None, None] * np.eye(2)
 
 
 def judged_all(

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from implicam.calibrators.forward_gp.heavy_tails import consistency, refined, taken_as_normal
 from implicam.calibrators.forward_gp.lens import Floats
 from implicam.calibrators.forward_gp.posterior import CHUNK, Posterior, Unknowns, spread
 from implicam.calibrators.forward_gp.shots import Shots
+from implicam.calibrators.forward_gp.wrong_views import DISAGREE, Linear, weighted, without_wrong_views
 from implicam.threads import side_by_side
 
 Bools = NDArray[np.bool_]
@@ -20,14 +24,11 @@ ITERATIONS = 12
 CONVERGED = 1e-3
 """Of a step, in standard deviations of the position."""
 
-DISAGREE = 1e-4
-"""Below this p-value the views disagree, and one or two are looked for that the others would do better without."""
+REWEIGHTED = 3
+"""Times that the views of tied cameras are weighted, where their noise has heavy tails."""
 
-AGREE = 1e-3
-"""The p-value that the others must have among themselves then."""
-
-CLEARLY = 100.0
-"""How many times better they must agree than without any other view."""
+MENDED, HOPELESS = 3, 1e4
+"""Steps after which chi-squared beyond this, at the end of the next step, will not come down to what is possible."""
 
 IMPOSSIBLE = 1e-10
 """Below this p-value there is no position, but a wrong match: a number would be worse than none."""
@@ -53,60 +54,89 @@ class Labels(NamedTuple):
     unknowns: Unknowns
 
 
-def locate(posterior: Posterior, uv: Floats, noise: Floats, labels: Labels | None = None) -> Located:
-    """Points from pixels uv (n, C, 2), NaN where not seen, with noise (n, C) in pixels."""
+def locate(
+    posterior: Posterior, uv: Floats, noise: Floats, labels: Labels | None = None, degrees: float | None = None
+) -> Located:
+    """Points from pixels uv (n, C, 2), NaN where not seen, with noise (n, C) in pixels: normal, or the scale of a t
+    with so many degrees of freedom."""
     if len(uv) == 0:
         return Located(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(uv.shape[:2], dtype=np.bool_))
     parts = [slice(i, i + CHUNK) for i in range(0, len(uv), CHUNK)]
-    found = side_by_side(lambda part: _locate(posterior, uv[part], noise[part], labels), parts)
+    found = side_by_side(lambda part: _locate(_Seen(posterior, uv[part], noise[part], labels, degrees)), parts)
     return Located(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
-def _locate(posterior: Posterior, uv: Floats, noise: Floats, labels: Labels | None) -> Located:
-    seen = np.asarray(np.isfinite(uv).all(axis=2))
-    xyz, cov, chi2 = _solve(posterior, uv, noise, seen, labels)
-    p = _p_value(chi2, seen.sum(axis=1))
+def _locate(points: _Seen) -> Located:
+    seen = np.asarray(np.isfinite(points.uv).all(axis=2))
+    xyz, cov, p = points.solved(np.arange(len(seen)), seen)
     left_out = np.zeros_like(seen)
-    for count in (1, 2):  # two wrong views among five can still be told
-        bad = np.flatnonzero((seen.sum(axis=1) >= 2 * count + 1) & ~(p >= DISAGREE))
-        for some in np.split(bad, range(CHUNK // 16, len(bad), CHUNK // 16)):
-            _leave_out(posterior, (uv[some], noise[some], seen[some]), labels, count, some, (xyz, cov, p, left_out))
+    bad = np.flatnonzero((seen.sum(axis=1) >= 3) & ~(p >= DISAGREE))
+    for some in np.split(bad, range(CHUNK // 16, len(bad), CHUNK // 16)):
+        for better in without_wrong_views(points, some, seen[some]):
+            rows = better.rows
+            xyz[rows], cov[rows], p[rows], left_out[rows] = better.xyz, better.cov, better.p, better.left_out
     impossible = p < IMPOSSIBLE
     xyz[impossible], cov[impossible] = np.nan, np.nan
     return Located(xyz, cov, p, left_out)
 
 
-def _leave_out(
-    posterior: Posterior,
-    views: tuple[Floats, Floats, Bools],
-    labels: Labels | None,
-    count: int,
-    rows: NDArray[np.int64],
-    out: tuple[Floats, Floats, Floats, Bools],
-) -> None:
-    """For points whose views disagree: leave out the `count` views that clearly are the wrong ones, if there are."""
-    uv, noise, seen = views
-    n, C = seen.shape
-    if n == 0:
-        return
-    groups = list(combinations(range(C), count))
-    tried, ps = [], np.full((n, len(groups)), -1.0)
-    for k, group in enumerate(groups):
-        there = np.asarray(seen[:, group].all(axis=1))
-        without = seen & there[:, None]
-        without[:, group] = False
-        x, cov, chi2 = _solve(posterior, uv, noise, without, labels)
-        p = _p_value(chi2, without.sum(axis=1))
-        ps[:, k] = np.where(there & np.isfinite(p), p, -1.0)
-        tried.append((x, cov))
-    best = np.argmax(ps, axis=1)
-    ordered = np.sort(ps, axis=1)
-    second = np.maximum(ordered[:, -2], 0) if len(groups) > 1 else np.zeros(n)
-    xyz, cov, p_values, left_out = out
-    for row in np.flatnonzero((ordered[:, -1] > AGREE) & (ordered[:, -1] > CLEARLY * second)):
-        i, k = rows[row], best[row]
-        xyz[i], cov[i], p_values[i] = tried[k][0][row], tried[k][1][row], ps[row, k]
-        left_out[i, groups[k]] = True
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Points to be located, as `wrong_views` asks about them: pixels uv (n, C, 2) and noise (n, C)."""
+
+    posterior: Posterior
+    uv: Floats
+    noise: Floats
+    labels: Labels | None = None
+    degrees: float | None = None
+
+    def solved(self, rows: NDArray[np.int64], seen: Bools) -> tuple[Floats, Floats, Floats]:
+        """Positions, covariances and p-values of points from the views `seen` alone."""
+        start = _start(*self.lines(rows), seen)
+        found = _solve(self.posterior, start, self.uv[rows], self.noise[rows], seen, self.labels)
+        if self.degrees is None:
+            return found.xyz, found.cov, _p_value(found.chi2, seen.sum(axis=1))
+        return self._by_t(found, rows, seen, self.degrees)
+
+    def _by_t(
+        self, found: _Solved, rows: NDArray[np.int64], seen: Bools, degrees: float
+    ) -> tuple[Floats, Floats, Floats]:
+        """The same with noise that is a t, from the solution with normal noise of the same scale."""
+        good = np.flatnonzero(np.isfinite(found.x).all(axis=1))
+        xyz, cov, p = found.xyz, found.cov, _p_value(found.chi2, seen.sum(axis=1))
+        if not len(good):
+            return xyz, cov, p
+        rows, seen = rows[good], seen[good]
+        linear = self.linear(rows, found.x[good], seen)
+        if linear.joint is None:
+            better = refined(linear, degrees)
+            xyz[good], cov[good] = found.x[good] + better.step, better.cov
+            p[good] = consistency(better.distance, seen, degrees)
+            return xyz, cov, p
+        for _ in range(REWEIGHTED):
+            distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
+            noise = taken_as_normal(self.noise[rows], distance, seen, degrees)
+            again = _solve(self.posterior, found.x[good], self.uv[rows], noise, seen, self.labels)
+            linear = self.linear(rows, again.x, seen, linear)
+        xyz[good], cov[good] = again.xyz, again.cov
+        distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
+        p[good] = consistency(distance, seen, degrees)
+        return xyz, cov, p
+
+    def linear(self, rows: NDArray[np.int64], x: Floats, seen: Bools, before: Linear | None = None) -> Linear:
+        """The views about x (n, 3)."""
+        weights = _Weights(self.posterior, x, self.noise[rows], seen) if before is None else before
+        r, D = _residuals(self.posterior, x, self.uv[rows], seen)
+        return Linear(r, D, weights.each, weights.joint)
+
+    def lines(self, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """Centres (C, 3) and directions (n, C, 3) of the lines of sight."""
+        return self._lines[0], self._lines[1][rows]
+
+    @cached_property
+    def _lines(self) -> tuple[Floats, Floats]:
+        found = [model.camera.lines(self.uv[:, c]) for c, model in enumerate(self.posterior.models)]
+        return np.array([centre for centre, _ in found]), np.stack([direction for _, direction in found], axis=1)
 
 
 def _p_value(chi2: Floats, views: NDArray[np.int64]) -> Floats:
@@ -114,41 +144,58 @@ def _p_value(chi2: Floats, views: NDArray[np.int64]) -> Floats:
     return np.where((views >= 2) & np.isfinite(chi2), chdtrc(degrees, chi2), np.nan)
 
 
-def _solve(
-    posterior: Posterior, uv: Floats, noise: Floats, seen: Bools, labels: Labels | None
-) -> tuple[Floats, Floats, Floats]:
-    """Position, covariance and chi-squared (n,) of points with the views `seen` (n, C); NaN where there is none."""
+def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Bools, labels: Labels | None) -> _Solved:
+    """Points with the views `seen` (n, C), from x (n, 3)."""
     n = len(uv)
+    before = np.full((n, 3), np.nan)
     xyz, cov, chi2 = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
-    x = _start(posterior, uv, seen)
     rows = np.flatnonzero(np.isfinite(x).all(axis=1))
     x, uv, noise, seen = x[rows], uv[rows], noise[rows], seen[rows]
     done = np.zeros(len(rows), dtype=np.bool_)
+    hopeless = done.copy()
+    going = np.arange(len(rows))  # those that have not converged
     weights = _Weights(posterior, x, noise, seen)
     for iteration in range(ITERATIONS):
-        H, g, squares = weights.normal(x, uv, seen)
+        H, g, squares = weights.normal(x[going], uv[going], seen[going])
         step = _solved(H, g)
         size = np.einsum("ni,nij,nj->n", step, H, step)
-        x = x + step
-        done = size < CONVERGED**2
-        last = iteration == ITERATIONS - 1 or bool((done | ~np.isfinite(size)).all())
-        if last or iteration in (0, 2, 5):
-            weights = _Weights(posterior, x, noise, seen)
-        if last:
+        x[going] += step
+        done[going] = size < CONVERGED**2
+        hopeless[going] = (iteration >= MENDED) & (squares - size > HOPELESS)
+        on = ~done[going] & ~hopeless[going] & np.isfinite(size)
+        going = going[on]
+        if not len(going):
             break
+        if iteration in (0, 2, 5):
+            weights = _Weights(posterior, x[going], noise[going], seen[going])
+        elif not on.all():
+            weights = weights.select(on)
+    weights = _Weights(posterior, x, noise, seen)
     H, g, squares = weights.normal(x, uv, seen)
     step = _solved(H, g)
     found = done & np.isfinite(H).all(axis=(1, 2)) & np.isfinite(step).all(axis=1)
     covariance = _inverted(H)
     found &= np.isfinite(covariance).all(axis=(1, 2))
     x = x + step
+    before[rows[found]] = x[found]
     if labels is not None:
         x, covariance = _as_labelled(weights, labels, x, covariance, seen)
     kept = rows[found]
     xyz[kept] = x[found]
     cov[kept] = covariance[found]
     chi2[kept] = (squares - np.einsum("ni,ni->n", g, step))[found]
-    return xyz, cov, chi2
+    chi2[rows[hopeless]] = HOPELESS
+    return _Solved(xyz, cov, chi2, before)
+
+
+class _Solved(NamedTuple):
+    """Positions (n, 3), covariances and chi-squared (n,) of points, NaN where there is none; x (n, 3): the positions
+    before labels are taken into account."""
+
+    xyz: Floats
+    cov: Floats
+    chi2: Floats
+    x: Floats
 
 
 def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen: Bools) -> tuple[Floats, Floats]:
@@ -162,70 +209,75 @@ def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen
     return x - known @ labels.unknowns.mean, cov + own + tied + tied.swapaxes(1, 2) + unknown
 
 
-def _start(posterior: Posterior, uv: Floats, seen: Bools) -> Floats:
+def _start(centres: Floats, directions: Floats, seen: Bools) -> Floats:
     """(n, 3) where the lines of sight meet best; NaN for fewer than two, or where they (nearly) coincide."""
-    n = len(uv)
-    A, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
-    count = np.zeros(n)
-    for c, model in enumerate(posterior.models):
-        centre, direction = model.camera.lines(np.where(seen[:, c, None], uv[:, c], np.nan))
-        good = np.isfinite(direction).all(axis=1)
-        d = direction[good]
-        across = np.eye(3) - d[:, :, None] * d[:, None, :]
-        A[good] += across
-        b[good] += across @ centre
-        count += good
+    good = seen & np.isfinite(directions).all(axis=2)
+    d = np.where(good[..., None], directions, 0)
+    across = good[..., None, None] * np.eye(3) - d[..., :, None] * d[..., None, :]
+    A, b = across.sum(axis=1), np.einsum("ncij,cj->ni", across, centres)
     start = _solved(A, b)
-    start[(count < 2) | (np.linalg.eigvalsh(A)[:, 0] < 1e-9)] = np.nan
+    start[(good.sum(axis=1) < 2) | (np.linalg.eigvalsh(A)[:, 0] < 1e-9)] = np.nan
     return start
+
+
+def _residuals(posterior: Posterior, x: Floats, uv: Floats, seen: Bools) -> tuple[Floats, Floats]:
+    """Residuals (n, C, 2) and slopes (n, C, 2, 3) of the views at x (n, 3); zero where not seen."""
+    n, C = seen.shape
+    r, D = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3))
+    for c, model in enumerate(posterior.models):
+        mean, slope = model.predict(x)
+        r[:, c] = np.where(seen[:, c, None], uv[:, c] - mean, 0.0)
+        D[:, c] = np.where(seen[:, c, None, None], slope, 0.0)
+    return r, D
 
 
 class _Weights:
     """The inverse covariance of all views of each point, at one place: per camera, or joint where they are tied."""
 
     def __init__(self, posterior: Posterior, x: Floats, noise: Floats, seen: Bools) -> None:
-        self.models = posterior.models
-        rows = [model.rows(x) for model in self.models]
-        C = len(self.models)
+        self.posterior = posterior
+        rows = [model.rows(x) for model in posterior.models]
+        n, C = seen.shape
         own = [(noise[:, c] ** 2 + rows[c].rest)[:, None, None] * np.eye(2) for c in range(C)]
-        self.each: list[Floats] = []
+        self.each = np.empty((n, C, 2, 2))
         self.joint: Floats | None = None
         if posterior.joint is None:
             for c in range(C):
                 covariance = own[c] + _square(spread(rows[c], posterior.alone[c]))
-                self.each.append(_inverted(np.where(seen[:, c, None, None], covariance, np.eye(2))))
+                self.each[:, c] = _inverted(np.where(seen[:, c, None, None], covariance, np.eye(2)))
             return
         self.half = np.concatenate([spread(rows[c], posterior.root(c)) for c in range(C)], axis=1)  # (n, 2C, sum P)
         S = _square(self.half).reshape(len(x), C, 2, C, 2)
         for c in range(C):
             S[:, c, :, c] += own[c]
+            self.each[:, c] = _inverted(np.where(seen[:, c, None, None], S[:, c, :, c], np.eye(2)))
         both = seen[:, :, None, None, None] & seen[:, None, None, :, None]
         masked = np.where(both, S, np.eye(2 * C).reshape(C, 2, C, 2))
         self.joint = _inverted(masked.reshape(len(x), 2 * C, 2 * C))
+
+    def select(self, keep: Bools) -> _Weights:
+        """Those of some points."""
+        chosen = copy(self)
+        chosen.each = self.each[keep]
+        if self.joint is not None:
+            chosen.joint, chosen.half = self.joint[keep], self.half[keep]
+        return chosen
 
     def with_cameras(self, x: Floats, cov: Floats, seen: Bools, cross: Floats) -> Floats:
         """(n, 3, k) covariance of the positions' error with unknowns that `cross` ties to the cameras'."""
         assert self.joint is not None
         n, C = seen.shape
-        D = np.stack([model.predict(x)[1] for model in self.models], axis=1)
+        D = np.stack([model.predict(x)[1] for model in self.posterior.models], axis=1)
         D = np.where(seen[..., None, None], D, 0).reshape(n, 2 * C, 3)
         through = np.where(seen.repeat(2, axis=1)[..., None], self.half @ cross, 0)
         return np.asarray(cov @ D.swapaxes(1, 2) @ self.joint @ through, dtype=np.float64)
 
     def normal(self, x: Floats, uv: Floats, seen: Bools) -> tuple[Floats, Floats, Floats]:
         """H (n, 3, 3), gradient (n, 3) and weighted squares (n,) of the residuals at x (n, 3)."""
-        n, C = len(x), len(self.models)
-        r, D = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3))
-        for c, model in enumerate(self.models):
-            mean, slope = model.predict(x)
-            r[:, c] = np.where(seen[:, c, None], uv[:, c] - mean, 0.0)
-            D[:, c] = np.where(seen[:, c, None, None], slope, 0.0)
-        if self.joint is None:
-            W = np.stack(self.each, axis=1)  # (n, C, 2, 2)
-            WD, Wr = W @ D, (W @ r[..., None])[..., 0]
-        else:
-            WD = (self.joint @ D.reshape(n, 2 * C, 3)).reshape(D.shape)
-            Wr = (self.joint @ r.reshape(n, 2 * C, 1)).reshape(r.shape)
+        n, C = seen.shape
+        r, D = _residuals(self.posterior, x, uv, seen)
+        linear = Linear(r, D, self.each, self.joint)
+        WD, Wr = weighted(linear, D), weighted(linear, r[..., None])[..., 0]
         Dt = D.reshape(n, 2 * C, 3).swapaxes(1, 2)
         H = Dt @ WD.reshape(n, 2 * C, 3)
         g = (Dt @ Wr.reshape(n, 2 * C, 1))[..., 0]

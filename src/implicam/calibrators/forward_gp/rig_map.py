@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.forward_gp.heavy_tails import information_loss
 from implicam.calibrators.forward_gp.locate import Labels, Located, locate
 from implicam.calibrators.forward_gp.posterior import Posterior, spread
 from implicam.calibrators.forward_gp.problem import Frame, stated_noise, view_noise
@@ -37,7 +38,8 @@ class Sensitivity(NamedTuple):
 class RigMap:
     """trained: what the cameras saw when they were fitted, all cameras; cameras: numbers of those that could be, in
     the order of posterior.models; posterior: in the working frame; labels: how known positions are off, if they are.
-    misfit_adds: residuals that are larger than the views state come from the lens models, and not from the views."""
+    misfit_adds: residuals that are larger than the views state come from the lens models, and not from the views.
+    degrees: of freedom of the noise, None where it is normal."""
 
     trained: Observations
     length_unit: str
@@ -46,6 +48,7 @@ class RigMap:
     posterior: Posterior
     labels: Labels | None = None
     misfit_adds: bool = False
+    degrees: float | None = None
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -58,7 +61,7 @@ class RigMap:
         trained = self.trained.with_cameras(known) if known else self.trained
         observations = same_cameras(trained, observations)
         uv, noise = self.views(observations)
-        found = locate(self.posterior, uv, noise, self.labels)
+        found = locate(self.posterior, uv, noise, self.labels, self.degrees)
         seen = np.asarray(np.isfinite(uv).all(axis=2))
         return Measurement(
             observations.points,
@@ -103,7 +106,7 @@ class RigMap:
             rows = model.rows(points)
             slope = model.predict(points)[1] / self.frame.scale
             half = spread(rows, self.posterior.root(number))
-            noise = np.full((len(points), 2), model.noise**2)
+            noise = np.full((len(points), 2), model.noise**2 * information_loss(self.degrees))
             parts.append(Sensitivity((c,), slope, half, rows.rest[:, None].repeat(2, axis=1), noise))
         if self.posterior.joint is None:
             return parts
@@ -114,8 +117,9 @@ class RigMap:
         """For positions (n, 3), per calibrated camera: the derivative of its pixels (n, 2, 3) per length unit, its
         noise in pixels, and its number in the dataset."""
         points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        loss = float(np.sqrt(information_loss(self.degrees)))
         for c, model in zip(self.cameras, self.posterior.models, strict=True):
-            yield model.predict(points)[1] / self.frame.scale, model.noise, c
+            yield model.predict(points)[1] / self.frame.scale, model.noise * loss, c
 
     def centres(self) -> dict[str, Floats]:
         """Where the calibrated cameras are: name -> (3,) in the world."""

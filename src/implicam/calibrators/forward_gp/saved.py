@@ -12,6 +12,7 @@ from implicam.calibrators.forward_gp.evidence import Hyperparameters, field_kern
 from implicam.calibrators.forward_gp.families import FAMILIES
 from implicam.calibrators.forward_gp.fit import FittedRig
 from implicam.calibrators.forward_gp.general_camera import GeneralCamera
+from implicam.calibrators.forward_gp.heavy_tails import Tails
 from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import CameraModel, DepthScale, Posterior, ShotErrors, Unknowns
 from implicam.calibrators.forward_gp.shots import Shots
@@ -41,6 +42,9 @@ def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict
             f"{number}/kept": fitted.kept[number],
             f"{number}/root": posterior.alone[number],
         }
+    if fitted.tails is not None:
+        arrays["tails"] = np.array([fitted.tails.degrees])
+        arrays |= {f"{number}/tail_weights": w for number, w in enumerate(fitted.tails.weights)}
     if posterior.joint is not None:
         arrays["joint"] = posterior.joint
     if posterior.displacement is not None:
@@ -96,7 +100,20 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
     errors, label_sd = _shot_errors(data, points, arrays, posterior)
     hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
     ordinary = tuple(float(one.get("ordinary_would_leave_px", np.nan)) for one in described)
-    return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd, ordinary)
+    return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd, _tails(arrays, kept), ordinary)
+
+
+def _tails(arrays: Arrays, kept: Sequence[NDArray[np.bool_]]) -> Tails | None:
+    """None where the noise is normal, as in files from before there were tails."""
+    if "tails" not in arrays:
+        return None
+    degrees = float(finite_column(arrays, "tails", (1,))[0])
+    if degrees <= 2:
+        raise ValueError("noise with two degrees of freedom or fewer has no variance")
+    weights = (
+        finite_column(arrays, f"{number}/tail_weights", used.shape, positive=True) for number, used in enumerate(kept)
+    )
+    return Tails(degrees, tuple(weights))
 
 
 def _shot_errors(

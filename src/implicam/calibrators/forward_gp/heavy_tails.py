@@ -1,0 +1,343 @@
+"""Pixel noise with heavy tails: Student's t, its degrees of freedom from the data, in the fit and when measuring.
+
+Detections are mostly good to a tenth of a pixel and sometimes off by a whole one. Taken for normal, such noise either
+bends the result or makes all error bars those of the bad views. Here a view's error is a bivariate t with `degrees`
+degrees of freedom; where the data do not say so clearly it is normal, and nothing changes. Eqs. (T1) to (T5) of
+docs/method.md; docs/decisions/0016.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.special import chdtrc, gammaln, logsumexp, ndtri
+from scipy.stats import qmc
+
+from implicam.calibrators.forward_gp.lens import Floats
+from implicam.calibrators.forward_gp.posterior import Sightings
+from implicam.calibrators.forward_gp.wrong_views import Linear
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+DEGREES = (2.2, 2.6, 3.0, 3.5, 4.2, 5.0, 7.0, 10.0, 20.0)
+"""Degrees of freedom tried. With two or fewer the noise has no variance, with more than 20 it is as good as normal."""
+
+CLEAR = 5.0
+"""Nats by which a t must be more likely than normal noise, or noise is normal: chance gains so much once in a
+thousand times."""
+
+STEPS = 40
+"""Of EM for scale and share of wrong detections, at each number of degrees."""
+
+AGREED = 2.0
+"""The same of what cameras say among themselves, which is less, and only has to confirm it."""
+
+SHARED = 0.5
+"""Scale squared of what cameras disagree on, over that of what they miss the known positions by, below which the errors
+are those of the known positions."""
+
+WRONG = 0.3
+"""Share of wrong detections, anywhere in the image, beyond which nothing is concluded."""
+
+MOST_VIEWS = 1000
+"""Views of a camera that the degrees are found from; more cost time and tell little more."""
+
+FEWEST = 60
+"""Views from which tails can be told."""
+
+DRAWS = 512
+"""Places at which the posterior of a position is looked up: its sds are then good to a few per cent."""
+
+FEW_VIEWS = 4
+"""Up to so many, the posterior may have a second mode, without one of them."""
+
+AMBIGUOUS = 8.0
+"""How many times larger an error bar may be than that of views that agree: beyond, there are two places, and nothing
+says which."""
+
+TO_MODE = 10
+"""Times that views are weighted to find a mode."""
+
+AT_ONCE = 256
+"""Views whose positions are integrated at once, so that all fits in the processor's cache."""
+
+FEW_DRAWS, MOST_POINTS = 64, 200
+"""The same for the evidence of the degrees, and points that it is taken from."""
+
+SINGULAR = 1e10
+"""Condition of a point's normal matrix beyond which its views do not fix it."""
+
+WIDER = 1.5
+"""How much wider than the posterior at its mode they are spread."""
+
+
+class Tails(NamedTuple):
+    """degrees: of freedom. weights: per camera (n seen,), how much each of its views counts, eq. (T3)."""
+
+    degrees: float
+    weights: tuple[Floats, ...]
+
+    def weighted(self, seen: tuple[Sightings, ...], *, told: bool) -> tuple[Sightings, ...]:
+        """The sightings, noisier where they count less; told: by the loss of information too."""
+        loss = self.loss if told else 1.0
+        return tuple(
+            s._replace(relative=s.relative * np.sqrt(loss / w)) for s, w in zip(seen, self.weights, strict=True)
+        )
+
+    @property
+    def loss(self) -> float:
+        """How many times less a view with such noise tells than a normal one of the same scale, eq. (T3)."""
+        return information_loss(self.degrees)
+
+
+def information_loss(degrees: float | None) -> float:
+    """Scale matrix over inverse Fisher information of a bivariate t; 1 for normal noise (None)."""
+    return 1.0 if degrees is None else (degrees + 4) / (degrees + 2)
+
+
+def outlier_distance(degrees: float, normal: float) -> float:
+    """The squared distance beyond which a view is as rare as beyond `normal` with normal noise."""
+    return float(degrees * np.expm1(normal / degrees))
+
+
+def weights_of(distance: Floats, degrees: float) -> Floats:
+    """How much views count at these squared distances (in their scale matrix)."""
+    return np.asarray((degrees + 2) / (degrees + distance), dtype=np.float64)
+
+
+def looks_heavy(distance: Floats, background: Floats) -> bool:
+    """Whether the noise of single cameras looks as if it had heavy tails, from squared distances (n,) of views to what
+    all others predict: that is quickly seen, and seldom so.
+
+    background: (n,) the density of a wrong detection, anywhere in the image, over that of a normal view at its centre.
+    """
+    good = np.isfinite(distance) & (distance >= 0)
+    q, b = distance[good], background[good]
+    if len(q) < FEWEST:
+        return False
+    normal, _, _ = _likelihood(q, b, np.inf)
+    value, _, wrong = max(_likelihood(q, b, degrees) for degrees in DEGREES)
+    return bool(value > normal + CLEAR and wrong < WRONG)
+
+
+def _likelihood(q: Floats, background: Floats, degrees: float) -> tuple[float, float, float]:
+    """Largest log likelihood, over the scale squared and the share of wrong detections; and these. By EM."""
+    scale, wrong = max(float(np.median(q)) / (2 * np.log(2)), 1e-300), 0.01
+    density = np.zeros_like(q)
+    for _ in range(STEPS):
+        if np.isinf(degrees):
+            density, w = np.exp(-0.5 * q / scale) / scale, np.ones_like(q)
+        else:
+            density = np.exp(-0.5 * (degrees + 2) * np.log1p(q / (degrees * scale))) / scale
+            w = weights_of(q / scale, degrees)
+        both = (1 - wrong) * density + wrong * background
+        right = (1 - wrong) * density / both
+        scale = max(float(np.sum(right * w * q) / (2 * np.sum(right))), 1e-300)
+        wrong = float(np.clip(1 - right.mean(), 1e-6, 0.9))
+    return float(np.sum(np.log((1 - wrong) * density + wrong * background))), scale, wrong
+
+
+def consistency(distance: Floats, seen: Bools, degrees: float) -> Floats:
+    """(n,) p-value that the views agree, from squared distances (n, C) at the most probable position, eq. (T5)."""
+    views = seen.sum(axis=1)
+    total = np.sum(np.where(seen, degrees * np.log1p(distance / degrees), 0), axis=1)
+    free = np.maximum(2 * views - 3 * degrees / (degrees + 2), 1)
+    return np.asarray(np.where((views >= 2) & np.isfinite(total), chdtrc(free, total), np.nan), dtype=np.float64)
+
+
+def taken_as_normal(noise: Floats, distance: Floats, seen: Bools, degrees: float) -> Floats:
+    """(n, C) noise of normal views that tell as much as these: by their distances, eq. (T3); of two views,
+    where nothing says which is the worse, the standard deviation."""
+    weighted = information_loss(degrees) / weights_of(distance, degrees)
+    plain = degrees / (degrees - 2)
+    few = (seen.sum(axis=1) < 3)[:, None]
+    return np.asarray(noise * np.sqrt(np.where(few, plain, weighted)), dtype=np.float64)
+
+
+class Refined(NamedTuple):
+    """The posterior of n positions: step (n, 3) from where the views were linearised, covariance (n, 3, 3), NaN where
+    two places are likely; and squared distances (n, C) of the views at the most probable one."""
+
+    step: Floats
+    cov: Floats
+    distance: Floats
+
+
+def refined(linear: Linear, degrees: float) -> Refined:
+    """Mean and covariance of the position under t noise, from views linearised near it, eq. (T4)."""
+    A, b = whitened(linear)
+    n, C = b.shape[:2]
+    out = Refined(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, C)))
+    there = np.any(A != 0, axis=(2, 3))
+    views = there.sum(axis=1)
+    order = np.argsort(~there, axis=1, kind="stable")
+    for V in np.unique(views):
+        alike = np.flatnonzero(views == V)
+        size = max(1, AT_ONCE // int(V))
+        for some in np.split(alike, range(size, len(alike), size)):
+            chosen = order[some, :V]
+            found = _integrated(A[some[:, None], chosen], b[some[:, None], chosen], degrees)
+            out.step[some], out.cov[some] = found.step, found.cov
+            out.distance[some[:, None], chosen] = found.distance
+    return out
+
+
+def _integrated(A: Floats, b: Floats, degrees: float) -> Refined:
+    """By importance sampling, from a mixture of spherical t about every place that may be a mode: with few views, each
+    of them may be the wrong one."""
+    n = len(b)
+    modes = [_about_mode(A, b, degrees, start) for start in _starts(A, b)]
+    z, log_density = _draws(DRAWS)
+    centre = np.stack([mode.step for mode in modes], axis=1)  # (n, K, 3)
+    spread = np.stack([mode.spread for mode in modes], axis=1)
+    K = len(modes)
+    own = np.arange(DRAWS) % K  # the component that each draw belongs to
+    x = centre[:, own] + (spread[:, own] @ z[None, :, :, None])[..., 0]  # (n, DRAWS, 3)
+    log_weight = -0.5 * (degrees + 2) * _bent(A, b, x, degrees)
+    if K == 1:
+        log_weight = log_weight - log_density
+    else:
+        back = np.linalg.inv(spread)
+        away = (x[:, None] - centre[:, :, None]) @ back.swapaxes(2, 3)  # (n, K, DRAWS, 3)
+        sizes = np.linalg.slogdet(back)[1][..., None]
+        log_weight = log_weight - logsumexp(sizes - 3.5 * np.log1p(np.sum(away**2, axis=3) / 4), axis=1)
+    weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
+    weight /= weight.sum(axis=1, keepdims=True)
+    mean = np.einsum("nk,nki->ni", weight, x)
+    about = x - mean[:, None]
+    cov = np.einsum("nk,nki,nkj->nij", weight, about, about)
+    agreeing = information_loss(degrees) * np.linalg.inv(np.einsum("ncij,ncik->njk", A, A))
+    larger = np.linalg.eigvals(np.linalg.solve(agreeing, cov)).real.max(axis=1)
+    mean[larger > AMBIGUOUS**2], cov[larger > AMBIGUOUS**2] = np.nan, np.nan
+    left = np.stack([mode.left for mode in modes], axis=1)
+    distance = np.sum(left**2, axis=3)  # (n, K, V)
+    best = np.argmin(np.sum(np.log1p(distance / degrees), axis=2), axis=1)
+    return Refined(mean, cov, distance[np.arange(n), best])
+
+
+def _starts(A: Floats, b: Floats) -> list[Floats]:
+    """Least squares (n, 3), and with few views, without each of them."""
+    N = A.swapaxes(2, 3) @ A
+    g = (A.swapaxes(2, 3) @ b[..., None])[..., 0]
+    H, pull = N.sum(axis=1), g.sum(axis=1)
+    starts = [np.linalg.solve(H, pull[..., None])[..., 0]]
+    V = b.shape[1]
+    if 3 <= V <= FEW_VIEWS:
+        held = 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        starts += [np.linalg.solve(H - N[:, c] + held, (pull - g[:, c])[..., None])[..., 0] for c in range(V)]
+    return starts
+
+
+def whitened(linear: Linear) -> tuple[Floats, Floats]:
+    """Slopes A (n, C, 2, 3) and residuals b (n, C, 2) of single views in the scale of their noise."""
+    root = np.linalg.cholesky(linear.each).swapaxes(2, 3)  # each = root^T root
+    return np.asarray(root @ linear.D), np.asarray((root @ linear.r[..., None])[..., 0])
+
+
+def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
+    """Degrees of freedom of the noise from what cameras say of the same points, wherever these are: from views (n, C)
+    whitened as above, the position of each point integrated out, eq. (T2). None where the noise is normal.
+
+    A known position that is off by itself looks like heavy tails in every single camera; here it does not count. And
+    where cameras agree among themselves much better than with the known positions, the errors are mostly of these:
+    what cameras share is not their noise, and noise is taken for normal.
+    """
+    views = seen.sum(axis=1)
+    some = np.flatnonzero(views >= 2)[:MOST_POINTS]
+    A, b, views = np.where(seen[..., None, None], A, 0)[some], np.where(seen[..., None], b, 0)[some], views[some]
+    H = np.einsum("ncij,ncik->njk", A, A)
+    good = np.linalg.cond(H) < SINGULAR
+    A, b, views, H, seen = A[good], b[good], views[good], H[good], seen[some][good]
+    free = float(np.sum(2 * views - 3))
+    if free < FEWEST:
+        return None
+    g = np.einsum("ncij,nci->nj", A, b)
+    squares = np.sum(b**2, axis=(1, 2)) - np.einsum("ni,ni->n", g, np.linalg.solve(H, g[..., None])[..., 0])
+    log_sizes = 0.5 * float(
+        np.sum(3 * np.log(2 * np.pi) - np.linalg.slogdet(H)[1]) - np.sum(views) * 2 * np.log(2 * np.pi)
+    )
+    usual = max(float(squares.sum()) / free, 1e-300)
+    normal = log_sizes - 0.5 * free * (1 + np.log(usual))
+
+    found = [_most_likely(A, b, views, degrees, usual) for degrees in DEGREES]
+    k = int(np.argmax([value for value, _ in found]))
+    value, scale = found[k]
+    alone = _likelihood(np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), DEGREES[k])[1]
+    return DEGREES[k] if value > normal + AGREED and scale > SHARED * alone else None
+
+
+def _most_likely(A: Floats, b: Floats, views: Ints, degrees: float, usual: float) -> tuple[float, float]:
+    """The largest evidence over the scale squared, and that."""
+    free = float(np.sum(2 * views - 3))
+    found = minimize_scalar(
+        lambda u: 0.5 * free * u - _evidence(A, b * np.exp(-0.5 * u), views, degrees),
+        bracket=(np.log(usual) - 1.0, np.log(usual) - 0.4),
+        method="brent",
+        options={"xtol": 0.05, "maxiter": 6},
+    )
+    return -float(found.fun), float(np.exp(found.x))
+
+
+def _evidence(A: Floats, b: Floats, views: Ints, degrees: float) -> float:
+    """Log density of the views of unit scale (those not there are zero), each point's position integrated out."""
+    mode = _about_mode(A, b, degrees)
+    z, log_density = _draws(FEW_DRAWS)
+    log_weight = -0.5 * (degrees + 2) * _bent(A, mode.left, z @ mode.spread.swapaxes(1, 2), degrees) - log_density
+    sizes = np.linalg.slogdet(mode.spread)[1] - views * np.log(2 * np.pi)
+    return float(np.sum(logsumexp(log_weight, axis=1) - np.log(len(z)) + sizes))
+
+
+class _Mode(NamedTuple):
+    """Of n points the most probable step (n, 3) near a start, residuals there (n, C, 2), and a root (n, 3, 3) of a
+    covariance larger than the posterior's."""
+
+    step: Floats
+    left: Floats
+    spread: Floats
+
+
+def _about_mode(A: Floats, b: Floats, degrees: float, start: Floats | None = None) -> _Mode:
+    step = _mode(A, b, degrees, np.zeros((len(A), 3)) if start is None else start)
+    left = b - np.einsum("ncij,nj->nci", A, step)
+    w = weights_of(np.sum(left**2, axis=2), degrees)
+    H = np.einsum("nc,ncij,ncik->njk", w, A, A)
+    return _Mode(step, left, WIDER * np.sqrt(information_loss(degrees)) * _inverse_root(H))
+
+
+def _bent(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
+    """(n, K) sum over the views of log(1 + squared distance / degrees), at steps away (n, K, 3)."""
+    n, C = left.shape[:2]
+    moved = (A.reshape(n, 2 * C, 3) @ away.swapaxes(1, 2)).reshape(n, C, 2, -1)
+    squares = np.sum((left[..., None] - moved) ** 2, axis=2)
+    return np.asarray(np.sum(np.log1p(squares / degrees), axis=1), dtype=np.float64)
+
+
+def _mode(A: Floats, b: Floats, degrees: float, step: Floats) -> Floats:
+    """(n, 3) the most probable step near a start: least squares, weighted again and again."""
+    for _ in range(TO_MODE):
+        left = b - np.einsum("ncij,nj->nci", A, step)
+        w = weights_of(np.sum(left**2, axis=2), degrees)
+        H = np.einsum("nc,ncij,ncik->njk", w, A, A)
+        step = step + np.linalg.solve(H, np.einsum("nc,ncij,nci->nj", w, A, left)[..., None])[..., 0]
+    return step
+
+
+def _inverse_root(H: Floats) -> Floats:
+    """R with R R^T = H^-1, in stacks."""
+    L = np.linalg.cholesky(H)
+    return np.asarray(np.linalg.inv(L).swapaxes(1, 2), dtype=np.float64)
+
+
+@lru_cache(maxsize=2)
+def _draws(count: int) -> tuple[Floats, Floats]:
+    """(count, 3) places of a spherical t with four degrees of freedom, z and -z, and the log of its density."""
+    u = np.clip(qmc.Sobol(5, scramble=True, rng=np.random.default_rng(0)).random(count // 2), 1e-6, 1 - 1e-6)
+    chi2 = -2 * np.log(u[:, 3] * u[:, 4])  # with four degrees
+    z = ndtri(u[:, :3]) / np.sqrt(chi2 / 4)[:, None]
+    z = np.concatenate([z, -z])
+    return z, gammaln(3.5) - 1.5 * np.log(4 * np.pi) - 3.5 * np.log1p(np.sum(z**2, axis=1) / 4)

@@ -1,0 +1,37 @@
+"""The search for wrong views by trying every choice: the reference that the fast one is held against."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.locate import _Seen
+from implicam.calibrators.forward_gp.posterior import Posterior
+from implicam.calibrators.forward_gp.wrong_views import AGREE, CLEARLY, DISAGREE
+
+
+def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most: int = 2) -> tuple[np.ndarray, ...]:
+    """Positions (n, 3), p-values (n,) and views left out (n, C) of points, up to `most` views each."""
+    points = _Seen(posterior, uv, noise, None)
+    seen = np.isfinite(uv).all(axis=2)
+    xyz, _, p = points.solved(np.arange(len(uv)), seen)
+    left_out = np.zeros_like(seen)
+    for count in range(1, most + 1):
+        rows = np.flatnonzero((seen.sum(axis=1) >= 2 * count + 1) & ~(p >= DISAGREE))
+        groups = list(combinations(range(seen.shape[1]), count))
+        if not len(rows):
+            continue
+        tried, ps = [], np.zeros((len(rows), len(groups)))
+        for k, group in enumerate(groups):
+            there = seen[rows][:, group].all(axis=1)
+            without = seen[rows] & there[:, None]
+            without[:, group] = False
+            x, _, found = points.solved(rows, without)
+            ps[:, k] = np.where(there & np.isfinite(found), found, 0.0)
+            tried.append(x)
+        best, ordered = np.argmax(ps, axis=1), np.sort(ps, axis=1)
+        for i in np.flatnonzero((ordered[:, -1] > AGREE) & (ordered[:, -1] > CLEARLY * ordered[:, -2])):
+            xyz[rows[i]], p[rows[i]] = tried[best[i]][i], ps[i, best[i]]
+            left_out[rows[i], groups[best[i]]] = True
+    return xyz, p, left_out
