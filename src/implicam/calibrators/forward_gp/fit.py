@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, Hyperparameters, RigEvidence
+from implicam.calibrators.forward_gp.label_errors import LabelErrors
 from implicam.calibrators.forward_gp.lens import Floats, Image
 from implicam.calibrators.forward_gp.posterior import (
     CameraModel,
@@ -24,6 +25,7 @@ from implicam.calibrators.forward_gp.posterior import (
     empty_field,
     spread,
 )
+from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
 from implicam.calibrators.forward_gp.start import FEWEST, Started, start_again, start_camera
 from implicam.errors import FitError
 from implicam.progress import Progress
@@ -69,7 +71,8 @@ class Problem:
 class FittedRig:
     """cameras: numbers of those that could be fitted, in order, as posterior.models. blind: (number, why) of others.
     kept: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are; label_sd
-    (1, k) its estimated sds, for error bars."""
+    (1, k) its estimated sds, for error bars. label_errors: how single known positions are off besides, if they are;
+    untold_sd (6,): how planes may be off that are too few to tell."""
 
     posterior: Posterior
     cameras: tuple[int, ...]
@@ -78,6 +81,8 @@ class FittedRig:
     hyperparameters: Hyperparameters
     errors: ShotErrors | None
     label_sd: Floats | None
+    label_errors: LabelErrors | None = None
+    untold_sd: Floats | None = None
 
 
 def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = None) -> FittedRig:
@@ -273,11 +278,18 @@ def _conditioned(
 
 
 def settle(
-    models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...], errors: ShotErrors | None
+    models: tuple[CameraModel, ...],
+    points: Floats,
+    used: tuple[Sightings, ...],
+    errors: ShotErrors | None,
+    scatter: Scatter | None = None,
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
     for _ in range(4):
-        posterior = condition(models, points, used, errors)
+        if scatter is None:
+            posterior = condition(models, points, used, errors)
+        else:
+            posterior = condition_scattered(models, points, used, errors, scatter)
         models = tuple(
             _in_front(before, after, step, points[seen.rows])
             for before, after, step, seen in zip(models, posterior.models, posterior.steps, used, strict=True)
