@@ -395,3 +395,13 @@ def test_label_errors_with_no_tail_have_their_scale_as_covariance() -> None:
     np.testing.assert_array_equal(LabelErrors(scale, np.inf, 0.5, 10).covariance, scale)
     root = LabelErrors(scale, 3.0, 0.5, 10).root
     np.testing.assert_allclose(root @ root.T, scale)
+
+
+def test_plates_follow_each_other_along_their_normal() -> None:
+    """Random points of wide plates close together: their centres lie farther apart across than along."""
+    rng = np.random.default_rng(0)
+    turn = rotation(2)
+    points = np.column_stack([rng.uniform(-1, 1, (60, 2)), np.repeat(0.05 * np.arange(5), 12)]) @ turn.T
+    shots = Shots.of(points, np.repeat(list("abcde"), 12))
+    assert shots is not None
+    assert abs(shots.along[0] @ turn[:, 2]) == pytest.approx(1, abs=1e-6)

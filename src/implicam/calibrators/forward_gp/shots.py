@@ -35,6 +35,10 @@ FARTHEST_WORLD, MOST_DRAWN = 3.0, 100.0
 """Half lengths of the traverse off its middle, and times the variance of a shot's error, to which the parabola through
 the shots is followed: beyond, nobody believes it."""
 
+FLAT, PARALLEL = 0.01, 1e-4
+"""Thickness over width of a plate, and one less the cosine between two (0.8 degrees), up to which they are parallel
+plates."""
+
 REACH = 0.25
 """How far the label of a shot holds around it, as a part of the distance to the next one."""
 
@@ -76,6 +80,7 @@ class Shots:
         spans = [np.abs((m - c) @ a.T) for m, c, a in zip(members, centre, axes, strict=True)]
         extent = np.array([span.max(axis=0) for span in spans])
         radius = np.array([np.sqrt(np.mean(np.sum(span**2, axis=1))) for span in spans])
+        direction = _common_normal(axes, extent) if direction is None else direction
         along = np.linalg.svd(centre - centre.mean(axis=0) if direction is None else direction[None])[2]
         t = (centre - centre.mean(axis=0)) @ along[0]
         if np.ptp(t) < 1e-9 or len(np.unique(np.round(t / np.ptp(t), 6))) < min(fewest, S):
@@ -150,3 +155,12 @@ class Shots:
         at = np.clip((points - middle) @ self.along[0] / half, -FARTHEST_WORLD, FARTHEST_WORLD)
         weights = np.vander(at, terms) @ np.linalg.pinv(np.vander(t / half, terms))
         return np.asarray(np.minimum(np.sum(weights**2, axis=1), MOST_DRAWN), dtype=np.float64)
+
+
+def _common_normal(axes: Floats, extent: Floats) -> Floats | None:
+    """(3,) of parallel plates, None of other shots. Where some of a plate's points are missing, its centre lies beside
+    the others', so that the centres say poorly where thin slabs follow each other."""
+    normals = axes[:, 2]
+    flat = extent[:, 2] <= FLAT * extent[:, 1]
+    parallel = np.abs(normals @ normals[0]) >= 1 - PARALLEL
+    return np.asarray(normals[0], dtype=np.float64) if (flat & parallel).all() else None
