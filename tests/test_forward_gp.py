@@ -34,6 +34,7 @@ from implicam.calibrators.forward_gp.posterior import (
     condition,
     empty_field,
 )
+from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
 from implicam.calibrators.forward_gp.shots import SMOOTH, Shots
 from implicam.calibrators.forward_gp.start import start_camera
 from implicam.cameras import BrownConrady, KannalaBrandt
@@ -471,8 +472,9 @@ def assert_close_covariance(found: np.ndarray, expected: np.ndarray, atol: float
 
 def covariance_of(posterior: Posterior) -> np.ndarray:
     """Of all cameras' unknowns, in order; a posterior keeps roots."""
-    if posterior.joint is not None:
-        return posterior.joint.T @ posterior.joint
+    if posterior.tied:
+        joint = np.concatenate([posterior.root(c) for c in range(len(posterior.models))], axis=1)
+        return joint.T @ joint
     return np.asarray(block_diag(*(root.T @ root for root in posterior.alone)))
 
 
@@ -621,6 +623,58 @@ def test_positions_that_may_be_off_tie_the_cameras(shots: int, k: int, estimated
     cross = covariance[:total, total:] / sd[:total, None]
     found = posterior.joint.T @ posterior.unknowns.cross
     np.testing.assert_allclose(found / sd[:total, None], cross, atol=1e-5)
+
+
+@pytest.mark.parametrize("shots", [0, 4])
+def test_single_positions_that_are_off_tie_the_cameras(shots: int) -> None:
+    """Of themselves, and with shots that are off besides: one dense linear regression."""
+    models, points, sightings = two_cameras()
+    rng = np.random.default_rng(5)
+    n = len(points)
+    scatter = Scatter(rng.normal(size=(3, 3)) * 2e-3, rng.uniform(0.5, 3, n))
+    own = ShotErrors(np.arange(n), scatter.root * scatter.size[:, None, None], np.ones((n, 3)), np.full(3, -1))
+    errors = replace(declared(points, 1, shots), group=np.zeros(shots, dtype=np.int64)) if shots else None
+    designs, y, sd, mean, precision = dense_problem(models, points, sightings)
+    X = [block_diag(*designs)]
+    for each in (own, *([errors] * (shots > 0))):
+        k = each.basis.shape[2]
+        wide = []
+        for model, seen in zip(models, sightings, strict=True):
+            D = model.camera.view(points[seen.rows]).by_point @ each.scaled[seen.rows]
+            block = np.zeros((len(D), 2, each.count, k))
+            block[np.arange(len(D)), :, each.shot[seen.rows]] = D
+            wide.append(block.reshape(2 * len(D), -1))
+        X.append(np.concatenate(wide))
+    design_matrix = np.concatenate(X, axis=1)
+    total, extra = len(mean), design_matrix.shape[1] - len(mean)
+    found, covariance, density = regression(
+        design_matrix, y, sd, np.concatenate([mean, np.zeros(extra)]), block_diag(precision, np.eye(extra))
+    )
+    posterior = condition_scattered(models, points, sightings, errors, scatter)
+    sds = np.sqrt(np.diag(covariance))[:total]
+    assert posterior.joint is None
+    assert posterior.ties is not None
+    assert len(posterior.ties) < total
+    np.testing.assert_allclose(unknowns_of(posterior) / sds, found[:total] / sds, atol=1e-4)
+    assert_close_covariance(covariance_of(posterior), covariance[:total, :total], 2e-4)
+    z = found[total : total + 3 * n].reshape(n, 3)
+    moved_by = np.einsum("nij,nj->ni", own.basis, z)
+    if errors is not None:
+        moved_by = moved_by + errors.scaled @ found[total + 3 * n :]
+        assert posterior.unknowns is not None
+        np.testing.assert_allclose(posterior.unknowns.mean, found[total + 3 * n :], atol=1e-4)
+        np.testing.assert_allclose(
+            posterior.unknowns.covariance, covariance[total + 3 * n :, total + 3 * n :], atol=1e-4
+        )
+        joint = np.concatenate([posterior.root(c) for c in range(2)], axis=1)
+        cross = joint.T @ posterior.unknowns.cross / sds[:, None]
+        np.testing.assert_allclose(cross, covariance[:total, total + 3 * n :] / sds[:, None], atol=1e-4)
+    assert posterior.displacement is not None
+    np.testing.assert_allclose(posterior.displacement, moved_by, atol=1e-5 * np.abs(moved_by).max())
+    exact = condition(models, points, sightings, None)
+    expected = density - regression(*_stacked(dense_problem(models, points, sightings)))[2]
+    assert abs(expected) > 5
+    assert posterior.evidence - exact.evidence == pytest.approx(expected, abs=1e-2)
 
 
 def test_more_shots_and_points_than_fit_in_one_piece_of_work() -> None:
@@ -939,10 +993,17 @@ def coarse(posterior: Posterior) -> Posterior:
     return replace(posterior, models=tuple(models), alone=tuple(roots))
 
 
-@pytest.mark.parametrize("kind", ["independent cameras", "tied cameras", "coarse fields"])
+@cache
+def dots_fit() -> ForwardGPCalibration:
+    """Known positions that are off by 0.15 mm each, which nothing says."""
+    xyz = known().xyz + 0.15 * rig().units_per_mm * np.random.default_rng(18).normal(size=known().xyz.shape)
+    return ForwardGP().fit(with_positions(known(), xyz, np.nan))
+
+
+@pytest.mark.parametrize("kind", ["independent cameras", "tied cameras", "dots off", "coarse fields"])
 def test_the_position_is_the_most_probable_one(kind: str) -> None:
     """Another optimiser, and finite differences for the covariance."""
-    calibration = declared_fit() if kind == "tied cameras" else fitted()
+    calibration = {"tied cameras": declared_fit, "dots off": dots_fit}.get(kind, fitted)()
     posterior, frame = calibration.posterior, calibration.frame
     assert (posterior.joint is not None) == (kind == "tied cameras")
     posterior = coarse(posterior) if kind == "coarse fields" else posterior
@@ -1357,10 +1418,16 @@ def test_between_shots_that_contradict_the_error_bars_are_wider() -> None:
     data = simulate(two, target, seed=72)
     measured = calibration.measure(data.observations)
     axis = two.volume.world_from_box.rotation[:, 2]
-    sd = np.sqrt(np.einsum("i,nij,j->n", axis, measured.cov, axis))
     number = np.array([int(shot[5:7]) for shot in data.shots])
     inside = (number > 2) & (number < 12)
-    assert sd[inside & (number % 2 == 0)].mean() > 1.3 * sd[inside & (number % 2 == 1)].mean()
+
+    def wider(cov: np.ndarray) -> float:
+        sd = np.sqrt(np.einsum("i,nij,j->n", axis, cov, axis))
+        return float(sd[inside & (number % 2 == 0)].mean() / sd[inside & (number % 2 == 1)].mean())
+
+    assert wider(measured.cov) > 1.15  # what the world is there: the parabola of its shots
+    # whoever judges by a known position there must add its own error
+    assert wider(measured.cov + calibration.known_position_covariance(data.xyz)) > 1.3
 
 
 @cache
@@ -1388,7 +1455,8 @@ def test_the_covariance_of_a_labelled_position_is_that_of_a_difference() -> None
     uv = calibration.data.observations.uv[some]
     noise = np.array([[model.noise for model in posterior.models]] * len(some))
     bare, labelled = locate(posterior, uv, noise), locate(posterior, uv, noise, labels)
-    known, unknown = labels.shots.labels(bare.xyz, labels.sd)[0], labels.shots.labels(bare.xyz, labels.label_sd)[1]
+    assert labels.unknowns is not None
+    known, unknown = labels.shots.labels(bare.xyz, labels.sd)[0], labels.world(bare.xyz)
     np.testing.assert_allclose(labelled.xyz, bare.xyz - known @ labels.unknowns.mean, atol=1e-12)
     cross = posterior.joint.T @ labels.unknowns.cross
     for i, x in enumerate(bare.xyz):
@@ -1409,6 +1477,7 @@ SAVED: dict[str, Callable[[], ForwardGPCalibration]] = {
     "exact positions": fitted,
     "declared noise": declared_fit,
     "estimated shots": lambda: board_fit()[0],
+    "dots off": lambda: dots_fit(),
     "no lens": lambda: unlensed_fit(),
 }
 every_saved = pytest.mark.parametrize("kind", SAVED)
@@ -1425,9 +1494,12 @@ def test_a_saved_calibration_measures_the_same_bits(kind: str, tmp_path: Path) -
     assert a.measured.any()
     for name in ("xyz", "cov", "views", "consistency", "reason"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-    for name in ("joint", "displacement"):
+    exact = ("exact positions", "no lens")
+    missing = {"joint": (*exact, "dots off"), "displacement": exact}
+    missing["ties"] = tuple(name for name in SAVED if name != "dots off")
+    for name in ("joint", "displacement", "ties"):
         x, y = getattr(calibration.posterior, name), getattr(loaded.posterior, name)
-        assert (x is None) == (y is None) == (kind in ("exact positions", "no lens"))
+        assert (x is None) == (y is None) == (kind in missing[name])
         if x is not None:
             np.testing.assert_array_equal(x, y)
     assert (loaded.posterior.unknowns is not None) == (kind == "estimated shots")
@@ -1437,7 +1509,7 @@ def test_a_saved_calibration_measures_the_same_bits(kind: str, tmp_path: Path) -
     assert loaded.unused == calibration.unused
 
 
-MAY_BE_MISSING = ("joint", "displacement", "shots/mean")
+MAY_BE_MISSING = ("joint", "displacement", "shots/mean", "untold_sd")
 """As a whole: each takes the others with it."""
 
 
@@ -1482,6 +1554,9 @@ def test_a_state_that_does_not_fit_is_refused(kind: str) -> None:
         ("estimated shots", "joint"),
         ("estimated shots", "displacement"),
         ("estimated shots", "shots/mean"),
+        ("dots off", "ties"),
+        ("dots off", "displacement"),
+        ("dots off", "labels/size"),
     ],
 )
 def test_a_state_with_half_of_what_ties_the_cameras_is_refused(kind: str, name: str) -> None:

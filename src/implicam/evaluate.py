@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,14 @@ class Fits(Protocol):
 
     def __call__(self, data: Dataset, progress: Progress = silent) -> Calibration:
         """Fit."""
+
+
+@runtime_checkable
+class KnowsLabelErrors(Protocol):
+    """A calibration that has found how far known positions are off."""
+
+    def known_position_covariance(self, xyz: Floats) -> Floats:
+        """(n, 3, 3) of the error of a known position near each of xyz (n, 3); zero where none seems off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +84,8 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
     if used.any():
         how += f"; {used.sum()} of this dataset were, and are left out"
     measurement = calibration.measure(held_out.observations)
-    return _judge(calibration, held_out, measurement, calibration.data.xyz, how, regions=regions)
+    labels = _label_covariance(calibration, held_out)
+    return _judge(calibration, held_out, measurement, labels, calibration.data.xyz, how, regions=regions)
 
 
 def cross_validate(fit: Fits, data: Dataset, k: int, *, seed: int = 0, progress: Progress = silent) -> Evaluation:
@@ -94,17 +103,18 @@ def leave_out_shots(fit: Fits, data: Dataset, *, progress: Progress = silent) ->
 def _held_out_in_turn(
     fit: Fits, data: Dataset, rounds: list[tuple[str, Dataset, Dataset]], how: str, progress: Progress
 ) -> Evaluation:
-    parts: list[tuple[Measurement, Dataset]] = []
+    parts: list[tuple[Measurement, Dataset, Floats]] = []
     progress(how, 0, len(rounds))
     for i, (_, others, held_out) in enumerate(rounds):
         calibration = fit(others)
-        parts.append((calibration.measure(held_out.observations), held_out))
+        parts.append((calibration.measure(held_out.observations), held_out, _label_covariance(calibration, held_out)))
         progress(how, i + 1, len(rounds))
-    measurement = _stacked(m for m, _ in parts)
+    measurement = _stacked(m for m, _, _ in parts)
+    labels = np.concatenate([covariance for _, _, covariance in parts])
     row = {str(name): i for i, name in enumerate(data.points)}
-    held_out = data.select([row[str(name)] for _, part in parts for name in part.points])
+    held_out = data.select([row[str(name)] for _, part, _ in parts for name in part.points])
     # what there is to note is of all points, not of those that the last round happened to leave
-    return _judge(fit(data), held_out, measurement, data.xyz, how)
+    return _judge(fit(data), held_out, measurement, labels, data.xyz, how)
 
 
 def _stacked(parts: Iterable[Measurement]) -> Measurement:
@@ -128,6 +138,7 @@ def _judge(
     calibration: Calibration,
     data: Dataset,
     measurement: Measurement,
+    labels: Floats,
     known_xyz: Floats,
     how: str,
     *,
@@ -135,22 +146,41 @@ def _judge(
 ) -> Evaluation:
     truth = data.truth
     true_xyz = data.xyz if truth is None else truth.xyz
-    cov = measurement.cov
-    if truth is None:  # the difference from a known position that is itself uncertain
-        cov = cov + np.nan_to_num(data.positions.sd)[:, :, None] ** 2 * np.eye(3)
     coverage = assess(
         measurement.xyz - true_xyz,
-        cov,
+        measurement.cov + labels,
         clusters=data.shots,
         regions=_regions(data) if regions else None,
         limit=None if truth is None else truth.limit,
     )
     against = "the simulated truth"
     if truth is None:
-        declared = bool((data.positions.sd > 0).any())
-        against = "the known positions" + ", whose declared sd is part of the error bars" * declared
+        against = f"the known positions{_whose_errors(data, labels)}"
     notes = tuple(calibration.notes())
     return Evaluation(calibration.method, data, measurement, true_xyz, known_xyz, coverage, how, against, notes)
+
+
+def _label_covariance(calibration: Calibration, data: Dataset) -> Floats:
+    """(n, 3, 3) of the errors of the known positions that are judged by: as declared, or else as the calibration has
+    estimated them; none of simulated true positions."""
+    if data.truth is not None:
+        return np.zeros((len(data), 3, 3))
+    if _declared(data) or not isinstance(calibration, KnowsLabelErrors):
+        return np.asarray(np.nan_to_num(data.positions.sd)[:, :, None] ** 2 * np.eye(3), dtype=np.float64)
+    return calibration.known_position_covariance(data.xyz)
+
+
+def _declared(data: Dataset) -> bool:
+    return bool((data.positions.sd > 0).any())
+
+
+def _whose_errors(data: Dataset, labels: Floats) -> str:
+    if not labels.any():
+        return ""
+    if _declared(data):
+        return ", whose declared sd is part of the error bars"
+    sd = ", ".join(f"{x:.2g}" for x in np.sqrt(np.diagonal(np.median(labels, axis=0))))
+    return f", whose own errors, as estimated (sd {sd} {data.length_unit} in x, y, z), are part of the error bars"
 
 
 def _regions(data: Dataset) -> dict[str, Names]:

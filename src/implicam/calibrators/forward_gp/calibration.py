@@ -19,6 +19,8 @@ from implicam import calibration_file
 from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.diagnosis import Diagnosis
 from implicam.calibrators.forward_gp.fit import AUTO, FittedRig, fit_rig
+from implicam.calibrators.forward_gp.label_fit import with_label_errors
+from implicam.calibrators.forward_gp.levels import untold
 from implicam.calibrators.forward_gp.locate import Labels
 from implicam.calibrators.forward_gp.posterior import Posterior
 from implicam.calibrators.forward_gp.problem import Frame, problem_of
@@ -59,7 +61,8 @@ class ForwardGP:
         """Fit to all known points that any camera saw."""
         frame = Frame.of(data, self.method)
         with solvable(), blas_threads(1):  # many small matrices, one after the other: two threads would wait
-            fitted = fit_rig(problem_of(self.lens, data, frame), progress)
+            problem = problem_of(self.lens, data, frame)
+            fitted = with_label_errors(problem, fit_rig(problem, progress), data.shots)
         return ForwardGPCalibration(self, data, frame, fitted)
 
 
@@ -113,10 +116,14 @@ class ForwardGPCalibration:
     @cached_property
     def _labels(self) -> Labels | None:
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
+        points = self.frame.inward(self.data.xyz)
         if errors is None or unknowns is None or self.fitted.label_sd is None:
-            return None
-        shots = Shots.of(self.frame.inward(self.data.xyz), self.data.shots)
-        return None if shots is None else Labels(shots, errors.sd[0], self.fitted.label_sd[0], unknowns)
+            untold_sd = self.fitted.untold_sd
+            planes = None if untold_sd is None else untold(points, self.data.shots)
+            return None if planes is None or untold_sd is None else Labels(planes.shots, np.zeros(0), None, untold_sd)
+        shots = Shots.of(points, self.data.shots)
+        bars = self.fitted.label_sd.reshape(6, -1)[:, 0]
+        return None if shots is None else Labels(shots, errors.sd[0], unknowns, bars)
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
@@ -145,15 +152,45 @@ class ForwardGPCalibration:
         if anew:
             return self.refit(data, progress)
         with solvable(), blas_threads(1):
-            fitted = fit_rig(problem_of(self.calibrator.lens, data, self.frame), progress, self.fitted)
+            problem = problem_of(self.calibrator.lens, data, self.frame)
+            fitted = with_label_errors(problem, fit_rig(problem, progress, self.fitted), data.shots)
         return ForwardGPCalibration(self.calibrator, data, self.frame, fitted)
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*self.diagnosis.notes(), *self._label_notes(), *self.diagnosis.noise_notes()]
+        return [
+            *self.diagnosis.notes(),
+            *self._label_notes(),
+            *self._plane_notes(),
+            *self._single_notes(),
+            *self.diagnosis.noise_notes(),
+        ]
+
+    def _plane_notes(self) -> list[str]:
+        if self._labels is None or self._labels.unknowns is not None:
+            return []
+        sd, unit, count = self._labels.bars[0] * self.frame.scale, self.data.length_unit, len(self._labels.shots.centre)
+        what = "shots" if len(np.unique(self.data.shots)) > 1 else "levels of one target"
+        return [
+            f"{count} {what} cannot contradict each other. Error bars away from them allow for planes that are off by "
+            f"{sd:.2g} {unit}, as is usual. State sd_x, sd_y, sd_z if you know better."
+        ]
+
+    def _single_notes(self) -> list[str]:
+        errors = self.fitted.label_errors
+        if errors is None:
+            return []
+        sd = ", ".join(f"{x:.2g}" for x in np.sqrt(np.diagonal(errors.covariance)) * self.frame.scale)
+        noise = [model.noise for model in self.posterior.models]
+        tails = "" if np.isinf(errors.freedom) else ", a few by much more"
+        return [
+            f"Single known positions (the dots of this target) seem to be off by about {sd} {self.data.length_unit} in "
+            f"x, y, z{tails}. Error bars are of true positions, and the pixel noise is {np.median(noise):.2g} px, not "
+            f"{np.median(noise) / errors.noise:.2g}. State sd_x, sd_y, sd_z if you know better."
+        ]
 
     def _label_notes(self) -> list[str]:
-        if self._labels is None:
+        if self._labels is None or self._labels.unknowns is None:
             return []
         sd = self._labels.sd.reshape(6, -1)[:, 0] * self.frame.scale
         along = self._labels.shots.along[0]
@@ -166,6 +203,15 @@ class ForwardGPCalibration:
             f"({along[0]:.2f}, {along[1]:.2f}, {along[2]:.2f}) and {sd[1]:.2g} {unit} across. Positions are measured "
             "in the world as labelled; between shots the error bars include this."
         ]
+
+    def known_position_covariance(self, xyz: Floats) -> Floats:
+        """(n, 3, 3) of the error of a known position near each of xyz (n, 3), as estimated; zero if none seems off."""
+        out = np.zeros((len(xyz), 3, 3))
+        if self.fitted.label_errors is not None:
+            out += self.fitted.label_errors.covariance
+        if self._labels is not None:
+            out += self._labels.own(self.frame.inward(xyz))
+        return out * self.frame.scale**2
 
     def residuals(self) -> dict[str, Any]:
         """Leave-one-out errors per axis in the dataset's unit, and per camera the noise and the field in pixels."""

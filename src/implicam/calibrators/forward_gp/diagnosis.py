@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import FittedRig, left_out
+from implicam.calibrators.forward_gp.label_fit import left_out_points
 from implicam.calibrators.forward_gp.posterior import Sightings
 from implicam.calibrators.forward_gp.problem import Frame, sightings_of, stated_noise
 from implicam.calibrators.protocol import Rejected, Unused
@@ -58,9 +59,14 @@ class Diagnosis:
 
     @cached_property
     def leave_one_out(self) -> tuple[Floats, Floats]:
-        """Errors and sds (n, 3) of the known points, each measured without its own views, to first order."""
+        """Errors and sds (n, 3) of the known points, each measured without its own views, to first order; the errors of
+        the known positions themselves are part of both, where they are estimated."""
         n = len(self.data)
         posterior = self.fitted.posterior
+        if self.fitted.label_errors is not None:
+            all_seen = tuple(self._sightings[c] for c in self.fitted.cameras)
+            error, cov = left_out_points(self.fitted, self._points, all_seen)
+            return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
         H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
         views = np.zeros(n)
         for number, c in enumerate(self.fitted.cameras):

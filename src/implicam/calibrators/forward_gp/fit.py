@@ -33,6 +33,7 @@ from implicam.calibrators.forward_gp.heavy_tails import (
     weights_of,
     whitened,
 )
+from implicam.calibrators.forward_gp.label_errors import LabelErrors
 from implicam.calibrators.forward_gp.lens import Floats, Image, Prior, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import (
     CameraFailedError,
@@ -46,6 +47,7 @@ from implicam.calibrators.forward_gp.posterior import (
     field_coordinates,
     spread,
 )
+from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
 from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
 from implicam.calibrators.forward_gp.wrong_views import Linear
 from implicam.errors import FitError
@@ -119,8 +121,9 @@ class Problem:
 class FittedRig:
     """cameras: numbers of those that could be fitted, in order, as posterior.models. blind: (number, why) of others.
     kept: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are; label_sd
-    (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. ordinary_px: per fitted
-    camera, see `Started`."""
+    (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. label_errors: how
+    single known positions are off besides, if they are; untold_sd (6,): how planes may be off that are too few to tell.
+    ordinary_px: per fitted camera, see `Started`."""
 
     posterior: Posterior
     cameras: tuple[int, ...]
@@ -130,6 +133,8 @@ class FittedRig:
     errors: ShotErrors | None
     label_sd: Floats | None
     tails: Tails | None = None
+    label_errors: LabelErrors | None = None
+    untold_sd: Floats | None = None
     ordinary_px: tuple[float, ...] = ()
 
     def left_by_ordinary(self, number: int) -> float:
@@ -329,7 +334,7 @@ def _fit_started(
         state.errors,
         state.label_sd,
         state.tails,
-        ordinary_px,
+        ordinary_px=ordinary_px,
     )
 
 
@@ -605,12 +610,19 @@ def _conditioned(
 
 
 def settle(
-    models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...], errors: ShotErrors | None
+    models: tuple[CameraModel, ...],
+    points: Floats,
+    used: tuple[Sightings, ...],
+    errors: ShotErrors | None,
+    scatter: Scatter | None = None,
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
     misfits: list[_Misfit] = []
     for _ in range(MAX_SETTLING_STEPS):
-        posterior = condition(models, points, used, errors)
+        if scatter is None:
+            posterior = condition(models, points, used, errors)
+        else:
+            posterior = condition_scattered(models, points, used, errors, scatter)
         steps = posterior.steps
         small = [_small(step, posterior.root(c)) for c, step in enumerate(steps)]
         if not misfits and not all(small):

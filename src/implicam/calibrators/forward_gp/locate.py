@@ -45,13 +45,27 @@ class Located(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """How the known positions of a shot are off: the shots, their sds (k,) as fitted and for error bars, and what is
-    known of the errors."""
+    """How the known positions of a shot are off: the shots, their sds (k,) as fitted, what is known of the errors (None
+    of shots too few to tell), and sds (6,) for error bars."""
 
     shots: Shots
     sd: Floats
-    label_sd: Floats
-    unknowns: Unknowns
+    unknowns: Unknowns | None
+    bars: Floats
+
+    def off(self, x: Floats) -> Floats:
+        """(n, 3) how far a label near each of x (n, 3) is off, as far as it is known."""
+        if self.unknowns is None:
+            return np.zeros_like(x)
+        return np.asarray(self.shots.labels(x, self.sd)[0] @ self.unknowns.mean, dtype=np.float64)
+
+    def own(self, x: Floats) -> Floats:
+        """(n, 3, 3) covariance of the error that a known position near each of x (n, 3) may have besides."""
+        return np.nan_to_num(self.shots.untold(x, self.bars))
+
+    def world(self, x: Floats) -> Floats:
+        """(n, 3, 3) how well the shots say what the world is there, which is made of their labels, eq. (28)."""
+        return self.own(x) * np.nan_to_num(self.shots.drawn_along(x))[:, None, None]
 
 
 def locate(
@@ -200,10 +214,11 @@ class _Solved(NamedTuple):
 
 def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen: Bools) -> tuple[Floats, Floats]:
     """Positions (n, 3) and covariance in the world as labelled, eq. (22): a label near x is off, by what is known of
-    its shot, and where no shot is near, by nobody knows what."""
-    known, _ = labels.shots.labels(x, labels.sd)
-    _, unknown = labels.shots.labels(x, labels.label_sd)
-    known, unknown = np.nan_to_num(known), np.nan_to_num(unknown)
+    its shot, and where no shot is near, the world itself is known as well as its labels."""
+    unknown = labels.world(x)
+    if labels.unknowns is None:
+        return x, cov + unknown
+    known = np.nan_to_num(labels.shots.labels(x, labels.sd)[0])
     own = known @ labels.unknowns.covariance @ known.swapaxes(1, 2)
     tied = weights.with_cameras(x, cov, seen, labels.unknowns.cross) @ known.swapaxes(1, 2)
     return x - known @ labels.unknowns.mean, cov + own + tied + tied.swapaxes(1, 2) + unknown
@@ -241,13 +256,16 @@ class _Weights:
         own = [(noise[:, c] ** 2 + rows[c].rest)[:, None, None] * np.eye(2) for c in range(C)]
         self.each = np.empty((n, C, 2, 2))
         self.joint: Floats | None = None
+        self.halves: list[Floats] = []  # of ties: each camera's own
         if posterior.joint is None:
+            self.halves = [spread(rows[c], posterior.alone[c]) for c in range(C)]
+            own = [own[c] + _square(self.halves[c]) for c in range(C)]
+        if not posterior.tied:
             for c in range(C):
-                covariance = own[c] + _square(spread(rows[c], posterior.alone[c]))
-                self.each[:, c] = _inverted(np.where(seen[:, c, None, None], covariance, np.eye(2)))
+                self.each[:, c] = _inverted(np.where(seen[:, c, None, None], own[c], np.eye(2)))
             return
-        self.half = np.concatenate([spread(rows[c], posterior.root(c)) for c in range(C)], axis=1)  # (n, 2C, sum P)
-        S = _square(self.half).reshape(len(x), C, 2, C, 2)
+        self.half = np.concatenate([spread(rows[c], posterior.shared_root(c)) for c in range(C)], axis=1)
+        S = _square(self.half).reshape(len(x), C, 2, C, 2)  # half is (n, 2C, sum P), of ties (n, 2C, q)
         for c in range(C):
             S[:, c, :, c] += own[c]
             self.each[:, c] = _inverted(np.where(seen[:, c, None, None], S[:, c, :, c], np.eye(2)))
@@ -269,8 +287,16 @@ class _Weights:
         n, C = seen.shape
         D = np.stack([model.predict(x)[1] for model in self.posterior.models], axis=1)
         D = np.where(seen[..., None, None], D, 0).reshape(n, 2 * C, 3)
-        through = np.where(seen.repeat(2, axis=1)[..., None], self.half @ cross, 0)
+        through = np.where(seen.repeat(2, axis=1)[..., None], self._through(cross), 0)
         return np.asarray(cov @ D.swapaxes(1, 2) @ self.joint @ through, dtype=np.float64)
+
+    def _through(self, cross: Floats) -> Floats:
+        """(n, 2C, k) covariance of what the cameras would see with unknowns that `cross` ties to the joint root."""
+        if not self.halves:
+            return np.asarray(self.half @ cross, dtype=np.float64)
+        parts = np.split(cross, np.cumsum([half.shape[2] for half in self.halves]))
+        own = [half @ part for half, part in zip(self.halves, parts[:-1], strict=True)]
+        return np.asarray(np.concatenate(own, axis=1) + self.half @ parts[-1], dtype=np.float64)
 
     def normal(self, x: Floats, uv: Floats, seen: Bools) -> tuple[Floats, Floats, Floats]:
         """H (n, 3, 3), gradient (n, 3) and weighted squares (n,) of the residuals at x (n, 3)."""

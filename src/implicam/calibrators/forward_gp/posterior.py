@@ -93,6 +93,10 @@ class CameraModel:
         """(n, 3) where the field is looked up."""
         return field_coordinates(view, self.image, self.depth)
 
+    def without_weights(self) -> CameraModel:
+        """As it was before it saw anything."""
+        return replace(self, weights=np.zeros_like(self.weights))
+
     @cached_property
     def _coefficients(self) -> Floats:
         return self.field.coefficients(self.signal * self.weights)
@@ -206,8 +210,8 @@ class ShotErrors:
 
 
 class Unknowns(NamedTuple):
-    """Of all shots, in their sds: mean (shots * k,), covariance, and cross, of which `joint^T cross` is
-    the covariance with the cameras' (sum P, shots * k)."""
+    """Of all shots, in their sds: mean (shots * k,), covariance, and cross, of which `root^T cross` with the joint root
+    is the covariance with the cameras' (sum P, shots * k)."""
 
     mean: Floats
     covariance: Floats
@@ -222,7 +226,8 @@ class Posterior:
     length and distance of a telephoto lens) the covariance itself would lose all digits of what pixels show.
     alone: of each camera (P, P), if the known positions were where they seem now; joint: (sum P, sum P) where unknown
     positions tie the cameras, else None. steps: how far each lens moved. evidence: log marginal likelihood, up to a
-    constant. displacement: (n, 3) of the known points, the posterior mean.
+    constant. displacement: (n, 3) of the known points, the posterior mean. ties: (q, sum P) instead of joint, where
+    single known positions are off: the roots of the cameras alone above these rows are the joint root, eq. (27).
     """
 
     models: tuple[CameraModel, ...]
@@ -232,11 +237,29 @@ class Posterior:
     evidence: float
     unknowns: Unknowns | None = None
     displacement: Floats | None = None
+    ties: Floats | None = None
+
+    @property
+    def tied(self) -> bool:
+        """Whether errors of known positions tie the cameras."""
+        return self.joint is not None or self.ties is not None
 
     def root(self, c: int) -> Floats:
-        """(., P) root of the covariance of camera c's unknowns, everything included."""
+        """(., P) root of the covariance of camera c's unknowns, everything included. Where cameras are tied, the roots
+        of all have the same rows, and their products are the covariances between cameras."""
         start, end = self.offsets[c : c + 2]
+        if self.ties is not None:
+            own = np.zeros((self.offsets[-1] + len(self.ties), end - start))
+            own[start:end], own[self.offsets[-1] :] = self.alone[c], self.ties[:, start:end]
+            return own
         return self.alone[c] if self.joint is None else self.joint[:, start:end]
+
+    def shared_root(self, c: int) -> Floats:
+        """(q, P) the part of the root by which camera c is tied to the others."""
+        start, end = self.offsets[c : c + 2]
+        both = self.joint if self.ties is None else self.ties
+        assert both is not None
+        return both[:, start:end]
 
     @property
     def offsets(self) -> list[int]:
@@ -252,10 +275,15 @@ def condition(
 
     The models returned have moved to the posterior mean, so that a second call linearises there.
     """
-    normals = side_by_side(lambda pair: _normal(pair[0], points, pair[1]), list(zip(models, sightings, strict=True)))
+    normals = camera_normals(models, points, sightings)
     if errors is None:
         return _independent(models, normals)
     return _tied(models, points, sightings, normals, errors)
+
+
+def camera_normals(models: tuple[CameraModel, ...], points: Floats, sightings: tuple[Sightings, ...]) -> list[_Normal]:
+    """The normal equations of each camera, eq. (13)."""
+    return side_by_side(lambda pair: _normal(pair[0], points, pair[1]), list(zip(models, sightings, strict=True)))
 
 
 def _independent(models: tuple[CameraModel, ...], normals: list[_Normal]) -> Posterior:
@@ -267,7 +295,7 @@ def _independent(models: tuple[CameraModel, ...], normals: list[_Normal]) -> Pos
         value += 0.5 * (float(normal.b @ mean) - log_determinant - normal.squares - normal.logs)
         means.append(mean)
         roots.append(root)
-    return Posterior(_moved(models, means), tuple(roots), None, _steps(models, means), value)
+    return Posterior(moved(models, means), tuple(roots), None, _steps(models, means), value)
 
 
 def _tied(
@@ -302,11 +330,11 @@ def _tied(
     displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
     unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
     return Posterior(
-        _moved(models, means), tuple(alone), joint, _steps(models, means), 0.5 * value, unknowns, displacement
+        moved(models, means), tuple(alone), joint, _steps(models, means), 0.5 * value, unknowns, displacement
     )
 
 
-def _moved(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
+def moved(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
     """Each camera at its posterior mean, the weights of its field too."""
     return tuple(
         replace(
@@ -379,7 +407,7 @@ def _whitened(
     model: CameraModel, points: Floats, seen: Sightings
 ) -> Iterator[tuple[Floats, Floats, Floats, Floats, Floats]]:
     """In parts: the noise (n,), and in units of it the residuals, their slopes by lens, field and point."""
-    bare = replace(model, weights=np.zeros_like(model.weights))
+    bare = model.without_weights()
     for part in _chunks(len(seen.rows)):
         sd = model.noise * seen.relative[part]
         rows = bare.rows(points[seen.rows[part]])

@@ -91,8 +91,7 @@ class RigMap:
         there = np.isfinite(points).all(axis=1)
         where = points[there]
         if self.labels is not None:
-            known, _ = self.labels.shots.labels(where, self.labels.sd)
-            where = where + known @ self.labels.unknowns.mean
+            where = where + self.labels.off(where)
         for number, c in enumerate(self.cameras):
             uv[there, c] = self.posterior.models[number].predict(where)[0]
         return uv
@@ -108,7 +107,7 @@ class RigMap:
             half = spread(rows, self.posterior.root(number))
             noise = np.full((len(points), 2), model.noise**2 * information_loss(self.degrees))
             parts.append(Sensitivity((c,), slope, half, rows.rest[:, None].repeat(2, axis=1), noise))
-        if self.posterior.joint is None:
+        if not self.posterior.tied:
             return parts
         together = (np.concatenate([part[i] for part in parts], axis=1) for i in range(1, len(Sensitivity._fields)))
         return [Sensitivity(self.cameras, *together)]

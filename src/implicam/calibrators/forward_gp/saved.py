@@ -13,6 +13,7 @@ from implicam.calibrators.forward_gp.families import FAMILIES
 from implicam.calibrators.forward_gp.fit import FittedRig
 from implicam.calibrators.forward_gp.general_camera import GeneralCamera
 from implicam.calibrators.forward_gp.heavy_tails import Tails
+from implicam.calibrators.forward_gp.label_errors import LabelErrors
 from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import CameraModel, DepthScale, Posterior, ShotErrors, Unknowns
 from implicam.calibrators.forward_gp.shots import Shots
@@ -49,6 +50,15 @@ def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict
         arrays["joint"] = posterior.joint
     if posterior.displacement is not None:
         arrays["displacement"] = posterior.displacement
+    if posterior.ties is not None and (found := fitted.label_errors) is not None and found.size is not None:
+        arrays |= {
+            "ties": posterior.ties,
+            "labels/scale": found.scale,
+            "labels/numbers": np.array([1 / found.freedom, found.noise, found.gain, len(posterior.ties)]),
+            "labels/size": found.size,
+        }
+    if fitted.untold_sd is not None:
+        arrays["untold_sd"] = fitted.untold_sd
     if posterior.unknowns is not None and fitted.errors is not None and fitted.label_sd is not None:
         arrays |= {f"shots/{key}": value for key, value in posterior.unknowns._asdict().items()}
         arrays |= {"shots/sd": fitted.errors.sd, "shots/label_sd": fitted.label_sd}
@@ -100,7 +110,13 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
     errors, label_sd = _shot_errors(data, points, arrays, posterior)
     hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
     ordinary = tuple(float(one.get("ordinary_would_leave_px", np.nan)) for one in described)
-    return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd, _tails(arrays, kept), ordinary)
+    label_errors, untold_sd = _label_errors(data, arrays, posterior), None
+    if "untold_sd" in arrays:
+        untold_sd = finite_column(arrays, "untold_sd", (6,), positive=True)
+    tails = _tails(arrays, kept)
+    return FittedRig(
+        posterior, cameras, blind, tuple(kept), hyper, errors, label_sd, tails, label_errors, untold_sd, ordinary
+    )
 
 
 def _tails(arrays: Arrays, kept: Sequence[NDArray[np.bool_]]) -> Tails | None:
@@ -114,6 +130,23 @@ def _tails(arrays: Arrays, kept: Sequence[NDArray[np.bool_]]) -> Tails | None:
         finite_column(arrays, f"{number}/tail_weights", used.shape, positive=True) for number, used in enumerate(kept)
     )
     return Tails(degrees, tuple(weights))
+
+
+def _label_errors(data: Dataset, arrays: Arrays, posterior: Posterior) -> LabelErrors | None:
+    if posterior.ties is None:
+        if any(name.startswith("labels/") for name in arrays):
+            raise ValueError("errors of known positions tie the cameras: ties is missing")
+        return None
+    thickness, noise, gain, rows = finite_column(arrays, "labels/numbers", (4,)).tolist()
+    if not (0 <= thickness < 0.5 and 0 < noise <= 1 and rows == len(posterior.ties)):
+        raise ValueError(
+            "labels/numbers must be one over the degrees of freedom, the noise left, the gain, and the ties"
+        )
+    scale = finite_column(arrays, "labels/scale", (3, 3))
+    if not np.allclose(scale, scale.T) or np.linalg.eigvalsh(scale)[0] <= 0:
+        raise ValueError("labels/scale must be a covariance")
+    size = finite_column(arrays, "labels/size", (len(data),), positive=True)
+    return LabelErrors(scale, 1 / thickness if thickness else np.inf, noise, gain, size)
 
 
 def _shot_errors(
@@ -163,17 +196,18 @@ def _model(
 def _posterior(data: Dataset, arrays: Arrays, models: tuple[CameraModel, ...], alone: tuple[Floats, ...]) -> Posterior:
     total = sum(model.size for model in models)
     joint = finite_column(arrays, "joint", (total, total)) if "joint" in arrays else None
+    ties = finite_column(arrays, "ties", (len(arrays["ties"]), total)) if "ties" in arrays else None
     displacement = finite_column(arrays, "displacement", (len(data), 3)) if "displacement" in arrays else None
-    if (joint is None) != (displacement is None):
-        raise ValueError("joint and displacement belong together")
+    if (joint is None and ties is None) != (displacement is None) or (joint is not None and ties is not None):
+        raise ValueError("joint or ties belongs to displacement, one of them")
     unknowns = None
     if any(name.startswith("shots/") for name in arrays):
-        if joint is None:
+        if joint is None and ties is None:
             raise ValueError("the errors of shots tie the cameras: joint is missing")
-        k = len(arrays["shots/mean"])
+        k, rows = len(arrays["shots/mean"]), total + (0 if ties is None else len(ties))
         unknowns = Unknowns(
             finite_column(arrays, "shots/mean", (k,)),
             finite_column(arrays, "shots/covariance", (k, k)),
-            finite_column(arrays, "shots/cross", (total, k)),
+            finite_column(arrays, "shots/cross", (rows, k)),
         )
-    return Posterior(models, alone, joint, (), 0.0, unknowns, displacement)
+    return Posterior(models, alone, joint, (), 0.0, unknowns, displacement, ties)

@@ -31,6 +31,14 @@ FIRST_GUESS = 2e-3
 FARTHEST_TILT = 2.0
 """Plate radii off its centre beyond which a tilt says no more: it is small, and not a matter of the whole world."""
 
+FARTHEST_WORLD, MOST_DRAWN = 3.0, 100.0
+"""Half lengths of the traverse off its middle, and times the variance of a shot's error, to which the parabola through
+the shots is followed: beyond, nobody believes it."""
+
+FLAT, PARALLEL = 0.01, 1e-4
+"""Thickness over width of a plate, and one less the cosine between two (0.8 degrees), up to which they are parallel
+plates."""
+
 REACH = 0.25
 """How far the label of a shot holds around it, as a part of the distance to the next one."""
 
@@ -50,11 +58,21 @@ class Shots:
     pattern: Floats
 
     @classmethod
-    def of(cls, points: Floats, labels: NDArray[np.str_]) -> Shots | None:
-        """None where there are too few shots, or too few points in them."""
+    def of(
+        cls,
+        points: Floats,
+        labels: NDArray[np.str_],
+        *,
+        fewest: int = SMOOTH + 1,
+        direction: Floats | None = None,
+    ) -> Shots | None:
+        """None where there are too few shots, or too few points in them; up to `SMOOTH` shots have no unknowns.
+
+        direction: (3,) in which the shots follow each other, where it is known.
+        """
         _, shot, count = np.unique(labels, return_inverse=True, return_counts=True)
         S = len(count)
-        if S <= SMOOTH or count.min() < POINTS:
+        if fewest > S or count.min() < POINTS:
             return None
         members = [points[shot == s] for s in range(S)]
         centre = np.array([m.mean(axis=0) for m in members])
@@ -62,9 +80,10 @@ class Shots:
         spans = [np.abs((m - c) @ a.T) for m, c, a in zip(members, centre, axes, strict=True)]
         extent = np.array([span.max(axis=0) for span in spans])
         radius = np.array([np.sqrt(np.mean(np.sum(span**2, axis=1))) for span in spans])
-        along = np.linalg.svd(centre - centre.mean(axis=0))[2]
+        direction = _common_normal(axes, extent) if direction is None else direction
+        along = np.linalg.svd(centre - centre.mean(axis=0) if direction is None else direction[None])[2]
         t = (centre - centre.mean(axis=0)) @ along[0]
-        if np.ptp(t) < 1e-9 or len(np.unique(np.round(t / np.ptp(t), 6))) <= SMOOTH:
+        if np.ptp(t) < 1e-9 or len(np.unique(np.round(t / np.ptp(t), 6))) < min(fewest, S):
             return None
         smooth = np.vander(t / np.abs(t).max(), SMOOTH)
         pattern = np.linalg.qr(smooth, mode="complete")[0][:, SMOOTH:]
@@ -112,9 +131,36 @@ class Shots:
         holds = np.exp(-0.5 * (distance / self._reach) ** 2)
         rigid = self._rigid(points, nearest)
         known = holds[:, None, None, None] * rigid[:, :, :, None] * self.pattern[nearest][:, None, None, :]
+        return known.reshape(n, 3, len(sd)) * sd, self.untold(points, sd.reshape(6, -1)[:, 0])
+
+    def untold(self, points: Floats, sd: Floats) -> Floats:
+        """(n, 3, 3) of the error of a label near each point, as far as the shots do not tell it: nothing at a shot. sd:
+        (6,) of a shot's error."""
+        nearest = np.argmin(outside := self._outside(points), axis=1)
+        if self._reach == 0:
+            return np.zeros((len(points), 3, 3))
+        holds = np.exp(-0.5 * (outside[np.arange(len(points)), nearest] / self._reach) ** 2)
         lengths = np.linalg.norm(points - self.centre[nearest], axis=1) / self.radius[nearest]
         within = np.minimum(1, FARTHEST_TILT / np.maximum(lengths, 1e-12))
-        lever = rigid * sd.reshape(6, -1)[:, 0]
+        lever = self._rigid(points, nearest) * sd
         lever[:, :, 3:] *= within[:, None, None]
-        left = (1 - holds**2)[:, None, None] * (lever @ lever.swapaxes(1, 2))
-        return known.reshape(n, 3, len(sd)) * sd, left
+        return np.asarray((1 - holds**2)[:, None, None] * (lever @ lever.swapaxes(1, 2)), dtype=np.float64)
+
+    def drawn_along(self, points: Floats) -> Floats:
+        """(n,) variance of the world at each point over that of a shot's error, eq. (28): the world is the parabola
+        through the shots by definition, or the line through two."""
+        t = (self.centre - (middle := self.centre.mean(axis=0))) @ self.along[0]
+        half = np.abs(t).max()
+        terms = min(SMOOTH, len(t))
+        at = np.clip((points - middle) @ self.along[0] / half, -FARTHEST_WORLD, FARTHEST_WORLD)
+        weights = np.vander(at, terms) @ np.linalg.pinv(np.vander(t / half, terms))
+        return np.asarray(np.minimum(np.sum(weights**2, axis=1), MOST_DRAWN), dtype=np.float64)
+
+
+def _common_normal(axes: Floats, extent: Floats) -> Floats | None:
+    """(3,) of parallel plates, None of other shots. Where some of a plate's points are missing, its centre lies beside
+    the others', so that the centres say poorly where thin slabs follow each other."""
+    normals = axes[:, 2]
+    flat = extent[:, 2] <= FLAT * extent[:, 1]
+    parallel = np.abs(normals @ normals[0]) >= 1 - PARALLEL
+    return np.asarray(normals[0], dtype=np.float64) if (flat & parallel).all() else None

@@ -1,0 +1,178 @@
+"""After the fit: are single known positions off, by how much, and what then is known of the cameras.
+
+The fit takes errors of known positions for pixel noise. Here they are told apart (label_errors.py), the views are
+judged again, and the cameras are conditioned once more, with less noise and tied by the errors of the positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.fit import OUTLIER, Bools, FittedRig, Problem, left_out, settle
+from implicam.calibrators.forward_gp.label_errors import Agreement, LabelErrors, estimated
+from implicam.calibrators.forward_gp.lens import Floats
+from implicam.calibrators.forward_gp.levels import untold
+from implicam.calibrators.forward_gp.posterior import Posterior, Sightings, spread
+from implicam.calibrators.forward_gp.scatter import Scatter
+from implicam.dataset import Names
+
+MOST = 400
+"""Points that the errors are estimated from; more cost time and tell little more."""
+
+LEVERAGE = 3.0
+"""Variance of a view predicted without its own point over that of the noise: beyond it the point says how a camera is,
+and not how it is off itself."""
+
+
+def with_label_errors(problem: Problem, fitted: FittedRig, shots: Names) -> FittedRig:
+    """The rig where known positions are off, if they are; else the same. shots: (n,) of the points. What is declared is
+    not estimated."""
+    if problem.errors is not None and not problem.errors.estimated:
+        return fitted
+    planes = untold(problem.points, shots) if problem.errors is None else None
+    if planes is not None:
+        fitted = replace(fitted, untold_sd=planes.sd)
+    return _with_scatter(problem, fitted)
+
+
+def _with_scatter(problem: Problem, fitted: FittedRig) -> FittedRig:
+    seen = tuple(problem.sightings[c] for c in fitted.cameras)
+    if fitted.tails is not None:
+        seen = fitted.tails.weighted(seen, told=True)
+    views = _left_out(fitted.posterior, problem.points, seen, fitted.kept)
+    kept, n = fitted.kept, len(problem.points)
+    found = _estimated(views, kept, n)
+    if found is None:
+        return fitted
+    kept = _judged(views, kept, found[0], n)
+    if any((a != b).any() for a, b in zip(kept, fitted.kept, strict=True)):
+        found = _estimated(views, kept, n) or found
+    errors, size = found
+    errors = replace(errors, size=size)
+    models = tuple(replace(model, noise=model.noise * errors.noise) for model in fitted.posterior.models)
+    used = tuple(one.select(k) for one, k in zip(seen, kept, strict=True))
+    try:
+        posterior = settle(models, problem.points, used, fitted.errors, Scatter(errors.root, size))
+    except np.linalg.LinAlgError:  # then the cameras stay as they were, with more noise than there is
+        return fitted
+    return replace(fitted, posterior=posterior, kept=kept, label_errors=errors)
+
+
+class _LeftOut(NamedTuple):
+    """Per view of one camera, predicted without it: rows (n,) of the points; residual (n, 2) and covariance inverse
+    (n, 2, 2); slope (n, 2, 3) by the position; high (n,) whether its point says how the camera is."""
+
+    rows: NDArray[np.int64]
+    residual: Floats
+    inverse: Floats
+    slope: Floats
+    high: Bools
+
+
+def _left_out(
+    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
+) -> list[_LeftOut]:
+    found = []
+    where = points if posterior.displacement is None else points + posterior.displacement
+    for c, (one, k) in enumerate(zip(seen, kept, strict=True)):
+        residual, covariance = left_out(posterior, c, points, one, k)
+        slope = posterior.models[c].predict(where[one.rows])[1]
+        noise2 = (posterior.models[c].noise * one.relative) ** 2
+        values = np.linalg.eigvalsh(covariance) / noise2[:, None]
+        high = ~((values > 0) & (values < LEVERAGE)).all(axis=1)  # negative: rounding, at a leverage of one
+        inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        found.append(_LeftOut(one.rows, residual, inverse, slope, np.asarray(high, dtype=np.bool_)))
+    return found
+
+
+def _sums(views: list[_LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
+    """Of all points, and which of them may be used: seen twice, and not of high leverage."""
+    total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+    high = np.zeros(n, dtype=np.bool_)
+    for view, k in zip(views, kept, strict=True):
+        rows = view.rows[k]  # a camera sees a point once
+        information, pull = _own(view)
+        total.information[rows] += information[k]
+        total.pull[rows] += pull[k]
+        total.squares[rows] += np.einsum("ni,nij,nj->n", view.residual, view.inverse, view.residual)[k]
+        total.coordinates[rows] += 2
+        high[rows] |= view.high[k]
+    return total, (total.coordinates >= 4) & ~high
+
+
+def _own(view: _LeftOut) -> tuple[Floats, Floats]:
+    """What each view says of the displacement of its point: information (n, 3, 3) and pull (n, 3)."""
+    weighted = view.inverse @ view.slope
+    return view.slope.swapaxes(1, 2) @ weighted, np.einsum("nij,ni->nj", weighted, view.residual)
+
+
+def _estimated(views: list[_LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[LabelErrors, Floats] | None:
+    """The errors, and (n,) how much larger than usual each point's own scale is."""
+    agreement, good = _sums(views, kept, n)
+    rows = np.flatnonzero(good).astype(np.int64)
+    some = rows if len(rows) <= MOST else np.random.default_rng(0).choice(rows, MOST, replace=False)
+    errors = estimated(agreement.select(some))
+    if errors is None:
+        return None
+    size = np.ones(len(good))
+    size[rows] = np.sqrt(errors.weights(agreement.select(rows)))
+    return errors, size
+
+
+def _judged(views: list[_LeftOut], kept: tuple[Bools, ...], found: LabelErrors, n: int) -> tuple[Bools, ...]:
+    """The views to use: those that agree with what the others say of where their point is."""
+    total, _ = _sums(views, kept, n)
+    noise2 = found.noise**2
+    prior = np.linalg.inv(found.covariance)
+    judged = []
+    for view, k in zip(views, kept, strict=True):
+        information, pull = _own(view)
+        others = (total.information[view.rows] - np.where(k[:, None, None], information, 0)) / noise2 + prior
+        drawn = (total.pull[view.rows] - np.where(k[:, None], pull, 0)) / noise2
+        where = np.linalg.inv(others)
+        residual = view.residual - np.einsum("nij,njk,nk->ni", view.slope, where, drawn)
+        covariance = noise2 * np.linalg.inv(view.inverse) + view.slope @ where @ view.slope.swapaxes(1, 2)
+        distance = np.einsum("ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
+        judged.append(np.asarray(distance <= OUTLIER, dtype=np.bool_))
+    return tuple(judged)
+
+
+def left_out_points(fitted: FittedRig, points: Floats, seen: tuple[Sightings, ...]) -> tuple[Floats, Floats]:
+    """Of the known points that two cameras see: the error (m, 3) against the known position of each, measured without
+    its own views, and its covariance (m, 3, 3), in which the error of the position is included; eq. (18) with all views
+    of a point together. seen: what each fitted camera saw."""
+    errors, posterior = fitted.label_errors, fitted.posterior
+    assert errors is not None
+    assert errors.size is not None
+    n, C = len(points), len(seen)
+    residual, slope = np.zeros((n, 2 * C)), np.zeros((n, 2 * C, 3))
+    noise2, half = np.ones((n, 2 * C)), np.zeros((n, 2 * C, posterior.root(0).shape[0]))
+    shift = np.zeros((n, 3))
+    if fitted.errors is not None and posterior.unknowns is not None:
+        shift = fitted.errors.scaled @ posterior.unknowns.mean
+    for c, (one, kept) in enumerate(zip(seen, fitted.kept, strict=True)):
+        used, pair = one.select(kept), slice(2 * c, 2 * c + 2)
+        model, where = posterior.models[c], (points + shift)[used.rows]
+        rows = model.rows(where)
+        residual[used.rows, pair] = used.uv - rows.mean
+        slope[used.rows, pair] = model.predict(where)[1]
+        noise2[used.rows, pair] = (model.noise * used.relative)[:, None] ** 2
+        half[used.rows, pair] = spread(rows, posterior.root(c))
+    own = slope @ (errors.root * errors.size[:, None, None])
+    views = noise2[:, :, None] * np.eye(2 * C) + own @ own.swapaxes(1, 2)
+    without = views @ np.linalg.solve(
+        views - half @ half.swapaxes(1, 2), np.concatenate([views, residual[..., None]], 2)
+    )
+    measured = without[:, :, :-1] - own @ own.swapaxes(1, 2)  # a measurement does not know of the label's error
+    weighted = np.linalg.solve(measured, slope)
+    information = slope.swapaxes(1, 2) @ weighted
+    good = (np.linalg.eigvalsh(information)[:, 0] > 1e-12 * np.trace(information, axis1=1, axis2=2)) & (
+        np.sum(slope.any(axis=2), axis=1) >= 4
+    )
+    covariance = np.linalg.inv(information[good])
+    error = np.einsum("nij,nkj,nk->ni", covariance, weighted[good], without[good, :, -1])
+    return error, covariance + errors.covariance

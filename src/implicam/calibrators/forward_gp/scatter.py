@@ -1,0 +1,174 @@
+"""Cameras tied by errors of single known positions, and of shots besides: eqs. (14) and (15), in few numbers.
+
+Each camera alone, as if the positions were exact, has the covariance W^T W of its unknowns. In units of these
+(*white*), what the errors take away is a symmetric matrix with eigenvalues below one, and of those that matter there
+are a few dozen. So the joint covariance is block diagonal plus low rank, eq. (27), and measuring costs little more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.lens import Floats
+from implicam.calibrators.forward_gp.posterior import (
+    CameraModel,
+    Posterior,
+    ShotErrors,
+    Sightings,
+    Unknowns,
+    camera_normals,
+    moved,
+    solve_normal,
+    spread,
+)
+from implicam.threads import side_by_side
+
+TOGETHER = 512
+"""Points at a time: each has a row of all cameras' unknowns."""
+
+NEGLIGIBLE = 1e-4
+"""Relative growth of a variance by the tie below which it is left out."""
+
+LOST = 1 - 1e-12
+"""At most this part of what a camera alone knows is taken away: the rest is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """How single known positions are off: `displacement of point i = size[i] root N(0, I)`, root (3, 3), size (n,)."""
+
+    root: Floats
+    size: Floats
+
+
+def condition_scattered(
+    models: tuple[CameraModel, ...],
+    points: Floats,
+    sightings: tuple[Sightings, ...],
+    errors: ShotErrors | None,
+    scatter: Scatter,
+) -> Posterior:
+    """As `posterior.condition`, where each known point has an error of its own. errors: those of shots besides, all
+    as one "shot"; or None."""
+    normals = camera_normals(models, points, sightings)
+    alone = [solve_normal(normal.A, normal.b) for normal in normals]
+    rig = _Rig(models, points, sightings, errors, scatter, tuple(root for root, _, _ in alone))
+    b = np.concatenate([root @ normal.b for root, normal in zip(rig.alone, normals, strict=True)])
+    value = -sum(normal.squares + normal.logs + log for normal, (_, _, log) in zip(normals, alone, strict=True))
+    k, P = rig.shot_unknowns, len(b)
+    shots = np.eye(k, k + P + 1)  # normal equations of the shots: with themselves, with the cameras, right hand side
+    M = np.zeros((P, P))
+    for views, slopes in rig.views():
+        shots += np.tensordot(views[:, :, :k], views, axes=((0, 1), (0, 1)))
+        half, squares_less_logs = _eliminated(*_displacements(views, slopes))
+        value += squares_less_logs
+        shots -= half[:, :k].T @ half
+        M += half[:, k:-1].T @ half[:, k:-1]
+        b -= half[:, k:-1].T @ half[:, -1]
+    if k:
+        half, squares_less_logs = _eliminated(shots[None, :, :k], shots[None, :, k:])
+        value += squares_less_logs
+        M += half[:, :-1].T @ half[:, :-1]
+        b -= half[:, :-1].T @ half[:, -1]
+    lost, turned = np.linalg.eigh(M)
+    lost = np.clip(lost, 0, LOST)
+    grown = lost / (1 - lost)
+    white = b + turned @ (grown * (turned.T @ b))  # (I - M)^-1 b
+    value += float(b @ white) - float(np.sum(np.log1p(-lost)))
+    kept = grown > NEGLIGIBLE
+    ties = np.sqrt(grown[kept])[:, None] * turned[:, kept].T
+    unknowns = _unknowns(shots, white, ties) if k else None
+    means = [root.T @ part for root, part in zip(rig.alone, rig.split(white), strict=True)]
+    return Posterior(
+        moved(models, means),
+        rig.alone,
+        None,
+        tuple(mean[: model.camera.size] for model, mean in zip(models, means, strict=True)),
+        0.5 * value,
+        unknowns,
+        rig.displacement(white, np.zeros(0) if unknowns is None else unknowns.mean),
+        np.hstack([part.T @ root for part, root in zip(rig.split(ties.T), rig.alone, strict=True)]).copy(),
+    )
+
+
+def _displacements(views: Floats, slopes: Floats) -> tuple[Floats, Floats]:
+    """Normal equations of the points' displacements: H (m, 3, 3), and (m, 3, k + P + 1) with all the rest."""
+    across = slopes.swapaxes(1, 2)
+    return np.eye(3) + across @ slopes, across @ views
+
+
+def _eliminated(H: Floats, rest: Floats) -> tuple[Floats, float]:
+    """L^-1 rest, of H = L L^T, its rows one below the other; and what it adds to twice the evidence."""
+    L = np.linalg.cholesky(H)
+    half = np.linalg.solve(L, rest).reshape(-1, rest.shape[2])
+    logs = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
+    return half, float(np.sum(half[:, -1] ** 2)) - logs
+
+
+def _unknowns(shots: Floats, white: Floats, ties: Floats) -> Unknowns:
+    """What is known of the shots' errors, after that of the cameras, whose root is their own roots above the ties."""
+    inverse = np.linalg.inv(shots[:, : len(shots)])
+    pull = inverse @ shots[:, len(shots) : -1]
+    cross = -np.concatenate([np.eye(len(white)), ties]) @ pull.T
+    return Unknowns(inverse @ shots[:, -1] - pull @ white, inverse + cross.T @ cross, cross)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rig:
+    """What is given, and alone: per camera the root (P, P) of what is known of it if the positions are exact."""
+
+    models: tuple[CameraModel, ...]
+    points: Floats
+    sightings: tuple[Sightings, ...]
+    errors: ShotErrors | None
+    scatter: Scatter
+    alone: tuple[Floats, ...]
+
+    @property
+    def shot_unknowns(self) -> int:
+        """Their number."""
+        return 0 if self.errors is None else self.errors.basis.shape[2]
+
+    def split(self, white: Floats) -> list[Floats]:
+        """Into the parts of each camera, along the first axis."""
+        return np.split(white, np.cumsum([len(root) for root in self.alone])[:-1])
+
+    def views(self) -> Iterator[tuple[Floats, Floats]]:
+        """Some points at a time, in units of the noise: (m, 2 C, k + P + 1) how their views depend on the shots and on
+        the white unknowns of the cameras, and what was seen; (m, 2 C, 3) on their own displacement, in its sds."""
+        for start in range(0, len(self.points), TOGETHER):
+            yield self._views(slice(start, min(start + TOGETHER, len(self.points))))
+
+    def _views(self, part: slice) -> tuple[Floats, Floats]:
+        m, C, k = part.stop - part.start, len(self.models), self.shot_unknowns
+        starts = k + np.cumsum([0, *(len(root) for root in self.alone)])
+        views, slopes = np.zeros((m, 2 * C, int(starts[-1]) + 1)), np.zeros((m, 2 * C, 3))
+        own = self.scatter.root * self.scatter.size[part, None, None]
+
+        def fill(c: int) -> None:
+            seen = self.sightings[c]
+            seen = seen.select((seen.rows >= part.start) & (seen.rows < part.stop))
+            model = self.models[c].without_weights()
+            rows = model.rows(self.points[seen.rows])
+            noise = (model.noise * seen.relative)[:, None, None]
+            at, pair = seen.rows - part.start, slice(2 * c, 2 * c + 2)
+            by_point = rows.by_point / noise
+            if self.errors is not None:
+                views[at, pair, :k] = by_point @ self.errors.scaled[seen.rows]
+            views[at, pair, starts[c] : starts[c + 1]] = spread(rows, self.alone[c]) / noise
+            views[at, pair, -1] = (seen.uv - rows.mean) / noise[..., 0]
+            slopes[at, pair] = by_point @ own[at]
+
+        side_by_side(fill, range(C))
+        return views, slopes
+
+    def displacement(self, white: Floats, shots: Floats) -> Floats:
+        """(n, 3) of the known points, the posterior mean, that of their shot included."""
+        taken = np.concatenate([-shots, -white, [1.0]])
+        parts = [_displacements(*each) for each in self.views()]
+        found = np.concatenate([np.linalg.solve(H, (rest @ taken)[..., None])[..., 0] for H, rest in parts])
+        found = self.scatter.size[:, None] * (found @ self.scatter.root.T)
+        return found if self.errors is None else found + self.errors.scaled @ shots
