@@ -27,7 +27,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from implicam.compare import Trial
-from implicam.coverage import Estimate, Summary
+from implicam.coverage import NEES_RIGHT, Estimate, Summary
 from implicam.demo import HELD_OUT, Demo
 from implicam.detect.folder import DetectionRun
 from implicam.evaluate import Evaluation
@@ -35,6 +35,8 @@ from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 
 MOST_NOTES = 6
+SMALLEST_IN_DECIMALS = 1e-8
+"""Smaller numbers would be nothing but zeros."""
 err = Console(stderr=True, highlight=False)
 
 
@@ -105,6 +107,8 @@ def number(value: float, digits: int = 3) -> str:
     if value == 0:
         return "0"
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    if abs(value) < SMALLEST_IN_DECIMALS:
+        return f"{value:.{digits - 1}e}"
     return f"{value:.{min(decimals, 9)}f}"
 
 
@@ -216,6 +220,8 @@ def interval(estimate: Estimate) -> str:
 def verdict(overall: Summary) -> str:
     """What the coverage says of the error bars, in a sentence."""
     text = f"error bars: {overall.verdict}"
+    if math.isfinite(overall.nees.value):
+        text += f"; the mean NEES is {interval(overall.nees)}, and {NEES_RIGHT:.0f} is right"
     if math.isfinite(overall.sd_factor):
         inside = 100 * overall.level(0.95).ellipsoid.value
         text += (
