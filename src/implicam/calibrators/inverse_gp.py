@@ -27,13 +27,14 @@ from implicam.calibrators.protocol import (
     Arrays,
     Rejected,
     Unused,
+    copied_points,
     finite_column,
     require_points,
     require_two_values,
     same_cameras,
     why_not_all_seen,
 )
-from implicam.dataset import Dataset, Floats, Names, Observations
+from implicam.dataset import Dataset, Floats, Names, Observations, copy_notes, without_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, maximise_each
 from implicam.measurement import Measurement
@@ -120,7 +121,9 @@ class InverseGP:
 
 
 def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
-    """The points with every view, and why the others are not used; FitError where they are too few."""
+    """The points with every view, each once, and why the others are not used; FitError where they are too few."""
+    copied = copied_points(data)
+    data = without_copies(data, cameras_too=True)
     seen = data.observations.seen
     complete = seen.all(axis=1)
     names = data.observations.camera_names
@@ -134,7 +137,7 @@ def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]
     require_points(int(complete.sum()), least, method, why)
     usable = data.select(complete)
     require_two_values(usable.xyz, method)
-    return usable, unused
+    return usable, (*unused, *copied)
 
 
 def pixels_of(data: Dataset) -> Floats:
@@ -176,6 +179,11 @@ class InverseGPCalibration:
 
     method: ClassVar[str] = "inverse-gp"
 
+    @cached_property
+    def used(self) -> Dataset:
+        """The data without the points and cameras that are there twice."""
+        return without_copies(self.data, cameras_too=True)
+
     @property
     def rejected(self) -> tuple[Rejected, ...]:
         """None: this method uses every view of the points it uses; `notes` names suspects."""
@@ -184,7 +192,7 @@ class InverseGPCalibration:
     @cached_property
     def processes(self) -> tuple[GaussianProcess, ...]:
         """The three conditioned GPs, in standardised units."""
-        usable = self.data.select(self.data.observations.seen.all(axis=1))
+        usable = self.used.select(self.used.observations.seen.all(axis=1))
         X, Y = self.pixels.apply(pixels_of(usable)), self.positions.apply(usable.xyz)
 
         def one(pair: tuple[Hyperparameters, Floats]) -> GaussianProcess:
@@ -195,7 +203,7 @@ class InverseGPCalibration:
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure the points that every camera saw; the others keep their row, with a reason."""
-        observations = same_cameras(self.data.observations, observations)
+        observations = same_cameras(self.used.observations, observations)
         seen = observations.seen
         complete = seen.all(axis=1)
         n = len(observations)
@@ -240,7 +248,7 @@ class InverseGPCalibration:
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*flat_note(self.data), *lattice_note(self.data, self.method), *self._suspects()]
+        return [*copy_notes(self.data), *flat_note(self.data), *lattice_note(self.data, self.method), *self._suspects()]
 
     def _suspects(self) -> list[str]:
         """Known points that the others contradict: a wrong detection, a wrong position."""
@@ -249,7 +257,7 @@ class InverseGPCalibration:
             mean, variance = gp.leave_one_out()
             errors.append(np.abs(gp.y - mean) / np.sqrt(variance))
         worst = np.max(errors, axis=0)
-        names = self.data.points[self.data.observations.seen.all(axis=1)]
+        names = self.used.points[self.used.observations.seen.all(axis=1)]
         found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > SUSPECT]
         if not found:
             return []
@@ -298,8 +306,9 @@ class InverseGPCalibration:
             str(table["kernel"]), str(table["preset"]), int(table["seed"]), float(table["shortest_lengthscale"])
         )
         _, unused = seen_by_all(data, cls.method)
-        d = 2 * len(data.cameras)
-        pixels, positions = scalings(arrays, data)
+        used = without_copies(data, cameras_too=True)
+        d = 2 * len(used.cameras)
+        pixels, positions = scalings(arrays, used)
         lengthscale = finite_column(arrays, "lengthscale", (3, d), positive=True)
         signal = finite_column(arrays, "signal_variance", (3,), positive=True)
         noise, mean = finite_column(arrays, "noise_variance", (3,), positive=True), finite_column(arrays, "mean", (3,))

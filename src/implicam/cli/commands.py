@@ -213,7 +213,7 @@ def calibrate_command(
 def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> None:
     residuals = calibration.residuals()
     unused = [asdict(unused) for unused in calibration.unused]
-    notes = calibration.notes()
+    notes = [*calibration.data.notes, *calibration.notes()]
     if json:
         show.emit_json(
             {"calibration": str(output), "method": calibration.method, "residuals": residuals, "unused": unused,
@@ -256,7 +256,7 @@ def measure_command(
         show.emit_json(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
              "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
-             "views_left_out": show.left_out(measured)}
+             "views_left_out": show.left_out(measured), "notes": list(data.notes)}
         )  # fmt: skip
         return
     text = f"{output}: {len(measured)} rows, {count} measured"
@@ -264,6 +264,7 @@ def measure_command(
         text += f", typical sd {', '.join(f'{a} {show.number(v)}' for a, v in zip('xyz', typical, strict=True))} "
         text += measured.length_unit
     show.line(text)
+    show.notes(data.notes)
     show.notes(show.reasons(measured))
     show.notes(show.left_out(measured))
 
@@ -418,9 +419,10 @@ def convert_command(
     data = read_dataset(dataset, unit=unit)
     write_dataset(data, out, overwrite=overwrite)
     if json:
-        show.emit_json({"dataset": str(out), "points": len(data)})
-    else:
-        show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
+        show.emit_json({"dataset": str(out), "points": len(data), "notes": list(data.notes)})
+        return
+    show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
+    show.notes(data.notes)
 
 
 @command("info")

@@ -7,7 +7,7 @@ parameters integrated out. The mathematics, with the numbered equations the code
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -25,8 +25,17 @@ from implicam.calibrators.forward_gp.posterior import Posterior
 from implicam.calibrators.forward_gp.problem import Frame, problem_of
 from implicam.calibrators.forward_gp.rig_map import RigMap
 from implicam.calibrators.forward_gp.shots import Shots
-from implicam.calibrators.protocol import Arrays, Rejected, Unused, finite_column, solvable
-from implicam.dataset import Dataset, Floats, Observations
+from implicam.calibrators.protocol import (
+    Arrays,
+    Rejected,
+    Unused,
+    blind_with_copies,
+    copied_points,
+    finite_column,
+    point_copy_notes,
+    solvable,
+)
+from implicam.dataset import Dataset, Floats, Observations, without_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -54,10 +63,15 @@ class ForwardGP:
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """Fit to all known points that any camera saw."""
-        frame = Frame.of(data, self.method)
+        used = without_copies(data)
+        frame = Frame.of(used, self.method)
         with solvable(), blas_threads(1):  # many small matrices, one after the other: two threads would wait
-            fitted = fit_rig(problem_of(self.lens, data, frame), progress)
-        return ForwardGPCalibration(self, data, frame, fitted)
+            fitted = fit_rig(problem_of(self.lens, used, frame), progress)
+        return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
+
+
+def _copies_named(data: Dataset, fitted: FittedRig) -> FittedRig:
+    return replace(fitted, blind=blind_with_copies(data, fitted.blind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +85,11 @@ class ForwardGPCalibration:
 
     method: ClassVar[str] = "forward-gp"
 
+    @cached_property
+    def used(self) -> Dataset:
+        """The data without what is there twice; of it are the numbers of points in the fit and its diagnosis."""
+        return without_copies(self.data)
+
     @property
     def posterior(self) -> Posterior:
         """What is known of each camera, in the working frame."""
@@ -80,7 +99,7 @@ class ForwardGPCalibration:
     def map(self) -> RigMap:
         """The cameras, and how they measure."""
         return RigMap(
-            self.data.observations, self.data.length_unit, self.frame, self.fitted.cameras, self.posterior, self._labels
+            self.used.observations, self.data.length_unit, self.frame, self.fitted.cameras, self.posterior, self._labels
         )
 
     @property
@@ -105,13 +124,13 @@ class ForwardGPCalibration:
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
         if errors is None or unknowns is None or self.fitted.label_sd is None:
             return None
-        shots = Shots.of(self.frame.inward(self.data.xyz), self.data.shots)
+        shots = Shots.of(self.frame.inward(self.used.xyz), self.used.shots)
         return None if shots is None else Labels(shots, errors.sd[0], self.fitted.label_sd[0], unknowns)
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """How it agrees with its own data."""
-        return Diagnosis(self.data, self.frame, self.fitted)
+        return Diagnosis(self.used, self.frame, self.fitted)
 
     @property
     def rejected(self) -> tuple[Rejected, ...]:
@@ -121,7 +140,7 @@ class ForwardGPCalibration:
     @property
     def unused(self) -> tuple[Unused, ...]:
         """The known points of which no view is used."""
-        return self.diagnosis.unused
+        return (*self.diagnosis.unused, *copied_points(self.data))
 
     def refit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """The same method with the same options on other data."""
@@ -135,12 +154,13 @@ class ForwardGPCalibration:
         if anew:
             return self.refit(data, progress)
         with solvable(), blas_threads(1):
-            fitted = fit_rig(problem_of(self.calibrator.lens, data, self.frame), progress, self.fitted)
-        return ForwardGPCalibration(self.calibrator, data, self.frame, fitted)
+            fitted = fit_rig(problem_of(self.calibrator.lens, without_copies(data), self.frame), progress, self.fitted)
+        return ForwardGPCalibration(self.calibrator, data, self.frame, _copies_named(data, fitted))
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*self.diagnosis.notes(), *self._label_notes(), *self.diagnosis.noise_notes()]
+        found = self.diagnosis
+        return [*point_copy_notes(self.data), *found.notes(), *self._label_notes(), *found.noise_notes()]
 
     def _label_notes(self) -> list[str]:
         if self._labels is None:
@@ -175,5 +195,6 @@ class ForwardGPCalibration:
         """Restore a calibration; nothing is computed again."""
         calibrator = ForwardGP(str(table["lens"]), int(table["seed"]))
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
-        fitted = saved.restored(calibrator.lens, data, working.inward(data.xyz), table, arrays)
+        used = without_copies(data)
+        fitted = saved.restored(calibrator.lens, used, working.inward(used.xyz), table, arrays)
         return cls(calibrator, data, working, fitted)
