@@ -256,9 +256,9 @@ def measure_command(
         show.emit_json(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
              "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
-             "views_left_out": show.left_out(measured), "notes": list(data.notes)}
+             "views_left_out": show.left_out(measured), "notes": list(data.notes), "alarm": measured.alarm}
         )  # fmt: skip
-        return
+        raise typer.Exit(int(bool(measured.alarm)))
     text = f"{output}: {len(measured)} rows, {count} measured"
     if count:
         text += f", typical sd {', '.join(f'{a} {show.number(v)}' for a, v in zip('xyz', typical, strict=True))} "
@@ -267,6 +267,9 @@ def measure_command(
     show.notes(data.notes)
     show.notes(show.reasons(measured))
     show.notes(show.left_out(measured))
+    if measured.alarm:
+        show.alarm(f"{measured.alarm}. Every row says that it is doubtful.")
+    raise typer.Exit(int(bool(measured.alarm)))
 
 
 def _read_to_measure(path: Path, unit: str | None, likely: str) -> Dataset:
@@ -361,7 +364,8 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
             {"method": evaluation.method, "how": evaluation.how, "against": evaluation.against,
              "length_unit": evaluation.data.length_unit, **evaluation.coverage.as_dict(),
              "not_measured": show.reasons(evaluation.measurement),
-             "views_left_out": show.left_out(evaluation.measurement), "notes": list(evaluation.notes),
+             "views_left_out": show.left_out(evaluation.measurement), "alarm": evaluation.measurement.alarm,
+             "notes": list(evaluation.notes),
              "report": None if report is None else str(report)}
         )  # fmt: skip
         return
@@ -373,6 +377,8 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
         show.line(f"report: {report}")
     show.notes(show.reasons(evaluation.measurement))
     show.notes(show.left_out(evaluation.measurement))
+    if evaluation.measurement.alarm:
+        show.alarm(evaluation.measurement.alarm)
     show.notes(evaluation.notes)
 
 

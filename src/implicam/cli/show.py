@@ -121,7 +121,8 @@ def percent(share: Estimate) -> str:
 
 def reasons(measurement: Measurement) -> list[str]:
     """How many points could not be measured, and why, the commonest reason first."""
-    return counted(map(str, measurement.reason[~measurement.measured]), "point", "not measured")
+    own = measurement.own_reason[~measurement.measured]
+    return counted(map(str, own), "point", "not measured")
 
 
 def left_out(measurement: Measurement) -> list[str]:
@@ -129,7 +130,8 @@ def left_out(measurement: Measurement) -> list[str]:
 
     The reason of a measured point says so, and goes on from its name: `measured without cam3, whose view ...`.
     """
-    without = Counter(map(str, measurement.reason[measurement.measured & (measurement.reason != "")]))
+    own = measurement.own_reason
+    without = Counter(map(str, own[measurement.measured & (own != "")]))
     each = [f"{_count(count, 'point')} {reason}" for reason, count in without.most_common()]
     total = f"{without.total()} points measured without a view that contradicts the others; of these:"
     return each if len(each) < 2 else [total, *each]
@@ -143,6 +145,11 @@ def counted(reasons: Iterable[str], noun: str, what: str) -> list[str]:
 
 def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def alarm(text: str) -> None:
+    """Something that makes the numbers not to be trusted."""
+    err.print(f"[bold red]alarm:[/] {escape(text)}", soft_wrap=True)
 
 
 def notes(texts: Sequence[str]) -> None:
