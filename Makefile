@@ -2,6 +2,7 @@
 # make check  all that CI checks                        make bench  speed against the limits
 # make real   the table of docs/real-data.md            make rigs   the tables of docs/choose.md on forward-gp
 # make methods   all methods side by side, the first table of docs/choose.md
+# make odd       300 rigs of all kinds: how many are right, refused, silently wrong
 # make active   the tables and the figure of docs/active.md
 # make paper  the paper's experiments, 21 minutes; docs/reproduce.md
 # make clean  start over
@@ -10,7 +11,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-slow check lint bench real rigs methods active paper clean
+.PHONY: demo test test-slow check lint bench real rigs methods odd active paper clean
 
 demo: $(VENV)/.demo
 	$(BIN)/implicam demo
@@ -33,6 +34,9 @@ bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/gp_fit.py
 	$(BIN)/python benchmarks/forward_speed.py
 	$(BIN)/python benchmarks/active_speed.py
+
+odd: $(VENV)/.dev
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/odd_rigs.py -o benchmarks/results/odd_rigs.md
 
 rigs: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/forward.py --rigs 16

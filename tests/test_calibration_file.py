@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from implicam import calibration_file
-from implicam.calibration_file import ARRAYS, TOML
+from implicam.calibration_file import ARRAYS, FORMAT_VERSION, TOML
 from implicam.calibrators import ForwardGP, InverseGP, InverseGPCalibration, load_calibration
 from implicam.dataset import Dataset, Observations, arrays_from_dataset, dataset_from_arrays
 from implicam.errors import CalibrationFileError, ImplicamError
@@ -120,7 +120,7 @@ def test_the_readable_part_says_what_formats_md_promises(original: InverseGPCali
     assert table["residuals"] == original.residuals()
     assert table["options"]["kernel"] == "squared-exponential"
     assert table["known_points"] == len(original.data)
-    assert table["format_version"] == 1
+    assert table["format_version"] == FORMAT_VERSION
     assert calibration_file.describe(saved) == table
 
 
@@ -163,9 +163,10 @@ def test_a_file_of_format_1_measures_as_on_the_day_it_was_made() -> None:
 FORWARD = REFERENCE.with_name("v1-forward-gp.implicam")
 
 
-def test_a_forward_gp_file_of_format_1_measures_as_on_the_day_it_was_made() -> None:
-    calibration = load_calibration(FORWARD)
-    expected = tomllib.loads(FORWARD.with_suffix(".toml").read_text())
+@pytest.mark.parametrize("path", [FORWARD, REFERENCE.with_name("v1-forward-gp-none.implicam")], ids=lambda p: p.stem)
+def test_a_forward_gp_file_of_format_1_measures_as_on_the_day_it_was_made(path: Path) -> None:
+    calibration = load_calibration(path)
+    expected = tomllib.loads(path.with_suffix(".toml").read_text())
     measured = calibration.measure(calibration.data.observations.select(np.arange(3)))
     np.testing.assert_allclose(measured.xyz, expected["xyz"], rtol=0, atol=1e-6)
     np.testing.assert_allclose(measured.sd, expected["sd"], rtol=1e-6)
@@ -433,7 +434,7 @@ TOML_EDITS: dict[str, Callable[[dict[str, Any]], None]] = {
     "version 0": lambda t: t.update(format_version=0),
     "version -1": lambda t: t.update(format_version=-1),
     "version 1.0": lambda t: t.update(format_version=1.0),
-    "newer": lambda t: t.update(format_version=2),
+    "newer": lambda t: t.update(format_version=FORMAT_VERSION + 1),
     "much newer": lambda t: t.update(format_version=2**62),
     "no method": lambda t: t.pop("method"),
     "method number": lambda t: t.update(method=1),

@@ -13,6 +13,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -466,6 +467,12 @@ USAGE = {
     "simulate x --grid 5x5": "is not a grid",
     "simulate x --grid 0x5x5": "is not a grid",
     "simulate x --unit km": "choose mm or m",
+    "simulate x --tilt 40": "it must be from 0 to 30 degrees",
+    "simulate x --aspect 0": "it must be from 0.2 to 5",
+    "simulate x --window -2": "it must be from 0 to 100 mm",
+    "simulate x --mirror cam7": "has no camera 'cam7'",
+    "simulate x --window 10 --images": "looks through a window cannot be photographed",
+    "simulate x --mirror all --images --target board": "a board in a mirror cannot be photographed",
     "simulate x.csv": "this command writes a folder",
 }
 FAILURES = {
@@ -632,6 +639,24 @@ def test_simulate_options_do_what_they_say(cli: Cli) -> None:
     assert np.abs(again.observations.uv - plain.observations.uv).max() < 5  # the same rig, other noise
     assert np.abs(other.observations.uv - plain.observations.uv).max() > 5  # another rig
     assert len(simulated("--rig", "dome5", "--positions", "random", "--points", 12).cameras) == 5
+
+
+def test_simulate_makes_cameras_that_are_not_ordinary(cli: Cli) -> None:
+    odd = ["--tilt", "5", "--mirror", "cam2", "--aspect", "1.25", "--window", "15"]
+    assert cli("simulate", "odd", "--rig", "stereo", "--noise", 0, *odd).code == 0
+    assert cli("simulate", "plain", "--rig", "stereo", "--noise", 0).code == 0
+    truth, plain_truth = (tomllib.loads((Path(name) / "truth.toml").read_text()) for name in ("odd", "plain"))
+    assert (truth["tilt"], truth["mirror"], truth["aspect"], truth["window"]) == (5, "cam2", 1.25, 15)
+    assert not set(truth) - set(plain_truth) - {"tilt", "mirror", "aspect", "window"}
+    cam1, cam2 = truth["cameras"]
+    assert "mirrored" not in cam1
+    assert cam2["mirrored"]
+    assert cam1["height"] == 1280
+    assert cam1["window"]["thickness"] == 15
+    data, plain = read_dataset("odd"), read_dataset("plain")
+    np.testing.assert_array_equal(data.xyz, plain.xyz)
+    assert data.truth is not None
+    assert np.isfinite(data.truth.limit[data.observations.seen.all(axis=1)]).all()
 
 
 def test_simulate_refuses_to_overwrite_unless_told(cli: Cli) -> None:

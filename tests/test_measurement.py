@@ -106,3 +106,12 @@ def test_writing_is_whole_or_not_at_all(tmp_path: Path) -> None:
     (tmp_path / "dir.csv").mkdir()
     with pytest.raises(ImplicamError, match="cannot write"):
         measurement().write_csv(tmp_path / "dir.csv")
+
+
+def test_a_covariance_is_symmetric_whatever_order_it_was_summed_in() -> None:
+    m = measurement()
+    skewed = m.cov.copy()
+    skewed[0, 0, 1] = np.nextafter(skewed[0, 0, 1], 1.0)
+    cov = Measurement(m.points, m.xyz, skewed, m.views, m.consistency, m.reason, "mm").cov
+    np.testing.assert_array_equal(cov, cov.swapaxes(1, 2))
+    np.testing.assert_allclose(cov, m.cov, rtol=1e-15)

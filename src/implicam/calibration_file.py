@@ -5,7 +5,8 @@ depend on the calibration only: no dates, so the same fit gives the same file. R
 checked before memory is spent, the arrays against a SHA-256, every shape and sign against the data, and whatever does
 not fit is a CalibrationFileError.
 
-Format versions: 1 (this one). A newer version is refused with the cure; an older one will be converted in `_UPGRADES`.
+Format versions: 2 (this one): cameras of forward-gp say which model, lens and kind they are. A newer version is refused
+with the cure; an older one is converted in `_UPGRADES`.
 """
 
 from __future__ import annotations
@@ -30,13 +31,30 @@ from implicam.dataset.tables import parse_toml
 from implicam.errors import CalibrationFileError, ImplicamError
 from implicam.files import inflated_bytes, npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MAX_BYTES = 1 << 31
 TOML, ARRAYS = "calibration.toml", "arrays.npz"
 PIXEL_CONVENTION = "(u, v) = (column, row); (0, 0) is the centre of the top-left pixel"
 _DATA, _METHOD = "data/", "method/"  # where an array belongs
 
-_UPGRADES: dict[int, Callable[[dict[str, Any], dict[str, NDArray[Any]]], None]] = {}
+
+def _upgrade_1(table: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """forward-gp had one lens for all cameras, one lengthscale, and counted log distance as it is."""
+    if table.get("method") != "forward-gp":
+        return
+    options = table["options"]
+    lens = str(options["lens"])
+    if lens not in ("central", "none"):
+        raise ValueError(f"{lens!r} is no lens of forward-gp")
+    described = {"model": lens, "lens": "none" if lens == "none" else "kannala-brandt"}
+    described["kind"] = "none" if lens == "none" else "ordinary"
+    options["cameras"] = [{"name": str(name), **described, "mirrored": False} for name in options["calibrated"]]
+    sizes = arrays[_METHOD + "sizes"]
+    arrays[_METHOD + "sizes"] = np.hstack([sizes, np.tile([0.0, 1.0], (len(sizes), 1))])
+    arrays[_METHOD + "lengthscale"] = np.tile(arrays[_METHOD + "lengthscale"], (len(sizes), 1))
+
+
+_UPGRADES: dict[int, Callable[[dict[str, Any], dict[str, NDArray[Any]]], None]] = {1: _upgrade_1}
 """Format version -> a function that turns its table and arrays into those of the next."""
 
 

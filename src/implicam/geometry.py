@@ -32,6 +32,12 @@ ENOUGH = 120
 UNDETERMINED = 1e-14
 """The second-smallest eigenvalue, as a part of the largest, below which the null space is not one vector."""
 
+SUBSETS_OF_LINEAR = 40
+"""Random subsets of seven points that a linear resection tries: with a fifth of wrong views eight of them hold none."""
+
+FAR_OUT = 4.0
+"""Times the distance from the middle that three quarters of the pixels keep: what is farther off is a wild view."""
+
 PINHOLE_TO = 1.2
 """Radians off the axis beyond which no lens is a pinhole."""
 
@@ -130,6 +136,90 @@ def resect(xyz: Floats, uv: Floats) -> Floats:
     p = p / np.linalg.norm(p[2, :3])
     in_front = np.median(_homogeneous(xyz) @ p[2]) > 0
     return p if in_front else -p
+
+
+def resect_robustly(xyz: Floats, uv: Floats) -> tuple[Floats, Bools]:
+    """As `resect`, where some views may be wrong; and the views (n,) that agree. Points (n, 3), all seen at (n, 2).
+
+    Of random subsets of seven points the one with the least median error (always the same subsets), then three times
+    what agrees with it.
+    """
+    rng = np.random.default_rng(0)
+    best, kept = np.inf, np.ones(len(xyz), dtype=np.bool_)
+    subsets = [np.arange(len(xyz))]
+    if len(xyz) >= 2 * FEWEST:
+        subsets += [rng.choice(len(xyz), FEWEST + 1, replace=False) for _ in range(SUBSETS_OF_LINEAR)]
+    for rows in subsets:
+        try:
+            error = _linear_error(resect(xyz[rows], uv[rows]), xyz, uv)
+        except FitError:
+            continue
+        if np.median(error) < best:
+            best, kept = float(np.median(error)), error <= np.quantile(error, 0.7)
+    if not np.isfinite(best):
+        raise _undetermined()
+    for _ in range(3):
+        p = resect(xyz[kept], uv[kept])
+        error = _linear_error(p, xyz, uv)
+        inside = error <= 4 * np.median(error[kept])
+        if inside.sum() < FEWEST + 1 or (inside == kept).all():
+            break
+        kept = inside
+    return p, np.asarray(kept, dtype=np.bool_)
+
+
+def _linear_error(p: Floats, xyz: Floats, uv: Floats) -> Floats:
+    """(n,) px between pixels and what a camera matrix projects, infinite behind it."""
+    u, v, w = (_homogeneous(xyz) @ p.T).T
+    w = np.where(w > 0, w, np.nan)
+    error = np.hypot(u / w - uv[:, 0], v / w - uv[:, 1])
+    return np.asarray(np.where(np.isnan(error), np.inf, error), dtype=np.float64)
+
+
+def camera_from_linear(p: Floats) -> tuple[float, Floats, Floats, bool, Pose] | None:
+    """The parts of a camera matrix: focal length, pixel shape (2,) p and q, principal point (2,), mirrored, pose.
+
+    `[fx skew; 0 fy]` up to a rotation about the axis is focal * exp([[p, q], [q, -p]]) (the polar decomposition), and a
+    negative determinant is a mirror: Hartley & Zisserman, section 6.2.4. None where the camera is at infinity.
+    """
+    size = float(np.linalg.norm(p[2, :3]))
+    if not size > 1e-12 * np.abs(p).max():
+        return None
+    p = p / size
+    axis = p[2, :3]
+    centre = p[:2, :3] @ axis
+    across = p[:2, :3] - np.outer(centre, axis)
+    values, vectors = np.linalg.eigh(across @ across.T)
+    if not values[0] > 1e-12 * values[1] > 0:
+        return None
+    root = vectors * np.sqrt(values) @ vectors.T
+    rows = np.linalg.solve(root, across)
+    mirrored = bool(np.cross(rows[0], rows[1]) @ axis < 0)
+    sign = np.array([-1.0 if mirrored else 1.0, 1.0])
+    rotation = np.vstack([rows * sign[:, None], axis])
+    sideways = sign * np.linalg.solve(root, p[:2, 3] - centre * p[2, 3])
+    focal = float(np.sqrt(np.linalg.det(root)))
+    log = vectors * (0.5 * np.log(values) - np.log(focal)) @ vectors.T
+    shape = np.array([0.5 * (log[0, 0] - log[1, 1]), log[0, 1]])
+    return focal, shape, centre, mirrored, Pose(rotation, np.append(sideways, p[2, 3]))
+
+
+def resect_affine(xyz: Floats, uv: Floats) -> tuple[Floats, Floats, Bools]:
+    """A (2, 3) and b (2,) of the parallel projection `A x + b` nearest to most views, and those (n,) that it explains.
+
+    FitError for points that fix none.
+    """
+    _check_spread(xyz)
+    kept = np.ones(len(xyz), dtype=np.bool_)
+    for _ in range(6):
+        found = np.linalg.lstsq(_homogeneous(xyz[kept]), uv[kept], rcond=None)[0]
+        error = np.linalg.norm(_homogeneous(xyz) @ found - uv, axis=1)
+        inside = error <= 3 * np.median(error)
+        if inside.sum() < FEWEST or (inside == kept).all() or _extents(xyz[inside])[2] < FLAT:
+            break
+        kept = inside
+    A, b = np.asarray(found[:3].T, dtype=np.float64), np.asarray(found[3], dtype=np.float64)
+    return A, b, np.asarray(kept, dtype=np.bool_)
 
 
 def camera_centre(p: Floats) -> Floats:
@@ -297,7 +387,7 @@ def candidate_rays(offset: Floats, every: int = 1) -> tuple[Floats, Bools, Float
     """A ladder of lenses: focal lengths (k,) in pixels, pinhole or equidistant (k,), and the unit rays (k, n, 3) that
     pixels (n, 2) off the middle then look along; every: only one rung in so many."""
     radius = np.linalg.norm(offset, axis=1)
-    outermost = float(radius.max()) or 1.0
+    outermost = float(radius[radius <= FAR_OUT * np.quantile(radius, 0.75)].max()) or 1.0  # no wild view decides
     widest = np.geomspace(0.03, 2.5, 40)[::every]  # radians at the outermost point
     bent = outermost / widest[:, None]
     theta = radius / bent

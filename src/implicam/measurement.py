@@ -44,6 +44,10 @@ class Measurement:
     length_unit: str
     alarm: str = ""
 
+    def __post_init__(self) -> None:
+        """A covariance is symmetric to the last bit, whatever order a method or a processor summed it in."""
+        object.__setattr__(self, "cov", 0.5 * (self.cov + self.cov.swapaxes(1, 2)))
+
     def __len__(self) -> int:
         return len(self.points)
 

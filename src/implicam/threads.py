@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import copy_context
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -40,4 +41,5 @@ def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[
     tasks = list(items)
     workers = max(1, min(len(tasks), cores()))
     with blas_threads(max(1, cores() // workers)), ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(work, tasks))
+        contexts = [copy_context() for _ in tasks]  # NumPy's error state, among others, is the caller's
+        return list(pool.map(lambda pair: pair[0].run(work, pair[1]), zip(contexts, tasks, strict=True)))

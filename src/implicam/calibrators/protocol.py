@@ -181,14 +181,15 @@ def require_two_values(xyz: NDArray[np.float64], method: str) -> None:
 
 @contextmanager
 def solvable() -> Iterator[None]:
-    """Turn equations of a fit without a solution into a FitError."""
+    """Turn equations of a fit without a solution into a FitError; numbers that run away on the way warn nobody."""
     try:
-        yield
+        with np.errstate(all="ignore"):
+            yield
     except np.linalg.LinAlgError as error:
         raise FitError(
             "the known points do not fix the rig: the equations have no solution.",
             why=str(error),
-            fix="add known points elsewhere in the volume, and look for wrong ones (implicam info DATASET)",
+            fix="add known points elsewhere in the volume, and look for wrong ones",
         ) from error
 
 

@@ -17,6 +17,7 @@ from implicam.errors import UsageError
 from implicam.files import toml_text
 from implicam.simulate import (
     Optics,
+    Unusual,
     as_boards,
     ball_grid,
     build_rig,
@@ -85,6 +86,18 @@ def simulate_command(
     outliers: Annotated[
         float, typer.Option(min=0, max=1, metavar="SHARE", help="Share of views that are wrong.")
     ] = 0.0,
+    tilt: Annotated[
+        float, typer.Option(metavar="DEG", help="Sensors tilted, each its own way (Scheimpflug), up to 30.")
+    ] = 0.0,
+    mirror: Annotated[
+        str, typer.Option(metavar="LIST", help="Cameras that look into a mirror, or all: v from below.")
+    ] = "",
+    aspect: Annotated[
+        float, typer.Option(metavar="RATIO", help="fy / fx: the pictures resized in height, 0.2 to 5.")
+    ] = 1.0,
+    window: Annotated[
+        float, typer.Option(metavar="MM", help="Thickness of a flat window, water behind it; 0 for none.")
+    ] = 0.0,
     images: Annotated[bool, typer.Option("--images", help="Also take photographs, for implicam detect.")] = False,
     image_noise: Annotated[
         float, typer.Option(min=0, max=0.5, metavar="PART", help="Noise of the photographs, part of full scale.")
@@ -107,7 +120,7 @@ def simulate_command(
         raise UsageError(f"a simulated rig has no unit {unit!r}.", fix="choose mm or m")
     built = build_rig(
         rig, seed=seed, lens_error=lens_error, noise=noise, frame=frame.value, unit="mm" if unit == "mm" else "m",
-        cameras=cameras,
+        cameras=cameras, unusual=Unusual(tilt, mirror, aspect, window),
     )  # fmt: skip
     shots = seed if shots_seed is None else shots_seed
     if target is Target.board:

@@ -20,8 +20,9 @@ from implicam.simulate.noise import (
     with_limit,
 )
 from implicam.simulate.photographs import BALL_RADIUS_MM, Optics, Recorded, Studio, record
-from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, build_rig, write_rig
+from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, Unusual, build_rig, write_rig
 from implicam.simulate.targets import Target, ball_grid, held_boards, moving_board, random_positions
+from implicam.simulate.window import Window
 
 __all__ = [
     "BALL_RADIUS_MM",
@@ -35,6 +36,8 @@ __all__ = [
     "SmoothError",
     "Studio",
     "Target",
+    "Unusual",
+    "Window",
     "as_boards",
     "ball_grid",
     "build_rig",

@@ -1,15 +1,22 @@
-"""One simulated camera: a lens, a pose, and a smooth error of the image that no lens model contains."""
+"""One simulated camera: a lens, a pose, and a smooth error of the image that no lens model contains.
+
+The light of a point goes through a window if there is one, a mirror if there is one, the lens, and falls on a sensor
+that may be tilted; the smooth error comes last. Pixels that are not square and a sensor that is cropped are the lens's
+own fx, fy, cx, cy.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from implicam.cameras import Lens
 from implicam.dataset import Floats
-from implicam.geometry import Pose
+from implicam.geometry import Pose, rotation_from_vector
+from implicam.simulate.window import Window
 
 WAVES = 64
 RANGE = 0.6
@@ -59,7 +66,13 @@ def random_error(rng: np.random.Generator, width: int, height: int, rms: float) 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCamera:
-    """A camera that knows itself perfectly: image size in pixels, lens, pose, smooth error, noise in pixels."""
+    """A camera that knows itself perfectly: image size in pixels, lens, pose, smooth error, noise in pixels.
+
+    tilt: rotation vector in radians about the image's u and v axes by which the sensor is turned away from square to
+    the lens's axis, about the point where that axis meets it (Scheimpflug). mirrored: it looks into a plane mirror, and
+    camera_from_world is where it seems to stand behind it; v counted from below and a left-handed world are the same.
+    window: a flat pane before it, with water behind.
+    """
 
     name: str
     width: int
@@ -68,13 +81,19 @@ class SimulatedCamera:
     camera_from_world: Pose
     error: SmoothError
     noise_sd: float
+    tilt: tuple[float, float] = (0.0, 0.0)
+    mirrored: bool = False
+    window: Window | None = None
 
     def pixel_from_world(self, xyz: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Pixels (n, 2) of world points (n, 3), without noise, and (n,) where they fall on the image.
 
         NaN where the lens gives no pixel at all; a pixel outside the image keeps its numbers.
         """
-        uv, valid = self.lens.pixel_from_camera_point(self.camera_from_world.apply(xyz))
+        uv, valid = self.lens.pixel_from_camera_point(self._before_lens(xyz))
+        if self._tilting is not None:
+            uv, facing = _projected(self._tilting, uv)
+            valid = valid & facing
         uv = uv + self.error.at(uv)
         on_image = (
             np.abs(uv - [(self.width - 1) / 2, (self.height - 1) / 2]) <= [self.width / 2, self.height / 2]
@@ -83,11 +102,69 @@ class SimulatedCamera:
 
     def jacobian(self, xyz: Floats) -> Floats:
         """(n, 2, 3) derivative of the pixels with respect to the world points, the smooth error included."""
-        points = self.camera_from_world.apply(xyz)
+        points = self._before_lens(xyz)
         uv, _ = self.lens.pixel_from_camera_point(points)
+        along = self.lens.jacobian(points)
+        if self._tilting is not None:
+            along = _projected_slope(self._tilting, uv) @ along
+            uv, _ = _projected(self._tilting, uv)
+        if self.mirrored:
+            along = along * MIRROR
+        if self.window is not None:
+            along = along @ self.window.jacobian(self.camera_from_world.apply(xyz))
         bend = np.eye(2) + self.error.jacobian(uv)
-        jacobian: Floats = bend @ self.lens.jacobian(points) @ self.camera_from_world.rotation
+        jacobian: Floats = bend @ along @ self.camera_from_world.rotation
         return jacobian
+
+    def ray_from_pixel(self, uv: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Unit rays (n, 3) in the camera frame of pixels (n, 2), before any window; and (n,) where they exist.
+
+        The smooth error is left out: take it off the pixels before, where it matters.
+        """
+        if self._tilting is not None:
+            uv, _ = _projected(np.asarray(np.linalg.inv(self._tilting), dtype=np.float64), uv)
+        rays, valid = self.lens.ray_from_pixel(uv)
+        return rays * MIRROR if self.mirrored else rays, valid
+
+    def _before_lens(self, xyz: Floats) -> Floats:
+        """Where world points (n, 3) seem to be to the lens, in the camera frame."""
+        points = self.camera_from_world.apply(xyz)
+        if self.window is not None:
+            points, _ = self.window.apparent(points)
+        return points * MIRROR if self.mirrored else points
+
+    @cached_property
+    def _tilting(self) -> Floats | None:
+        """(3, 3) pixels on the tilted sensor from pixels on one square to the axis, None for none.
+
+        A ray (x, y, 1) meets the plane through (0, 0, 1) that the rotation's first two columns span.
+        """
+        if not any(self.tilt):
+            return None
+        turn = rotation_from_vector([*self.tilt, 0.0])
+        ray_to_plane = np.vstack([turn.T[:2] * turn[2, 2] - np.outer(turn[2, :2], turn[:, 2]), turn[:, 2]])
+        lens = self.lens
+        intrinsics = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+        return np.asarray(intrinsics @ ray_to_plane @ np.linalg.inv(intrinsics), dtype=np.float64)
+
+
+MIRROR = np.array([-1.0, 1.0, 1.0])
+"""What a mirror does to the camera frame."""
+
+
+def _projected(homography: Floats, uv: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Pixels (n, 2) by a homography, and (n,) which are before it; NaN for the others."""
+    ends = uv @ homography[:, :2].T + homography[:, 2]
+    before = ends[:, 2] > 0
+    return ends[:, :2] / np.where(before, ends[:, 2], np.nan)[:, None], before
+
+
+def _projected_slope(homography: Floats, uv: Floats) -> Floats:
+    """(n, 2, 2) derivative of `_projected`."""
+    to, _ = _projected(homography, uv)
+    scale = uv @ homography[2, :2] + homography[2, 2]
+    slope = homography[:2, :2] - to[:, :, None] * homography[2, :2]
+    return np.asarray(slope / scale[:, None, None], dtype=np.float64)
 
 
 def _affine_basis(uv: Floats) -> Floats:

@@ -84,6 +84,20 @@ class Studio:
     covered: float = 0.0
     ball_radius_mm: float = BALL_RADIUS_MM
 
+    def __post_init__(self) -> None:
+        if any(camera.window is not None for camera in self.rig.cameras):
+            raise UsageError(
+                "a rig that looks through a window cannot be photographed.",
+                why="its lines of sight do not meet in one point, and the pictures are made of those that do",
+                fix="leave out --window, or --images",
+            )
+        if self.target.board is not None and any(camera.mirrored for camera in self.rig.cameras):
+            raise UsageError(
+                "a board in a mirror cannot be photographed.",
+                why="a checkerboard does not show that it is mirrored, and its corners would be numbered wrongly",
+                fix="leave out --images or --mirror, or show the ball",
+            )
+
     @cached_property
     def shots(self) -> list[str]:
         """The names of the shots, in the order of the target."""
@@ -346,11 +360,11 @@ def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
     straight = grid.copy()
     for _ in range(6):  # the smooth error changes by less than a per cent from pixel to pixel
         straight = grid - camera.error.at(straight)
-    rays, seen = camera.lens.ray_from_pixel(straight)
+    rays, seen = camera.ray_from_pixel(straight)
     middle = np.array([camera.lens.cx, camera.lens.cy])
     while not seen.all():
         straight[~seen] = middle + 0.98 * (straight[~seen] - middle)
-        rays[~seen], seen[~seen] = camera.lens.ray_from_pixel(straight[~seen])
+        rays[~seen], seen[~seen] = camera.ray_from_pixel(straight[~seen])
     directions = (rays @ camera.camera_from_world.rotation).reshape(len(vs), len(us), 3)
     u, v = np.arange(-PAD, size[0] + PAD), np.arange(-PAD, size[1] + PAD)
     planes = [RectBivariateSpline(vs, us, directions[:, :, k])(v, u) for k in range(3)]

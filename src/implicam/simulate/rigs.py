@@ -18,6 +18,7 @@ from implicam.dataset import Floats
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Pose, look_at, rotation_from_vector
 from implicam.simulate.camera import SimulatedCamera, random_error
+from implicam.simulate.window import Window
 
 BAR_FOCAL_MM = (1.55, 2.8, 2.8, 1.85, 2.2, 1.3)
 """The paper's effective focal lengths of cam1 ... cam6."""
@@ -36,6 +37,11 @@ CAMERA_SETS = {
 """The paper's sets of cameras of bar6: two regular, and two or four wide lenses."""
 
 SPECS = ("bar6", "stereo", "dome8")
+
+WATER_BEFORE_VOLUME_MM = 20.0
+"""Water between the window and what is nearest to it of the working volume (of a dome: of the ball around it)."""
+STEEPEST_TILT_DEG, THICKEST_WINDOW_MM, EXTREME_ASPECT = 30.0, 100.0, 5.0
+"""Beyond, the sensor would not see the volume, the glass would reach the cameras, the picture would be a stripe."""
 UNITS_PER_MM = {"mm": 1.0, "m": 1e-3}
 
 # Rows: what forward, left and up of a robot's base are on the bench (x right, y down, z away).
@@ -50,6 +56,35 @@ class Box:
     size: Floats
 
 
+@dataclass(frozen=True)
+class Unusual:
+    """What is unusual about all cameras of a rig, or some of them.
+
+    tilt: degrees by which each sensor is turned away from square to the lens's axis, each about a line of its own.
+    mirror: names of the cameras that look into a mirror, or see v counted from below, joined by commas; "all" for a
+    left-handed world. aspect: fy / fx, the pictures resized in height. window: thickness in mm of a flat pane of
+    acrylic glass with water behind it; 0 for none. Of a bar or a stereo pair it is one pane across the bench, of a dome
+    one before each camera, square to the line from there to the middle.
+    """
+
+    tilt: float = 0.0
+    mirror: str = ""
+    aspect: float = 1.0
+    window: float = 0.0
+
+    def __post_init__(self) -> None:
+        for what, value, low, high, unit in (
+            ("tilt", self.tilt, 0.0, STEEPEST_TILT_DEG, " degrees"),
+            ("aspect", self.aspect, 1 / EXTREME_ASPECT, EXTREME_ASPECT, ""),
+            ("window", self.window, 0.0, THICKEST_WINDOW_MM, " mm"),
+        ):
+            if not low <= value <= high:
+                raise UsageError(
+                    f"{what} = {value:g}{unit}; it must be from {low:g} to {high:g}{unit}.",
+                    fix={"tilt": "for example 10", "aspect": "for example 1.333", "window": "for example 15"}[what],
+                )
+
+
 @dataclass(frozen=True, eq=False)
 class Rig:
     """Cameras and the volume they watch, in a world frame with `length_unit`; built with `frame` and `seed`."""
@@ -60,6 +95,7 @@ class Rig:
     length_unit: str
     frame: str
     seed: int
+    unusual: Unusual = Unusual()
 
     @property
     def units_per_mm(self) -> float:
@@ -86,22 +122,33 @@ def build_rig(
     frame: Literal["robot", "random"] = "robot",
     unit: Literal["mm", "m"] = "mm",
     cameras: str | None = None,
+    unusual: Unusual = Unusual(),
 ) -> Rig:
     """A rig like `spec`: "bar6", "stereo", "dome8", or any "bar<N>" or "dome<N>"; every seed differs a little.
 
     lens_error: rms in pixels of the smooth error no lens model contains. noise: sd in pixels of a view. frame: a
     world like a robot's base (z up, axes parallel to the bench, origin elsewhere) or any rotation and offset.
     unit: of the world. cameras: names joined by commas, or a set of the paper ("2R", "2R2W", "2R4W"); the
-    rig itself stays the same.
+    rig itself stays the same. unusual: tilted sensors, mirrors, pixels that are not square, a window.
     """
     _check_options(seed=seed, lens_error=lens_error, noise=noise, frame=frame, unit=unit)
     mounts, size = _design(spec)
     world_from_bench = _world_from_bench(np.random.default_rng([seed, 0]), frame)
     built = tuple(
-        _camera(f"cam{i + 1}", mount, np.random.default_rng([seed, 1, i]), world_from_bench, lens_error, noise)
+        _camera(
+            f"cam{i + 1}",
+            mount,
+            np.random.default_rng([seed, 1, i]),
+            world_from_bench,
+            lens_error,
+            noise,
+            aspect=unusual.aspect,
+        )
         for i, mount in enumerate(mounts)
     )
     rig = Rig(spec, built, Box(world_from_bench, np.array(size)), "mm", frame, seed)
+    if unusual != Unusual():
+        rig = _unusual(rig, unusual)
     return _in_unit(_with_cameras(rig, cameras), unit)
 
 
@@ -116,6 +163,7 @@ def write_rig(rig: Rig) -> dict[str, Any]:
         "seed": rig.seed,
         "frame": rig.frame,
         "length_unit": rig.length_unit,
+        **{key: value for key, value in asdict(rig.unusual).items() if value != getattr(Unusual, key)},
         "volume": {"size": volume.size.tolist(), "world_from_box": _pose_table(volume.world_from_box)},
         "cameras": [_camera_table(camera) for camera in rig.cameras],
     }
@@ -130,7 +178,20 @@ def _camera_table(camera: SimulatedCamera) -> dict[str, Any]:
         "lens": {"model": type(camera.lens).__name__, **asdict(camera.lens)},
         "camera_from_world": _pose_table(camera.camera_from_world),
         "lens_error_rms_px": camera.error.rms,
+        **_unusual_table(camera),
     }
+
+
+def _unusual_table(camera: SimulatedCamera) -> dict[str, Any]:
+    """What a camera has beyond lens and pose; nothing where it has nothing."""
+    table: dict[str, Any] = {}
+    if any(camera.tilt):
+        table["tilt_rotation_vector"] = list(camera.tilt)
+    if camera.mirrored:
+        table["mirrored"] = True
+    if camera.window is not None:
+        table["window"] = {**asdict(camera.window), "normal": camera.window.normal.tolist()}
+    return table
 
 
 def _pose_table(pose: Pose) -> dict[str, Any]:
@@ -169,16 +230,25 @@ def _dome(n: int) -> Iterator[_Mount]:
 
 
 def _camera(
-    name: str, mount: _Mount, rng: np.random.Generator, world_from_bench: Pose, lens_error: float, noise: float
+    name: str,
+    mount: _Mount,
+    rng: np.random.Generator,
+    world_from_bench: Pose,
+    lens_error: float,
+    noise: float,
+    *,
+    aspect: float,
 ) -> SimulatedCamera:
     """A camera as built: nothing is quite where the drawing says."""
     aimed = look_at(mount.place, (0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0))
     turned = Pose(rotation_from_vector(rng.normal(scale=np.radians(1.2), size=3)), np.zeros(3))  # about 2° in all
     moved = Pose(np.eye(3), rng.normal(scale=3.0, size=3))
     camera_from_world = turned @ aimed @ moved @ world_from_bench.inverse()
-    lens = _random_lens(mount, rng)
-    error = random_error(rng, mount.width, mount.height, lens_error)
-    return SimulatedCamera(name, mount.width, mount.height, lens, camera_from_world, error, noise)
+    lens, height = _random_lens(mount, rng), mount.height
+    if aspect != 1:  # the same picture, resized
+        lens, height = replace(lens, fy=lens.fy * aspect, cy=(lens.cy + 0.5) * aspect - 0.5), round(height * aspect)
+    error = random_error(rng, mount.width, height, lens_error)
+    return SimulatedCamera(name, mount.width, height, lens, camera_from_world, error, noise)
 
 
 def _random_lens(mount: _Mount, rng: np.random.Generator) -> Lens:
@@ -206,12 +276,49 @@ def _random_rotation_vector(rng: np.random.Generator) -> Floats:
     return axis / np.linalg.norm(axis) * rng.uniform(0.5, np.pi)
 
 
+def _unusual(rig: Rig, unusual: Unusual) -> Rig:
+    """The rig with tilted sensors, mirrors and a window; its cameras stay where they are."""
+    mirrored = _camera_names(rig, unusual.mirror) if unusual.mirror not in ("", "all") else []
+    cameras = []
+    for i, camera in enumerate(rig.cameras):
+        around = np.random.default_rng([rig.seed, 2, i]).uniform(0, 2 * np.pi)
+        tilt = np.radians(unusual.tilt) * np.array([np.cos(around), np.sin(around)])
+        cameras.append(
+            replace(
+                camera,
+                tilt=(float(tilt[0]), float(tilt[1])),
+                mirrored=unusual.mirror == "all" or camera.name in mirrored,
+                window=_window(rig, camera, unusual.window) if unusual.window > 0 else None,
+            )
+        )
+    return replace(rig, cameras=tuple(cameras), unusual=unusual)
+
+
+def _window(rig: Rig, camera: SimulatedCamera, thickness: float) -> Window:
+    """The pane before a camera, in its frame, in mm."""
+    box = rig.volume
+    place = box.world_from_box.inverse().apply(camera.camera_from_world.centre)
+    if rig.name.startswith("dome"):
+        normal, water_side = -place / np.linalg.norm(place), 0.5 * float(np.linalg.norm(box.size))
+    else:
+        normal, water_side = np.array([0.0, 0.0, 1.0]), 0.5 * float(box.size[2])
+    distance = -float(place @ normal) - water_side - WATER_BEFORE_VOLUME_MM - thickness
+    camera_from_box = camera.camera_from_world @ box.world_from_box
+    return Window(camera_from_box.rotation @ normal, distance, thickness)
+
+
 def _with_cameras(rig: Rig, wanted: str | None) -> Rig:
     if wanted is None:
         return rig
+    known = {camera.name: camera for camera in rig.cameras}
+    return replace(rig, cameras=tuple(known[name] for name in _camera_names(rig, wanted)))
+
+
+def _camera_names(rig: Rig, wanted: str) -> Sequence[str]:
+    """The names of a set of cameras, or of a list separated by commas."""
     if wanted in CAMERA_SETS and rig.name != "bar6":
         raise UsageError(f"the set {wanted!r} belongs to bar6, not to {rig.name}.", fix="name the cameras: cam1,cam2")
-    known = {camera.name: camera for camera in rig.cameras}
+    known = [camera.name for camera in rig.cameras]
     names: Sequence[str] = CAMERA_SETS.get(wanted) or [name.strip() for name in wanted.split(",")]
     for name in names:
         if name not in known:
@@ -219,7 +326,7 @@ def _with_cameras(rig: Rig, wanted: str | None) -> Rig:
                 f"rig {rig.name} has no camera {name!r}{did_you_mean(name, [*known, *CAMERA_SETS])}.",
                 fix=f"its cameras are {', '.join(known)}",
             )
-    return replace(rig, cameras=tuple(known[name] for name in names))
+    return names
 
 
 def _in_unit(rig: Rig, unit: str) -> Rig:
@@ -229,7 +336,14 @@ def _in_unit(rig: Rig, unit: str) -> Rig:
     def scaled(pose: Pose) -> Pose:
         return Pose(pose.rotation, pose.translation * scale)
 
-    cameras = tuple(replace(camera, camera_from_world=scaled(camera.camera_from_world)) for camera in rig.cameras)
+    cameras = tuple(
+        replace(
+            camera,
+            camera_from_world=scaled(camera.camera_from_world),
+            window=None if camera.window is None else camera.window.scaled(scale),
+        )
+        for camera in rig.cameras
+    )
     volume = Box(scaled(rig.volume.world_from_box), rig.volume.size * scale)
     return replace(rig, cameras=cameras, volume=volume, length_unit=unit)
 

@@ -124,7 +124,7 @@ def _places(diagonal: float, cameras: Sequence[SimulatedCamera], rng: np.random.
     places = np.full((TRIES, 3), np.nan)
     for c, camera in enumerate(cameras):
         mine = chosen == c
-        rays, _ = camera.lens.ray_from_pixel(part[mine] * [camera.width - 1, camera.height - 1])
+        rays, _ = camera.ray_from_pixel(part[mine] * [camera.width - 1, camera.height - 1])
         reach = camera.lens.fx * diagonal / (span[mine] * camera.width)
         world = rays @ camera.camera_from_world.rotation
         places[mine] = camera.camera_from_world.centre + reach[:, None] * world

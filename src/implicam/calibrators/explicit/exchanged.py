@@ -11,6 +11,7 @@ from implicam.calibrators.explicit.fitted import Fitted, posterior_of
 from implicam.calibrators.explicit.lenses import Choice, name_of
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
 from implicam.calibrators.forward_gp.fit import without_field
+from implicam.calibrators.forward_gp.general_camera import GeneralCamera
 from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior
 from implicam.calibrators.forward_gp.problem import Frame
 from implicam.calibrators.forward_gp.start import Started, levenberg_marquardt
@@ -36,10 +37,14 @@ def rig_of(calibration: Any) -> tuple[Rig, list[str]]:
     for number, c in enumerate(rig_map.cameras):
         described = rig_map.trained.cameras[c]
         camera = rig_map.posterior.models[number].camera
+        if isinstance(camera, GeneralCamera) and not camera.mirrored:
+            camera = camera.as_central()
         if not isinstance(camera, CentralCamera):
+            what = "sees a mirror image" if isinstance(camera, GeneralCamera) else "has no lens model"
             raise UsageError(
-                "a calibration with --lens none has no lens models.",
-                fix="calibrate the same data with --method explicit",
+                f"{described.name} {what}, and no camera file can say so.",
+                why="other programs know lenses that see the world as it is",
+                fix="turn its pictures over, or calibrate the same data with --method explicit",
             )
         if isinstance(calibration, ForwardGPCalibration):
             camera, note = _nearest(calibration, number, camera)

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from implicam import calibration_file
 from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.diagnosis import Diagnosis
-from implicam.calibrators.forward_gp.fit import FittedRig, fit_rig
-from implicam.calibrators.forward_gp.lens import LENSES
+from implicam.calibrators.forward_gp.fit import AUTO, FittedRig, fit_rig
 from implicam.calibrators.forward_gp.locate import Labels
 from implicam.calibrators.forward_gp.posterior import Posterior
 from implicam.calibrators.forward_gp.problem import Frame, problem_of
@@ -41,24 +40,28 @@ from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import blas_threads
 
+LENS_OPTIONS = (AUTO, "central", "none")
+"""What `ForwardGP(lens=...)` may be."""
+
 
 @dataclass(frozen=True)
 class ForwardGP:
-    """Our method. lens: `central`, one model for all lenses, or `none`, a linear projection and the GP for the rest.
+    """Our method. lens: `auto`, the camera model that the data choose for each camera; `central`, an ordinary camera
+    with one model for all lenses; or `none`, a linear projection and the GP for the rest.
 
     seed is there because every method has one; nothing in this method is left to chance.
     """
 
-    lens: str = "central"
+    lens: str = AUTO
     seed: int = 0
 
     method: ClassVar[str] = "forward-gp"
 
     def __post_init__(self) -> None:
-        if self.lens not in LENSES:
+        if self.lens not in LENS_OPTIONS:
             raise UsageError(
-                f"forward-gp has no lens {self.lens!r}{did_you_mean(self.lens, LENSES)}.",
-                fix=f"choose one of {', '.join(LENSES)}",
+                f"forward-gp has no lens {self.lens!r}{did_you_mean(self.lens, LENS_OPTIONS)}.",
+                fix=f"choose one of {', '.join(LENS_OPTIONS)}",
             )
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
@@ -196,5 +199,5 @@ class ForwardGPCalibration:
         calibrator = ForwardGP(str(table["lens"]), int(table["seed"]))
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = without_copies(data)
-        fitted = saved.restored(calibrator.lens, used, working.inward(used.xyz), table, arrays)
+        fitted = saved.restored(used, working.inward(used.xyz), table, arrays)
         return cls(calibrator, data, working, fitted)

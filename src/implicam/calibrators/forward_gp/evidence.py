@@ -22,13 +22,13 @@ LENGTHSCALE = np.log([1.0, 2.0])
 """Prior medians: across the image in half its longer side, and in log distance. Optics vary smoothly across the image;
 refraction and the entrance pupil vary with the distance as 1 / distance does."""
 LENGTHSCALE_SD = np.array([0.7, 1.0])
-SHORTEST = np.log([0.15, 0.1])
+SHORTEST = np.log([0.5, 0.1])
 LONGEST = np.log([30.0, 100.0])
 
 GRID = ((0.6, 1.5, 4.0), (0.15, 0.5, 2.0))
 """Where the search looks first."""
 
-SIGNAL = {"central": (np.log(5e-4), 1.0), "none": (np.log(2e-2), 2.0)}
+SIGNAL = {"central": (np.log(5e-4), 1.0), "general": (np.log(5e-4), 1.0), "none": (np.log(2e-2), 2.0)}
 """Prior of the field's sd, median and log sd, in half the longer side: what good lens models leave, 0.3 px in 1280."""
 
 NOISE = (np.log(3e-4), 1.0)
@@ -48,8 +48,23 @@ DETERMINED = 1e-12
 """Eigenvalues below this part of the largest add nothing."""
 
 
+JITTERS = (0.0, 1e-13, 1e-11, 1e-9)
+"""Added to a unit diagonal, one after the other, where the matrix is indefinite by rounding."""
+
+
+def stable_cholesky(A: Floats) -> Floats:
+    """Of matrices (..., p, p) with unit diagonals; where rounding made one indefinite, of the nearest that is not."""
+    for jitter in JITTERS:
+        try:
+            return np.asarray(np.linalg.cholesky(A + jitter * np.eye(A.shape[-1]) if jitter else A), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            continue
+    raise np.linalg.LinAlgError("the views do not fix the camera")
+
+
 class Hyperparameters(NamedTuple):
-    """lengthscale (2,): across the image, in half its longer side, and in log distance; signal and noise sd (C,) px."""
+    """lengthscale (C, 2): across the image, in half its longer side, and in log distance, the same for cameras of one
+    kind; signal and noise sd (C,) px."""
 
     lengthscale: Floats
     signal: Floats
@@ -157,7 +172,7 @@ class _Together(NamedTuple):
         pull = (self.precision @ self.off[..., None])[..., 0]
         b = pull + self.Xy / noise2[:, None] + (weighted @ self.y[..., None])[..., 0]
         scale = 1 / np.sqrt(np.diagonal(A, axis1=1, axis2=2))  # lens parameters differ by many orders of magnitude
-        L = np.linalg.cholesky(A * scale[:, :, None] * scale[:, None, :])
+        L = stable_cholesky(A * scale[:, :, None] * scale[:, None, :])
         inverse = np.linalg.inv(L) * scale[:, None, :]
         half = (inverse @ b[..., None])[..., 0]
         step = (inverse.swapaxes(1, 2) @ half[..., None])[..., 0]
@@ -208,7 +223,7 @@ class RigEvidence:
                     at(np.log([across, along]))
             first, size = np.array(min(known, key=lambda key: known[key][0])), 0.5
         else:
-            first, size = np.log(start.lengthscale), 0.2
+            first, size = np.log(start.lengthscale[0]), 0.2
         shared = known[tuple(first)][1] if start is None else shared
         simplex = first + size * np.array([[0, 0], [-1, 0.3], [0.3, -1]])
         minimize(
@@ -220,7 +235,7 @@ class RigEvidence:
         lengthscale = np.array(min(known, key=lambda key: known[key][0]))
         shared = known[tuple(lengthscale)][1]
         signal, noise = self._averaged(self._spectra(lengthscale), shared)
-        return Hyperparameters(np.exp(lengthscale), signal, noise)
+        return Hyperparameters(np.tile(np.exp(lengthscale), (len(self.cameras), 1)), signal, noise)
 
     def _averaged(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
         """Signal and noise (C,) whose squares are the posterior means of the variances, eq. (12).

@@ -5,7 +5,7 @@ The order of docs/method.md, section "Fit".
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -13,20 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from implicam.calibrators.forward_gp.choose_camera import (
+    Candidate,
+    Scene,
+    as_started,
+    candidate_again,
+    candidates,
+    choose,
+)
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, Hyperparameters, RigEvidence
-from implicam.calibrators.forward_gp.lens import Floats, Image
+from implicam.calibrators.forward_gp.general_camera import AnyCamera
+from implicam.calibrators.forward_gp.lens import Floats, Image, Prior, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import (
+    CameraFailedError,
     CameraModel,
+    DepthScale,
     Posterior,
     ShotErrors,
     Sightings,
     condition,
     empty_field,
+    field_coordinates,
     spread,
 )
-from implicam.calibrators.forward_gp.start import FEWEST, Started, start_again, start_camera
+from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
 from implicam.errors import FitError
-from implicam.progress import Progress
+from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
 
 Bools = NDArray[np.bool_]
@@ -40,11 +52,35 @@ MOST_UNCERTAIN = 50
 OUTLIER = 25.0
 """Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
 
-TOLERABLE = {"central": 0.05, "none": 0.3}
+TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
 """Median error of a start, in half the extent of the pixels, beyond which it is none."""
 
-TOLERANCE = {"central": 1e-6, "none": 1e-9}
+TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
+
+MAX_SETTLING_STEPS = 15
+"""Gauss-Newton steps of the cameras; ordinary ones take one to four."""
+
+MAX_MISFIT_VIEWS = 1000
+"""Views that say whether a step is for the better."""
+
+MISFIT_TOLERANCE = 1e-3
+"""By how much a step may worsen minus twice the log posterior: rounding and what is left out of the views."""
+
+FAR_OFF = 4.0
+"""Median error of a fitted camera at its own views, in its noise, beyond which the fit has failed."""
+
+FEWEST_WITHOUT_LENS = 40
+"""Views that a camera without a lens model takes: its field must learn what a lens would say."""
+
+LARGE_FIELD = 3e-3
+"""A field's sd, in half the longer side, that makes an ordinary camera doubtful: 2 px in 1280."""
+
+CLEAR_NATS = 3.0
+"""By how much left-out views must at least be more probable without a lens model."""
+
+AUTO = "auto"
+"""The kind of each camera is chosen by the data."""
 
 ROUNDS, ROUNDS_WITH_SHOTS = 6, 18
 SETTLED = 0.1
@@ -54,7 +90,7 @@ SETTLED = 0.1
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Known points (n, 3) in the working frame; per camera what it saw (all of it), its image, and its stated noise in
-    pixels or NaN; how the points may be off; lens: "central" or "none"."""
+    pixels or NaN; how the points may be off; lens: "auto", "central" or "none"."""
 
     points: Floats
     names: tuple[str, ...]
@@ -85,14 +121,158 @@ def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = Non
     moment ago: its cameras and hyperparameters are the guess. Where known positions have declared errors, which make
     hyperparameters costly, they are kept."""
     progress("fitting", 0, 3)
+    started, blind = _started(problem, before)
+    fitted = _fit_without_failures(problem, progress, before, started, blind)
+    return _with_projections(problem, fitted, started) if problem.lens == AUTO else fitted
+
+
+def _fit_without_failures(
+    problem: Problem,
+    progress: Progress,
+    before: FittedRig | None,
+    started: dict[int, Started],
+    blind: list[tuple[int, str]],
+) -> FittedRig:
+    """One bad camera never takes the rig down: it goes on without a lens model, or is left out. Changes `started` and
+    `blind`."""
+    while True:
+        try:
+            return _fit_started(problem, progress, before, started, blind)
+        except CameraFailedError as error:
+            failed = list(started)[error.number]
+            again = None
+            if problem.lens == AUTO and started[failed].family != "none":
+                again = _without_lens(problem, failed)
+            if again is not None:
+                started[failed] = again
+                continue
+            blind.append((failed, f"no camera model fits its views: {error}."))
+            del started[failed]
+            _require_two(problem, started, blind)
+
+
+def _without_lens(problem: Problem, c: int) -> Started | None:
+    """Camera c as a linear projection with a field; None where it saw too little for one."""
+    seen = problem.sightings[c]
+    if len(seen.rows) < FEWEST_WITHOUT_LENS:
+        return None
+    try:
+        found = start_camera(problem.points[seen.rows], seen.uv, problem.images[c], "none")
+        _check_start(found, problem.points[seen.rows], seen.uv, problem)
+    except FitError:
+        return None
+    return found
+
+
+def _with_projections(problem: Problem, fitted: FittedRig, started: dict[int, Started]) -> FittedRig:
+    """The rig with those cameras as linear projections that clearly predict left-out views better so."""
+    tried = {}
+    for number, c in enumerate(fitted.cameras):
+        model = fitted.posterior.models[number]
+        odd = model.family in ("free", "crop") or model.signal > LARGE_FIELD * model.image.half
+        if odd and model.family != "none" and c in started:
+            found = _without_lens(problem, c)
+            if found is not None:
+                tried[c] = found
+    if not tried:
+        return fitted
+    blind = list(fitted.blind)
+    try:
+        other = _fit_started(problem, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, blind)
+    except np.linalg.LinAlgError:
+        return fitted
+    better = {
+        c for number, c in enumerate(fitted.cameras) if c in tried and _predicts_better(problem, other, fitted, number)
+    }
+    if better == set(tried) or not better:
+        return other if better else fitted
+    mixed = {c: tried[c] if c in better else started[c] for c in fitted.cameras}
+    try:
+        return _fit_started(problem, silent, None, mixed, blind)
+    except np.linalg.LinAlgError:
+        return fitted
+
+
+def _predicts_better(problem: Problem, one: FittedRig, other: FittedRig, number: int) -> bool:
+    """Whether a camera's left-out views are clearly more probable in one fit than in another."""
+    gain = _left_out_log_densities(problem, one, number) - _left_out_log_densities(problem, other, number)
+    clearly = 2 * float(np.std(gain)) * np.sqrt(len(gain))
+    return bool(np.sum(gain) > max(clearly, CLEAR_NATS))
+
+
+def _left_out_log_densities(problem: Problem, fitted: FittedRig, number: int) -> Floats:
+    """(n,) of each view of a camera, predicted from all others; a wrong view costs what a view just rejected does."""
+    seen, kept = problem.sightings[fitted.cameras[number]], fitted.kept[number]
+    residual, covariance = left_out(fitted.posterior, number, problem.points, seen, kept)
+    distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
+    distance = np.where(np.isfinite(distance), distance, OUTLIER)
+    return np.asarray(-0.5 * np.minimum(distance, OUTLIER) - 0.5 * np.linalg.slogdet(covariance)[1], dtype=np.float64)
+
+
+def _check_fitted(problem: Problem, state: _Round, seen: tuple[Sightings, ...]) -> None:
+    """A camera that ends far off its own known points is no camera, whatever its covariance says."""
+    points = problem.points
+    if state.posterior.displacement is not None:
+        points = points + state.posterior.displacement
+    for number, (model, views, kept) in enumerate(zip(state.posterior.models, seen, state.kept, strict=True)):
+        rows = views.rows[kept]
+        error = np.linalg.norm(model.predict(points[rows])[0] - views.uv[kept], axis=1) / views.relative[kept]
+        if len(rows) < FEWEST or not np.median(error) < FAR_OFF * model.noise:
+            off = float(np.median(error)) if len(rows) else np.nan
+            raise CameraFailedError(number, f"it ends {off:.3g} px off its own known points")
+
+
+def _started(problem: Problem, before: FittedRig | None) -> tuple[dict[int, Started], list[tuple[int, str]]]:
     guess = {} if before is None else dict(zip(before.cameras, before.posterior.models, strict=True))
+    if problem.lens == AUTO:
+        return choose_cameras(problem, guess)
 
     def start(c: int, points: Floats, uv: Floats) -> Started:
         if c in guess:
             return start_again(guess[c].camera, points, uv, problem.images[c], problem.lens)
         return start_camera(points, uv, problem.images[c], problem.lens)
 
-    started, blind = start_rig(problem, start)
+    return start_rig(problem, start)
+
+
+def choose_cameras(
+    problem: Problem, guess: Mapping[int, CameraModel]
+) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    """The kind of each camera, and where it starts; guess: cameras that fitted most of the points a moment ago."""
+
+    def scene(c: int) -> Scene:
+        seen = problem.sightings[c]
+        return Scene(problem.points[seen.rows], seen.uv, seen.relative, problem.images[c], float(problem.stated[c]))
+
+    def look(c: int) -> list[Candidate] | FitError:
+        try:
+            known = candidate_again(scene(c), guess[c].camera, guess[c].family) if c in guess else None
+            return [known] if known is not None else candidates(scene(c))
+        except FitError as error:
+            return error
+        except np.linalg.LinAlgError as error:
+            return FitError(f"its equations have no solution: {error}.")
+
+    found = side_by_side(look, range(len(problem.sightings)))
+    seeing = [c for c, some in enumerate(found) if not isinstance(some, FitError)]
+    chosen = dict(zip(seeing, choose([some for some in found if not isinstance(some, FitError)]), strict=True))
+
+    def start(c: int, points: Floats, uv: Floats) -> Started:
+        some = found[c]
+        if isinstance(some, FitError):
+            raise some
+        return as_started(chosen[c], scene(c))
+
+    return start_rig(problem, start)
+
+
+def _fit_started(
+    problem: Problem,
+    progress: Progress,
+    before: FittedRig | None,
+    started: dict[int, Started],
+    blind: list[tuple[int, str]],
+) -> FittedRig:
     cameras = tuple(started)
     seen = tuple(problem.sightings[c] for c in cameras)
     images = tuple(problem.images[c] for c in cameras)
@@ -116,6 +296,7 @@ def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = Non
             state = state._replace(kept=judged)
     progress("fitting", 3, 3)
     assert state.hyper is not None
+    _check_fitted(problem, state, seen)
     return FittedRig(state.posterior, cameras, tuple(blind), state.kept, state.hyper, state.errors, state.label_sd)
 
 
@@ -163,7 +344,10 @@ def _round(
 def without_field(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
     """A camera model that is nothing but the camera; noise in pixels."""
     field = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
-    return CameraModel(started.camera, started.camera, started.prior, image, field, 0.0, noise, np.zeros((1, 2)))
+    none = np.zeros((1, 2))
+    return CameraModel(
+        started.camera, started.camera, started.prior, image, field, 0.0, noise, none, family=started.family
+    )
 
 
 def start_rig(
@@ -189,24 +373,29 @@ def start_rig(
             blind.append((c, found.what))
         else:
             started[c] = found
+    _require_two(problem, started, blind)
+    return started, blind
+
+
+def _require_two(problem: Problem, started: dict[int, Started], blind: list[tuple[int, str]]) -> None:
     if len(started) < 2:
         raise FitError(
             f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
             why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
             fix="show the cameras more known points, in the whole volume",
         )
-    return started, blind
 
 
 def _check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:
     error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.kept]
-    half = float(np.ptp(uv, axis=0).max()) / 2
+    low, high = pixel_extent(uv)
+    half = float((high - low).max()) / 2
     if len(error) < FEWEST:
         raise FitError(
             f"{len(error)} of its {len(uv)} views agree on one camera, and it takes {FEWEST}.",
             fix="add known points, or look for wrong detections",
         )
-    if not np.median(error) < TOLERABLE[problem.lens] * half:
+    if not np.median(error) < TOLERABLE[started.camera.kind] * half:
         raise FitError(
             f"no camera sees the known points at these pixels: the best of all fits leaves {np.median(error):.3g} px."
         )
@@ -221,13 +410,26 @@ def _hyperparameters(
     before: Hyperparameters | None,
     moved: Floats | None,
 ) -> Hyperparameters:
-    evidence = [_evidence(problem, model, seen, moved) for model, seen in zip(models, used, strict=True)]
-    half = np.array([image.half for image in images])
-    rig = RigEvidence(evidence, half, stated, problem.lens, TOLERANCE[problem.lens])
-    found = rig.maximise(before)
+    found = Hyperparameters(np.ones((len(models), 2)), np.ones(len(models)), np.ones(len(models)))
+    groups = []
+    for numbers in _alike(models):
+        evidence = [_evidence(problem, models[c], used[c], moved) for c in numbers]
+        half = np.array([images[c].half for c in numbers])
+        kind = models[numbers[0]].camera.kind
+        rig = RigEvidence(evidence, half, stated[numbers], kind, TOLERANCE[kind])
+        guess = None if before is None else Hyperparameters(*(values[numbers] for values in before))
+        for values, part in zip(found, rig.maximise(guess), strict=True):
+            values[numbers] = part
+        groups.append((numbers, rig))
     if problem.errors is None or problem.errors.estimated:
         return found
-    return _joint_sizes(problem, models, used, found, rig)
+    return _joint_sizes(problem, models, used, found, groups)
+
+
+def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
+    """The numbers of cameras whose fields are of one kind: what a lens model leaves, or a linear projection."""
+    none = [c for c, model in enumerate(models) if model.camera.kind == ProjectiveCamera.kind]
+    return [group for group in ([c for c in range(len(models)) if c not in none], none) if group]
 
 
 def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floats | None) -> CameraEvidence:
@@ -250,7 +452,7 @@ def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floa
         precision = np.eye(len(off))
         precision[:-extra, :-extra] = prior.precision
         prior = prior._replace(mean=off, precision=precision)
-    return CameraEvidence(seen.uv - view.uv, X, off, prior, model.coordinates(view), seen.relative)
+    return CameraEvidence(seen.uv - view.uv, X, off, prior, field_coordinates(view, model.image), seen.relative)
 
 
 def _thinned(seen: Sightings, most: int) -> Sightings:
@@ -276,13 +478,19 @@ def settle(
     models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...], errors: ShotErrors | None
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
-    for _ in range(4):
+    misfits: list[_Misfit] = []
+    for _ in range(MAX_SETTLING_STEPS):
         posterior = condition(models, points, used, errors)
+        steps = posterior.steps
+        small = [_small(step, posterior.root(c)) for c, step in enumerate(steps)]
+        if not misfits and not all(small):
+            where = points if posterior.displacement is None else points + posterior.displacement
+            misfits = [_Misfit.of(model, where, seen) for model, seen in zip(models, used, strict=True)]
         models = tuple(
-            _in_front(before, after, step, points[seen.rows])
-            for before, after, step, seen in zip(models, posterior.models, posterior.steps, used, strict=True)
+            _downhill(models[c], posterior.models[c], steps[c], points[used[c].rows], None if small[c] else misfits[c])
+            for c in range(len(models))
         )
-        if all(_small(step, posterior.root(c)) for c, step in enumerate(posterior.steps)):
+        if all(small):
             break
     return replace(posterior, models=models)
 
@@ -296,10 +504,13 @@ def _sized(
         model = models[c]
         points = problem.points[used[c].rows]
         view = model.camera.view(points[:: max(1, len(points) // 4000)])
-        field = empty_field(hyper.lengthscale, model.coordinates(view), TOLERANCE[problem.lens])
+        depth = DepthScale.of(view)
+        tolerance = TOLERANCE[model.camera.kind]
+        field = empty_field(hyper.lengthscale[c], field_coordinates(view, model.image, depth), tolerance)
         return replace(
             model,
             ruler=model.camera,
+            depth=depth,
             field=field,
             signal=float(hyper.signal[c]),
             noise=float(hyper.noise[c]),
@@ -314,7 +525,7 @@ def _joint_sizes(
     models: tuple[CameraModel, ...],
     used: tuple[Sightings, ...],
     hyper: Hyperparameters,
-    rig: RigEvidence,
+    groups: list[tuple[list[int], RigEvidence]],
 ) -> Hyperparameters:
     """Signal and noise from all cameras at once, where positions have errors of their own.
 
@@ -330,7 +541,8 @@ def _joint_sizes(
         signal, noise = np.exp(z)
         sized = tuple(replace(m, signal=m.signal * signal, noise=m.noise * noise) for m in laid_out)
         evidence = condition(sized, problem.points, some, problem.errors).evidence
-        return rig.penalty(hyper.signal * signal, hyper.noise * noise) - evidence
+        penalties = (rig.penalty(hyper.signal[c] * signal, hyper.noise[c] * noise) for c, rig in groups)
+        return float(sum(penalties)) - evidence
 
     first = min((np.array([0.0, noise]) for noise in (0.0, 1.0, 2.0)), key=loss)
     simplex = first + np.array([[0, 0], [0.4, 0], [0, 0.4]])
@@ -343,11 +555,49 @@ def _joint_sizes(
     return Hyperparameters(hyper.lengthscale, hyper.signal * signal, hyper.noise * noise)
 
 
-def _in_front(before: CameraModel, after: CameraModel, step: Floats, points: Floats) -> CameraModel:
-    """A camera never steps so far that it loses a point it saw: half the step, then, or half of that."""
+class _Misfit(NamedTuple):
+    """How badly a camera fits, with the field that then fits best: what Gauss-Newton must not increase.
+
+    prior; points (n, 3), pixels (n, 2) and sd (n,) of at most MAX_MISFIT_VIEWS views; phi (n, m) the field's features
+    over sd, and the Cholesky factor (m, m) of I + phi^T phi.
+    """
+
+    prior: Prior
+    points: Floats
+    uv: Floats
+    sd: Floats
+    phi: Floats
+    factor: Floats
+
+    @classmethod
+    def of(cls, model: CameraModel, points: Floats, seen: Sightings) -> _Misfit:
+        """Of the camera's present field."""
+        seen = _thinned(seen, MAX_MISFIT_VIEWS)
+        where = points[seen.rows]
+        sd = model.noise * seen.relative
+        phi = model.rows(where).phi / sd[:, None]
+        factor = np.asarray(np.linalg.cholesky(np.eye(phi.shape[1]) + phi.T @ phi), dtype=np.float64)
+        return cls(model.prior, where, seen.uv, sd, phi, factor)
+
+    def __call__(self, camera: AnyCamera) -> float:
+        """Minus twice the log posterior, up to a constant; infinite where the camera loses a point."""
+        y = (self.uv - camera.pixel(self.points)) / self.sd[:, None]
+        if not (camera.sane and np.isfinite(y).all()):
+            return np.inf
+        off = self.prior.mean - camera.parameters
+        field = np.linalg.solve(self.factor, self.phi.T @ y)
+        return float(np.sum(y**2) - np.sum(field**2) + off @ self.prior.precision @ off)
+
+
+def _downhill(
+    before: CameraModel, after: CameraModel, step: Floats, points: Floats, misfit: _Misfit | None
+) -> CameraModel:
+    """A camera never steps so far that it loses a point it saw, or fits worse: half the step, then, or half of that."""
+    now = np.inf if misfit is None else misfit(before.camera)
     for halvings in range(20):
         camera = after.camera if halvings == 0 else before.camera.moved(step * 0.5**halvings)
-        if camera.sane and np.isfinite(camera.pixel(points)).all():
+        fits = misfit is None or misfit(camera) <= now + MISFIT_TOLERANCE
+        if fits and camera.sane and np.isfinite(camera.pixel(points)).all():
             return after if halvings == 0 else replace(after, camera=camera)
     return before
 

@@ -227,11 +227,3 @@ class ProjectiveCamera:
     def from_array(cls, array: Floats) -> ProjectiveCamera:
         """The inverse of `as_array`."""
         return cls(array.reshape(3, 4))
-
-
-AnyCamera = CentralCamera | ProjectiveCamera
-
-LENSES: dict[str, type[CentralCamera] | type[ProjectiveCamera]] = {
-    kind.kind: kind for kind in (CentralCamera, ProjectiveCamera)
-}
-"""Name -> camera."""

@@ -9,6 +9,7 @@ cameras together. Work and memory grow linearly with the number of points.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -17,16 +18,46 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
-from implicam.calibrators.forward_gp.evidence import field_kernel
-from implicam.calibrators.forward_gp.lens import AnyCamera, Floats, Image, Prior, View
+from implicam.calibrators.forward_gp.evidence import field_kernel, stable_cholesky
+from implicam.calibrators.forward_gp.general_camera import AnyCamera
+from implicam.calibrators.forward_gp.lens import Floats, Image, Prior, View
 from implicam.gp.low_rank import LowRank
 from implicam.threads import side_by_side
 
 CHUNK = 4096
 """Points at a time."""
 
+TYPICAL_DEPTH_SPREAD = 0.12
+"""Standard deviation of the log distance of the known points in an ordinary rig. Where the volume is thinner, depth
+counts in its own spread: what a window or water does varies over the volume, however far that is."""
+
 LIKELY = (np.log(3e-3), 1.0)
 """Prior of how far a shot is off, median and log sd, in the working frame: a thousandth of the volume's size."""
+
+
+class DepthScale(NamedTuple):
+    """How log distance becomes a coordinate of the field: its mean over the known points, and the unit it counts in."""
+
+    mean: float = 0.0
+    unit: float = 1.0
+
+    @classmethod
+    def of(cls, view: View) -> DepthScale:
+        """Of the known points that a camera sees."""
+        spread = float(np.std(view.log_distance))
+        return cls(float(np.mean(view.log_distance)), min(max(spread / TYPICAL_DEPTH_SPREAD, 1e-6), 1.0))
+
+
+AS_IT_IS = DepthScale()
+"""Log distance itself is the coordinate."""
+
+
+def field_coordinates(view: View, image: Image, depth: DepthScale | None = None) -> Floats:
+    """(n, 3) where a field is looked up: pixel about the centre in half the longer side, scaled log distance, eq. (8).
+
+    depth: as of these very points where it is not given."""
+    mean, unit = DepthScale.of(view) if depth is None else depth
+    return np.column_stack([(view.uv - image.centre) / image.half, (view.log_distance - mean) / unit])
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +76,8 @@ class CameraModel:
     signal: float  # px
     noise: float  # px, of a view with the camera's usual noise
     weights: Floats
+    depth: DepthScale = AS_IT_IS
+    family: str = "ordinary"
 
     @property
     def size(self) -> int:
@@ -57,8 +90,8 @@ class CameraModel:
         return view, view if self.ruler is self.camera else self.ruler.view(points)
 
     def coordinates(self, view: View) -> Floats:
-        """(n, 3) where the field is looked up: pixel about the centre in half the longer side, log distance."""
-        return np.column_stack([(view.uv - self.image.centre) / self.image.half, view.log_distance])
+        """(n, 3) where the field is looked up."""
+        return field_coordinates(view, self.image, self.depth)
 
     @cached_property
     def _coefficients(self) -> Floats:
@@ -73,7 +106,7 @@ class CameraModel:
         by_point = (
             view.by_point
             + by_q[:, :, :2] @ (measured.by_point / self.image.half)
-            + by_q[:, :, 2, None] * measured.distance_by_point[:, None, :]
+            + by_q[:, :, 2, None] * (measured.distance_by_point[:, None, :] / self.depth.unit)
         )
         return view.uv + K @ self._coefficients, by_point
 
@@ -228,8 +261,9 @@ def condition(
 def _independent(models: tuple[CameraModel, ...], normals: list[_Normal]) -> Posterior:
     """Known positions are exact: every camera on its own, eq. (13)."""
     value, means, roots = 0.0, [], []
-    for normal in normals:
-        root, mean, log_determinant = solve_normal(normal.A, normal.b)
+    for c, normal in enumerate(normals):
+        with naming_camera(c):
+            root, mean, log_determinant = solve_normal(normal.A, normal.b)
         value += 0.5 * (float(normal.b @ mean) - log_determinant - normal.squares - normal.logs)
         means.append(mean)
         roots.append(root)
@@ -253,6 +287,10 @@ def _tied(
         return _Meeting.of(models, points, seen, errors, part)
 
     kept = meeting(*parts[0]) if len(parts) == 1 else None  # of many, each is made twice and never kept
+    alone = []
+    for c, normal in enumerate(normals):
+        with naming_camera(c):
+            alone.append(solve_normal(normal.A, normal.b)[0])
     for each in parts:
         block = kept or meeting(*each)
         squares, logs = block.eliminate(A, b)
@@ -260,11 +298,12 @@ def _tied(
     joint, mean, log_determinant = solve_normal(A, b)
     value += float(b @ mean) - log_determinant
     means = np.split(mean, ends[:-1])
-    alone = tuple(solve_normal(normal.A, normal.b)[0] for normal in normals)
     found = np.concatenate([(kept or meeting(*each)).unknowns(mean) for each in parts])
     displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
     unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
-    return Posterior(_moved(models, means), alone, joint, _steps(models, means), 0.5 * value, unknowns, displacement)
+    return Posterior(
+        _moved(models, means), tuple(alone), joint, _steps(models, means), 0.5 * value, unknowns, displacement
+    )
 
 
 def _moved(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
@@ -281,6 +320,25 @@ def _moved(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[Camera
 
 def _steps(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[Floats, ...]:
     return tuple(mean[: model.camera.size] for model, mean in zip(models, means, strict=True))
+
+
+class CameraFailedError(np.linalg.LinAlgError):
+    """The views of one camera do not fix it: `number` of those being fitted."""
+
+    def __init__(self, number: int, why: str) -> None:
+        super().__init__(why)
+        self.number = number
+
+
+@contextmanager
+def naming_camera(number: int) -> Iterator[None]:
+    """Say which camera it was whose equations have no solution."""
+    try:
+        yield
+    except CameraFailedError:
+        raise
+    except np.linalg.LinAlgError as error:
+        raise CameraFailedError(number, str(error)) from error
 
 
 class _Normal(NamedTuple):
@@ -427,7 +485,7 @@ def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
     if not np.isfinite(A).all():
         raise np.linalg.LinAlgError("a camera has turned its back on points that it saw")
     scale = 1 / np.sqrt(np.diag(A))
-    L = np.linalg.cholesky(A * scale[:, None] * scale)
+    L = stable_cholesky(A * scale[:, None] * scale)
     root = np.ascontiguousarray(solve_triangular(L, np.diag(scale), lower=True))
     return root, root.T @ (root @ b), float(2 * np.sum(np.log(np.diag(L) / scale)))
 

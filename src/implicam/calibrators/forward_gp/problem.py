@@ -10,7 +10,7 @@ from implicam.calibrators.forward_gp.fit import Problem
 from implicam.calibrators.forward_gp.lens import Image
 from implicam.calibrators.forward_gp.posterior import ShotErrors, Sightings
 from implicam.calibrators.forward_gp.shots import Shots
-from implicam.calibrators.forward_gp.start import FEWEST
+from implicam.calibrators.forward_gp.start import FEWEST, pixel_extent
 from implicam.calibrators.protocol import require_points, require_volume
 from implicam.dataset import Dataset, Floats, Observations
 
@@ -81,7 +81,7 @@ def image_of(observations: Observations, c: int) -> Image:
     uv = observations.uv[observations.seen[:, c], c]  # not told: what is seen must do
     if not len(uv):
         return Image(np.zeros(2), 1.0)
-    low, high = uv.min(axis=0), uv.max(axis=0)
+    low, high = pixel_extent(uv)  # one wild view must not say where the image is
     return Image((low + high) / 2, float(max((high - low).max() / 2, 1.0)))
 
 

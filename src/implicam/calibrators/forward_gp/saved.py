@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.evidence import Hyperparameters, field_kernel
+from implicam.calibrators.forward_gp.families import FAMILIES
 from implicam.calibrators.forward_gp.fit import FittedRig
-from implicam.calibrators.forward_gp.lens import LENSES, CentralCamera, Image, Prior
-from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, ShotErrors, Unknowns
+from implicam.calibrators.forward_gp.general_camera import GeneralCamera
+from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.calibrators.forward_gp.posterior import CameraModel, DepthScale, Posterior, ShotErrors, Unknowns
 from implicam.calibrators.forward_gp.shots import Shots
 from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, Floats
@@ -24,10 +26,11 @@ def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict
     table = {
         "calibrated": [names[c] for c in fitted.cameras],
         "not_calibrated": {names[c]: why for c, why in fitted.blind},
+        "cameras": [_described(names[c], model) for c, model in zip(fitted.cameras, posterior.models, strict=True)],
     }
     arrays: dict[str, NDArray[Any]] = {
         "lengthscale": np.asarray(fitted.hyperparameters.lengthscale),
-        "sizes": np.array([[m.signal, m.noise, *m.image.centre, m.image.half] for m in posterior.models]),
+        "sizes": np.array([[m.signal, m.noise, *m.image.centre, m.image.half, *m.depth] for m in posterior.models]),
     }
     for number, model in enumerate(posterior.models):
         arrays |= {
@@ -48,7 +51,20 @@ def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict
     return table, arrays
 
 
-def restored(lens: str, data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays) -> FittedRig:
+CAMERAS: dict[str, type[CentralCamera] | type[GeneralCamera] | type[ProjectiveCamera]] = {
+    kind.kind: kind for kind in (CentralCamera, GeneralCamera, ProjectiveCamera)
+}
+"""Name in a file -> camera model."""
+
+
+def _described(name: str, model: CameraModel) -> dict[str, Any]:
+    """The readable entry of one camera: its model, its lens by name, its kind, and whether it is mirrored."""
+    mirrored = isinstance(model.camera, GeneralCamera) and model.camera.mirrored
+    lens = "none" if isinstance(model.camera, ProjectiveCamera) else "kannala-brandt"
+    return {"name": name, "model": model.camera.kind, "lens": lens, "kind": model.family, "mirrored": mirrored}
+
+
+def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays) -> FittedRig:
     """The inverse of `state`; points: (n, 3) the known positions in the working frame.
 
     KeyError, ValueError or TypeError for anything that does not fit.
@@ -58,11 +74,14 @@ def restored(lens: str, data: Dataset, points: Floats, table: Mapping[str, Any],
     blind = tuple((names.index(str(name)), str(why)) for name, why in table["not_calibrated"].items())
     if sorted([*cameras, *(c for c, _ in blind)]) != list(range(len(names))) or len(cameras) < 2:
         raise ValueError("the cameras calibrated and not calibrated are not those of the data")
-    lengthscale = finite_column(arrays, "lengthscale", (2,), positive=True)
-    sizes = finite_column(arrays, "sizes", (len(cameras), 5))
+    lengthscales = finite_column(arrays, "lengthscale", (len(cameras), 2), positive=True)
+    sizes = finite_column(arrays, "sizes", (len(cameras), 7))
+    described = list(table["cameras"])
+    if [str(one["name"]) for one in described] != [names[c] for c in cameras]:
+        raise ValueError("the cameras described are not those calibrated")
     models, alone, kept = [], [], []
     for number, c in enumerate(cameras):
-        model, covariance = _model(lens, arrays, number, sizes[number], lengthscale)
+        model, covariance = _model(described[number], arrays, number, sizes[number], lengthscales[number])
         models.append(model)
         alone.append(covariance)
         used = arrays[f"{number}/kept"]
@@ -71,7 +90,7 @@ def restored(lens: str, data: Dataset, points: Floats, table: Mapping[str, Any],
         kept.append(used)
     posterior = _posterior(data, arrays, tuple(models), tuple(alone))
     errors, label_sd = _shot_errors(data, points, arrays, posterior)
-    hyper = Hyperparameters(lengthscale, sizes[:, 0], sizes[:, 1])
+    hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
     return FittedRig(posterior, cameras, blind, tuple(kept), hyper, errors, label_sd)
 
 
@@ -92,9 +111,13 @@ def _shot_errors(
     return ShotErrors(errors.shot, errors.basis, sd, errors.group), label_sd
 
 
-def _model(lens: str, arrays: Arrays, number: int, sizes: Floats, lengthscale: Floats) -> tuple[CameraModel, Floats]:
-    kind = LENSES[lens]
-    numbers = (20 if kind is CentralCamera else 12,)
+def _model(
+    described: Mapping[str, Any], arrays: Arrays, number: int, sizes: Floats, lengthscale: Floats
+) -> tuple[CameraModel, Floats]:
+    kind, family = CAMERAS[str(described["model"])], str(described["kind"])
+    if family not in (*FAMILIES, "none"):
+        raise ValueError(f"{family!r} is no kind of camera")
+    numbers = {"central": (20,), "general": (24,), "none": (12,)}[kind.kind]
     camera, ruler = (
         kind.from_array(finite_column(arrays, f"{number}/{what}", numbers)) for what in ("camera", "ruler")
     )
@@ -103,12 +126,16 @@ def _model(lens: str, arrays: Arrays, number: int, sizes: Floats, lengthscale: F
     weights = finite_column(arrays, f"{number}/weights", (m, 2))
     size = camera.size + 2 * m
     alone = finite_column(arrays, f"{number}/root", (size, size))
-    signal, noise, *centre, half = sizes.tolist()
-    if not (signal > 0 and noise > 0 and half > 0):
-        raise ValueError("signal, noise and image size must be positive")
+    signal, noise, *centre, half, depth, unit = sizes.tolist()
+    if not (signal > 0 and noise > 0 and half > 0 and unit > 0):
+        raise ValueError("signal, noise, image size and depth unit must be positive")
     none = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))  # only a fit needs it
     field = LowRank(field_kernel(lengthscale), inducing)
-    return CameraModel(camera, ruler, none, Image(np.array(centre), half), field, signal, noise, weights), alone
+    image = Image(np.array(centre), half)
+    model = CameraModel(
+        camera, ruler, none, image, field, signal, noise, weights, DepthScale(depth, unit), family=family
+    )
+    return model, alone
 
 
 def _posterior(data: Dataset, arrays: Arrays, models: tuple[CameraModel, ...], alone: tuple[Floats, ...]) -> Posterior:

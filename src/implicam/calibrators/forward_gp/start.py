@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.forward_gp.general_camera import AnyCamera
 from implicam.calibrators.forward_gp.lens import (
     TANGENT,
-    AnyCamera,
     CentralCamera,
     Floats,
     Image,
@@ -33,12 +33,26 @@ FAR = 8.0
 """Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
 
 
+FAR_OUT = 4.0
+"""Times the distance from the median pixel that three quarters of the views keep: what is farther has no say in where
+the image is and how large."""
+
+
+def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
+    """The lowest and highest (2,) of pixels (n, 2), wild ones aside."""
+    away = np.linalg.norm(uv - np.median(uv, axis=0), axis=1)
+    inside = uv[away <= FAR_OUT * np.quantile(away, 0.75)]
+    return inside.min(axis=0), inside.max(axis=0)
+
+
 class Started(NamedTuple):
     """A camera that fits, its prior, and the views (n,) it was started from."""
 
     camera: AnyCamera
     prior: Prior
     kept: Bools
+    family: str = "ordinary"
+    mirrored: bool = False
 
 
 def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> Started:
@@ -80,7 +94,7 @@ def _start_projective(points: Floats, uv: Floats, image: Image) -> Started:
             break
         kept = inside
     front = ~np.isnan(camera.pixel(points)[:, 0])  # no linear projection sees what is behind it
-    return Started(camera, camera.prior(image, 1.0), kept & front)
+    return Started(camera, camera.prior(image, 1.0), kept & front, "none")
 
 
 def _refined(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, kept: Bools) -> Started:
@@ -97,8 +111,13 @@ def _refined(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image:
     return Started(camera, prior, kept)
 
 
-def levenberg_marquardt(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, sd: float) -> AnyCamera:
-    """The camera that minimises `sum (residual / sd)^2` plus the prior's own square, eq. (6)."""
+def levenberg_marquardt(
+    camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, sd: float, max_steps: int = 300
+) -> AnyCamera:
+    """The camera that minimises `sum (residual / sd)^2` plus the prior's own square, eq. (6).
+
+    The damped equations are solved in units of their own diagonal: parameters differ by many orders of magnitude.
+    """
 
     def cost(candidate: AnyCamera) -> float:
         if not candidate.sane:
@@ -108,7 +127,7 @@ def levenberg_marquardt(camera: AnyCamera, prior: Prior, points: Floats, uv: Flo
         return total if np.isfinite(total) else np.inf
 
     best, damping = cost(camera), 1e-3
-    for _ in range(300):
+    for _ in range(max_steps):
         view = camera.view(points)
         J = view.by_parameters.reshape(-1, camera.size) / sd
         off = prior.mean - camera.parameters
@@ -116,10 +135,15 @@ def levenberg_marquardt(camera: AnyCamera, prior: Prior, points: Floats, uv: Flo
         gradient = J.T @ ((uv - view.uv).ravel() / sd) + prior.precision @ off
         if not np.isfinite(normal).all():
             break
+        scale = 1 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+        scaled, pull = normal * scale[:, None] * scale, gradient * scale
         previous = best
         while damping < 1e9:
-            damped = normal + damping * np.diag(np.diag(normal))
-            step = np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
+            try:
+                step = np.asarray(scale * np.linalg.solve(scaled + damping * np.eye(len(pull)), pull), dtype=np.float64)
+            except np.linalg.LinAlgError:
+                damping *= 6
+                continue
             candidate = camera.moved(step)
             now = cost(candidate)
             if now < best:

@@ -1,0 +1,342 @@
+"""Which kind of camera each one is, and where it starts: from no guess, in several ways that share no assumption.
+
+Ordinary cameras take the quick path: the ladder of lenses, one refinement, and the proof that nothing freer is clearly
+better. All others are started by the ladder, by a direct linear transformation and by an affine projection, each
+mirrored too; the best go on, and the kind is chosen by marginal likelihood, with the rig's other cameras as a hint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.families import (
+    FAMILIES,
+    MAX_CHOICE_VIEWS,
+    MIRRORED_WEIGHT,
+    Views,
+    family_prior,
+    log_evidence,
+    near_prior,
+    widest_angle,
+)
+from implicam.calibrators.forward_gp.general_camera import RHO, SMALLEST_RHO, AnyCamera, GeneralCamera
+from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, Image
+from implicam.calibrators.forward_gp.start import FAR, FEWEST, Bools, Started, levenberg_marquardt
+from implicam.cameras import KannalaBrandt
+from implicam.errors import FitError
+from implicam.geometry import Pose, camera_from_linear, resect_affine, resect_any_lens, resect_robustly
+
+QUICK_MEDIAN = 2e-3
+"""Median error of an ordinary camera, in half the longer side; more needs a look at everything else."""
+
+QUICK_GAIN = 0.6
+"""A freer camera that brings the median error below this part asks for the whole choice."""
+
+QUICK_NATS = 3.0
+"""So does one whose evidence, odds aside, is better by this less."""
+
+MAX_START_VIEWS = 80
+"""Views that starts are refined with."""
+
+SHORT_STEPS, LONG_STEPS, FINAL_STEPS = 8, 25, 60
+"""Steps of refinement: of every start, of the best of them, of each kind."""
+
+BEST_STARTS = 3
+"""Starts of each sign that go on."""
+
+CLEARLY_WRONG = 0.3
+"""The sign whose best camera leaves the other's median times this is the right one without further question."""
+
+AFFINE_RHOS = (0.02, 0.2)
+"""Inverse distances that an affine start tries."""
+
+ROUNDS_OF_CHOICE = 5
+
+
+class Candidate(NamedTuple):
+    """One kind and sign of one camera, refined; evidence in nats, odds aside."""
+
+    camera: GeneralCamera
+    family: str
+    kept: Bools
+    evidence: float
+
+    @property
+    def kind(self) -> tuple[str, bool]:
+        """Family, and whether it is mirrored."""
+        return self.family, self.camera.mirrored
+
+
+class Scene(NamedTuple):
+    """What one camera saw: points (n, 3), pixels (n, 2), relative noise (n,), image, stated noise or NaN."""
+
+    points: Floats
+    uv: Floats
+    relative: Floats
+    image: Image
+    stated: float
+
+    def error(self, camera: GeneralCamera) -> Floats:
+        """(n,) px, infinite where the camera sees nothing."""
+        away = np.linalg.norm(camera.pixel(self.points) - self.uv, axis=1)
+        return np.asarray(np.where(np.isnan(away), np.inf, away), dtype=np.float64)
+
+    def near(self, error: Floats, kept: Bools) -> Bools:
+        """The views that a camera explains, judged by the median of those kept."""
+        return np.asarray(error <= max(FAR * float(np.median(error[kept])), 1e-4 * self.image.half), dtype=np.bool_)
+
+
+def candidates(whole: Scene) -> list[Candidate]:
+    """The kinds of camera that explain the views; one where it is ordinary. FitError where there is none."""
+    if len(whole.points) < FEWEST:
+        raise FitError(f"{len(whole.points)} known points are seen; a camera needs at least {FEWEST}.")
+    ladder = _from_ladder(whole, mirrored=False)
+    quick = _quick(whole, ladder) if ladder is not None else None
+    return [quick] if quick is not None else _thorough(whole, ladder)
+
+
+def choose(rig: Sequence[list[Candidate]]) -> list[Candidate]:
+    """One candidate of each camera: evidence, prior odds, and what the rig's other cameras are."""
+    chosen = [max(some, key=lambda one: one.evidence + np.log(_weight(one, []))) for some in rig]
+    for _ in range(ROUNDS_OF_CHOICE):
+        before = [one.kind for one in chosen]
+        for c, some in enumerate(rig):
+            others = [one.kind for k, one in enumerate(chosen) if k != c]
+            chosen[c] = max(some, key=lambda one: one.evidence + np.log(_weight(one, others)))
+        if [one.kind for one in chosen] == before:
+            break
+    return chosen
+
+
+def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate | None:
+    """A camera that fitted most of these points a moment ago, refined; None where it no longer does."""
+    if not isinstance(camera, GeneralCamera) or family not in FAMILIES:
+        return None
+    error = whole.error(camera)
+    kept = whole.near(error, np.isfinite(error))
+    if kept.sum() < max(FEWEST, len(error) / 2):
+        return None
+    found, kept = _refined(camera, family, whole, kept, FINAL_STEPS, rounds=4)
+    return Candidate(found, family, kept, 0.0)
+
+
+def as_started(one: Candidate, whole: Scene) -> Started:
+    """What the fit starts from."""
+    prior = family_prior(one.camera, one.family, whole.image, _widest(one.camera, whole.points[one.kept]))
+    if one.family == "free":
+        prior = near_prior(one.camera, prior, whole.image)
+    kept = one.kept & np.isfinite(whole.error(one.camera))
+    return Started(one.camera, prior, kept, one.family, one.camera.mirrored)
+
+
+def _weight(one: Candidate, others: list[tuple[str, bool]]) -> float:
+    families = sum(family == one.family for family, _ in others)
+    signs = sum(mirrored == one.camera.mirrored for _, mirrored in others)
+    total = sum(kind.weight for kind in FAMILIES.values())
+    of_sign = MIRRORED_WEIGHT if one.camera.mirrored else 1.0
+    return (
+        (FAMILIES[one.family].weight + families)
+        / (total + len(others))
+        * ((of_sign + signs) / (1 + MIRRORED_WEIGHT + len(others)))
+    )
+
+
+def _widest(camera: GeneralCamera, points: Floats) -> float:
+    return max(widest_angle(camera, points), 1e-4)
+
+
+def _refined(
+    camera: GeneralCamera, family: str, scene: Scene, kept: Bools, steps: int, rounds: int = 1
+) -> tuple[GeneralCamera, Bools]:
+    """The camera of that kind that explains the views kept, and those that it then explains."""
+    for _ in range(rounds):
+        rows = np.flatnonzero(kept)
+        if len(rows) > MAX_START_VIEWS:
+            rows = rows[np.random.default_rng(0).choice(len(rows), MAX_START_VIEWS, replace=False)]
+        points, uv = scene.points[rows], scene.uv[rows]
+        prior = family_prior(camera, family, scene.image, _widest(camera, points))
+        error = scene.error(camera)
+        usual = float(np.median(error[rows]))
+        sd = max(usual if np.isfinite(usual) else scene.image.half, 1e-5 * scene.image.half)
+        found = levenberg_marquardt(camera, prior, points, uv, sd, steps)
+        assert isinstance(found, GeneralCamera)
+        camera = found
+        inside = scene.near(scene.error(camera), kept)
+        if inside.sum() < FEWEST or (inside == kept).all():
+            break
+        kept = inside
+    return camera, kept
+
+
+def _from_ladder(scene: Scene, *, mirrored: bool) -> tuple[GeneralCamera, Bools] | None:
+    uv, middle = scene.uv, scene.image.centre
+    if mirrored:
+        uv = uv * [-1.0, 1.0] + [2 * middle[0], 0.0]
+    try:
+        found = resect_any_lens(scene.points, uv, middle=middle)
+    except FitError:
+        if not mirrored:
+            raise
+        return None
+    k = TANGENT if found.pinhole else np.zeros(4)
+    lens = KannalaBrandt(found.focal, found.focal, *middle.tolist(), *k.tolist())
+    central = CentralCamera(lens, found.camera_from_world)
+    about = float(middle[0]) if mirrored else None
+    camera = GeneralCamera.from_central(central, mirrored_about=about)
+    if camera.rho < SMALLEST_RHO:
+        return None
+    kept = found.kept
+    if len(kept) > kept.sum() and len(scene.points) > 120:  # the ladder looked at some of many
+        error = scene.error(camera)
+        kept = scene.near(error, found.kept)
+    return (camera, kept) if kept.sum() >= FEWEST else (camera, found.kept)
+
+
+def _quick(scene: Scene, ladder: tuple[GeneralCamera, Bools]) -> Candidate | None:
+    """The ordinary camera, if nothing freer is clearly better."""
+    camera, kept = _refined(ladder[0], "ordinary", scene, ladder[1], FINAL_STEPS * 5, rounds=4)
+    error = scene.error(camera)
+    median = float(np.median(error[kept]))
+    if kept.sum() < FEWEST or not median < QUICK_MEDIAN * scene.image.half or camera.rho < 4 * SMALLEST_RHO:
+        return None
+    free, free_kept = _refined(camera, "free", scene, kept, LONG_STEPS)
+    free_error = scene.error(free)
+    # what seventeen free numbers gain over eleven by chance is no reason
+    by_chance = np.sqrt(max(2 * kept.sum() - 17, 0) / (2 * kept.sum() - 11))
+    if np.median(free_error[kept]) < QUICK_GAIN * by_chance * median or free_kept.sum() > kept.sum():
+        return None
+    views = _common_views(scene, kept)
+    tight = _evidence(camera, "ordinary", views)
+    if tight < _evidence(free, "free", views) - QUICK_NATS:
+        return None
+    return Candidate(camera, "ordinary", kept, tight)
+
+
+def _thorough(scene: Scene, ladder: tuple[GeneralCamera, Bools] | None) -> list[Candidate]:
+    """Every start, the best few of each sign, and each kind from them."""
+    starts = list(_starts(scene, ladder))
+    if not starts:
+        raise FitError("no camera sees the known points at these pixels.", fix="look for wrong detections")
+    best: dict[bool, list[tuple[float, GeneralCamera, Bools]]] = {False: [], True: []}
+    for camera, kept in starts:
+        found, explained = _refined(camera, "free", scene, kept, SHORT_STEPS)
+        best[camera.mirrored].append((_score(scene, found), found, explained))
+    for sign, some in best.items():
+        some.sort(key=lambda one: one[0])
+        again = [_refined(camera, "free", scene, kept, LONG_STEPS, rounds=2) for _, camera, kept in some[:BEST_STARTS]]
+        best[sign] = sorted(((_score(scene, c), c, k) for c, k in again), key=lambda one: one[0])
+    leading = {sign: some[0][0] if some else np.inf for sign, some in best.items()}
+    signs = [sign for sign in best if best[sign] and not leading[sign] * CLEARLY_WRONG > leading[not sign]]
+    common = min((best[sign][0] for sign in signs), key=lambda one: one[0])[2]
+    views = _common_views(scene, common)
+    found_all = [one for sign in signs for one in _kinds(scene, views, best[sign][0], starts, sign)]
+    usable = [one for one in found_all if np.isfinite(one.evidence)]
+    if not usable:
+        raise FitError("no camera sees the known points at these pixels.", fix="look for wrong detections")
+    return usable
+
+
+def _kinds(
+    scene: Scene,
+    views: Views,
+    best: tuple[float, GeneralCamera, Bools],
+    starts: list[tuple[GeneralCamera, Bools]],
+    sign: bool,
+) -> Iterator[Candidate]:
+    """Each kind, from the best free camera and from the ladder."""
+    _, free, kept = best
+    ladder = next((camera for camera, _ in starts if camera.mirrored == sign), free)
+    for family, kind in FAMILIES.items():
+        shape = free.shape if kind.p > 0.01 else np.zeros(2)
+        tilt = free.tilt if kind.tilt > 0.01 else np.zeros(2)
+        some = []
+        for camera in (free.with_shape(shape, tilt), ladder):
+            found, explained = _refined(camera, family, scene, kept, FINAL_STEPS, rounds=2)
+            some.append(Candidate(found, family, explained, _evidence(found, family, views)))
+        yield max(some, key=lambda one: one.evidence)
+
+
+def _score(scene: Scene, camera: GeneralCamera) -> float:
+    """A robust size of the errors at all views, px: wrong views do not count, and a camera cannot win with a few."""
+    error = scene.error(camera)
+    return float(np.median(error)) + 1e-9 * scene.image.half
+
+
+def _common_views(scene: Scene, kept: Bools) -> Views:
+    rows = np.flatnonzero(kept)
+    if len(rows) > MAX_CHOICE_VIEWS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_CHOICE_VIEWS, replace=False))
+    return Views(scene.points[rows], scene.uv[rows], scene.relative[rows], scene.image, scene.stated)
+
+
+def _evidence(camera: GeneralCamera, family: str, views: Views) -> float:
+    prior = family_prior(camera, family, views.image, _widest(camera, views.points))
+    return log_evidence(camera, prior, views)
+
+
+def _starts(scene: Scene, ladder: tuple[GeneralCamera, Bools] | None) -> Iterator[tuple[GeneralCamera, Bools]]:
+    if ladder is not None:
+        yield ladder
+    mirrored = _from_ladder(scene, mirrored=True)
+    if mirrored is not None:
+        yield mirrored
+    try:
+        P, kept = resect_robustly(scene.points, scene.uv)
+        camera = _from_linear(P)
+        if camera is not None:
+            yield camera, kept
+            farther = np.zeros(camera.size)
+            farther[RHO] = -0.7 * camera.rho
+            yield camera.moved(farther), kept  # its perspective is what noise disturbs first
+    except FitError:
+        pass
+    yield from _from_affine(scene)
+
+
+def _from_linear(P: Floats) -> GeneralCamera | None:
+    """The camera of a linear projection, whatever its pixels and its sign; None where it is at infinity."""
+    parts = camera_from_linear(P)
+    if parts is None:
+        return None
+    focal, shape, centre, mirrored, pose = parts
+    if not SMALLEST_RHO < 1 / max(float(np.linalg.norm(pose.translation)), 1e-12) < 100:
+        return None
+    return GeneralCamera(focal, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose)
+
+
+def _from_affine(scene: Scene) -> Iterator[tuple[GeneralCamera, Bools]]:
+    """Far cameras: a parallel projection and a guess of the distance, both signs."""
+    try:
+        A, b, kept = resect_affine(scene.points, scene.uv)
+    except FitError:
+        return
+    values, vectors = np.linalg.eigh(A @ A.T)
+    if not values[0] > 1e-12 * values[1] > 0:
+        return
+    root = vectors * np.sqrt(values) @ vectors.T  # scale * B
+    scale = float(np.sqrt(np.linalg.det(root)))
+    shape = _log_of_shape(root / scale)
+    across_rows = np.linalg.solve(root, A)
+    for mirrored in (False, True):
+        sign = np.array([-1.0 if mirrored else 1.0, 1.0])
+        x, y = across_rows * sign[:, None]
+        rotation = np.stack([x, y, np.cross(x, y)])
+        offset = sign * np.linalg.solve(root, b - scene.image.centre)
+        for rho in AFFINE_RHOS:
+            angle = rho * float(np.hypot(*offset))
+            if angle > 1.2:
+                continue
+            translation = np.append(offset * np.sinc(angle / np.pi), np.cos(angle) / rho)
+            pose = Pose(rotation, translation)
+            centre = scene.image.centre
+            yield GeneralCamera(scale / rho, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose), kept
+
+
+def _log_of_shape(B: Floats) -> Floats:
+    """(p, q) with exp([[p, q], [q, -p]]) = B, symmetric with determinant 1."""
+    values, vectors = np.linalg.eigh(B)
+    log = vectors * np.log(values) @ vectors.T
+    return np.array([0.5 * (log[0, 0] - log[1, 1]), log[0, 1]])

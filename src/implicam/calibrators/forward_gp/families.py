@@ -1,0 +1,150 @@
+"""Kinds of cameras: four priors on one camera model, and how probable each is after the views, eqs. (3) and (11).
+
+Every kind has the same parameters; one that a kind does not have is held by a narrow prior. So evidences compare
+directly: with few points the simplest kind wins, with more the views overrule it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from implicam.calibrators.forward_gp.evidence import NOISE, SIGNAL, STATED, CameraEvidence
+from implicam.calibrators.forward_gp.general_camera import CENTRE, KAPPA, RHO, SMALLEST_RHO, GeneralCamera
+from implicam.calibrators.forward_gp.lens import BENT, BENT_AT_EDGE, TANGENT, Floats, Image, Prior
+from implicam.calibrators.forward_gp.posterior import field_coordinates
+
+
+class Family(NamedTuple):
+    """Prior sds: of p and q of the pixels' shape, of the tilt, of the principal point in the longer side of the image;
+    weight: prior odds of the kind."""
+
+    p: float
+    q: float
+    tilt: float
+    centre: float
+    weight: float
+
+
+FAMILIES = {
+    "ordinary": Family(0.001, 1e-5, 1e-5, 0.02, 1.0),
+    "aspect": Family(0.15, 0.02, 1e-5, 0.02, 0.05),
+    "crop": Family(0.001, 1e-5, 1e-5, 0.4, 0.05),
+    "free": Family(0.15, 0.08, 0.3, 0.4, 0.02),
+}
+"""ordinary: square pixels, the lens over the image's centre. aspect: pixels of any shape. crop: the lens anywhere.
+free: all of it, and a tilted image plane."""
+
+MIRRORED_WEIGHT = 0.2
+"""Prior odds of a mirrored picture; each kind and sign gains 1 for every other camera of the rig that has it."""
+
+TELEPHOTO_EDGE = np.array([0.01, 0.0005])
+"""What k1 and k2 may do at the edge of the image at least, as a part of the radius: at 2 degrees a prior of the angle
+alone would allow no distortion at all."""
+
+RHO_SD = 3.0
+"""Prior sd of the inverse distance of the working frame's origin, in the working frame."""
+
+NEAR = Family(0.05, 0.05, 0.25, 0.25, 0.0)
+"""Of a free camera after the choice: sds about the camera found. Where its field is large it would wander without."""
+NEAR_RHO = 0.75
+
+CHOICE_SIGNAL_LOG_SD = 0.5
+"""Log sd of the field's size while kinds are compared: a field of 100 px must not stand in for a tilt."""
+
+AT_INFINITY = 3.0
+"""Nats against a camera at the largest distance there is: a perspective of the wrong sign ends there."""
+
+CHOICE_LENGTHSCALE = np.array([1.0, 2.0])
+
+MAX_CHOICE_VIEWS = 200
+"""Views that kinds are compared by."""
+
+_PROPER = slice(1, 12)
+"""The parameters with a proper prior in every kind: focal length and pose are flat."""
+
+
+def family_prior(camera: GeneralCamera, family: str, image: Image, widest: float) -> Prior:
+    """Eq. (3) of a camera that is used up to `widest` radians off its axis."""
+    kind = FAMILIES[family]
+    mean, precision = np.zeros(camera.size), np.zeros((camera.size, camera.size))
+    mean[CENTRE] = image.centre
+    sd = np.array([kind.p, kind.q, kind.tilt, kind.tilt, *2 * [kind.centre * 2 * image.half]])
+    precision[range(1, 7), range(1, 7)] = 1 / sd**2
+    powers = np.array([2, 4, 6, 8])
+    own = BENT.copy()
+    own[:2] = np.maximum(own[:2], TELEPHOTO_EDGE / widest ** powers[:2])
+    own = np.minimum(own, BENT_AT_EDGE / widest**powers)
+    unit = camera.rho**powers
+    covariance = np.diag(own**2) + 0.25 * np.outer(TANGENT, TANGENT)
+    precision[KAPPA, KAPPA] = np.linalg.inv(covariance) / np.outer(unit, unit)
+    precision[RHO, RHO] = 1 / RHO_SD**2
+    return Prior(mean, precision)
+
+
+def near_prior(camera: GeneralCamera, prior: Prior, image: Image) -> Prior:
+    """The prior of a free camera about where it was found."""
+    mean, precision = prior.mean.copy(), prior.precision.copy()
+    at = camera.parameters
+    sd = np.array([NEAR.p, NEAR.q, NEAR.tilt, NEAR.tilt, *2 * [NEAR.centre * 2 * image.half]])
+    mean[1:7] = at[1:7]
+    precision[range(1, 7), range(1, 7)] = 1 / sd**2
+    mean[RHO], precision[RHO, RHO] = at[RHO], 1 / (NEAR_RHO * at[RHO]) ** 2
+    return Prior(mean, precision)
+
+
+def widest_angle(camera: GeneralCamera, points: Floats) -> float:
+    """Radians off the axis of the farthest of points (n, 3)."""
+    there = camera.pose.apply(points)
+    return float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
+
+
+class Views(NamedTuple):
+    """What kinds are compared by: points (n, 3), pixels (n, 2), relative noise (n,), the image, and the stated noise in
+    pixels or NaN."""
+
+    points: Floats
+    uv: Floats
+    relative: Floats
+    image: Image
+    stated: float
+
+
+def log_evidence(camera: GeneralCamera, prior: Prior, views: Views) -> float:
+    """Log marginal likelihood of the views, in nats: lens and pose integrated out, sizes at their most probable."""
+    view = camera.view(views.points)
+    if not np.isfinite(view.by_parameters).all():
+        return -np.inf
+    off = prior.mean - camera.parameters
+    q = field_coordinates(view, views.image)
+    one = CameraEvidence(views.uv - view.uv, view.by_parameters, off, prior, q, views.relative)
+    try:
+        spectrum = one.spectrum(CHOICE_LENGTHSCALE, 1e-6)
+        stated = np.isfinite(views.stated)
+        median = np.log([np.exp(SIGNAL["general"][0]) * views.image.half, 1.0])
+        median[1] = np.log(views.stated) if stated else NOISE[0] + np.log(views.image.half)
+        sd = np.array([CHOICE_SIGNAL_LOG_SD, STATED if stated else NOISE[1]])
+
+        def loss(z: Floats) -> tuple[float, Floats]:
+            value, by_signal, by_noise = one.objective(spectrum, *np.exp(median + z))
+            return value + 0.5 * float(np.sum((z / sd) ** 2)), np.array([by_signal, by_noise]) + z / sd**2
+
+        start = np.array([0.0, np.clip(np.log(_rms(spectrum)) - median[1], -4, 8)])
+        found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(-4, 8), (-6, 10)], options={"ftol": 1e-6})
+        proper = np.linalg.slogdet(_scaled(prior.precision[_PROPER, _PROPER]))
+    except np.linalg.LinAlgError:
+        return -np.inf
+    logs = float(proper[1] + np.sum(np.log(np.diag(prior.precision)[_PROPER])))
+    at_infinity = AT_INFINITY if camera.rho < 1.01 * SMALLEST_RHO else 0.0
+    return -float(found.fun) + 0.5 * logs - at_infinity
+
+
+def _scaled(A: Floats) -> Floats:
+    scale = 1 / np.sqrt(np.diag(A))
+    return A * scale[:, None] * scale
+
+
+def _rms(spectrum: object) -> float:
+    return float(np.sqrt((np.sum(spectrum.y**2) + spectrum.yy) / max(2 * len(spectrum.y) + spectrum.outside, 1)))  # type: ignore[attr-defined]

@@ -1,0 +1,245 @@
+"""One camera model for any camera: any lens, pixels that are not square, a tilted or cropped sensor, a mirror.
+
+    pixel = centre + focal B y,    y = m / (1 + tilt . m),    m = diag(s, 1) d(alpha) (X / a, Y / a)
+
+with (X, Y, Z) = R x + T, a = hypot(X, Y), alpha = atan2(a, Z), d the Kannala-Brandt polynomial, B = exp([[p, q],
+[q, -p]]) the shape of the pixels (symmetric, determinant 1) and s = -1 where the picture is mirrored: eq. (2) of
+docs/method.md. `tilt` is a projective map of the image plane: a tilted sensor (Scheimpflug), an oblique window. With it
+every linear projection is such a camera.
+
+The parameters are chosen so that a telephoto lens is an ordinary case (weak perspective, Hartley & Zisserman, section
+6.3): focal length over distance, the inverse distance rho of the working frame's origin, where that origin is seen
+across the axis, and the rotation about it. Distortion is counted in the image and not in the angle, so that it stays
+what it is while rho changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, ProjectiveCamera, View
+from implicam.cameras import KannalaBrandt
+from implicam.geometry import Pose, rotation_from_vector
+
+SMALLEST_RHO = 5e-4
+"""Of the inverse distance, in the working frame: farther away nothing shows it, and the evidence loses its digits."""
+
+PARAMETERS = (
+    "log_scale", "p", "q", "tilt_u", "tilt_v", "cu", "cv", "kappa1", "kappa2", "kappa3", "kappa4", "rho", "across_x",
+    "across_y", "turn_x", "turn_y", "turn_z",
+)  # fmt: skip
+"""A step's numbers, in order: log(focal * rho); shape of the pixels; tilt; principal point; distortion in the image;
+1 / distance of the origin; where it is across the axis, as an arc; rotation about it."""
+
+SHAPE, TILT, CENTRE, KAPPA, RHO = slice(1, 3), slice(3, 5), slice(5, 7), slice(7, 11), 11
+_POWERS = np.array([2, 4, 6, 8])
+
+
+@dataclass(frozen=True, eq=False)
+class GeneralCamera:
+    """focal px, the geometric mean of the two directions; shape (2,) p and q; tilt (2,); centre (2,) px; k (4,);
+    mirrored; pose camera_from_world, where the world is the working frame."""
+
+    focal: float
+    shape: Floats
+    tilt: Floats
+    centre: Floats
+    k: Floats
+    mirrored: bool
+    pose: Pose
+
+    kind: ClassVar[str] = "general"
+    size: ClassVar[int] = len(PARAMETERS)
+
+    @property
+    def rho(self) -> float:
+        """1 / distance of the working frame's origin."""
+        return 1 / float(np.linalg.norm(self.pose.translation))
+
+    @property
+    def parameters(self) -> Floats:
+        """(17,) what the prior is about; the rotation has no prior and is zero here."""
+        rho = self.rho
+        kappa = (self.k - 0.5 * TANGENT) * rho**_POWERS
+        direction = self.pose.translation * rho
+        sine = float(np.hypot(*direction[:2]))
+        arc = np.arctan2(sine, direction[2]) / (sine * rho) if sine > 0 else 1 / rho
+        log_scale = np.log(self.focal * rho)
+        return np.concatenate(
+            [[log_scale], self.shape, self.tilt, self.centre, kappa, [rho], direction[:2] * arc, np.zeros(3)]
+        )
+
+    @property
+    def sane(self) -> bool:
+        """Not inside out, and every number finite."""
+        return bool(np.isfinite(self.focal) and 0 < self.focal < 1e12 and np.abs(self.tilt).max() < 1e3)
+
+    def moved(self, step: Floats) -> GeneralCamera:
+        """The camera with its parameters changed by (17,)."""
+        x = self.parameters + step
+        rho = max(float(x[RHO]), SMALLEST_RHO)
+        across = x[12:14]
+        angle = rho * float(np.hypot(*across))
+        translation = np.append(across * np.sinc(angle / np.pi), np.cos(angle) / rho)
+        turn = rotation_from_vector(step[14:])
+        return GeneralCamera(
+            float(np.exp(min(x[0], 50.0)) / rho),
+            x[SHAPE],
+            x[TILT],
+            x[CENTRE],
+            0.5 * TANGENT + x[KAPPA] / rho**_POWERS,
+            self.mirrored,
+            Pose(turn @ self.pose.rotation, translation),
+        )
+
+    def with_shape(self, shape: Floats, tilt: Floats) -> GeneralCamera:
+        """The camera with other pixels."""
+        return replace(self, shape=shape, tilt=tilt)
+
+    def pixel(self, points: Floats) -> Floats:
+        """(n, 2) pixels of points (n, 3), NaN where there is none."""
+        return self._image(self._lens.pixel_from_camera_point(self.pose.apply(points))[0])[0]
+
+    def view(self, points: Floats) -> View:
+        """Everything at once, of points (n, 3)."""
+        n = len(points)
+        turned = points @ self.pose.rotation.T
+        there = turned + self.pose.translation
+        bent, _ = self._lens.pixel_from_camera_point(there)
+        uv, y, w = self._image(bent)
+        sign = np.array([-1.0 if self.mirrored else 1.0, 1.0])
+        B, by_p, by_q = _pixel_shape(self.shape)
+        by_y = self.focal * B
+        # y by m: (I - y tilt^T) / w
+        by_m = (by_y @ (np.eye(2) - y[:, :, None] * self.tilt)) / w[:, None, None] * sign
+        slope = by_m @ self._lens.jacobian(there)
+        by_k = by_m @ self._lens.parameter_jacobian(there)[:, :, 4:]
+        rho = self.rho
+        by_across, by_rho = self._translation_slopes()
+        out = np.empty((n, 2, self.size))
+        away = y @ by_y.T
+        out[:, :, 0] = away
+        out[:, :, 1], out[:, :, 2] = self.focal * (y @ by_p.T), self.focal * (y @ by_q.T)
+        out[:, :, 3:5] = -away[:, :, None] * y[:, None, :]
+        out[:, :, 5:7] = np.where(np.isnan(uv[:, :1, None]), np.nan, np.eye(2))
+        out[:, :, KAPPA] = by_k / rho**_POWERS
+        out[:, :, RHO] = -away / rho + slope @ by_rho - by_k @ (_POWERS * (self.k - 0.5 * TANGENT) / rho)
+        out[:, :, 12:14] = slope @ by_across
+        out[:, :, 14:] = np.cross(turned[:, None, :], slope)  # slope . (omega x turned)
+        squared = np.sum(there**2, axis=1)
+        return View(
+            uv,
+            0.5 * np.log(squared),
+            out,
+            slope @ self.pose.rotation,
+            there @ self.pose.rotation / squared[:, None],
+        )
+
+    def lines(self, uv: Floats) -> tuple[Floats, Floats]:
+        """The lines of sight of pixels (n, 2): the camera's centre (3,) and unit directions (n, 3), NaN for none."""
+        y = np.linalg.solve(self.focal * _pixel_shape(self.shape)[0], (uv - self.centre).T).T
+        w = 1 - y @ self.tilt
+        m = y / np.where(w > 0, w, np.nan)[:, None]
+        if self.mirrored:
+            m = m * [-1.0, 1.0]
+        rays, _ = self._lens.ray_from_pixel(m)
+        return self.pose.centre, rays @ self.pose.rotation
+
+    def as_array(self) -> Floats:
+        """(24,) focal, shape, tilt, centre, k, +1 or -1 if mirrored, rotation, translation."""
+        sign = -1.0 if self.mirrored else 1.0
+        return np.concatenate(
+            [
+                [self.focal],
+                self.shape,
+                self.tilt,
+                self.centre,
+                self.k,
+                [sign],
+                self.pose.rotation.ravel(),
+                self.pose.translation,
+            ]
+        )
+
+    @classmethod
+    def from_array(cls, array: Floats) -> GeneralCamera:
+        """The inverse of `as_array`; ValueError for what is none."""
+        rotation = array[12:21].reshape(3, 3)
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise ValueError("a camera's rotation is not one")
+        if not array[0] > 0 or abs(array[11]) != 1 or not np.linalg.norm(array[21:]) > 0:
+            raise ValueError("a camera's focal length, mirror sign or place is none")
+        pose = Pose(rotation, array[21:])
+        return cls(float(array[0]), array[1:3], array[3:5], array[5:7], array[7:11], bool(array[11] < 0), pose)
+
+    @classmethod
+    def from_central(cls, camera: CentralCamera, *, mirrored_about: float | None = None) -> GeneralCamera:
+        """The same camera as a Kannala-Brandt `CentralCamera`; mirrored_about: the u at which its pictures, which were
+        turned left for right, are turned back."""
+        lens = camera.lens
+        assert isinstance(lens, KannalaBrandt)
+        p = 0.5 * np.log(lens.fx / lens.fy)
+        cx = lens.cx if mirrored_about is None else 2 * mirrored_about - lens.cx
+        return cls(
+            float(np.sqrt(lens.fx * lens.fy)),
+            np.array([p, 0.0]),
+            np.zeros(2),
+            np.array([cx, lens.cy]),
+            np.array([lens.k1, lens.k2, lens.k3, lens.k4]),
+            mirrored_about is not None,
+            camera.pose,
+        )
+
+    def as_central(self) -> CentralCamera:
+        """The Kannala-Brandt camera that is left when mirror, skew and tilt are not there."""
+        fx, fy = self.focal * np.exp([self.shape[0], -self.shape[0]])
+        lens = KannalaBrandt(float(fx), float(fy), *map(float, self.centre), *map(float, self.k))
+        return CentralCamera(lens, self.pose)
+
+    @cached_property
+    def _lens(self) -> KannalaBrandt:
+        return KannalaBrandt(1.0, 1.0, 0.0, 0.0, *self.k.tolist())
+
+    def _image(self, bent: Floats) -> tuple[Floats, Floats, Floats]:
+        """Pixels (n, 2), y (n, 2) and 1 + tilt . m (n,) of what the lens makes of a point (n, 2)."""
+        m = bent * [-1.0, 1.0] if self.mirrored else bent
+        w = 1 + m @ self.tilt
+        w = np.where(w > 0, w, np.nan)
+        y = m / w[:, None]
+        return self.centre + self.focal * (y @ _pixel_shape(self.shape)[0].T), y, w
+
+    def _translation_slopes(self) -> tuple[Floats, Floats]:
+        """How the translation depends on where the origin is across the axis (3, 2), and on rho (3,)."""
+        rho = self.rho
+        direction = self.pose.translation * rho
+        sine, cosine = float(np.hypot(*direction[:2])), float(direction[2])
+        angle = np.arctan2(sine, cosine)
+        outward = direction[:2] / sine if sine > 0 else np.array([1.0, 0.0])
+        sideways = np.array([-outward[1], outward[0]])
+        radial = np.append(outward * cosine, -sine)
+        around = np.append(sideways * np.sinc(angle / np.pi), 0.0)
+        by_across = np.outer(radial, outward) + np.outer(around, sideways)
+        arc = angle / rho
+        by_rho = radial * arc / rho - direction / rho**2
+        return by_across, by_rho
+
+
+AnyCamera = CentralCamera | ProjectiveCamera | GeneralCamera
+
+
+def _pixel_shape(shape: Floats) -> tuple[Floats, Floats, Floats]:
+    """B = exp([[p, q], [q, -p]]) and its derivatives by p and q, (2, 2) each."""
+    p, q = shape
+    M = np.array([[p, q], [q, -p]])
+    h2 = float(p * p + q * q)
+    h = np.sqrt(h2)
+    cosh, sinhc = np.cosh(h), np.sinh(h) / h if h > 0 else 1.0
+    bend = (cosh - sinhc) / h2 if h > 1e-4 else 1 / 3 + h2 / 30
+    B = cosh * np.eye(2) + sinhc * M
+    by_p = sinhc * p * np.eye(2) + bend * p * M + sinhc * np.diag([1.0, -1.0])
+    by_q = sinhc * q * np.eye(2) + bend * q * M + sinhc * np.array([[0.0, 1.0], [1.0, 0.0]])
+    return B, by_p, by_q
