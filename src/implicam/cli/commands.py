@@ -54,6 +54,7 @@ from implicam.errors import DatasetError, UsageError
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import toml_text
 from implicam.images import PATTERN
+from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
 __all__ = ["EXAMPLES", "app"]
 
@@ -194,6 +195,7 @@ def calibrate_command(
     without: Without = None,
     unit: Unit = None,
     seed: Seed = 0,
+    force: Annotated[bool, typer.Option("--force", help="Write the file even if it is not usable.")] = False,
     json: Json = False,
 ) -> None:
     """Learn the rig from known points; points kept back with --points are there for `implicam evaluate`."""
@@ -206,24 +208,30 @@ def calibrate_command(
         wanted = replace(wanted, method=Explicit.method)  # nothing else can be made of boards
     with show.progress(json) as progress:
         calibration = wanted.calibrator().fit(data, progress)
-    calibration.save(output)
-    _tell_calibration(calibration, output, json)
+        verdict = judge(calibration, progress)
+    written = force or verdict.word != NOT_USABLE
+    if written:
+        calibration_file.save(calibration, output, verdict.as_table())
+    _tell_calibration(calibration, verdict, output if written else None, json)
+    if not written:
+        raise typer.Exit(1)
 
 
-def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> None:
+def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path | None, json: bool) -> None:
     residuals = calibration.residuals()
     unused = [asdict(unused) for unused in calibration.unused]
     notes = [*calibration.data.notes, *calibration.notes()]
     if json:
         show.emit_json(
-            {"calibration": str(output), "method": calibration.method, "residuals": residuals, "unused": unused,
+            {"calibration": None if output is None else str(output), "verdict": verdict.as_table(),
+             "method": calibration.method, "residuals": residuals, "unused": unused,
              "rejected": [asdict(view) for view in calibration.rejected], "notes": notes,
              "length_unit": calibration.data.length_unit}
         )  # fmt: skip
         return
     unit = calibration.data.length_unit
     rms = residuals["leave_one_out_rms"]
-    show.line(f"{output}: {calibration.method} from {residuals['points_used']} points")
+    show.line(f"{output or 'no file written'}: {calibration.method} from {residuals['points_used']} points")
     within = ", ".join(f"{axis} {show.number(value)}" for axis, value in rms.items())
     how = "each left out in turn is predicted from the rest"
     if "held_out" in residuals:
@@ -232,7 +240,10 @@ def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> Non
         how = f"the {residuals['held_out_points']} of them that it was not trained on are predicted"
     show.line(f"{how} within {within} {unit} rms")
     show.notes(show.counted((entry.reason for entry in calibration.unused), "known point", "not used"))
-    show.notes(notes)
+    show.notes([note for note in notes if note not in verdict.reasons])
+    show.calibration_verdict(verdict, unit)
+    if output is None:
+        show.say("no file is written; --force writes it nevertheless")
 
 
 @command("measure")
@@ -245,6 +256,7 @@ def measure_command(
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
     fitted = load_calibration(calibration)
+    judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
     data = _read_to_measure(dataset, unit, fitted.data.length_unit)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
@@ -264,6 +276,8 @@ def measure_command(
         text += f", typical sd {', '.join(f'{a} {show.number(v)}' for a, v in zip('xyz', typical, strict=True))} "
         text += measured.length_unit
     show.line(text)
+    if judged in (DOUBTFUL, NOT_USABLE):
+        show.note(f"this calibration was found {judged} when it was made: implicam info {calibration} says why")
     show.notes(data.notes)
     show.notes(show.reasons(measured))
     show.notes(show.left_out(measured))

@@ -33,6 +33,7 @@ from implicam.detect.folder import DetectionRun
 from implicam.evaluate import Evaluation
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
+from implicam.verdict import Verdict
 
 MOST_NOTES = 6
 SMALLEST_IN_DECIMALS = 1e-8
@@ -150,6 +151,20 @@ def _count(count: int, noun: str) -> str:
 def alarm(text: str) -> None:
     """Something that makes the numbers not to be trusted."""
     err.print(f"[bold red]alarm:[/] {escape(text)}", soft_wrap=True)
+
+
+def calibration_verdict(found: Verdict, unit: str) -> None:
+    """Whether a calibration is to be used, and why not."""
+    text = found.word
+    if found.held_out is not None:
+        h = found.held_out
+        text += (
+            f"; {h.how}: {h.points} points are off by {number(h.rms)} {unit} rms, their error bars say "
+            f"{number(h.stated)}, and {100 * h.inside:.0f} % are in their 95 % ellipsoids"
+        )
+    line(f"verdict: {text}")
+    for reason in found.reasons:
+        err.print(f"[bold red]{found.word}:[/] {escape(reason)}", soft_wrap=True)
 
 
 def notes(texts: Sequence[str]) -> None:
