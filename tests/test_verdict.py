@@ -125,7 +125,7 @@ class _Pretends:
 TRUE = rig(25)
 
 
-@pytest.mark.parametrize(("off", "word"), [(0.02, USABLE), (0.1, DOUBTFUL), (5.0, NOT_USABLE), (500.0, NOT_USABLE)])
+@pytest.mark.parametrize(("off", "word"), [(0.02, USABLE), (0.06, DOUBTFUL), (5.0, NOT_USABLE), (500.0, NOT_USABLE)])
 def test_errors_far_above_the_error_bars(off: float, word: str) -> None:
     verdict = ic.judge(_Pretends(TRUE, off))
     assert verdict.word == word
