@@ -30,6 +30,9 @@ USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
 FEW_POINTS = 12
 """Fewer known points fix a rig, but leave too little to check it by."""
 
+ENOUGH_POINTS = 17
+"""From so many on, a fit that fails without a fifth of them is bad luck and no sign, unless most of them do."""
+
 FLAT_RATIO = 0.01
 """Thickness over width of known points that are nearly on a plane, or a line: beyond it nothing is known."""
 
@@ -140,6 +143,7 @@ def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | N
     plan = _plan(calibration, n)
     fold = np.random.default_rng(0).permutation(np.arange(n) % plan.folds)
     found: list[_Measured] = []
+    failures: list[ImplicamError] = []
     for i in range(plan.done):
         progress("checking", i, plan.done)
         others = calibration.data.select(~np.isin(calibration.data.points, data.points[fold == i]))
@@ -148,11 +152,13 @@ def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | N
         except UsageError:  # made without known points: nothing can be held out
             return None, []
         except ImplicamError as error:
-            progress("checking", plan.done, plan.done)
-            return None, _not_repeatable(n, error)
+            failures.append(error)
+            continue
         found.append(_measured(again, data.select(fold == i)))
     progress("checking", plan.done, plan.done)
-    how = f"{plan.done} fits from nothing without {'a fifth' if plan.folds == 5 else 'a third'} of the known points"
+    if len(failures) > plan.done / 2 or (failures and n < ENOUGH_POINTS):
+        return None, _not_repeatable(n, failures[0])
+    how = f"{len(found)} fits from nothing without {'a fifth' if plan.folds == 5 else 'a third'} of the known points"
     return _summary(found, how + (f", at most {plan.train} points each" if n > plan.train else "")), []
 
 
