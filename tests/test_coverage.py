@@ -148,6 +148,33 @@ def test_verdict(factor: float, verdict: str):
     assert row.sd_factor == pytest.approx(1 / factor, rel=0.1)
 
 
+@pytest.mark.parametrize("factor", [1e6, 10.0, 2.0])
+def test_error_bars_that_are_too_wide_are_not_right_however_few_the_points(factor: float):
+    errors, cov = sample(60, seed=3)
+    row = assess(errors, cov * factor**2, clusters=np.arange(60).astype(str)).overall
+    assert row.verdict == "too large"
+    assert row.nees.high < 3
+    assert row.level(0.95).ellipsoid.high == 1.0
+
+
+@pytest.mark.parametrize(("points", "in_shots_of"), [(20, 1), (60, 1), (200, 1), (60, 5), (200, 10)])
+def test_honest_error_bars_are_rarely_called_wrong(points: int, in_shots_of: int):
+    rng = np.random.default_rng(points)
+    shots, cov = np.arange(points) // in_shots_of, np.tile(np.eye(3), (points, 1, 1))
+    own, shared = (1.0, 0.0) if in_shots_of == 1 else (0.5**0.5, 0.5**0.5)
+    wrong = 0
+    for _ in range(100):
+        errors = own * rng.normal(size=(points, 3)) + shared * rng.normal(size=(points, 3))[shots]
+        wrong += assess(errors, cov, clusters=shots).overall.verdict in ("too small", "too large")
+    assert wrong <= 8  # at 5 %, one in 50 would have more
+
+
+def test_heavy_tails_are_too_small_bars_even_where_most_points_are_too_good():
+    rng = np.random.default_rng(0)
+    errors = rng.normal(size=(400, 3)) * np.where(rng.random(400) < 0.12, 8.0, 0.3)[:, None]
+    assert assess(errors, np.tile(np.eye(3), (400, 1, 1))).overall.verdict == "too small"
+
+
 # ----------------------------------------------------------------------------------------------------- properties
 
 

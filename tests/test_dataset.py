@@ -22,6 +22,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, join, read_dataset, write_dataset
+from implicam.dataset.marks import MARKS
 from implicam.errors import DatasetError, ImplicamError
 from implicam.files import left_behind, replacing_folder
 from implicam.simulate import simulated
@@ -135,6 +136,8 @@ def datasets(draw: Any) -> Dataset:
                     uv[i, k, axis] = draw(
                         st.floats(-0.5, size - 0.5) if whole else st.floats(allow_nan=False, allow_infinity=False)
                     )
+                if tuple(uv[i, k]) in MARKS:  # would be read as a missing view
+                    uv[i, k] += 0.25
                 if stated:
                     sd[i, k] = [draw(st.just(np.nan) | st.floats(1e-300, 1e300)) for _ in range(2)]
     seen = ~np.isnan(uv[..., 0])
@@ -617,10 +620,10 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
         ),
     ),
     'nan pixel': (
-        put("observations.csv", "50,60", "nan,nan"),
+        put("observations.csv", "50,60", "nan,60"),
         (
             "{at}/rig/observations.csv, line 4: u = 'nan' is not a finite number.\n"
-            '  fix: a view that is missing has no row: remove it'
+            '  fix: leave both u and v empty where the view is missing, or remove the row'
         ),
     ),
     'far outside': (
@@ -651,7 +654,7 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
         (
             "{at}/rig/observations.csv, line 4: v = '' is not a number.\n"
             '  why: the cell is empty\n'
-            '  fix: a view that is missing has no row: remove it'
+            '  fix: leave both u and v empty where the view is missing, or remove the row'
         ),
     ),
     'negative sd': (
@@ -1043,8 +1046,9 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
     'half a camera': (
         "x,y,z,u_a,v_b\n1,2,3,4,5\n",
         (
-            '{at}/w.csv, line 1: there are no camera columns.\n'
-            '  fix: name them u_cam1,v_cam1,u_cam2,v_cam2, ...'
+            "{at}/w.csv, line 1: there is a column 'u_a' but no 'v_a' (did you mean 'v_b'?).\n"
+            '  why: the pixels of a camera are a pair of columns, u_NAME and v_NAME\n'
+            '  fix: correct the heading, add the other column, or give a column that is no pixel another name'
         ),
     ),
     'no z': (

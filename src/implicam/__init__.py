@@ -48,6 +48,7 @@ from implicam.errors import (
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.measurement import Measurement
 from implicam.simulate import simulated
+from implicam.verdict import Verdict, judge
 
 __version__ = package_version()
 
@@ -77,11 +78,13 @@ __all__ = [
     "NumericalError",
     "Observations",
     "UsageError",
+    "Verdict",
     "assess",
     "calibrator",
     "cross_validate",
     "evaluate",
     "join",
+    "judge",
     "leave_out_shots",
     "load_calibration",
     "read_dataset",

@@ -87,14 +87,20 @@ class Contents:
     arrays: Mapping[str, NDArray[Any]]
 
 
-def save(calibration: Savable, path: str | Path) -> None:
-    """Write the calibration, whole or not at all."""
+def save(calibration: Savable, path: str | Path, verdict: Mapping[str, Any] | None = None) -> None:
+    """Write the calibration, whole or not at all; verdict: what `judge` says of it, for the readable table."""
     path = Path(path)
     method_table, method_arrays = calibration.state()
     arrays = {_DATA + name: array for name, array in arrays_from_dataset(calibration.data).items()}
     arrays |= {_METHOD + name: array for name, array in method_arrays.items()}
     content = npz_bytes(arrays)
-    table = {**_description(calibration), "arrays_sha256": hashlib.sha256(content).hexdigest(), "options": method_table}
+    judged = {} if verdict is None else {"verdict": dict(verdict)}
+    table = {
+        **_description(calibration),
+        **judged,
+        "arrays_sha256": hashlib.sha256(content).hexdigest(),
+        "options": method_table,
+    }
     with replacing(path) as temporary:
         write_zip(temporary, {TOML: toml_text(table).encode(), ARRAYS: content})
 

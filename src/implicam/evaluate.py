@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from implicam.calibrators import Calibration
 from implicam.coverage import Coverage, assess, tercile_labels
-from implicam.dataset import Dataset, Floats, Names, Observations
+from implicam.dataset import Dataset, Floats, Names, Observations, copies_of
+from implicam.dataset.copies import fingerprints
 from implicam.errors import DatasetError
 from implicam.geometry import depth_of_points
 from implicam.measurement import Measurement
@@ -81,6 +82,9 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
         )
     held_out = data.select(~used)
     how = f"{len(held_out)} points not used in the fit"
+    if copies_of(held_out).points.any():
+        how += f", of which {int(copies_of(held_out).points.sum())} are copies of others and not counted"
+        held_out = held_out.select(~copies_of(held_out).points)
     if used.any():
         how += f"; {used.sum()} of this dataset were, and are left out"
     measurement = calibration.measure(held_out.observations)
@@ -91,13 +95,23 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
 def cross_validate(fit: Fits, data: Dataset, k: int, *, seed: int = 0, progress: Progress = silent) -> Evaluation:
     """Hold each of `k` random folds out in turn: a fit to the others measures it."""
     how = f"{k}-fold cross-validation (seed {seed})"
+    data, how = _each_once(data, how)
     return _held_out_in_turn(fit, data, list(data.folds(k, seed=seed)), how, progress)
 
 
 def leave_out_shots(fit: Fits, data: Dataset, *, progress: Progress = silent) -> Evaluation:
     """Hold each shot (a board, a plane) out in turn: a fit to the others measures it."""
+    data, more = _each_once(data, "")
     rounds = list(data.leave_out_shots())
-    return _held_out_in_turn(fit, data, rounds, f"each of {len(rounds)} shots left out in turn", progress)
+    return _held_out_in_turn(fit, data, rounds, f"each of {len(rounds)} shots left out in turn{more}", progress)
+
+
+def _each_once(data: Dataset, how: str) -> tuple[Dataset, str]:
+    """Without copied points: a copy in another fold is a point that the fit knows, and no second piece of evidence."""
+    copied = copies_of(data).points
+    if not copied.any():
+        return data, how
+    return data.select(~copied), f"{how}; {copied.sum()} points are copies of others and not counted"
 
 
 def _held_out_in_turn(
@@ -156,7 +170,7 @@ def _judge(
     against = "the simulated truth"
     if truth is None:
         against = f"the known positions{_whose_errors(data, labels)}"
-    notes = tuple(calibration.notes())
+    notes = (*dict.fromkeys((*data.notes, *calibration.data.notes, *calibration.notes())),)
     return Evaluation(calibration.method, data, measurement, true_xyz, known_xyz, coverage, how, against, notes)
 
 
@@ -211,8 +225,11 @@ def _same_views(fitted: Observations, given: Observations) -> NDArray[np.bool_]:
 
 def _fingerprints(observations: Observations) -> list[bytes]:
     """Per point its pixels as bytes; a point without any is known by its name."""
-    uv = np.where(np.isnan(observations.uv), np.nan, observations.uv + 0.0)  # one NaN, one zero
+    marks, seen_at_all = (
+        fingerprints(observations.uv.reshape(len(observations), 2 * len(observations.cameras))),
+        observations.seen.sum(axis=1) > 0,
+    )
     return [
-        views.tobytes() if np.isfinite(views).any() else str(name).encode()
-        for views, name in zip(uv, observations.points, strict=True)
+        mark if seen else str(name).encode()
+        for mark, seen, name in zip(marks, seen_at_all, observations.points, strict=True)
     ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,10 @@ MEASURED_COLUMNS = (
 )  # fmt: skip
 
 
+DOUBTFUL = "doubtful: the table as a whole contradicts the calibration"
+"""How the reason of every row begins where there is an alarm."""
+
+
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """Positions of n points, in the world frame and length unit of the calibration.
@@ -27,6 +31,8 @@ class Measurement:
     cov: (n, 3, 3) covariance of the *position*, everything included: pixel noise of this measurement, lack of
     calibration data, parameters. views: (n,) number of views used. consistency: (n,) p-value of the chi-squared test
     that the views agree, NaN where it cannot be tested.
+    alarm: what is wrong with the table as a whole, in a sentence: the rig is not the one that was calibrated. Then no
+    number of it is to be trusted, and every reason begins with DOUBTFUL. Empty where nothing is.
     """
 
     points: Names
@@ -36,6 +42,7 @@ class Measurement:
     consistency: Floats
     reason: Names
     length_unit: str
+    alarm: str = ""
 
     def __post_init__(self) -> None:
         """A covariance is symmetric to the last bit, whatever order a method or a processor summed it in."""
@@ -48,6 +55,20 @@ class Measurement:
     def measured(self) -> NDArray[np.bool_]:
         """(n,) where there is a position."""
         return ~np.isnan(self.xyz[:, 0])
+
+    @property
+    def own_reason(self) -> Names:
+        """(n,) the reasons without what an alarm puts before them."""
+        return np.array(
+            [str(reason).removeprefix(DOUBTFUL).removeprefix("; ") for reason in self.reason], dtype=np.str_
+        )
+
+    def with_alarm(self, alarm: str) -> Measurement:
+        """The same, every row marked as doubtful; itself where there is no alarm."""
+        if not alarm:
+            return self
+        reasons = [f"{DOUBTFUL}; {reason}" if reason else DOUBTFUL for reason in map(str, self.own_reason)]
+        return replace(self, alarm=alarm, reason=np.array(reasons, dtype=np.str_))
 
     @property
     def sd(self) -> Floats:

@@ -30,13 +30,14 @@ from implicam.calibrators.protocol import (
     Arrays,
     Rejected,
     Unused,
+    copied_points,
     finite_column,
     require_points,
     require_two_values,
     same_cameras,
     why_not_all_seen,
 )
-from implicam.dataset import Dataset, Floats, Names, Observations
+from implicam.dataset import Dataset, Floats, Names, Observations, copy_notes, without_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
 from implicam.measurement import Measurement
@@ -144,7 +145,9 @@ class InverseGP:
 
 
 def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
-    """The points with every view, and why the others are not used; FitError where they are too few."""
+    """The points with every view, each once, and why the others are not used; FitError where they are too few."""
+    copied = copied_points(data)
+    data = without_copies(data, cameras_too=True)
     seen = data.observations.seen
     complete = seen.all(axis=1)
     names = data.observations.camera_names
@@ -158,7 +161,7 @@ def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]
     require_points(int(complete.sum()), least, method, why)
     usable = data.select(complete)
     require_two_values(usable.xyz, method)
-    return usable, unused
+    return usable, (*unused, *copied)
 
 
 def pixels_of(data: Dataset) -> Floats:
@@ -205,6 +208,11 @@ class InverseGPCalibration:
 
     method: ClassVar[str] = "inverse-gp"
 
+    @cached_property
+    def used(self) -> Dataset:
+        """The data without the points and cameras that are there twice."""
+        return without_copies(self.data, cameras_too=True)
+
     @property
     def rejected(self) -> tuple[Rejected, ...]:
         """None: this method uses every view of the points it uses; `notes` names suspects."""
@@ -242,7 +250,7 @@ class InverseGPCalibration:
 
     @property
     def _usable(self) -> Dataset:
-        return self.data.select(self.data.observations.seen.all(axis=1))
+        return self.used.select(self.used.observations.seen.all(axis=1))
 
     @property
     def _known(self) -> tuple[Floats, Floats]:
@@ -253,7 +261,7 @@ class InverseGPCalibration:
     def measure(self, observations: Observations) -> Measurement:
         """Measure the points that every camera saw, and whose pixels are like those learned from (`smooth`); the
         others keep their row, with a reason."""
-        observations = same_cameras(self.data.observations, observations)
+        observations = same_cameras(self.used.observations, observations)
         seen = observations.seen
         reason = blind_reasons(seen, observations.camera_names, self.method).astype(object)
         complete = np.flatnonzero(seen.all(axis=1))
@@ -300,7 +308,7 @@ class InverseGPCalibration:
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         flat = flat_note(self.data) or self._thin_note()
-        return [*flat, *lattice_note(self.data, self.method), *self._suspects()]
+        return [*copy_notes(self.data), *flat, *lattice_note(self.data, self.method), *self._suspects()]
 
     @cached_property
     def _thickness(self) -> tuple[float, float]:
@@ -333,7 +341,7 @@ class InverseGPCalibration:
         """Known points that the others contradict: a wrong detection, a wrong position."""
         errors, variances = self.map.leave_one_out()
         worst = np.max(np.abs(errors) / np.sqrt(variances), axis=1)
-        names = self.data.points[self.data.observations.seen.all(axis=1)]
+        names = self.used.points[self.used.observations.seen.all(axis=1)]
         found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > SUSPECT]
         if not found:
             return []
@@ -387,8 +395,9 @@ class InverseGPCalibration:
             str(table["kernel"]), str(table["preset"]), int(table["seed"]), float(table["shortest_lengthscale"])
         )
         _, unused = seen_by_all(data, cls.method)
-        d = 2 * len(data.cameras)
-        pixels, positions = scalings(arrays, data)
+        used = without_copies(data, cameras_too=True)
+        d = 2 * len(used.cameras)
+        pixels, positions = scalings(arrays, used)
         if calibrator.preset == "smooth":
             smoothness = Smoothness(
                 calibrator.kernel,

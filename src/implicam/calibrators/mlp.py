@@ -34,7 +34,7 @@ from implicam.calibrators.inverse_gp import (
 from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import Examples, train
 from implicam.calibrators.protocol import Arrays, Rejected, Unused, finite_column, same_cameras
-from implicam.dataset import Dataset, Floats, Observations
+from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_copies
 from implicam.errors import FitError, UsageError
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -137,6 +137,11 @@ class MLPCalibration:
 
     method: ClassVar[str] = "mlp"
 
+    @cached_property
+    def used(self) -> Dataset:
+        """The data without the points and cameras that are there twice."""
+        return without_copies(self.data, cameras_too=True)
+
     @property
     def rejected(self) -> tuple[Rejected, ...]:
         """None: this method uses every view of the points it uses."""
@@ -144,7 +149,7 @@ class MLPCalibration:
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure the points that every camera saw; the others keep their row, with a reason."""
-        observations = same_cameras(self.data.observations, observations)
+        observations = same_cameras(self.used.observations, observations)
         seen = observations.seen
         complete = seen.all(axis=1)
         n = len(observations)
@@ -180,7 +185,7 @@ class MLPCalibration:
     @cached_property
     def _kept(self) -> Dataset:
         """The points kept for early stopping, which no weight was fitted to; the epoch was chosen by them."""
-        usable = self.data.select(self.data.observations.seen.all(axis=1))
+        usable = self.used.select(self.used.observations.seen.all(axis=1))
         return usable.select(self.held_out)
 
     @cached_property
@@ -202,7 +207,12 @@ class MLPCalibration:
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration: always what its error bars are worth."""
-        return [self._worth_of_error_bars(), *flat_note(self.data), *lattice_note(self.data, self.method)]
+        return [
+            self._worth_of_error_bars(),
+            *copy_notes(self.data),
+            *flat_note(self.data),
+            *lattice_note(self.data, self.method),
+        ]
 
     def _worth_of_error_bars(self) -> str:
         n = int(self.held_out.sum())
@@ -252,8 +262,9 @@ class MLPCalibration:
         held_out = arrays["held_out"]
         if held_out.dtype != np.bool_ or held_out.shape != (len(usable),) or held_out.all() or not held_out.any():
             raise ValueError(f"held_out must be {len(usable)} booleans, some true and some false")
-        pixels, positions = scalings(arrays, data)
-        shapes = list(enumerate(layer_shapes(2 * len(data.cameras))))
+        used = without_copies(data, cameras_too=True)
+        pixels, positions = scalings(arrays, used)
+        shapes = list(enumerate(layer_shapes(2 * len(used.cameras))))
         network = Network(
             tuple(finite_column(arrays, f"weight{k}", shape) for k, shape in shapes),
             tuple(finite_column(arrays, f"bias{k}", shape[1:]) for k, shape in shapes),

@@ -16,7 +16,8 @@ from typing import Any, ClassVar, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset import Dataset, Observations
+from implicam.dataset import Dataset, Observations, copies_of, copy_notes
+from implicam.dataset.copies import why_no_camera
 from implicam.errors import DatasetError, FitError
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -39,6 +40,26 @@ class Rejected:
     point: str
     camera: str
     residual: float
+
+
+def copied_points(data: Dataset) -> tuple[Unused, ...]:
+    """The known points that are copies of others: each is used once."""
+    copies = copies_of(data)
+    return tuple(
+        Unused(str(data.points[i]), "a copy of another: the same pixels at the same position to the last bit")
+        for i in np.flatnonzero(copies.points)
+    )
+
+
+def blind_with_copies(data: Dataset, blind: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
+    """Why cameras (their number, the reason) are not calibrated, of those that are copies what they are."""
+    copies = copies_of(data)
+    return tuple((c, why_no_camera(data, c, copies) if copies.cameras[c] else why) for c, why in blind)
+
+
+def point_copy_notes(data: Dataset) -> list[str]:
+    """What is there more than once among points; a method that names its uncalibrated cameras names copied ones too."""
+    return copy_notes(data)[int(copies_of(data).cameras.sum()) :]
 
 
 class Calibration(Protocol):

@@ -54,6 +54,7 @@ from implicam.errors import DatasetError, UsageError
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import toml_text
 from implicam.images import PATTERN
+from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
 __all__ = ["EXAMPLES", "app"]
 
@@ -194,6 +195,7 @@ def calibrate_command(
     without: Without = None,
     unit: Unit = None,
     seed: Seed = 0,
+    force: Annotated[bool, typer.Option("--force", help="Write the file even if it is not usable.")] = False,
     json: Json = False,
 ) -> None:
     """Learn the rig from known points; points kept back with --points are there for `implicam evaluate`."""
@@ -206,24 +208,30 @@ def calibrate_command(
         wanted = replace(wanted, method=Explicit.method)  # nothing else can be made of boards
     with show.progress(json) as progress:
         calibration = wanted.calibrator().fit(data, progress)
-    calibration.save(output)
-    _tell_calibration(calibration, output, json)
+        verdict = judge(calibration, progress)
+    written = force or verdict.word != NOT_USABLE
+    if written:
+        calibration_file.save(calibration, output, verdict.as_table())
+    _tell_calibration(calibration, verdict, output if written else None, json)
+    if not written:
+        raise typer.Exit(1)
 
 
-def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> None:
+def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path | None, json: bool) -> None:
     residuals = calibration.residuals()
     unused = [asdict(unused) for unused in calibration.unused]
-    notes = calibration.notes()
+    notes = [*calibration.data.notes, *calibration.notes()]
     if json:
         show.emit_json(
-            {"calibration": str(output), "method": calibration.method, "residuals": residuals, "unused": unused,
+            {"calibration": None if output is None else str(output), "verdict": verdict.as_table(),
+             "method": calibration.method, "residuals": residuals, "unused": unused,
              "rejected": [asdict(view) for view in calibration.rejected], "notes": notes,
              "length_unit": calibration.data.length_unit}
         )  # fmt: skip
         return
     unit = calibration.data.length_unit
     rms = residuals["leave_one_out_rms"]
-    show.line(f"{output}: {calibration.method} from {residuals['points_used']} points")
+    show.line(f"{output or 'no file written'}: {calibration.method} from {residuals['points_used']} points")
     within = ", ".join(f"{axis} {show.number(value)}" for axis, value in rms.items())
     how = "each left out in turn is predicted from the rest"
     if "held_out" in residuals:
@@ -232,7 +240,10 @@ def _tell_calibration(calibration: Calibration, output: Path, json: bool) -> Non
         how = f"the {residuals['held_out_points']} of them that it was not trained on are predicted"
     show.line(f"{how} within {within} {unit} rms")
     show.notes(show.counted((entry.reason for entry in calibration.unused), "known point", "not used"))
-    show.notes(notes)
+    show.notes([note for note in notes if note not in verdict.reasons])
+    show.calibration_verdict(verdict, unit)
+    if output is None:
+        show.say("no file is written; --force writes it nevertheless")
 
 
 @command("measure")
@@ -245,6 +256,7 @@ def measure_command(
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
     fitted = load_calibration(calibration)
+    judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
     data = _read_to_measure(dataset, unit, fitted.data.length_unit)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
@@ -256,16 +268,22 @@ def measure_command(
         show.emit_json(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
              "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
-             "views_left_out": show.left_out(measured)}
+             "views_left_out": show.left_out(measured), "notes": list(data.notes), "alarm": measured.alarm}
         )  # fmt: skip
-        return
+        raise typer.Exit(int(bool(measured.alarm)))
     text = f"{output}: {len(measured)} rows, {count} measured"
     if count:
         text += f", typical sd {', '.join(f'{a} {show.number(v)}' for a, v in zip('xyz', typical, strict=True))} "
         text += measured.length_unit
     show.line(text)
+    if judged in (DOUBTFUL, NOT_USABLE):
+        show.note(f"this calibration was found {judged} when it was made: implicam info {calibration} says why")
+    show.notes(data.notes)
     show.notes(show.reasons(measured))
     show.notes(show.left_out(measured))
+    if measured.alarm:
+        show.alarm(f"{measured.alarm}. Every row says that it is doubtful.")
+    raise typer.Exit(int(bool(measured.alarm)))
 
 
 def _read_to_measure(path: Path, unit: str | None, likely: str) -> Dataset:
@@ -360,7 +378,8 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
             {"method": evaluation.method, "how": evaluation.how, "against": evaluation.against,
              "length_unit": evaluation.data.length_unit, **evaluation.coverage.as_dict(),
              "not_measured": show.reasons(evaluation.measurement),
-             "views_left_out": show.left_out(evaluation.measurement), "notes": list(evaluation.notes),
+             "views_left_out": show.left_out(evaluation.measurement), "alarm": evaluation.measurement.alarm,
+             "notes": list(evaluation.notes),
              "report": None if report is None else str(report)}
         )  # fmt: skip
         return
@@ -372,6 +391,8 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
         show.line(f"report: {report}")
     show.notes(show.reasons(evaluation.measurement))
     show.notes(show.left_out(evaluation.measurement))
+    if evaluation.measurement.alarm:
+        show.alarm(evaluation.measurement.alarm)
     show.notes(evaluation.notes)
 
 
@@ -418,9 +439,10 @@ def convert_command(
     data = read_dataset(dataset, unit=unit)
     write_dataset(data, out, overwrite=overwrite)
     if json:
-        show.emit_json({"dataset": str(out), "points": len(data)})
-    else:
-        show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
+        show.emit_json({"dataset": str(out), "points": len(data), "notes": list(data.notes)})
+        return
+    show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
+    show.notes(data.notes)
 
 
 @command("info")

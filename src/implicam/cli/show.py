@@ -27,14 +27,17 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 
 from implicam.compare import Trial
-from implicam.coverage import Estimate, Summary
+from implicam.coverage import NEES_RIGHT, Estimate, Summary
 from implicam.demo import HELD_OUT, Demo
 from implicam.detect.folder import DetectionRun
 from implicam.evaluate import Evaluation
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
+from implicam.verdict import Verdict
 
 MOST_NOTES = 6
+SMALLEST_IN_DECIMALS = 1e-8
+"""Smaller numbers would be nothing but zeros."""
 err = Console(stderr=True, highlight=False)
 
 
@@ -105,6 +108,8 @@ def number(value: float, digits: int = 3) -> str:
     if value == 0:
         return "0"
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    if abs(value) < SMALLEST_IN_DECIMALS:
+        return f"{value:.{digits - 1}e}"
     return f"{value:.{min(decimals, 9)}f}"
 
 
@@ -117,7 +122,8 @@ def percent(share: Estimate) -> str:
 
 def reasons(measurement: Measurement) -> list[str]:
     """How many points could not be measured, and why, the commonest reason first."""
-    return counted(map(str, measurement.reason[~measurement.measured]), "point", "not measured")
+    own = measurement.own_reason[~measurement.measured]
+    return counted(map(str, own), "point", "not measured")
 
 
 def left_out(measurement: Measurement) -> list[str]:
@@ -125,7 +131,8 @@ def left_out(measurement: Measurement) -> list[str]:
 
     The reason of a measured point says so, and goes on from its name: `measured without cam3, whose view ...`.
     """
-    without = Counter(map(str, measurement.reason[measurement.measured & (measurement.reason != "")]))
+    own = measurement.own_reason
+    without = Counter(map(str, own[measurement.measured & (own != "")]))
     each = [f"{_count(count, 'point')} {reason}" for reason, count in without.most_common()]
     total = f"{without.total()} points measured without a view that contradicts the others; of these:"
     return each if len(each) < 2 else [total, *each]
@@ -139,6 +146,25 @@ def counted(reasons: Iterable[str], noun: str, what: str) -> list[str]:
 
 def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def alarm(text: str) -> None:
+    """Something that makes the numbers not to be trusted."""
+    err.print(f"[bold red]alarm:[/] {escape(text)}", soft_wrap=True)
+
+
+def calibration_verdict(found: Verdict, unit: str) -> None:
+    """Whether a calibration is to be used, and why not."""
+    text = found.word
+    if found.held_out is not None:
+        h = found.held_out
+        text += (
+            f"; {h.how}: {h.points} points are off by {number(h.rms)} {unit} rms, their error bars say "
+            f"{number(h.stated)}, and {100 * h.inside:.0f} % are in their 95 % ellipsoids"
+        )
+    line(f"verdict: {text}")
+    for reason in found.reasons:
+        err.print(f"[bold red]{found.word}:[/] {escape(reason)}", soft_wrap=True)
 
 
 def notes(texts: Sequence[str]) -> None:
@@ -216,6 +242,8 @@ def interval(estimate: Estimate) -> str:
 def verdict(overall: Summary) -> str:
     """What the coverage says of the error bars, in a sentence."""
     text = f"error bars: {overall.verdict}"
+    if math.isfinite(overall.nees.value):
+        text += f"; the mean NEES is {interval(overall.nees)}, and {NEES_RIGHT:.0f} is right"
     if math.isfinite(overall.sd_factor):
         inside = 100 * overall.level(0.95).ellipsoid.value
         text += (

@@ -2,6 +2,6 @@
 
 from implicam.coverage.assess import assess, tercile_labels
 from implicam.coverage.intervals import Estimate
-from implicam.coverage.model import LEVELS, Coverage, Level, Summary
+from implicam.coverage.model import LEVELS, NEES_RIGHT, Coverage, Level, Summary
 
-__all__ = ["LEVELS", "Coverage", "Estimate", "Level", "Summary", "assess", "tercile_labels"]
+__all__ = ["LEVELS", "NEES_RIGHT", "Coverage", "Estimate", "Level", "Summary", "assess", "tercile_labels"]

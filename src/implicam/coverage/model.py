@@ -15,6 +15,22 @@ LEVELS = (0.50, 0.68, 0.90, 0.95, 0.99)
 # Below this a 95 % interval that holds 0.95 says little: at most 4 in 5 could be all there is.
 _TOO_WIDE = 0.80
 
+NEES_RIGHT = 3.0
+"""Expected squared error of a position in its own covariance: one for each axis."""
+
+SLIGHT_NEES_RATIO = 1.25
+"""Mean NEES this many times too large or small (error bars 12 % off) is not worth a word, however sure it is."""
+
+DOUBT_WIDENING = 1.5
+"""Intervals of the mean NEES are so much wider, on a log scale, before error bars are called wrong by them alone: with
+that of coverage they are two tests, and together they are to call honest error bars wrong in 1 of 20 cases at most."""
+
+FEW_CLUSTERS = 10
+"""Of fewer an interval can be narrow by chance, and points of one shot share errors: then VAGUE_NEES_RATIO counts."""
+
+VAGUE_NEES_RATIO = 4.0
+"""An interval of the mean NEES that reaches so far beyond the right value (error bars half or twice) says little."""
+
 
 @dataclass(frozen=True)
 class Level:
@@ -66,13 +82,21 @@ class Summary:
 
     @property
     def verdict(self) -> str:
-        """Error bars "too small", "right" or "too large", judged by the 95 % ellipsoid's interval, or "cannot tell"."""
-        inside = self.level(0.95).ellipsoid
-        if inside.high < 0.95:
+        """Error bars "too small", "right" or "too large", or "cannot tell".
+
+        Judged by the 95 % interval of what the 95 % ellipsoids hold, and by that of the mean NEES: a coverage near 1
+        cannot tell how much too wide error bars are, NEES can. Where they contradict each other, too small counts.
+        """
+        inside, nees = self.level(0.95).ellipsoid, self.nees
+        enough = self.clusters >= FEW_CLUSTERS and self.cluster_kind != "points of one shot"
+        least = SLIGHT_NEES_RATIO if enough else VAGUE_NEES_RATIO
+        sure = max(_ratio(nees.high, nees.value) ** DOUBT_WIDENING, least)
+        if inside.high < 0.95 or nees.value > NEES_RIGHT * sure:
             return "too small"
-        if inside.low > 0.95:
+        if inside.low > 0.95 or nees.value < NEES_RIGHT / sure:
             return "too large"
-        return "right" if inside.low >= _TOO_WIDE else "cannot tell"
+        sharp = nees.low >= NEES_RIGHT / VAGUE_NEES_RATIO and nees.high <= NEES_RIGHT * VAGUE_NEES_RATIO
+        return "right" if inside.low >= _TOO_WIDE and sharp else "cannot tell"
 
 
 @dataclass(frozen=True)
@@ -93,6 +117,11 @@ class Coverage:
         for row, summary in zip(plain["rows"], self.rows, strict=True):
             row["verdict"] = summary.verdict
         return plain
+
+
+def _ratio(a: float, b: float) -> float:
+    """The quotient; infinite where it is not known, so that it proves nothing."""
+    return a / b if np.isfinite(a) and b > 0 else float("inf")
 
 
 def _plain(value: Any) -> Any:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from implicam.dataset.copies import copies_of, copy_notes, without_copies
 from implicam.dataset.folder import folder_files, read_folder, write_folder
+from implicam.dataset.marks import without_marks
 from implicam.dataset.model import (
     TRUTH_COLUMNS,
     Camera,
@@ -41,11 +43,14 @@ __all__ = [
     "Observations",
     "Truth",
     "arrays_from_dataset",
+    "copies_of",
+    "copy_notes",
     "covariance_from_columns",
     "dataset_from_arrays",
     "folder_files",
     "join",
     "read_dataset",
+    "without_copies",
     "write_dataset",
 ]
 
@@ -69,7 +74,7 @@ def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
             why="its own description states the length unit",
             fix="leave out --unit, or correct the description",
         )
-    return data
+    return without_marks(data)
 
 
 def _read(path: Path, unit: str | None) -> Dataset:

@@ -41,7 +41,7 @@ DESCRIPTION, POINTS, VIEWS, IMAGES = "dataset.toml", "points.csv", "observations
 TRUTH = "truth.toml"
 """What only a simulated rig has beside its data; its photographs can be taken again."""
 
-_NO_VIEW = "a view that is missing has no row: remove it"
+_NO_VIEW = "leave both u and v empty where the view is missing, or remove the row"
 _NO_SD = "leave the cell empty where no uncertainty is stated"
 
 
@@ -49,9 +49,10 @@ def read_folder(path: Path) -> Dataset:
     """Read a dataset folder; every mistake is a DatasetError naming file, line, value and cure."""
     name, unit, cameras, extra = read_description(path)
     points = read_points(path / POINTS) if (path / POINTS).exists() else None
-    observations = _read_observations(path / VIEWS, cameras, points)
+    observations, missing = _read_observations(path / VIEWS, cameras, points)
+    notes = (f"{missing} rows of {VIEWS} have no pixels: views that are missing.",) if missing else ()
     with naming(path / DESCRIPTION):
-        return Dataset(name, unit, observations, points.known if points else None, extra)
+        return Dataset(name, unit, observations, points.known if points else None, extra, notes)
 
 
 def read_description(path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
@@ -78,7 +79,7 @@ class _Points:
 def read_points(path: Path) -> _Points:
     """The table points.csv: names, and known positions in their order."""
     header, rows = read_table(path, POINT_COLUMNS)
-    at = {column: header.index(column) for column in header}
+    at = {column: i for i, column in enumerate(header)}
     extra_columns = [c for c in header if c not in (*POINT_COLUMNS, *SD_POINT)]
     names: dict[str, int] = {}
     shots, xyz, sd = [], [], []
@@ -123,7 +124,8 @@ def read_points(path: Path) -> _Points:
     return _Points(path, list(names), known)
 
 
-def _read_observations(path: Path, cameras: tuple[Camera, ...], points: _Points | None) -> Observations:
+def _read_observations(path: Path, cameras: tuple[Camera, ...], points: _Points | None) -> tuple[Observations, int]:
+    """The observations, and how many rows of the table are views that are missing."""
     header, rows = read_table(path, VIEW_COLUMNS)
     index, views = _view_rows(path, header, rows, cameras, points)
     if not views.lines:
@@ -139,13 +141,14 @@ def _read_observations(path: Path, cameras: tuple[Camera, ...], points: _Points 
     check_inside(uv, cameras, lambda p, k: f"{path}, line {lines[p, k]}")
     extra = {column: _spread(values, i, j, (n, c)) for column, values in views.extra.items()}
     with naming(path):
-        return Observations(np.array(list(index), dtype=np.str_), cameras, uv, sd, extra)
+        return Observations(np.array(list(index), dtype=np.str_), cameras, uv, sd, extra), views.missing
 
 
 class _Views:
     """The columns of observations.csv as they are read."""
 
     def __init__(self, extra_columns: Iterable[str]) -> None:
+        self.missing = 0
         self.lines: list[int] = []
         self.point: list[int] = []
         self.camera: list[int] = []
@@ -157,7 +160,7 @@ class _Views:
 def _view_rows(
     path: Path, header: list[str], rows: Iterable[Row], cameras: tuple[Camera, ...], points: _Points | None
 ) -> tuple[dict[str, int], _Views]:
-    at = {column: header.index(column) for column in header}
+    at = {column: i for i, column in enumerate(header)}
     views = _Views(c for c in header if c not in (*VIEW_COLUMNS, *SD_VIEW))
     camera_index = {camera.name: k for k, camera in enumerate(cameras)}
     index = {name: i for i, name in enumerate(points.names)} if points else {}
@@ -175,6 +178,9 @@ def _view_rows(
                 fix="keep one of the two rows",
             )
         seen[i, k] = line
+        if _no_pixels(row[at["u"]], row[at["v"]]):
+            views.missing += 1
+            continue
         views.lines.append(line)
         views.point.append(i)
         views.camera.append(k)
@@ -184,6 +190,14 @@ def _view_rows(
         for c, values in views.extra.items():
             values.append(row[at[c]])
     return index, views
+
+
+def _no_pixels(u: str, v: str) -> bool:
+    """Whether a row says that the view is missing."""
+    return u.strip().lower() in _NOTHING and v.strip().lower() in _NOTHING
+
+
+_NOTHING = ("", "nan")
 
 
 def _point_index(name: str, index: dict[str, int], points: _Points | None, place: str) -> int:

@@ -199,13 +199,17 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Observations, the known positions that go with them (None where they are to be measured), and the unit."""
+    """Observations, the known positions that go with them (None where they are to be measured), and the unit.
+
+    notes: what reading it had to take for something else, such as marks for missing views; not written with it.
+    """
 
     name: str
     length_unit: str
     observations: Observations
     known: KnownPositions | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_name(self.name, "dataset name")

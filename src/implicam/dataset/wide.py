@@ -76,6 +76,7 @@ def _layout(header: list[str], description: dict[str, Any] | None, path: Path, u
                 why=f"a wide CSV carries it in {_sidecar(path).name} beside it, which is not there",
                 fix='add --unit mm, or unit="mm" in read_dataset(...)',
             )
+        _refuse_unpaired(header, path)
         cameras = tuple(Camera(name) for name in _cameras_named(header))
         name = path.stem
     else:
@@ -103,6 +104,24 @@ def _layout(header: list[str], description: dict[str, Any] | None, path: Path, u
     taken |= {f"{q}_{c.name}" for c in cameras for q in ("u", "v", *SD_VIEW, *view_extra)}
     point_extra = tuple(column for column in header if column not in taken)
     return _Layout(cameras, view_extra, point_extra, name, unit, extra)
+
+
+def _refuse_unpaired(header: list[str], path: Path) -> None:
+    """A column u_ without its v_, or the reverse: a camera must not vanish for a slip of the pen."""
+    columns = set(header)
+    partner = {column: ("v_" if column[0] == "u" else "u_") + column[2:] for column in header if column[:2] in _PAIR}
+    lonely = [column for column, other in partner.items() if other not in columns]
+    for column in lonely[:1]:
+        likely = [other for other in lonely if other[0] != column[0]] or [c for c in header if c not in partner]
+        raise DatasetError(
+            f"{path}, line 1: there is a column {column!r} but no {partner[column]!r}"
+            f"{did_you_mean(partner[column], likely)}.",
+            why="the pixels of a camera are a pair of columns, u_NAME and v_NAME",
+            fix="correct the heading, add the other column, or give a column that is no pixel another name",
+        )
+
+
+_PAIR = ("u_", "v_")
 
 
 def _cameras_named(header: Iterable[str]) -> list[str]:

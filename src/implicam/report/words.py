@@ -94,14 +94,15 @@ def tiles(data: ReportData) -> list[tuple[str, str, str]]:
 def _judgement(row: Summary) -> str:
     inside = row.level(0.95).ellipsoid
     seen = f"95 % of points should lie in their 95 % ellipsoid; {per_cent(inside)} did."
+    seen += f" NEES should be 3; it is {interval(row.nees)}." if math.isfinite(row.nees.value) else ""
     factor = number(row.sd_factor, 2)
     return {
-        "right": f"{seen} The interval includes 95 %.",
+        "right": f"{seen} The intervals include both.",
         "too small": f"{seen} The instrument claims to know more than it does: its standard uncertainties "
         f"would have to be {factor} times as large.",
         "too large": f"{seen} The instrument is better than it says: its standard uncertainties could be "
         f"{factor} times as large.",
-        "cannot tell": f"{seen} So wide an interval proves nothing: evaluate more points."
+        "cannot tell": f"{seen} Such wide intervals prove nothing: evaluate more points."
         if math.isfinite(inside.value)
         else "No point has both a known truth and a usable covariance.",
     }[row.verdict]

@@ -20,8 +20,15 @@ from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior
 from implicam.calibrators.forward_gp.problem import Frame, problem_of, stated_noise
 from implicam.calibrators.forward_gp.rig_map import RigMap
 from implicam.calibrators.forward_gp.start import Started
-from implicam.calibrators.protocol import Rejected, Unused, same_cameras
-from implicam.dataset import Dataset, Floats, KnownPositions, Names, Observations
+from implicam.calibrators.protocol import (
+    Rejected,
+    Unused,
+    blind_with_copies,
+    copied_points,
+    point_copy_notes,
+    same_cameras,
+)
+from implicam.dataset import Dataset, Floats, KnownPositions, Names, Observations, without_copies
 from implicam.errors import FitError
 from implicam.geometry import Bools
 from implicam.progress import Progress
@@ -50,9 +57,11 @@ class Fitted:
 
 def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
     """Every camera from the known points; FitError where fewer than two can be calibrated."""
-    frame = Frame.of(data, METHOD)
-    fitted, choices = fit_points(problem_of("central", data, frame, shots_off=False), family, progress)
-    diagnosis = Diagnosis(data, frame, fitted)
+    used = without_copies(data)
+    frame = Frame.of(used, METHOD)
+    fitted, choices = fit_points(problem_of("central", used, frame, shots_off=False), family, progress)
+    fitted = replace(fitted, blind=blind_with_copies(data, fitted.blind))
+    diagnosis = Diagnosis(used, frame, fitted)
     return Fitted(
         data.observations,
         frame,
@@ -61,13 +70,15 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
         tuple(choices[c] for c in fitted.cameras),
         *diagnosis.leave_one_out,
         diagnosis.rejected,
-        diagnosis.unused,
-        (*diagnosis.notes(), *diagnosis.noise_notes()),
+        (*diagnosis.unused, *copied_points(data)),
+        (*point_copy_notes(data), *diagnosis.notes(), *diagnosis.noise_notes()),
     )
 
 
 def fit_to_boards(data: Dataset, network: Network, boards: Dataset, how: str) -> Fitted:
     """Cameras from boards, brought into the world by the known points."""
+    copied, notes = copied_points(data), point_copy_notes(data)
+    data = without_copies(data)
     trained = by_cameras_of(data, boards)
     known, bundle = data.positions, network.bundle
     posterior = _posterior(network, bundle.cameras, network.root)
@@ -88,8 +99,9 @@ def fit_to_boards(data: Dataset, network: Network, boards: Dataset, how: str) ->
         alignment.errors,
         alignment.sds,
         _rejected(network, boards),
-        _not_used(data, in_rig.measure(data.observations).reason, alignment),
+        (*_not_used(data, in_rig.measure(data.observations).reason, alignment), *copied),
         (
+            *notes,
             *_without_boards(data, trained),
             *_moved_notes(in_rig, found.left_out, np.asarray(np.isfinite(uv).all(axis=2))),
             *_notes(network, trained, boards),

@@ -7,7 +7,7 @@ parameters integrated out. The mathematics, with the numbered equations the code
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,8 +26,17 @@ from implicam.calibrators.forward_gp.posterior import Posterior
 from implicam.calibrators.forward_gp.problem import Frame, problem_of
 from implicam.calibrators.forward_gp.rig_map import RigMap
 from implicam.calibrators.forward_gp.shots import Shots
-from implicam.calibrators.protocol import Arrays, Rejected, Unused, finite_column, solvable
-from implicam.dataset import Dataset, Floats, Observations
+from implicam.calibrators.protocol import (
+    Arrays,
+    Rejected,
+    Unused,
+    blind_with_copies,
+    copied_points,
+    finite_column,
+    point_copy_notes,
+    solvable,
+)
+from implicam.dataset import Dataset, Floats, Observations, without_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -59,11 +68,16 @@ class ForwardGP:
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """Fit to all known points that any camera saw."""
-        frame = Frame.of(data, self.method)
+        used = without_copies(data)
+        frame = Frame.of(used, self.method)
         with solvable(), blas_threads(1):  # many small matrices, one after the other: two threads would wait
-            problem = problem_of(self.lens, data, frame)
-            fitted = with_label_errors(problem, fit_rig(problem, progress), data.shots)
-        return ForwardGPCalibration(self, data, frame, fitted)
+            problem = problem_of(self.lens, used, frame)
+            fitted = with_label_errors(problem, fit_rig(problem, progress), used.shots)
+        return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
+
+
+def _copies_named(data: Dataset, fitted: FittedRig) -> FittedRig:
+    return replace(fitted, blind=blind_with_copies(data, fitted.blind))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +91,11 @@ class ForwardGPCalibration:
 
     method: ClassVar[str] = "forward-gp"
 
+    @cached_property
+    def used(self) -> Dataset:
+        """The data without what is there twice; of it are the numbers of points in the fit and its diagnosis."""
+        return without_copies(self.data)
+
     @property
     def posterior(self) -> Posterior:
         """What is known of each camera, in the working frame."""
@@ -87,7 +106,7 @@ class ForwardGPCalibration:
         """The cameras, and how they measure."""
         tails = self.fitted.tails
         return RigMap(
-            self.data.observations,
+            self.used.observations,
             self.data.length_unit,
             self.frame,
             self.fitted.cameras,
@@ -116,19 +135,19 @@ class ForwardGPCalibration:
     @cached_property
     def _labels(self) -> Labels | None:
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
-        points = self.frame.inward(self.data.xyz)
+        points = self.frame.inward(self.used.xyz)
         if errors is None or unknowns is None or self.fitted.label_sd is None:
             untold_sd = self.fitted.untold_sd
-            planes = None if untold_sd is None else untold(points, self.data.shots)
+            planes = None if untold_sd is None else untold(points, self.used.shots)
             return None if planes is None or untold_sd is None else Labels(planes.shots, np.zeros(0), None, untold_sd)
-        shots = Shots.of(points, self.data.shots)
+        shots = Shots.of(points, self.used.shots)
         bars = self.fitted.label_sd.reshape(6, -1)[:, 0]
         return None if shots is None else Labels(shots, errors.sd[0], unknowns, bars)
 
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """How it agrees with its own data."""
-        return Diagnosis(self.data, self.frame, self.fitted)
+        return Diagnosis(self.used, self.frame, self.fitted)
 
     @property
     def rejected(self) -> tuple[Rejected, ...]:
@@ -138,7 +157,7 @@ class ForwardGPCalibration:
     @property
     def unused(self) -> tuple[Unused, ...]:
         """The known points of which no view is used."""
-        return self.diagnosis.unused
+        return (*self.diagnosis.unused, *copied_points(self.data))
 
     def refit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """The same method with the same options on other data."""
@@ -152,13 +171,15 @@ class ForwardGPCalibration:
         if anew:
             return self.refit(data, progress)
         with solvable(), blas_threads(1):
-            problem = problem_of(self.calibrator.lens, data, self.frame)
-            fitted = with_label_errors(problem, fit_rig(problem, progress, self.fitted), data.shots)
-        return ForwardGPCalibration(self.calibrator, data, self.frame, fitted)
+            used = without_copies(data)
+            problem = problem_of(self.calibrator.lens, used, self.frame)
+            fitted = with_label_errors(problem, fit_rig(problem, progress, self.fitted), used.shots)
+        return ForwardGPCalibration(self.calibrator, data, self.frame, _copies_named(data, fitted))
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         return [
+            *point_copy_notes(self.data),
             *self.diagnosis.notes(),
             *self._label_notes(),
             *self._plane_notes(),
@@ -231,5 +252,6 @@ class ForwardGPCalibration:
         """Restore a calibration; nothing is computed again."""
         calibrator = ForwardGP(str(table["lens"]), int(table["seed"]))
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
-        fitted = saved.restored(data, working.inward(data.xyz), table, arrays)
+        used = without_copies(data)
+        fitted = saved.restored(used, working.inward(used.xyz), table, arrays)
         return cls(calibrator, data, working, fitted)

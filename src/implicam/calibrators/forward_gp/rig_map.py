@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.alarm import Table, alarm_of
 from implicam.calibrators.forward_gp.heavy_tails import information_loss
 from implicam.calibrators.forward_gp.locate import Labels, Located, locate
 from implicam.calibrators.forward_gp.posterior import Posterior, spread
 from implicam.calibrators.forward_gp.problem import Frame, stated_noise, view_noise
+from implicam.calibrators.forward_gp.wrong_views import AGREE
 from implicam.calibrators.protocol import same_cameras
 from implicam.dataset import Floats, Names, Observations
 from implicam.measurement import Measurement
@@ -63,7 +65,7 @@ class RigMap:
         uv, noise = self.views(observations)
         found = locate(self.posterior, uv, noise, self.labels, self.degrees)
         seen = np.asarray(np.isfinite(uv).all(axis=2))
-        return Measurement(
+        measured = Measurement(
             observations.points,
             self.frame.outward(found.xyz),
             found.cov * self.frame.scale**2,
@@ -72,6 +74,23 @@ class RigMap:
             self._reasons(observations, seen, found),
             self.length_unit,
         )
+        cameras = tuple(self.trained.cameras[c] for c in self.cameras)
+        table = Table(cameras, uv, noise, found.p, found.left_out, self._agree, self._lines, self._pixels)
+        return measured.with_alarm(alarm_of(table))
+
+    def _agree(self, uv: Floats) -> NDArray[np.bool_]:
+        """(n,) whether all views (n, C, 2) of each point agree, with the usual noise."""
+        noise = np.broadcast_to([model.noise for model in self.posterior.models], uv.shape[:2])
+        found = locate(self.posterior, uv, noise, self.labels)
+        return np.asarray((found.p >= AGREE) & ~found.left_out.any(axis=1))
+
+    def _lines(self, uv: Floats) -> Iterator[tuple[Floats, Floats]]:
+        """Per calibrated camera the centre (3,) and directions (n, 3) of the lines of sight of pixels (n, C, 2)."""
+        return (model.camera.lines(uv[:, c]) for c, model in enumerate(self.posterior.models))
+
+    def _pixels(self, points: Floats) -> Floats:
+        """(n, C, 2) where the calibrated cameras see points (n, 3) of the working frame."""
+        return np.stack([model.predict(points)[0] for model in self.posterior.models], axis=1)
 
     def views(self, observations: Observations) -> tuple[Floats, Floats]:
         """Pixels (n, C, 2) of the calibrated cameras, NaN where not seen, and the noise (n, C) of each view, pixels."""

@@ -1,0 +1,230 @@
+"""Look at a measured table as a whole: does the rig still stand as it was calibrated?
+
+Each point is tested alone: do its views agree? Of honest views one point in ten thousand fails (`DISAGREE`). Wrong
+detections make single points fail, and the rest stays as good as ever. A camera that was moved, or two that were
+exchanged, make most of them fail, and what is left does not look honest either: that is the alarm.
+
+Three signs, each beyond what a table with one wrong view in five (`USUAL_WRONG`) shows once in a thousand times:
+
+1. points that no wrong view or two explain: more of them than MANY;
+2. more than MANY contradict, and of the others too many nearly do;
+3. views of one camera contradict the other cameras: more of them than MANY.
+
+Then the likeliest causes are tried on some of the points, and the one that makes them agree is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc
+
+from implicam.dataset import Camera, Floats
+
+Bools = NDArray[np.bool_]
+
+FEWEST_POINTS = 10
+"""Of fewer points that can be tested nothing is said."""
+
+MANY = 0.3
+"""Share of the points that contradict, beyond which it is no longer them."""
+
+USUAL_WRONG = 0.2
+"""Share of wrong views in a table whose detection is bad, and whose rig is as it was."""
+
+FALSE_ALARM = 5e-4
+"""Probability that a sign is there where nothing is wrong."""
+
+DISAGREE = 1e-4
+"""Below this p-value the views of a point disagree."""
+
+GREY, GREY_SHARE = 0.05, 0.15
+"""p-values below this are few; three times as many are allowed for error bars that are somewhat too small."""
+
+TRIED = 24
+"""Points on which the causes are tried."""
+
+EXPLAINS, BETTER = 0.6, 0.3
+"""A cause makes so many of the points agree, and so many more than agree without it."""
+
+MOST_PAIRS = 2000
+"""Pairs of cameras that are tried; of more, the neighbours."""
+
+CONFIRMED = 3
+"""The likeliest causes, which are put to the full test."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A measured table: uv (n, C, 2) and noise (n, C) in pixels; p (n,) NaN where not tested; left_out (n, C) views.
+
+    What the calibration says of others: agree, (m,) of pixels (m, C, 2) whether the views of each row agree, all of
+    them; lines, per camera the centre (3,) and directions (m, 3) of its lines of sight; pixels, (m, C, 2) of places."""
+
+    cameras: tuple[Camera, ...]
+    uv: Floats
+    noise: Floats
+    p: Floats
+    left_out: Bools
+    agree: Callable[[Floats], Bools]
+    lines: Callable[[Floats], Iterator[tuple[Floats, Floats]]]
+    pixels: Callable[[Floats], Floats]
+
+    @property
+    def seen(self) -> Bools:
+        """(n, C) the views."""
+        return np.asarray(~np.isnan(self.uv[..., 0]))
+
+    @property
+    def names(self) -> list[str]:
+        """Of the cameras."""
+        return [camera.name for camera in self.cameras]
+
+
+def alarm_of(table: Table) -> str:
+    """What is wrong with the table as a whole, in a sentence; empty where nothing is."""
+    views = table.seen.sum(axis=1)
+    tested = views >= 2
+    n = int(tested.sum())
+    if n < FEWEST_POINTS:
+        return ""
+    explained = tested & table.left_out.any(axis=1)
+    contradict = tested & (explained | ~(table.p >= DISAGREE))
+    share = contradict.sum() / n
+    if not share > MANY:
+        return ""
+    alone = int((contradict & ~explained).sum())
+    usual = max(USUAL_WRONG, float(np.mean([_inexplicable(int(k)) for k in views[tested]])))
+    rest = tested & ~contradict
+    grey = int((rest & (table.p < GREY)).sum())
+    moved = _contradicted(table, views)
+    signs = (
+        alone > MANY * n and _surprising(alone, n, usual),
+        _surprising(grey, int(rest.sum()), GREY_SHARE),
+        bool(moved),
+    )
+    if not any(signs):
+        return ""
+    chance = f"{100 * DISAGREE:g} % would be chance"
+    return f"{100 * share:.0f} % of {n} points contradict the calibration; {chance}: {_cause(table, tested, moved)}"
+
+
+def _inexplicable(views: int) -> float:
+    """Probability that more of a point's views are wrong than leaving one or two out can mend."""
+    mended = 2 if views >= 5 else 1 if views >= 3 else 0
+    return float(bdtrc(mended, views, USUAL_WRONG))
+
+
+def _surprising(count: int, n: int, share: float) -> bool:
+    """Whether so many of n are too many for chance, where each has the probability `share`."""
+    return count > 0 and float(bdtrc(count - 1, n, share)) < FALSE_ALARM
+
+
+def _contradicted(table: Table, views: NDArray[np.int64]) -> list[str]:
+    """Cameras whose views are left out far more often than wrong detections would be."""
+    can_tell = views >= 3
+    seen, away = table.seen[can_tell].sum(axis=0), table.left_out[can_tell].sum(axis=0)
+    return [
+        name
+        for name, n, k in zip(table.names, seen.tolist(), away.tolist(), strict=True)
+        if n >= FEWEST_POINTS and k > MANY * n and _surprising(k, n, USUAL_WRONG)
+    ]
+
+
+def _cause(table: Table, tested: Bools, moved: Sequence[str]) -> str:
+    """The likeliest cause as a question: what makes most of some points agree."""
+    rows = np.flatnonzero(tested)
+    if len(rows) > TRIED:
+        rows = np.sort(np.random.default_rng(0).choice(rows, TRIED, replace=False))
+    now = (table.p[rows] >= DISAGREE) & ~table.left_out[rows].any(axis=1)
+    least = max(EXPLAINS, BETTER + float(now.mean()))
+    guesses = [
+        (_misfit(table, rows, uv, noise) * handicap, words, uv) for words, uv, noise, handicap in _guesses(table)
+    ]
+    for _, words, uv in sorted(guesses, key=lambda guess: guess[0])[:CONFIRMED]:
+        testable = rows[_views(uv[rows]) >= 2]
+        agree = table.agree(uv[testable])
+        if len(testable) and agree.mean() >= least:
+            return words.format(share=f"{100 * agree.mean():.0f} % of those tried agree")
+    if moved and len(moved) < len(table.cameras) - 1:
+        return f"most views of {' and '.join(moved)} contradict the other cameras. Has it been moved or refocused?"
+    return (
+        "has a camera been moved, or are cameras exchanged? No single one explains it: several may have been moved, or "
+        "the pictures are not of the same instants, or their points are matched wrongly"
+    )
+
+
+def _views(uv: Floats) -> NDArray[np.int64]:
+    return np.asarray((~np.isnan(uv[..., 0])).sum(axis=1), dtype=np.int64)
+
+
+def _misfit(table: Table, rows: NDArray[np.int64], uv: Floats, noise: Floats) -> float:
+    """How far, in their noise, the views of most rows are off where their lines of sight meet best; a quick look."""
+    rows = rows[_views(uv[rows]) >= 2]
+    if not len(rows):
+        return float("inf")
+    A, b = np.zeros((len(rows), 3, 3)), np.zeros((len(rows), 3))
+    for centre, direction in table.lines(uv[rows]):
+        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+        across[~np.isfinite(across).all(axis=(1, 2))] = 0.0
+        A += across
+        b += across @ centre
+    x = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], dtype=np.float64)
+    off = np.asarray(np.linalg.norm(table.pixels(x) - uv[rows], axis=2) / noise[rows], dtype=np.float64)
+    worst = np.where(np.isnan(uv[rows, :, 0]), 0.0, np.nan_to_num(off, nan=np.inf)).max(axis=1)
+    return float(np.quantile(worst, EXPLAINS))
+
+
+Guess = tuple[str, Floats, Floats, float]
+"""Words with a place for the share that agrees; pixels and noise as they would be; a factor on the misfit: a camera
+less, or a row less, fits better by itself."""
+
+
+def _guesses(table: Table) -> Iterator[Guess]:
+    names = table.names
+    for c, name in enumerate(names):
+        if len(names) > 2:
+            uv = table.uv.copy()
+            uv[:, c] = np.nan
+            yield f"has {name} been moved or refocused? Without it {{share}}", uv, table.noise, 3.0
+        for late in (1, -1):
+            uv = table.uv.copy()
+            uv[:, c] = _late(uv[:, c], late)
+            when = "later" if late > 0 else "earlier"
+            yield f"is {name} a picture {when} than the others? One row on {{share}}", uv, table.noise, 1.5
+    pairs = list(combinations(range(len(names)), 2))
+    for a, b in pairs if len(pairs) <= MOST_PAIRS else pairs[: len(names) - 1] + _neighbours(len(names)):
+        order = np.arange(len(names))
+        order[[a, b]] = b, a
+        words = f"are {names[a]} and {names[b]} exchanged? With the two the other way round {{share}}"
+        yield words, table.uv[:, order], table.noise[:, order], 1.0
+    yield from _other_pixels(table)
+
+
+def _neighbours(cameras: int) -> list[tuple[int, int]]:
+    """Of very many cameras: those that follow each other, which are exchanged most easily."""
+    return [(c, c + 1) for c in range(1, cameras - 1)]
+
+
+def _late(values: Floats, rows: int) -> Floats:
+    """Each row with the values of the one `rows` after it; the last has none."""
+    moved = np.roll(values, -rows, axis=0)
+    moved[-1 if rows > 0 else 0] = np.nan
+    return moved
+
+
+def _other_pixels(table: Table) -> Iterator[Guess]:
+    """The ways in which other programs count pixels."""
+    if all(camera.height is not None for camera in table.cameras):
+        height = np.array([camera.height for camera in table.cameras], dtype=np.float64)
+        uv = table.uv.copy()
+        uv[..., 1] = height - 1 - uv[..., 1]
+        yield "is v counted from below here, and was not when the rig was calibrated? So {share}", uv, table.noise, 1.0
+    yield "are u and v exchanged? The other way round {share}", table.uv[..., ::-1].copy(), table.noise, 1.0
+    for factor, words in ((2.0, "half"), (0.5, "twice")):
+        uv = factor * (table.uv + 0.5) - 0.5
+        yield f"are the pictures {words} the size they were? Resized {{share}}", uv, factor * table.noise, 1.0

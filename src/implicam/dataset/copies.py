@@ -1,0 +1,124 @@
+"""Rows and cameras that are there more than once under other names, the same to the last bit: they are one.
+
+Files joined twice, a camera exported under two names. A copy carries no information, so it must not count as evidence:
+neither in a fit, which would believe a noise of nothing, nor in a held-out fold, whose points the fit would know.
+
+Points are copies where the known position is the same and so are all pixels, in two cameras or more. With whole-number
+pixels a point that was measured twice at rest may look like that: it is no news either. One camera alone proves
+nothing, unless the table has copies that do. Cameras are copies where all views that both have are the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset.model import Dataset, Floats, Observations
+
+Integers = NDArray[np.int64]
+
+FEWEST_VIEWS = 5
+"""Views that two cameras must have in common, with the same pixels and not all at one, to be one camera."""
+
+NAMED = 3
+"""Copies that a note names one by one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Copies:
+    """point_of (n,), camera_of (C,): the number of the first that is the same; its own where there is none before."""
+
+    point_of: Integers
+    camera_of: Integers
+
+    @property
+    def points(self) -> NDArray[np.bool_]:
+        """(n,) which points are copies of others."""
+        return np.asarray(self.point_of != np.arange(len(self.point_of)), dtype=np.bool_)
+
+    @property
+    def cameras(self) -> NDArray[np.bool_]:
+        """(C,) which cameras are copies of others."""
+        return np.asarray(self.camera_of != np.arange(len(self.camera_of)), dtype=np.bool_)
+
+
+def copies_of(data: Dataset) -> Copies:
+    """Which points and cameras are copies; points only where their positions are known."""
+    n, cameras = len(data), len(data.cameras)
+    camera_of = _camera_of(data.observations)
+    if data.known is None:
+        return Copies(np.arange(n), camera_of)
+    own = np.flatnonzero(camera_of == np.arange(cameras))
+    observations = data.observations
+    views = observations.seen[:, own].sum(axis=1)
+    marks = fingerprints(np.concatenate([observations.uv[:, own].reshape(n, 2 * len(own)), data.known.xyz], axis=1))
+    first: dict[bytes, int] = {}
+    point_of = np.array([first.setdefault(mark, i) for i, mark in enumerate(marks)], dtype=np.int64)
+    proven = (views >= 2) & (point_of != np.arange(n))
+    believed = (views >= 1) if proven.any() else proven
+    return Copies(np.where(believed, point_of, np.arange(n)), camera_of)
+
+
+def fingerprints(values: Floats) -> list[bytes]:
+    """Per row (n, k) its numbers as bytes, with one NaN and one zero."""
+    return [row.tobytes() for row in np.where(np.isnan(values), np.nan, values + 0.0)]
+
+
+def _camera_of(observations: Observations) -> Integers:
+    uv, seen = observations.uv, observations.seen
+    found = np.arange(seen.shape[1])
+    order = np.argsort(-seen.sum(axis=0), kind="stable")  # the one that saw the most stays
+    for later, c in enumerate(order):
+        for original in order[:later]:
+            if found[original] == original and _same(uv[:, c], uv[:, original], seen[:, c] & seen[:, original]):
+                found[c] = original
+                break
+    return found
+
+
+def _same(a: Floats, b: Floats, both: NDArray[np.bool_]) -> bool:
+    if both.sum() < FEWEST_VIEWS or (a[both] != b[both]).any():
+        return False
+    return len(np.unique(a[both], axis=0)) >= FEWEST_VIEWS - 2
+
+
+def without_copies(data: Dataset, *, cameras_too: bool = False) -> Dataset:
+    """Each point once, and each camera: the views of a copied camera are missing, or with `cameras_too` it is gone.
+
+    The dataset itself where nothing is a copy.
+    """
+    copies = copies_of(data)
+    if copies.points.any():
+        data = data.select(~copies.points)
+    if not copies.cameras.any():
+        return data
+    observations = data.observations
+    if cameras_too:
+        names = np.array(observations.camera_names)[~copies.cameras]
+        return data.with_cameras([str(name) for name in names])
+    blank = np.where(copies.cameras[None, :, None], np.nan, observations.uv)
+    return replace(data, observations=replace(observations, uv=blank))
+
+
+def copy_notes(data: Dataset) -> list[str]:
+    """What is there more than once, in words; empty where nothing is."""
+    copies, notes = copies_of(data), list[str]()
+    names = data.observations.camera_names
+    notes += [f"{names[c]} is not used: {why_no_camera(data, int(c), copies)}." for c in np.flatnonzero(copies.cameras)]
+    extra = np.flatnonzero(copies.points)
+    if len(extra):
+        some = ", ".join(f"{data.points[i]} of {data.points[copies.point_of[i]]}" for i in extra[:NAMED])
+        more = f" and {len(extra) - NAMED} more" if len(extra) > NAMED else ""
+        notes.append(
+            f"{len(extra)} of {len(data)} known points are copies of others, the same pixels at the same position to "
+            f"the last bit ({some}{more}): each is used once. Were files joined twice?"
+        )
+    return notes
+
+
+def why_no_camera(data: Dataset, c: int, copies: Copies) -> str:
+    """Of a copied camera, what it is."""
+    original = data.observations.camera_names[copies.camera_of[c]]
+    return f"its pixels are those of {original} to the last bit, so the two are one camera"

@@ -1,0 +1,352 @@
+"""Is a calibration to be used? A verdict in words, with the reasons and their cures.
+
+The formula for leaving one point out knows the fit that it belongs to, and shares its mistakes: it once believed
+0.0007 mm where the errors were 13 mm. So the method is fitted again from nothing without a part of the known points,
+a few times, and measures those. Beside that stands what can be seen from the data: wrong views, noise, copies, marks.
+
+"usable": nothing speaks against it. "doubtful": measure, but look at the reasons first. "not usable": a number from it
+would be worse than none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc, chdtri
+
+from implicam.calibrators import MLP, Calibration, InverseGP
+from implicam.calibrators.forward_gp.problem import stated_noise
+from implicam.dataset import Dataset, Floats, copies_of, copy_notes
+from implicam.dataset.marks import without_marks
+from implicam.errors import ImplicamError, UsageError
+from implicam.progress import Progress, silent
+
+USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
+
+FEW_POINTS = 12
+"""Fewer known points fix a rig, but leave too little to check it by."""
+
+ENOUGH_POINTS = 17
+"""From so many on, a fit that fails without a fifth of them is bad luck and no sign, unless most of them do."""
+
+FLAT_RATIO = 0.01
+"""Thickness over width of known points that are nearly on a plane, or a line: beyond it nothing is known."""
+
+MANY_REJECTED, USUAL_WRONG = 0.3, 0.15
+"""Share of a camera's views that contradict the others beyond which it is not the views; share that is usual."""
+
+RARE = 1e-4
+"""A share is beyond the usual where chance would show it so rarely."""
+
+RESIDUAL_RATIO = 4.0
+"""Median error of a camera at its own known points, in its stated noise; 1.2 is right."""
+
+UNLIKE_OTHERS, UNLIKE_OTHERS_PIXELS = 10.0, 2.0
+"""The same where no noise is stated: in the median error of the other cameras, and at least so many pixels."""
+
+WORST_NEES, HOPELESS_NEES = 7.0, 60.0
+"""Mean NEES of held-out points, 3 is right, above which error bars are doubtful, and above which they are nothing."""
+
+TRIMMED = 0.05
+"""Share of the held-out points, the worst and at least one, that have no say: a wrong view may hide among two."""
+
+FEW_FOR_FOLDS = 25
+"""Up to so many, a fit without a third of the points would be another calibration: a fifth is left out."""
+
+FEWEST_JUDGED = 6
+"""Held-out points of which something can be said."""
+
+USELESS = 0.3
+"""rms error of held-out points, in the rms distance of the known points from their middle, that is no measurement."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Known points measured by fits that had not seen them; lengths in the dataset's unit.
+
+    points: measured with all their views. rms, stated: their error, and what the error bars say it is. nees: mean
+    without the worst TRIMMED, right near 2.6. inside: share in the 95 % ellipsoids. contradicting: share of all that
+    were held out whose views contradict each other. how: in words.
+    """
+
+    points: int
+    rms: float
+    stated: float
+    nees: float
+    inside: float
+    contradicting: float
+    how: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """word: "usable", "doubtful" or "not usable"; reasons: sentences with their cures, the gravest first."""
+
+    word: str
+    reasons: tuple[str, ...]
+    held_out: HeldOut | None = None
+
+    def as_table(self) -> dict[str, Any]:
+        """Plain values, for a calibration file or JSON."""
+        table: dict[str, Any] = {"word": self.word, "reasons": list(self.reasons)}
+        if self.held_out is not None:
+            table["held_out"] = asdict(self.held_out)
+        return table
+
+
+class Finding(NamedTuple):
+    """Something that speaks against a calibration."""
+
+    grave: bool
+    reason: str
+
+
+def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
+    """Judge a calibration by its known points: a few fits without some of them, and what the data show."""
+    held_out, failed = _held_out(calibration, progress)
+    findings = [*failed, *_of_held_out(held_out, calibration), *_of_data(calibration.data)]
+    findings += [*_of_rejected(calibration), *_of_residuals(calibration)]
+    reasons = tuple(finding.reason for finding in sorted(findings, key=lambda finding: not finding.grave))
+    word = NOT_USABLE if any(finding.grave for finding in findings) else DOUBTFUL if findings else USABLE
+    return Verdict(word, reasons, held_out)
+
+
+# --- held out ------------------------------------------------------------------------------------------------------
+
+
+class _Plan(NamedTuple):
+    """How many folds, how many of them are done, and the most points that a fit gets."""
+
+    folds: int
+    done: int
+    train: int
+
+
+def _plan(calibration: Calibration, n: int) -> _Plan:
+    """What is affordable: the slow methods get fewer points, or fewer folds."""
+    if calibration.method == InverseGP.method:
+        return _Plan(3, 1 if getattr(calibration, "calibrator", InverseGP()).preset == "paper" else 3, 120)
+    return _Plan(5, 5, 300) if n <= FEW_FOR_FOLDS else _Plan(3, 3, 300)
+
+
+def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | None, list[Finding]]:
+    if calibration.method == MLP.method:
+        return None, list(_of_network(calibration))
+    data = _clean(calibration)
+    n = len(data)
+    if n < FEWEST_JUDGED:
+        return None, []
+    plan = _plan(calibration, n)
+    fold = np.random.default_rng(0).permutation(np.arange(n) % plan.folds)
+    found: list[_Measured] = []
+    failures: list[ImplicamError] = []
+    for i in range(plan.done):
+        progress("checking", i, plan.done)
+        others = calibration.data.select(~np.isin(calibration.data.points, data.points[fold == i]))
+        try:
+            again = calibration.refit(_at_most(others, plan.train))
+        except UsageError:  # made without known points: nothing can be held out
+            return None, []
+        except ImplicamError as error:
+            failures.append(error)
+            continue
+        found.append(_measured(again, data.select(fold == i)))
+    progress("checking", plan.done, plan.done)
+    if len(failures) > plan.done / 2 or (failures and n < ENOUGH_POINTS):
+        return None, _not_repeatable(n, failures[0])
+    how = f"{len(found)} fits from nothing without {'a fifth' if plan.folds == 5 else 'a third'} of the known points"
+    return _summary(found, how + (f", at most {plan.train} points each" if n > plan.train else "")), []
+
+
+def _not_repeatable(n: int, error: ImplicamError) -> list[Finding]:
+    if n < FEW_POINTS:  # said of their number already
+        return []
+    return [
+        Finding(False, f"Without a few of the known points there is no calibration ({error.what}): add known points.")
+    ]
+
+
+def _clean(calibration: Calibration) -> Dataset:
+    """The known points once each, without the views that the fit rejected: those are judged by their number."""
+    data = calibration.data
+    row = {str(name): i for i, name in enumerate(data.points)}
+    column = {name: k for k, name in enumerate(data.observations.camera_names)}
+    uv = data.observations.uv.copy()
+    for view in calibration.rejected:
+        if view.point in row and view.camera in column:  # corners of boards are elsewhere
+            uv[row[view.point], column[view.camera]] = np.nan
+    views = (~np.isnan(uv[..., 0])).sum(axis=1)
+    unused = np.isin(data.points, [one.point for one in calibration.unused])
+    clean = replace(data, observations=replace(data.observations, uv=uv))
+    return clean.select((views >= 2) & ~unused & ~copies_of(data).points)
+
+
+def _at_most(data: Dataset, most: int) -> Dataset:
+    return data if len(data) <= most else data.split(most, seed=0)[0]
+
+
+class _Measured(NamedTuple):
+    errors: Floats
+    cov: Floats
+    contradicting: NDArray[np.bool_]
+
+
+def _measured(calibration: Calibration, data: Dataset) -> _Measured:
+    data = _at_most(data, 300)
+    measured = calibration.measure(data.observations)
+    own = measured.own_reason
+    fine = measured.measured & (own == "")
+    sd = np.nan_to_num(data.positions.sd)
+    cov = measured.cov + sd[:, :, None] ** 2 * np.eye(3)
+    contradicting = ~fine & (~np.isnan(measured.consistency) | measured.measured)
+    return _Measured((measured.xyz - data.xyz)[fine], cov[fine], contradicting)
+
+
+def _summary(found: list[_Measured], how: str) -> HeldOut | None:
+    errors, cov, contradicting = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if len(errors) < FEWEST_JUDGED:
+        return None
+    with np.errstate(all="ignore"):
+        nees = np.einsum("ni,nij,nj->n", errors, np.linalg.pinv(cov, hermitian=True), errors)
+    nees = np.sort(np.nan_to_num(nees, nan=np.inf))
+    kept = nees[: len(nees) - max(1, int(np.ceil(TRIMMED * len(nees))))]
+    return HeldOut(
+        points=len(errors),
+        rms=float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
+        stated=float(np.sqrt(np.mean(np.trace(cov, axis1=1, axis2=2)))),
+        nees=float(kept.mean()),
+        inside=float(np.mean(nees <= chdtri(3, 0.05))),
+        contradicting=float(contradicting.mean()),
+        how=how,
+    )
+
+
+def _of_held_out(found: HeldOut | None, calibration: Calibration) -> Iterator[Finding]:
+    if found is None:
+        return
+    unit = calibration.data.length_unit
+    said = f"{found.points} known points that a fit had not seen are off by {found.rms:.2g} {unit} rms"
+    extent = float(np.sqrt(np.mean(np.sum((calibration.data.xyz - calibration.data.xyz.mean(axis=0)) ** 2, axis=1))))
+    if found.rms > USELESS * extent and found.nees > WORST_NEES:
+        yield Finding(True, f"{said}, and all of them lie within {extent:.2g} {unit}: this is no measurement. {_LOOK}")
+    elif found.nees > HOPELESS_NEES and found.inside < 0.5:
+        yield Finding(True, f"{said}, where the error bars say {found.stated:.2g}: they mean nothing. {_LOOK}")
+    elif found.nees > WORST_NEES:
+        yield Finding(
+            False,
+            f"{said}, where the error bars say {found.stated:.2g}, and {100 * found.inside:.0f} % lie in their 95 % "
+            f"ellipsoids. {_LOOK}",
+        )
+    tested = found.points + round(found.contradicting * found.points / max(1 - found.contradicting, 1e-3))
+    if found.contradicting > MANY_REJECTED and _beyond(round(found.contradicting * tested), tested, USUAL_WRONG):
+        yield Finding(
+            False,
+            f"The views of {100 * found.contradicting:.0f} % of the known points contradict each other in a fit that "
+            "has not seen them. Look whether all cameras took them at the same instants, and for wrong matches.",
+        )
+
+
+_LOOK = (
+    "Look for wrong known positions (a unit, an axis, names in another order), a camera that moved in between, or "
+    "known points that fill too little of the volume; try other methods (implicam compare)."
+)
+
+
+def _of_network(calibration: Calibration) -> Iterator[Finding]:
+    """The network keeps points for early stopping; to train it again takes too long."""
+    residuals = calibration.residuals()
+    n, inside = 3 * int(residuals["held_out_points"]), float(residuals["held_out_in_95"])
+    if n >= 3 * FEWEST_JUDGED and inside < 0.5:
+        yield Finding(
+            False,
+            f"{100 * inside:.0f} % of the {n} coordinates of points kept for early stopping lie in their 95 % bars: "
+            "the spread of dropout says little of the errors. Take forward-gp, or judge with implicam evaluate --cv 5.",
+        )
+
+
+# --- what the data show --------------------------------------------------------------------------------------------
+
+
+def _of_data(data: Dataset) -> Iterator[Finding]:
+    copies = copies_of(data)
+    n = int((~copies.points & data.observations.seen.any(axis=1)).sum())
+    if 0 < n < FEW_POINTS:
+        yield Finding(False, f"{n} known points are few: show the cameras {FEW_POINTS} or more, better 17, all over.")
+    for note in copy_notes(data):
+        yield Finding(False, note)
+    for note in without_marks(data).notes[len(data.notes) :]:
+        yield Finding(False, note.replace("missing, and taken as such", "missing, but here it was taken for a pixel"))
+    if n < 3:
+        return
+    xyz = data.xyz[data.observations.seen.any(axis=1)]
+    extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    if extents[-1] <= FLAT_RATIO * extents[0]:
+        shape = "line" if extents[1] <= FLAT_RATIO * extents[0] else "plane"
+        yield Finding(
+            False,
+            f"The known points lie nearly on a {shape}: away from it positions are guessed. Add known points in front "
+            "of it and behind.",
+        )
+
+
+def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
+    """Cameras of which too many views contradict the rest."""
+    data = calibration.data
+    points = set(map(str, data.points))
+    names = data.observations.camera_names
+    rejected = [view.camera for view in calibration.rejected if view.point in points]
+    seen = data.observations.seen.sum(axis=0)
+    bad = []
+    for name, n in zip(names, seen.tolist(), strict=True):
+        k = rejected.count(name)
+        if k > MANY_REJECTED * n and _beyond(k, n, USUAL_WRONG):
+            bad.append(f"{name} ({k} of {n})")
+    if not bad:
+        return
+    most = len(rejected) > 0.5 * seen.sum()
+    yield Finding(
+        most,
+        f"Too many views contradict the known positions: {', '.join(bad)}. Was the camera moved in between, are its "
+        "views matched to other points, does no lens model hold it, or is the detection wrong? Leave it out with "
+        "--without NAME to see.",
+    )
+
+
+def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
+    """Cameras that miss their own known points."""
+    predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
+    data = calibration.data
+    if predict is None or not len(data):
+        return
+    uv = np.where(copies_of(data).cameras[:, None], np.nan, data.observations.uv)
+    predicted = predict(data.xyz)
+    if predicted.shape != uv.shape:
+        return
+    off = np.linalg.norm(predicted - uv, axis=2)
+    medians = np.array(
+        [np.median(column[~np.isnan(column)]) if (~np.isnan(column)).any() else np.nan for column in off.T]
+    )
+    stated = stated_noise(data.observations)
+    declared = bool((data.positions.sd > 0).any())  # then the fit explains what the positions are off by
+    usual = np.nanmedian(medians) if np.isfinite(medians).any() else np.nan
+    for name, median, sd in zip(data.observations.camera_names, medians, stated, strict=True):
+        if np.isfinite(sd) and median > RESIDUAL_RATIO * sd and not declared:
+            yield Finding(
+                False,
+                f"{name} misses its own known points by {median:.2g} px in the median, and its views state {sd:.2g} "
+                "px: the stated sd is wrong, known positions are off, or the camera is not understood.",
+            )
+        elif not np.isfinite(sd) and median > max(UNLIKE_OTHERS * usual, UNLIKE_OTHERS_PIXELS):
+            yield Finding(
+                False,
+                f"{name} misses its own known points by {median:.2g} px in the median, the cameras together by "
+                f"{usual:.2g}: look at its pictures, or leave it out with --without {name}.",
+            )
+
+
+def _beyond(count: int, n: int, share: float) -> bool:
+    return count > 0 and float(bdtrc(count - 1, n, share)) < RARE

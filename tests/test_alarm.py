@@ -1,0 +1,128 @@
+"""A table as a whole: a rig that is not the one that was calibrated, and tables that are only bad."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import implicam as ic
+from implicam.calibrators.alarm import _inexplicable
+from implicam.cli import main
+from implicam.dataset import Floats, Observations
+from implicam.geometry import Pose, rotation_from_vector
+from implicam.measurement import DOUBTFUL
+from implicam.simulate import Rig, build_rig, random_positions, simulate
+
+CASES = Path(__file__).parent / "data" / "cases"
+
+
+@cache
+def case(name: str) -> tuple[ic.ForwardGPCalibration, ic.Dataset]:
+    calibration = ic.ForwardGP().fit(ic.read_dataset(CASES / name / "known.csv"))
+    return calibration, ic.read_dataset(CASES / name / "new.csv")
+
+
+@cache
+def fitted(spec: str) -> tuple[Rig, ic.ForwardGPCalibration]:
+    rig = build_rig(spec, seed=5)
+    return rig, ic.ForwardGP().fit(simulate(rig, random_positions(rig, 40, np.random.default_rng(5)), seed=1))
+
+
+def table(rig: Rig, points: int = 40, seed: int = 2, **how: float) -> Observations:
+    target = random_positions(rig, points, np.random.default_rng(seed))
+    return simulate(rig, target, seed=seed, **how).observations
+
+
+def knocked(rig: Rig, camera: int, degrees: float) -> Rig:
+    cameras = list(rig.cameras)
+    turn = Pose(rotation_from_vector(np.radians([degrees, -degrees, 0.0]) / 2**0.5), np.zeros(3))
+    cameras[camera] = replace(cameras[camera], camera_from_world=turn @ cameras[camera].camera_from_world)
+    return replace(rig, cameras=tuple(cameras))
+
+
+def test_a_rig_that_was_knocked_raises_an_alarm() -> None:
+    calibration, new = case("knocked-cameras-no-alarm")
+    found = calibration.measure(new.observations)
+    assert "of 80 points contradict the calibration; 0.01 % would be chance" in found.alarm
+    assert "has a camera been moved" in found.alarm
+    assert all(str(reason).startswith(DOUBTFUL) for reason in found.reason)
+    assert found.measured.sum() > 10  # the numbers stay
+
+
+def test_exchanged_cameras_are_named() -> None:
+    calibration, new = case("swapped-cameras-no-alarm")
+    found = calibration.measure(new.observations)
+    assert "are cam1 and cam2 exchanged?" in found.alarm
+    assert all(str(reason).startswith(DOUBTFUL) for reason in found.reason)
+    assert DOUBTFUL not in " ".join(found.own_reason)
+
+
+def test_the_command_fails_and_keeps_its_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calibration, _ = case("swapped-cameras-no-alarm")
+    rig, measured = tmp_path / "r.implicam", tmp_path / "m.csv"
+    calibration.save(rig)
+    new = str(CASES / "swapped-cameras-no-alarm" / "new.csv")
+    with pytest.raises(SystemExit) as left:
+        main(["measure", str(rig), new, "-o", str(measured), "--json"])
+    assert left.value.code == 1
+    assert "exchanged" in json.loads(capsys.readouterr().out)["alarm"]
+    assert measured.read_text().count(DOUBTFUL) == 80
+    with pytest.raises(SystemExit) as left:
+        main(["evaluate", str(rig), new])
+    assert left.value.code == 0  # evaluate judges, whatever it finds
+    assert "alarm:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("spec", ["stereo", "bar3"])
+@pytest.mark.parametrize("wrong", [0.0, 0.1, 0.2])
+def test_ordinary_tables_raise_none(spec: str, wrong: float) -> None:
+    rig, calibration = fitted(spec)
+    for seed in range(6):
+        points = (10, 12, 20, 40, 80, 150)[seed]
+        found = calibration.measure(table(rig, points, seed, outliers=wrong, missing=0.1))
+        assert found.alarm == "", (points, found.alarm)
+
+
+def one_row_late(uv: Floats) -> Floats:
+    return np.stack([uv[:, 0], np.roll(uv[:, 1], 1, axis=0)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda uv: uv[:, ::-1], "are cam1 and cam2 exchanged?"),
+        (one_row_late, "One row on"),
+        (lambda uv: np.stack([uv[..., 0], 1023 - uv[..., 1]], axis=-1), "is v counted from below"),
+        (lambda uv: uv[..., ::-1], "are u and v exchanged?"),
+        (lambda uv: (uv + 0.5) / 2 - 0.5, "are the pictures half the size"),
+    ],
+)
+def test_likely_causes_are_named(change: Callable[[Floats], Floats], said: str) -> None:
+    """Two cameras: as people report of unsynchronised videos, exchanged names, resized pictures."""
+    rig, calibration = fitted("stereo")
+    seen = table(rig)
+    uv = np.clip(change(seen.uv), 0, 1023) if "u and v" in said else change(seen.uv)
+    assert said in calibration.measure(replace(seen, uv=uv)).alarm
+
+
+def test_one_camera_that_was_moved_is_named_and_left_out() -> None:
+    rig, calibration = fitted("bar3")
+    found = calibration.measure(table(knocked(rig, 1, 0.5)))
+    assert "has cam2 been moved or refocused? Without it 100 % of those tried agree" in found.alarm
+
+
+def test_a_few_points_are_not_a_table() -> None:
+    rig, calibration = fitted("stereo")
+    seen = table(rig, 9)
+    assert calibration.measure(replace(seen, uv=seen.uv[:, ::-1])).alarm == ""
+
+
+@pytest.mark.parametrize(("views", "share"), [(2, 0.36), (3, 0.104), (5, 0.05792)])
+def test_how_many_points_no_wrong_view_explains(views: int, share: float) -> None:
+    assert _inexplicable(views) == pytest.approx(share)

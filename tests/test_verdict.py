@@ -1,0 +1,151 @@
+"""Is a calibration to be used? Ordinary rigs are; what is wrong is named, with its cure."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import implicam as ic
+from implicam import calibration_file
+from implicam.cli import commands, main
+from implicam.dataset import Dataset, Floats
+from implicam.geometry import Pose, rotation_from_vector
+from implicam.measurement import Measurement
+from implicam.simulate import build_rig, random_positions, simulate
+from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _of_data
+
+CASES = Path(__file__).parent / "data" / "cases"
+
+
+def rig(points: int, spec: str = "bar3", seed: int = 3, **how: float) -> Dataset:
+    built = build_rig(spec, seed=seed)
+    return simulate(built, random_positions(built, points, np.random.default_rng(seed)), seed=seed, **how)
+
+
+def with_pixels(data: Dataset, uv: Floats) -> Dataset:
+    return replace(data, observations=replace(data.observations, uv=uv))
+
+
+@pytest.mark.parametrize(("spec", "points"), [("stereo", 17), ("bar3", 30)])
+def test_an_ordinary_rig_is_usable(spec: str, points: int) -> None:
+    verdict = ic.judge(ic.ForwardGP().fit(rig(points, spec, outliers=0.03, missing=0.05)))
+    assert (verdict.word, verdict.reasons) == (USABLE, ())
+    assert verdict.held_out is not None
+    assert verdict.held_out.points >= points - 5
+    assert verdict.held_out.inside > 0.8
+    assert verdict.held_out.rms < 3 * verdict.held_out.stated
+
+
+def test_explicit_is_judged_too() -> None:
+    assert ic.judge(ic.Explicit().fit(rig(25, "stereo"))).word == USABLE
+
+
+def test_few_points_are_doubtful() -> None:
+    verdict = ic.judge(ic.ForwardGP().fit(rig(10)))
+    assert verdict.word == DOUBTFUL
+    assert "10 known points are few" in verdict.reasons[0]
+
+
+def test_rows_copied_are_doubtful_and_the_error_is_that_of_new_points(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "r.implicam"
+    with pytest.raises(SystemExit) as left:
+        main(["calibrate", str(CASES / "rows-copied" / "known.csv"), "-o", str(file), "--json"])
+    assert left.value.code == 0
+    told = json.loads(capsys.readouterr().out)["verdict"]
+    assert told["word"] == DOUBTFUL
+    assert told["reasons"][0].startswith("48 of 60 known points are copies of others")
+    assert 0.05 < told["held_out"]["rms"] < 1  # 0.53 mm at new points, where 0.0000006 was believed
+    assert calibration_file.describe(file)["verdict"] == told
+    with pytest.raises(SystemExit):
+        main(["measure", str(file), str(CASES / "rows-copied" / "new.csv"), "-o", str(tmp_path / "m.csv")])
+    assert "found doubtful when it was made" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_a_camera_that_moved_halfway_is_named() -> None:
+    """As people report who bump a tripod while they calibrate."""
+    built = build_rig("bar3", seed=3)
+    target = random_positions(built, 30, np.random.default_rng(3))
+    before, cameras = simulate(built, target, seed=3), list(built.cameras)
+    turn = Pose(rotation_from_vector(np.radians([0.3, -0.2, 0.2])), np.zeros(3))
+    cameras[2] = replace(cameras[2], camera_from_world=turn @ cameras[2].camera_from_world)
+    after = simulate(replace(built, cameras=tuple(cameras)), target, seed=3)
+    uv = before.observations.uv.copy()
+    uv[15:] = after.observations.uv[15:]
+    verdict = ic.judge(ic.ForwardGP().fit(with_pixels(before, uv)))
+    assert verdict.word != USABLE
+    assert "cam3" in " ".join(verdict.reasons)
+
+
+def test_marks_that_came_by_the_api_are_said() -> None:
+    data = rig(25)
+    uv = data.observations.uv.copy()
+    uv[::5, 0] = -1
+    verdict = ic.judge(ic.ForwardGP().fit(with_pixels(data, uv)))
+    assert verdict.word == DOUBTFUL
+    assert "The pixel (-1, -1) is there 5 times (cam1)" in verdict.reasons[0]
+    assert "taken for a pixel" in verdict.reasons[0]
+
+
+def test_points_nearly_on_a_plane_are_doubtful() -> None:
+    data = rig(25)
+    xyz = data.xyz.copy()
+    xyz[:, 0] = xyz[:, 0].mean() + 0.002 * (xyz[:, 0] - xyz[:, 0].mean())
+    (finding,) = _of_data(replace(data, known=replace(data.positions, xyz=xyz)))
+    assert "nearly on a plane" in finding.reason
+    assert not finding.grave
+
+
+class _Pretends:
+    """A calibration that is off by `off` in each axis and believes in 0.02."""
+
+    method, unused, rejected = "pretends", (), ()
+
+    def __init__(self, data: Dataset, off: float) -> None:
+        self.data, self.off = data, off
+
+    def refit(self, data: Dataset) -> _Pretends:
+        return _Pretends(data, self.off)
+
+    def measure(self, observations: ic.Observations) -> Measurement:
+        row = {str(name): xyz for name, xyz in zip(TRUE.points, TRUE.xyz, strict=True)}
+        xyz = np.array([row[str(name)] for name in observations.points])
+        n = len(xyz)
+        off = self.off * np.random.default_rng(n).normal(size=(n, 3))
+        cov = np.tile(0.02**2 * np.eye(3), (n, 1, 1))
+        reasons = np.full(n, "")
+        return Measurement(observations.points, xyz + off, cov, np.full(n, 3), np.full(n, 0.5), reasons, "mm")
+
+
+TRUE = rig(25)
+
+
+@pytest.mark.parametrize(("off", "word"), [(0.02, USABLE), (0.06, DOUBTFUL), (5.0, NOT_USABLE), (500.0, NOT_USABLE)])
+def test_errors_far_above_the_error_bars(off: float, word: str) -> None:
+    verdict = ic.judge(_Pretends(TRUE, off))
+    assert verdict.word == word
+    assert bool(verdict.reasons) == (word != USABLE)
+
+
+def test_not_usable_writes_nothing_unless_forced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ic.write_dataset(rig(20), tmp_path / "d")
+    file = tmp_path / "r.implicam"
+    monkeypatch.setattr(commands, "judge", lambda *_: ic.Verdict(NOT_USABLE, ("it is nonsense.",)))
+    with pytest.raises(SystemExit) as left:
+        main(["calibrate", str(tmp_path / "d"), "-o", str(file)])
+    assert left.value.code == 1
+    assert not file.exists()
+    said = capsys.readouterr()
+    assert "no file written" in said.out
+    assert "it is nonsense" in said.err
+    with pytest.raises(SystemExit) as left:
+        main(["calibrate", str(tmp_path / "d"), "-o", str(file), "--force"])
+    assert left.value.code == 0
+    assert calibration_file.describe(file)["verdict"]["word"] == NOT_USABLE
