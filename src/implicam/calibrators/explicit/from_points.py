@@ -7,13 +7,14 @@ cameras see the same error and are refined together. The equations are those of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from implicam.calibrators.explicit.lenses import Choice, start_with_lens
+from implicam.calibrators.explicit.lenses import Choice
+from implicam.calibrators.explicit.start import MirroredError, start_with_lens
 from implicam.calibrators.forward_gp.evidence import Hyperparameters
 from implicam.calibrators.forward_gp.fit import (
     Bools,
@@ -26,7 +27,8 @@ from implicam.calibrators.forward_gp.fit import (
 )
 from implicam.calibrators.forward_gp.lens import Floats
 from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, spread
-from implicam.calibrators.forward_gp.start import Started
+from implicam.calibrators.forward_gp.start import FEWEST, Started
+from implicam.errors import FitError
 from implicam.progress import Progress
 
 ROUNDS = 8
@@ -44,7 +46,15 @@ def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[Fitte
         started, choices[c] = start_with_lens(points, uv, problem.images[c], family)
         return started
 
-    started, blind = start_rig(problem, start)
+    started, blind = _started(problem, start)
+    fitted = refined(problem, started, blind, progress)
+    return fitted, {c: choices[c] for c in fitted.cameras}
+
+
+def refined(
+    problem: Problem, started: Mapping[int, Started], blind: Sequence[tuple[int, str]], progress: Progress
+) -> FittedRig:
+    """Cameras from where they start, with the noise that the residuals show and without the views that contradict."""
     cameras = tuple(started)
     progress("fitting", 1, 3)
     seen = tuple(problem.sightings[c] for c in cameras)
@@ -72,8 +82,38 @@ def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[Fitte
     )
     progress("fitting", 3, 3)
     hyper = Hyperparameters(np.ones(2), np.zeros(len(cameras)), noise)
-    fitted = FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
-    return fitted, {c: choices[c] for c in cameras}
+    return FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
+
+
+def _started(
+    problem: Problem, start: Callable[[int, Floats, Floats], Started]
+) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    """As start_rig; where mirrors are why it fails, the error says so."""
+    mirrored: dict[int, MirroredError] = {}
+
+    def noting(c: int, points: Floats, uv: Floats) -> Started:
+        try:
+            return start(c, points, uv)
+        except MirroredError as error:
+            mirrored[c] = error
+            raise
+
+    try:
+        return start_rig(problem, noting)
+    except FitError as error:
+        if not mirrored:
+            raise
+        names = [problem.names[c] for c in sorted(mirrored)]
+        everyone = len(names) == sum(len(seen.rows) >= FEWEST for seen in problem.sightings)
+        raise FitError(
+            f"{' and '.join(names)} see{'s' * (len(names) == 1)} the known points as in a mirror.",
+            why=error.why,
+            fix="an axis of the known positions points the other way (a left-handed frame), or v is counted from below"
+            ": turn the sign of one axis in points.csv, or write height - 1 - v for v"
+            if everyone
+            else "pictures flipped left to right (webcams do so) or through a mirror: write width - 1 - u for u of "
+            f"{' and '.join(names)}, or switch the flip off",
+        ) from error
 
 
 def with_noise(models: Sequence[CameraModel], noise: Floats) -> tuple[CameraModel, ...]:
