@@ -317,6 +317,23 @@ def log_marginal_with_slack(bundle: Bundle) -> float:
     return float(-0.5 * total)
 
 
+def root_with_slack(bundle: Bundle, root: Floats) -> Floats:
+    """(q, P) root of the covariance where there was slack, of cameras that were adjusted without, with root^T root: to
+    each view's own error comes what the slack of its board moved the cameras by."""
+    plain = replace(bundle, slack=0.0)
+    normal, starts, pulls = _Normal.of(plain, robust=False), bundle.starts, []
+    back = np.linalg.solve(normal.D, normal.B.swapaxes(1, 2))  # (b, 6, P): how boards follow the cameras
+    for c in range(len(bundle.cameras)):
+        _, J, K = _whitened(plain, c, robust=False)
+        for (k, rows), (Q, size) in zip(bundle.views.stacks[c].sections, _slacks(bundle, c, K), strict=True):
+            G = (Q * size).T
+            pull = -(G @ K[rows].reshape(len(Q), 6)) @ back[k]
+            pull[:, starts[c] : starts[c + 1]] += G @ J[rows].reshape(len(Q), -1)
+            pulls.append(pull)
+    both = np.vstack([root, np.concatenate(pulls) @ root.T @ root])
+    return np.asarray(np.linalg.qr(both, mode="r"), dtype=np.float64)
+
+
 def unexplained(bundle: Bundle, c: int) -> Floats:
     """(n,) lengths of the residuals of a camera that its slack does not explain either, in its usual pixels."""
     r, _, K = _whitened(replace(bundle, slack=0.0), c, robust=False)

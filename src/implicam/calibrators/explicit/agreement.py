@@ -15,7 +15,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from implicam.calibrators.explicit.adjust import Adjusted, Bundle, adjust, log_marginal_with_slack, unexplained
+from implicam.calibrators.explicit.adjust import (
+    Adjusted,
+    Bundle,
+    adjust,
+    log_marginal_with_slack,
+    root_with_slack,
+    unexplained,
+)
 from implicam.calibrators.explicit.boards import BoardView
 from implicam.calibrators.forward_gp.lens import CentralCamera, Floats
 from implicam.geometry import Pose
@@ -33,6 +40,12 @@ HOPELESS = 0.02
 
 FAR = 5.0
 """Standard deviations off, beyond which a corner is wrong: one in 270,000 of good ones."""
+
+LITTLE = (3e-4, 1e-3)
+"""Parts of the extent of the boards that they may have moved without anybody having noticed."""
+
+CLEARLY = 10.0
+"""Log evidence that moved boards must gain."""
 
 RAYLEIGH = 1.1774
 """Median length of a residual with sd 1 in u and in v."""
@@ -109,6 +122,25 @@ def with_slack(bundle: Bundle, progress: Progress = silent) -> tuple[Adjusted, l
         for i in np.flatnonzero(wrong[c][rows])
     ]
     return found, listed
+
+
+def loosened(found: Adjusted, progress: Progress = silent) -> Adjusted:
+    """The same with the covariance that it has if boards moved a little between the pictures of them, where the views
+    clearly say so. Errors that all corners of a view share, those of a lens that its model does not hold, too, are not
+    errors of single corners, which would cancel; the cameras stay as they are, since it is not known which it was."""
+    bundle, seen = found.bundle, np.zeros(len(found.bundle.boards.translation), dtype=np.int64)
+    for view in bundle.views.each:
+        seen[view.board] += 1
+    if np.sum(seen >= 2) < ENOUGH_BOARDS:
+        return found
+    extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
+    before = log_marginal_with_slack(bundle)
+    for part in LITTLE:
+        trial = adjust(replace(bundle, slack=part * extent), robust=False, iterations=4).bundle
+        if log_marginal_with_slack(trial) > before + CLEARLY:
+            slack = _most_probable(trial, progress).slack
+            return found._replace(root=root_with_slack(replace(bundle, slack=slack), found.root))
+    return found
 
 
 def _most_probable(bundle: Bundle, progress: Progress) -> Bundle:

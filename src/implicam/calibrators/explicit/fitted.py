@@ -157,8 +157,8 @@ def network_notes(network: Network, trained: Observations, boards: Dataset) -> l
     notes += [
         f"{names[one.pair[0]]} and {names[one.pair[1]]} contradict each other on the {one.boards} boards that both saw"
         f": alone {one.alone:.2g} px, together {one.together:.2g} px, as if boards had moved by {moved:.2g} "
-        f"{boards.length_unit} from one picture to the other. The pictures are not of the same instants, or a camera or "
-        "the rig moved between them. The error bars allow for it; what moves while it is measured is off by more."
+        f"{boards.length_unit} from one picture to the other. The pictures are not of the same instants, or a camera "
+        "or the rig moved between them. The error bars allow for it; what moves while it is measured is off by more."
         for one in network.doubts
     ]
     if network.wrong:

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
-from implicam.calibrators.explicit.agreement import Agreement, agreements, lengths_alone, with_slack
+from implicam.calibrators.explicit.agreement import Agreement, agreements, lengths_alone, loosened, with_slack
 from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import Choice, angles
 from implicam.calibrators.explicit.pixels import prior_of
@@ -110,15 +110,6 @@ def _network(
         found = adjust_in_steps(better, half, one_noise=True, progress=progress)
     agreed = agreements(found.bundle, half, _alone(boards, singles, found.bundle, cameras))
     doubts = [one for one in agreed if one.contradict]
-    import os
-
-    if os.environ.get("AGREE"):
-        print(
-            [
-                (a.pair, a.boards, round(a.alone, 3), round(a.together, 3), round(a.together / a.alone, 2))
-                for a in agreed
-            ]
-        )
     _check_pairs(boards, cameras, doubts)
     if doubts:
         found, wrong, doubts = _with_slack(boards, singles, cameras, found.bundle, doubts, progress)
@@ -126,6 +117,7 @@ def _network(
         found = adjust_in_steps(found.bundle, half, progress=progress)
         _check(boards, cameras, found, half)
         found, wrong = _refined(boards, cameras, found, progress)
+        found = loosened(found, progress)
     return Network(
         cameras,
         tuple(sorted(blind)),

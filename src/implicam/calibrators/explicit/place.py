@@ -31,6 +31,9 @@ SPREAD = 0.02
 TOLERABLE = 0.02
 """Median error of the best place, in half the longer side of the image, beyond which it is none."""
 
+MIRRORED, MIRROR_FROM = 0.3, 2e-3
+"""A mirror is looked for where more than so much of half the longer side is left; it must leave so many times less."""
+
 AS_GOOD = 9.0
 """Squared residuals, in the noise, that a second place may have more than the first and be as good."""
 
@@ -66,6 +69,9 @@ def _placed(network: Network, points: Floats, uv: Floats) -> Started:
     _check_spread(points[valid])
     prior = _prior(network)
     found = _best(known, prior, points, uv, rays, valid, sd)
+    left = _median(found[0][0], points, uv) if found else np.inf
+    if left > max(FAR * sd, MIRROR_FROM * half):
+        _check_mirror(known, prior, points, uv, rays, valid, sd, left)
     if not found:
         raise FitError("from no place does its lens see the known points at these pixels.")
     (camera, kept), *others = found
@@ -84,6 +90,20 @@ def _placed(network: Network, points: Floats, uv: Floats) -> Started:
                 f"its {int(kept.sum())} known points place it in two ways: show it more, spread out in depth."
             )
     return Started(camera, prior, kept)
+
+
+def _check_mirror(
+    known: CentralCamera, prior: Prior, points: Floats, uv: Floats, rays: Floats, valid: Bools, sd: float, left: float
+) -> None:
+    """FitError where known points seen in a mirror would fit."""
+    other = points * np.array([1.0, 1.0, -1.0])
+    found = _best(known, prior, other, uv, rays, valid, sd)
+    mirrored = _median(found[0][0], other, uv) if found else np.inf
+    if mirrored < MIRRORED * left:
+        raise FitError(
+            f"it sees the known points as in a mirror: as they are {left:.3g} px are left, mirrored {mirrored:.2g} px. "
+            "Are its pictures flipped, or is v counted from below, or are the known positions left-handed?"
+        )
 
 
 def _check_spread(points: Floats) -> None:
