@@ -33,6 +33,9 @@ ITERATIONS = 60
 CONVERGED = 1e-8
 """Relative change of the sum of squares in one step."""
 
+NOTHING = 1e-14
+"""Least eigenvalue of a normal matrix with a diagonal of ones."""
+
 BARELY = 1e-9
 """Keeps a board of which nothing is left solvable; one corner counts a million million times as much."""
 
@@ -88,8 +91,9 @@ class Views:
         return tuple(Stack.of([view for view in self.each if view.camera == c]) for c in range(self.count))
 
     def select(self, keep: Sequence[Bools]) -> Views:
-        """Per camera, some of its corners: masks as its stack."""
-        return Views(tuple(view.select(keep[c][rows]) for c, view, rows in self.in_stacks()), self.count)
+        """Per camera, some of its corners: masks as its stack. Views of which none is left are left out."""
+        some = (view.select(keep[c][rows]) for c, view, rows in self.in_stacks())
+        return Views(tuple(view for view in some if len(view.rows)), self.count)
 
     def in_stacks(self) -> Iterator[tuple[int, BoardView, slice]]:
         """Camera number, view, and its rows in the camera's stack."""
@@ -250,7 +254,8 @@ class _Normal(NamedTuple):
         """(q, P) root of the covariance of the cameras' unknowns, the boards integrated out; zero where fixed."""
         if not self.free.any():
             return np.zeros((0, len(self.a)))
-        found, _, _ = solve_normal(*self.reduced(self.A, self.D))
+        S, s = self.reduced(self.A, self.D)
+        found, _, _ = solve_normal(*_definite(S, s))
         root = np.zeros((len(found), len(self.a)))
         root[:, self.free] = found
         return root
@@ -263,6 +268,14 @@ class _Normal(NamedTuple):
         S = A[np.ix_(self.free, self.free)] - flat @ pulled[:, :, :-1].reshape(len(B) * 6, B.shape[1])
         s = self.a[self.free] - flat @ pulled[:, :, -1].reshape(-1)
         return 0.5 * (S + S.T), s
+
+
+def _definite(S: Floats, s: Floats) -> tuple[Floats, Floats]:
+    """The normal matrix, on its diagonal as much more as it takes to be positive definite: rounding may take that where
+    an adjustment has got lost."""
+    scale = np.sqrt(np.maximum(np.diag(S), np.finfo(np.float64).tiny))
+    least = float(np.linalg.eigvalsh(S / scale[:, None] / scale)[0])
+    return S + np.diag(scale**2) * max(NOTHING - least, 0), s
 
 
 def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Floats]:
@@ -298,7 +311,7 @@ def _slacks(bundle: Bundle, c: int, by_board: Floats) -> Iterator[tuple[Floats, 
     for k, rows in stack.sections:
         turned = stack.xyz[rows] @ bundle.boards.rotation[k].T
         middle = turned.mean(axis=0)
-        radius = float(np.sqrt(np.mean(np.sum((turned - middle) ** 2, axis=1))))
+        radius = max(float(np.sqrt(np.mean(np.sum((turned - middle) ** 2, axis=1)))), 1e-9)
         flat = by_board[rows].reshape(-1, 6)
         about = flat[:, :3] - np.cross(middle, flat[:, 3:])  # turned about its middle, not about its first corner
         Q, size, _ = np.linalg.svd(bundle.slack * np.column_stack([about / radius, flat[:, 3:]]), full_matrices=False)
@@ -308,7 +321,7 @@ def _slacks(bundle: Bundle, c: int, by_board: Floats) -> Iterator[tuple[Floats, 
 def log_marginal_with_slack(bundle: Bundle) -> float:
     """Log marginal likelihood of the views for the bundle's slack, cameras and boards integrated out (Laplace)."""
     normal = _Normal.of(bundle, robust=False)
-    _, _, cameras = solve_normal(*normal.reduced(normal.A, normal.D))
+    _, _, cameras = solve_normal(*_definite(*normal.reduced(normal.A, normal.D)))
     total = _cost(bundle, robust=False) + np.sum(np.linalg.slogdet(normal.D)[1]) + cameras
     plain = replace(bundle, slack=0.0)
     for c in range(len(bundle.cameras)):
@@ -350,11 +363,7 @@ def log_marginal(bundle: Bundle) -> float:
     boards; robust cost."""
     normal = _Normal.of(bundle, robust=True)
     boards = np.linalg.slogdet(normal.D)[1]
-    S, s = normal.reduced(normal.A, normal.D)
-    try:
-        _, _, cameras = solve_normal(S, s)
-    except np.linalg.LinAlgError:
-        return -np.inf
+    _, _, cameras = solve_normal(*_definite(*normal.reduced(normal.A, normal.D)))
     return float(-0.5 * (_cost(bundle, robust=True) + np.sum(boards) + cameras))
 
 

@@ -35,7 +35,13 @@ they leave as much as the noise, 1.7 where they leave three times as much (docs/
 ENOUGH_BOARDS = 3
 """Boards that two cameras must share before what they leave says anything of the rig."""
 
-HOPELESS = 0.02
+CONTRADICT = 0.15
+"""Share of the corners that do not fit, beyond which cameras contradict each other and nothing makes up for it."""
+
+TOO_FAR = 0.1
+"""Part of the boards' extent that they may seem to have moved: more is no lag of a camera."""
+
+HOPELESS = 0.01
 """Usual residual together, in half the longer side of the image, beyond which no error bar makes up for it."""
 
 FAR = 5.0
@@ -46,6 +52,9 @@ LITTLE = (3e-4, 1e-3)
 
 CLEARLY = 10.0
 """Log evidence that moved boards must gain."""
+
+MIRRORED = 0.3
+"""Two cameras that leave so many times less with one turned left to right are mirrored."""
 
 RAYLEIGH = 1.1774
 """Median length of a residual with sd 1 in u and in v."""
@@ -112,9 +121,10 @@ def with_slack(bundle: Bundle, progress: Progress = silent) -> tuple[Adjusted, l
         whole = replace(bundle, views=everything)
         off = [unexplained(whole, c) for c in range(len(bundle.cameras))]
         now = [length > FAR * noise for length, noise in zip(off, alone, strict=True)]
-        if all((a == b).all() for a, b in zip(now, wrong, strict=True)):
-            break
+        same = all((a == b).all() for a, b in zip(now, wrong, strict=True))
         wrong = now
+        if same or np.mean(np.concatenate(wrong)) > CONTRADICT:
+            break
     found = adjust(bundle, robust=False)
     listed = [
         (int(view.rows[i]), c, float(off[c][rows][i]))
@@ -158,6 +168,32 @@ def _most_probable(bundle: Bundle, progress: Progress) -> Bundle:
     found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 0.1, "maxiter": 12})
     progress("looking how far the boards moved", 1, 1)
     return adjust(replace(best, slack=float(np.exp(found.x))), robust=False).bundle
+
+
+def mirrored(
+    camera: CentralCamera, seen: Mapping[int, BoardView], placed: Mapping[int, Pose], other: Mapping[int, Pose]
+) -> float:
+    """The usual error in pixels of a camera on the boards (numbers) that another saw as well, if the pictures of one of
+    the two are mirrored. placed, other: camera_from_board of each camera alone.
+
+    A mirrored picture of a board fits as well as a right one, from behind; or from the front, where a detector has
+    counted the corners anew, along the mirrored rows or columns.
+    """
+    common = sorted(placed.keys() & other.keys())
+    flip, best = np.diag([-1.0, 1.0, 1.0]), np.inf
+    extent = np.max([seen[k].xyz.max(axis=0) for k in common], axis=0)
+    for signs in ((1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)):
+        counted = np.array(signs)
+        start = np.where(counted < 0, extent, 0) * np.array([1.0, 1.0, 0.0])
+        truly = {}
+        for k in common:
+            rotation = flip @ other[k].rotation * counted
+            truly[k] = Pose(rotation, flip @ other[k].translation - rotation @ start)
+        for k in common:
+            pose = placed[k] @ truly[k].inverse()
+            off = [float(np.median(lengths_alone(camera, seen[j], pose @ truly[j]))) for j in common]
+            best = min(best, float(np.median(off)))
+    return best
 
 
 def lengths_alone(camera: CentralCamera, view: BoardView, pose: Pose) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +11,9 @@ from implicam.calibrators.explicit.boards import boards_of
 from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.network import Network, calibrate_network
+from implicam.calibrators.explicit.pixels import told
 from implicam.calibrators.forward_gp.diagnosis import NAMED, Diagnosis
-from implicam.calibrators.forward_gp.fit import without_field
+from implicam.calibrators.forward_gp.fit import FittedRig, without_field
 from implicam.calibrators.forward_gp.lens import CentralCamera
 from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior
 from implicam.calibrators.forward_gp.problem import Frame, problem_of, stated_noise
@@ -59,8 +60,16 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
         *diagnosis.leave_one_out,
         diagnosis.rejected,
         diagnosis.unused,
-        (*diagnosis.notes(), *diagnosis.noise_notes()),
+        (*diagnosis.notes(), *_pixel_notes(data, fitted, choices), *diagnosis.noise_notes()),
     )
+
+
+def _pixel_notes(data: Dataset, fitted: FittedRig, choices: Mapping[int, Choice]) -> list[str]:
+    notes = []
+    for c, model in zip(fitted.cameras, fitted.posterior.models, strict=True):
+        assert isinstance(model.camera, CentralCamera)
+        notes += told(data.observations.camera_names[c], model.camera, model.image, choices[c].pixels)
+    return notes
 
 
 def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple[Dataset, Fitted]:
@@ -153,10 +162,10 @@ def network_notes(network: Network, trained: Observations, boards: Dataset) -> l
     """What is to be said of the boards: cameras that contradict each other, wrong corners, lenses hardly fixed."""
     names = trained.camera_names
     notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in network.blind]
-    moved = np.sqrt(2) * network.bundle.slack  # in both pictures
+    moved = np.sqrt(6) * network.bundle.slack  # along three axes, in either picture
     notes += [
         f"{names[one.pair[0]]} and {names[one.pair[1]]} contradict each other on the {one.boards} boards that both saw"
-        f": alone {one.alone:.2g} px, together {one.together:.2g} px, as if boards had moved by {moved:.2g} "
+        f": alone {one.alone:.2g} px, together {one.together:.2g} px, as if boards had moved by about {moved:.1g} "
         f"{boards.length_unit} from one picture to the other. The pictures are not of the same instants, or a camera "
         "or the rig moved between them. The error bars allow for it; what moves while it is measured is off by more."
         for one in network.doubts
@@ -177,6 +186,7 @@ def _lens_notes(network: Network, trained: Observations) -> list[str]:
     stated = stated_noise(trained)
     for number, c in enumerate(network.cameras):
         name, lens = trained.camera_names[c], bundle.cameras[number].lens
+        notes += told(name, bundle.cameras[number], network.images[number], network.choices[c].pixels)
         loose = float(sd[bundle.starts[number]] / lens.fx)
         if loose > LOOSE:
             notes.append(

@@ -104,15 +104,16 @@ def _started(
         if not mirrored:
             raise
         names = [problem.names[c] for c in sorted(mirrored)]
+        listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
         everyone = len(names) == sum(len(seen.rows) >= FEWEST for seen in problem.sightings)
         raise FitError(
-            f"{' and '.join(names)} see{'s' * (len(names) == 1)} the known points as in a mirror.",
+            f"{listed} see{'s' * (len(names) == 1)} the known points as in a mirror.",
             why=error.why,
             fix="an axis of the known positions points the other way (a left-handed frame), or v is counted from below"
             ": turn the sign of one axis in points.csv, or write height - 1 - v for v"
             if everyone
             else "pictures flipped left to right (webcams do so) or through a mirror: write width - 1 - u for u of "
-            f"{' and '.join(names)}, or switch the flip off",
+            f"{listed}, or switch the flip off",
         ) from error
 
 

@@ -25,8 +25,8 @@ WIDEST = np.radians(75.0)
 
 FOLDS = 5
 
-SHIFTED = 5.0
-"""How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""
+USUAL = "square"
+"""The name of the usual pixels (pixels.py)."""
 
 
 class Choice(NamedTuple):
@@ -34,7 +34,7 @@ class Choice(NamedTuple):
 
     lens: str
     held_out: Mapping[str, float]
-    pixels: str = "square"
+    pixels: str = USUAL
 
 
 def name_of(camera: CentralCamera) -> str:

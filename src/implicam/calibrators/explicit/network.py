@@ -12,7 +12,17 @@ from itertools import combinations
 import numpy as np
 
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
-from implicam.calibrators.explicit.agreement import Agreement, agreements, lengths_alone, loosened, with_slack
+from implicam.calibrators.explicit.agreement import (
+    CONTRADICT,
+    MIRRORED,
+    TOO_FAR,
+    Agreement,
+    agreements,
+    lengths_alone,
+    loosened,
+    mirrored,
+    with_slack,
+)
 from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import Choice, angles
 from implicam.calibrators.explicit.pixels import prior_of
@@ -29,9 +39,6 @@ FAR = 5.0
 
 AS_IF = 2.0
 """The stated noise counts like so many residuals."""
-
-CONTRADICT = 0.15
-"""Share of the corners on shared boards that do not fit, beyond which two cameras contradict each other."""
 
 TOLERABLE = 0.02
 """Usual residual of a camera in the whole rig, in half the longer side of its image, beyond which there is no fit."""
@@ -110,7 +117,7 @@ def _network(
         found = adjust_in_steps(better, half, one_noise=True, progress=progress)
     agreed = agreements(found.bundle, half, _alone(boards, singles, found.bundle, cameras))
     doubts = [one for one in agreed if one.contradict]
-    _check_pairs(boards, cameras, doubts)
+    _check_pairs(boards, singles, cameras, doubts)
     if doubts:
         found, wrong, doubts = _with_slack(boards, singles, cameras, found.bundle, doubts, progress)
     else:
@@ -302,13 +309,15 @@ def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floa
     raise _contradiction(boards, [cameras[worst]], f"its corners are left {usual[worst]:.3g} px off")
 
 
-def _check_pairs(boards: Boards, cameras: tuple[int, ...], doubts: Sequence[Agreement]) -> None:
-    """FitError where cameras that fit alone are far off together."""
+def _check_pairs(
+    boards: Boards, singles: Mapping[int, OneCamera], cameras: tuple[int, ...], doubts: Sequence[Agreement]
+) -> None:
+    """FitError where cameras that fit alone are far off together, or fit together in a mirror."""
+    _check_mirrors(boards, singles, cameras, doubts)
     bad = [one for one in doubts if one.hopeless]
     if not bad:
         return
-    in_all = set(bad[0].pair).intersection(*(one.pair for one in bad))
-    culprits = sorted(in_all) if len(bad) > 1 and in_all else sorted({c for one in bad for c in one.pair})
+    culprits = _culprits(bad)
     worst = max(bad, key=lambda one: one.together / one.alone)
     raise _contradiction(
         boards,
@@ -331,6 +340,14 @@ def _with_slack(
     half = np.array([boards.images[c].half for c in cameras])
     own = np.maximum([singles[c].noise for c in cameras], 1e-5 * half)
     found, wrong = with_slack(replace(bundle, noise=own), progress)
+    extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
+    wrong_share = len(wrong) / sum(len(stack.uv) for stack in bundle.views.stacks)
+    if wrong_share > CONTRADICT or found.bundle.slack > TOO_FAR * extent:
+        worst = max(doubts, key=lambda one: one.together / one.alone)
+        told = f"alone {worst.alone:.2g} px, together {worst.together:.2g} px"
+        if found.bundle.slack > TOO_FAR * extent:
+            told += f", as if boards had moved by {np.sqrt(6) * found.bundle.slack:.1g} between their pictures"
+        raise _contradiction(boards, [cameras[c] for c in _culprits(doubts)], told)
     pairs = {one.pair for one in doubts}
     now = agreements(found.bundle, half, _alone(boards, singles, bundle, cameras))
     doubts = [one for one in now if one.pair in pairs]
@@ -340,6 +357,37 @@ def _with_slack(
             noise[c] = max(noise[c], one.together)
     listed = [(row, cameras[c], off) for row, c, off in wrong]
     return found._replace(bundle=replace(found.bundle, noise=noise)), listed, doubts
+
+
+def _culprits(bad: Sequence[Agreement]) -> list[int]:
+    """The camera that is in all of two pairs or more, else all of them."""
+    in_all = set(bad[0].pair).intersection(*(one.pair for one in bad))
+    return sorted(in_all if len(bad) > 1 and in_all else {c for one in bad for c in one.pair})
+
+
+def _check_mirrors(
+    boards: Boards, singles: Mapping[int, OneCamera], cameras: tuple[int, ...], doubts: Sequence[Agreement]
+) -> None:
+    """FitError where one of two cameras that contradict each other has mirrored pictures."""
+    seen = {c: {view.board: view for view in boards.of_camera(c)} for c in cameras}
+    placed = {c: _placed(boards, c, singles[c]) for c in cameras}
+    found = []
+    for one in doubts:
+        a, b = (cameras[c] for c in one.pair)
+        left = mirrored(singles[a].camera, seen[a], placed[a], placed[b])
+        if left < MIRRORED * one.together:
+            found.append(one._replace(alone=left))
+    if not found:
+        return
+    names, worst = [boards.names[cameras[c]] for c in _culprits(found)], found[0]
+    how = f"{worst.together:.2g} px are left; with one turned left to right, {worst.alone:.2g} px"
+    raise FitError(
+        f"the pictures of {names[0]} are mirrored: together with the others {how}."
+        if len(names) == 1
+        else f"the pictures of one of {' and '.join(names)} are mirrored: together {how}.",
+        why="a webcam flips its pictures, a camera looks into a mirror, or v is counted from below",
+        fix="switch the flip off, or flip the pictures back before the corners are detected",
+    )
 
 
 def _refined(
@@ -391,12 +439,14 @@ def _check_shared(boards: Boards, cameras: tuple[int, ...], views: Views, kept: 
 def _contradiction(boards: Boards, which: list[int], how: str) -> FitError:
     names = [boards.names[c] for c in which]
     one = len(names) == 1
+    without = " or ".join(f"--without {name}" for name in names)
+    leave_out = f"; or use {without}" if len(boards.cameras) > 2 else ""
     return FitError(
         f"the cameras contradict each other: {' and '.join(names)}: {how}.",
         why="alone it fits its boards; with the others it does not"
         if one
         else "each fits its boards, but not the other",
-        fix=f"see that all pictures are of the same instants and that no camera moved; or use --without {names[0]}",
+        fix=f"see that all pictures are of the same instants and that no camera moved{leave_out}",
     )
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from implicam.calibrators.explicit.lenses import USUAL
 from implicam.calibrators.forward_gp.lens import ASPECT, CENTRE, CentralCamera, Image, Prior
 
 ASPECTS = (1.0, 0.5, 0.63, 0.79, 1.26, 1.59, 2.0)
@@ -42,7 +43,7 @@ class Pixels(NamedTuple):
 
 def square(centre: float = CENTRE) -> Pixels:
     """Square pixels and a lens over the middle of the picture: the usual."""
-    return Pixels("square", ASPECT, centre, 1.0)
+    return Pixels(USUAL, ASPECT, centre, 1.0)
 
 
 def kinds(usual: Pixels) -> tuple[Pixels, ...]:
@@ -65,6 +66,17 @@ def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels)
     precision[:2, :2] = np.array([[1, -1], [-1, 1]]) / (pixels.aspect * typical) ** 2
     precision[2, 2] = precision[3, 3] = 1 / (pixels.centre * 2 * image.half) ** 2
     return Prior(mean, precision)
+
+
+def told(name: str, camera: CentralCamera, image: Image, pixels: str) -> list[str]:
+    """A note on a camera whose pixels are not the usual ones."""
+    lens, notes = camera.lens, []
+    if pixels in ("stretched", "any"):
+        notes.append(f"its pixels are not square, fy / fx = {lens.fy / lens.fx:.4g}")
+    if pixels in ("cropped", "any"):
+        off = np.array([lens.cx, lens.cy]) - image.centre
+        notes.append(f"its lens is {off[0]:+.3g}, {off[1]:+.3g} px off the middle of the picture")
+    return [f"{name}: {' and '.join(notes)}, as its views clearly say."] if notes else []
 
 
 def log_density_at_peak(prior: Prior, camera: CentralCamera, image: Image, pixels: Pixels) -> float:
