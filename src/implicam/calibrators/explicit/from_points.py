@@ -26,12 +26,15 @@ from implicam.calibrators.forward_gp.fit import (
     without_field,
 )
 from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, spread
-from implicam.calibrators.forward_gp.start import FEWEST, Started
+from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, condition, spread
+from implicam.calibrators.forward_gp.start import FEWEST, Started, levenberg_marquardt
 from implicam.errors import FitError
 from implicam.progress import Progress
 
 ROUNDS = 8
+
+ASTRAY = 2.0
+"""Times what was left: a step to more than that was no step towards the optimum."""
 
 AS_IF = 2.0
 """The stated noise counts like so many residuals; so does the noise of all cameras together where none is stated."""
@@ -67,7 +70,7 @@ def refined(
             s.select(k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1))
             for s, k, m in zip(seen, kept, models, strict=True)
         )
-        posterior = settle(models, problem.points, used, problem.errors)
+        posterior = _settled(models, problem, used)
         noise = _noise(problem, posterior, used, stated)
         close = np.allclose(noise, [m.noise for m in models], rtol=0.01)
         models = with_noise(posterior.models, noise)
@@ -77,9 +80,7 @@ def refined(
         if number < ROUNDS - 1:
             kept = judged
         progress("fitting", 2, 3)
-    posterior = settle(
-        models, problem.points, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)), problem.errors
-    )
+    posterior = _settled(models, problem, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)))
     progress("fitting", 3, 3)
     hyper = Hyperparameters(np.ones(2), np.zeros(len(cameras)), noise)
     return FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
@@ -115,6 +116,35 @@ def _started(
             else "pictures flipped left to right (webcams do so) or through a mirror: write width - 1 - u for u of "
             f"{listed}, or switch the flip off",
         ) from error
+
+
+def _settled(models: tuple[CameraModel, ...], problem: Problem, used: tuple[Sightings, ...]) -> Posterior:
+    """As fit.settle; a camera that Gauss-Newton would lead astray, as a lens can that bends much, is taken there by
+    damped steps, and stays."""
+    posterior = settle(models, problem.points, used, problem.errors)
+
+    def left(model: CameraModel, seen: Sightings) -> float:
+        off = np.sum((seen.uv - model.camera.pixel(problem.points[seen.rows])) ** 2)
+        return float(off) if np.isfinite(off) else np.inf
+
+    astray = [
+        left(after, seen) > (ASTRAY * before.noise) ** 2 * 2 * len(seen.rows) + ASTRAY**2 * left(before, seen)
+        for before, after, seen in zip(models, posterior.models, used, strict=True)
+    ]
+    if not any(astray):
+        return posterior
+    damped = []
+    for model, lost, seen in zip(models, astray, used, strict=True):
+        camera = model.camera
+        if lost:
+            camera = levenberg_marquardt(camera, model.prior, problem.points[seen.rows], seen.uv, model.noise)
+        damped.append(replace(model, camera=camera, ruler=camera))
+    posterior = condition(tuple(damped), problem.points, used, problem.errors)
+    ends = (
+        replace(after, camera=before.camera, ruler=before.camera) if lost else after
+        for before, after, lost in zip(damped, posterior.models, astray, strict=True)
+    )
+    return replace(posterior, models=tuple(ends))
 
 
 def with_noise(models: Sequence[CameraModel], noise: Floats) -> tuple[CameraModel, ...]:

@@ -6,6 +6,7 @@ refines the winner, evidence chooses among the priors of pixels.py, held-out vie
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -62,11 +63,12 @@ def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tu
         raise FitError(f"{len(points)} known points are seen; a camera needs at least {FEWEST}.")
     first = _resected(points, uv, image)
     _check_mirror(first, points, uv, image)
-    bent = _with_pixels(first.camera, first.kept, points, uv, image)
+    tried = _with_pixels([first], points, uv, image)
+    bent = tried[0]
 
     def perspective() -> _Candidate:
-        camera = as_brown_conrady(bent.camera, points[bent.kept])
-        return _with_pixels(camera, bent.kept, points, uv, image)
+        starts = [one._replace(camera=as_brown_conrady(one.camera, points[one.kept])) for one in tried]
+        return _with_pixels(starts, points, uv, image)[0]
 
     candidates = {"kannala-brandt": lambda: bent, "brown-conrady": perspective}
     found, choice = chosen(family, candidates, lambda one: _held_out(one.started, points, uv, image))
@@ -82,19 +84,24 @@ def _resected(points: Floats, uv: Floats, image: Image) -> _Candidate:
     return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.kept, points, uv, image, 1e-3)
 
 
-def _with_pixels(camera: CentralCamera, kept: Bools, points: Floats, uv: Floats, image: Image) -> _Candidate:
-    """The camera refined with each prior of its pixels that may be right, and of these the most probable one."""
+def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image: Image) -> list[_Candidate]:
+    """The cameras refined with each prior of their pixels that may be right, the most probable one first; one alone
+    where the usual one is clearly right."""
     usual, *between, widest = kinds(square(SHIFTED * CENTRE))
 
-    def fitted(pixels: Pixels) -> _Candidate:
-        return _refined(camera, pixels, kept, points, uv, image)
+    def fitted(pixels: Pixels, starts: Sequence[_Candidate]) -> _Candidate:
+        found = [_refined(one.camera, pixels, one.kept, points, uv, image) for one in starts]
+        return found[int(np.argmax(_evidence(found, points, uv, image)))] if len(found) > 1 else found[0]
 
-    found = [fitted(usual), fitted(widest)]
+    found = [fitted(usual, starts), fitted(widest, starts)]
     simple, free = _evidence(found, points, uv, image)
     if free < simple - SURPRISING:
-        return found[0]
-    found[1:1] = [fitted(pixels) for pixels in between]
-    return found[int(np.argmax(_evidence(found, points, uv, image)))]
+        return found[:1]
+    found = [found[0], *(fitted(pixels, starts) for pixels in between), found[1]]
+    best = found[int(np.argmax(_evidence(found, points, uv, image)))]
+    found = [fitted(one.pixels, [one, best]) for one in found]  # an unusual lens has optima that are not the best
+    order = np.argsort(_evidence(found, points, uv, image), kind="stable")[::-1]
+    return [found[i] for i in order]
 
 
 def _refined(
