@@ -64,13 +64,14 @@ def refined(
     kept = tuple(started[c].kept for c in cameras)
     stated = problem.stated[list(cameras)]
     models = tuple(without_field(started[c], problem.images[c]) for c in cameras)
-    models = with_noise(models, _first_noise(problem, models, seen, kept))
+    first = _first_noise(problem, models, seen, kept)
+    models = with_noise(models, first)
     for number in range(ROUNDS):
         used = tuple(
             s.select(k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1))
             for s, k, m in zip(seen, kept, models, strict=True)
         )
-        posterior = _settled(models, problem, used)
+        posterior = _settled(models, problem, used, first)
         noise = _noise(problem, posterior, used, stated)
         close = np.allclose(noise, [m.noise for m in models], rtol=0.01)
         models = with_noise(posterior.models, noise)
@@ -80,7 +81,7 @@ def refined(
         if number < ROUNDS - 1:
             kept = judged
         progress("fitting", 2, 3)
-    posterior = _settled(models, problem, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)))
+    posterior = _settled(models, problem, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)), first)
     progress("fitting", 3, 3)
     hyper = Hyperparameters(np.ones(2), np.zeros(len(cameras)), noise)
     return FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
@@ -118,9 +119,11 @@ def _started(
         ) from error
 
 
-def _settled(models: tuple[CameraModel, ...], problem: Problem, used: tuple[Sightings, ...]) -> Posterior:
+def _settled(
+    models: tuple[CameraModel, ...], problem: Problem, used: tuple[Sightings, ...], first: Floats
+) -> Posterior:
     """As fit.settle; a camera that Gauss-Newton would lead astray, as a lens can that bends much, is taken there by
-    damped steps, and stays."""
+    damped steps, and stays. first (C,): the noise at the start, pixels."""
     posterior = settle(models, problem.points, used, problem.errors)
 
     def left(model: CameraModel, seen: Sightings) -> float:
@@ -128,8 +131,8 @@ def _settled(models: tuple[CameraModel, ...], problem: Problem, used: tuple[Sigh
         return float(off) if np.isfinite(off) else np.inf
 
     astray = [
-        left(after, seen) > (ASTRAY * before.noise) ** 2 * 2 * len(seen.rows) + ASTRAY**2 * left(before, seen)
-        for before, after, seen in zip(models, posterior.models, used, strict=True)
+        left(after, seen) > (ASTRAY * noise) ** 2 * 2 * len(seen.rows) + left(before, seen)
+        for before, after, seen, noise in zip(models, posterior.models, used, first, strict=True)
     ]
     if not any(astray):
         return posterior

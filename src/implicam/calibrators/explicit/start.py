@@ -33,6 +33,9 @@ SHIFTED = 5.0
 
 FOLDS = 5
 
+HOPELESS = 100.0
+"""Log evidence that a kind of pixels may lack from one start and still be looked at from others."""
+
 MIRRORED = 0.3
 """A mirrored picture leaves less than this part of what the picture as it is leaves: then it is mirrored."""
 
@@ -89,17 +92,21 @@ def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image
     where the usual one is clearly right."""
     usual, *between, widest = kinds(square(SHIFTED * CENTRE))
 
-    def fitted(pixels: Pixels, starts: Sequence[_Candidate]) -> _Candidate:
-        found = [_refined(one.camera, pixels, one.kept, points, uv, image) for one in starts]
-        return found[int(np.argmax(_evidence(found, points, uv, image)))] if len(found) > 1 else found[0]
+    def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
+        return _refined(start.camera, pixels, start.kept, points, uv, image)
 
-    found = [fitted(usual, starts), fitted(widest, starts)]
+    found = [fitted(usual, starts[0]), fitted(widest, starts[0])]
     simple, free = _evidence(found, points, uv, image)
     if free < simple - SURPRISING:
         return found[:1]
-    found = [found[0], *(fitted(pixels, starts) for pixels in between), found[1]]
-    best = found[int(np.argmax(_evidence(found, points, uv, image)))]
-    found = [fitted(one.pixels, [one, best]) for one in found]  # an unusual lens has optima that are not the best
+    found = [found[0], *(fitted(pixels, starts[0]) for pixels in between), found[1]]
+    evidence = _evidence(found, points, uv, image)
+    best = found[int(np.argmax(evidence))]
+    found = [one for one, log in zip(found, evidence, strict=True) if log > max(evidence) - HOPELESS]
+    for i, one in enumerate(found):  # an unusual lens has optima that are not the best
+        others = [start for start in (best, *starts[1:]) if start is not one]
+        tries = [one, *(fitted(one.pixels, start) for start in others)]
+        found[i] = tries[int(np.argmax(_evidence(tries, points, uv, image)))]
     order = np.argsort(_evidence(found, points, uv, image), kind="stable")[::-1]
     return [found[i] for i in order]
 
