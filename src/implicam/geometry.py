@@ -8,6 +8,7 @@ camera. Chapters and algorithms: Hartley & Zisserman, Multiple View Geometry, 2n
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -308,6 +309,29 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, su
     )
 
 
+def resect_any_pixels(
+    xyz: Floats, uv: Floats, *, middle: Floats | None = None, aspects: Sequence[float] = (1.0,)
+) -> tuple[Resection, float]:
+    """As `resect_any_lens` for pixels that need not be square: what fits best, and its ratio fy / fx out of `aspects`.
+
+    rms: in pixels of u. Where that ratio is 1, it is `resect_any_lens`."""
+    there = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
+    rows = np.flatnonzero(there)
+    if len(rows) > ENOUGH:
+        rows = np.sort(np.random.default_rng(0).choice(rows, ENOUGH, replace=False))
+    _check_spread(xyz[rows])
+    middle = np.quantile(uv[rows], (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
+
+    def off(aspect: float) -> float:
+        offset = (uv[rows] - middle) / np.array([1.0, aspect])
+        errors = _trimmed(xyz[rows], offset, np.ones(len(rows), dtype=np.bool_))[1]
+        return float(np.median(errors) * np.sqrt(aspect))  # no ratio may win by making pixels large
+
+    best = min(aspects, key=off) if len(aspects) > 1 else aspects[0]
+    squared = middle + (uv - middle) / np.array([1.0, best])
+    return resect_any_lens(xyz, squared, middle=middle), float(best)
+
+
 def _trimmed(xyz: Floats, offset: Floats, keep: Bools) -> tuple[_Candidate, Floats, Bools]:
     """The best lens for the points kept; those far off left out, others taken in, four times at most."""
     for _ in range(4):
@@ -346,6 +370,39 @@ def resect_rays(xyz: Floats, rays: Floats) -> Pose:
     if not determined[0]:
         raise _undetermined()
     return Pose(rotations[0], translations[0])
+
+
+def poses_from_rays(xyz: Floats, rays: Floats) -> list[Pose]:
+    """`camera_from_world` from four or more known points (n, 3), flat or not, and their unit rays (n, 3) in the camera
+    frame: all poses that are locally best, the best first, as few points may have more than one.
+
+    Orthogonal iteration (Lu, Hager & Mjolsness 2000): points are brought onto their rays in turn with the rotation that
+    fits best; here from 24 rotations that lie evenly, so that no guess is needed.
+    """
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    solve = np.linalg.inv(across.mean(axis=0))
+    centred = xyz - xyz.mean(axis=0)
+    R = np.asarray(Rotation.create_group("O").as_matrix(), dtype=np.float64)
+
+    def shift(R: Floats) -> Floats:
+        """(k, 3) the best translations."""
+        pull = np.einsum("nij,knj->ki", across, centred @ R.swapaxes(1, 2))
+        return np.asarray(-pull @ solve.T / len(xyz), dtype=np.float64)
+
+    for _ in range(200):
+        there = centred @ R.swapaxes(1, 2) + shift(R)[:, None]
+        onto = rays * np.maximum(np.sum(there * rays, axis=2), 0)[..., None]
+        R = _nearest_rotations(np.einsum("kni,nj->kij", onto - onto.mean(axis=1, keepdims=True), centred))
+    t = shift(R)
+    there = centred @ R.swapaxes(1, 2) + t[:, None]
+    along = np.sum(there * rays, axis=2)
+    off = np.sum(np.arctan2(np.linalg.norm(there - along[..., None] * rays, axis=2), along) ** 2, axis=1)
+    found: list[Pose] = []
+    for k in np.argsort(off):
+        pose = Pose(R[k], t[k] - R[k] @ xyz.mean(axis=0))
+        if (along[k] > 0).all() and all(np.trace(pose.rotation.T @ one.rotation) < 3 - 1e-3 for one in found):
+            found.append(pose)
+    return found
 
 
 def _resect_many(xyz: Floats, rays: Floats) -> tuple[Floats, Floats, Bools]:

@@ -33,6 +33,9 @@ ITERATIONS = 60
 CONVERGED = 1e-8
 """Relative change of the sum of squares in one step."""
 
+NOTHING = 1e-14
+"""Least eigenvalue of a normal matrix with a diagonal of ones."""
+
 BARELY = 1e-9
 """Keeps a board of which nothing is left solvable; one corner counts a million million times as much."""
 
@@ -88,8 +91,9 @@ class Views:
         return tuple(Stack.of([view for view in self.each if view.camera == c]) for c in range(self.count))
 
     def select(self, keep: Sequence[Bools]) -> Views:
-        """Per camera, some of its corners: masks as its stack."""
-        return Views(tuple(view.select(keep[c][rows]) for c, view, rows in self.in_stacks()), self.count)
+        """Per camera, some of its corners: masks as its stack. Views of which none is left are left out."""
+        some = (view.select(keep[c][rows]) for c, view, rows in self.in_stacks())
+        return Views(tuple(view for view in some if len(view.rows)), self.count)
 
     def in_stacks(self) -> Iterator[tuple[int, BoardView, slice]]:
         """Camera number, view, and its rows in the camera's stack."""
@@ -102,7 +106,10 @@ class Views:
 @dataclass(frozen=True, eq=False)
 class Bundle:
     """cameras and their poses in the rig's frame, which is that of the first camera; boards: rig_from_board of each;
-    noise: (C,) in pixels; held: the cameras are known, and only the boards move."""
+    noise: (C,) in pixels; held: the cameras are known, and only the boards move.
+
+    slack: sd of how far the board was elsewhere in each view of its own, in the board's length unit, where pictures are
+    not of the same instants; it turned by as much at its rim. It is integrated out, not with the robust cost."""
 
     cameras: tuple[CentralCamera, ...]
     priors: tuple[Prior, ...]
@@ -110,6 +117,7 @@ class Bundle:
     views: Views
     noise: Floats
     held: bool = False
+    slack: float = 0.0
 
     @property
     def starts(self) -> list[int]:
@@ -186,8 +194,11 @@ def _cost(bundle: Bundle, robust: bool) -> float:
     total = 0.0
     for c, (camera, prior) in enumerate(zip(bundle.cameras, bundle.priors, strict=True)):
         off = prior.mean - camera.parameters
-        squares = _squares(bundle, c)
         total += float(off @ prior.precision @ off)
+        if bundle.slack > 0 and not robust:
+            total += float(np.sum(_whitened(bundle, c, robust)[0] ** 2))
+            continue
+        squares = _squares(bundle, c)
         total += float(np.sum(ROBUST**2 * np.log1p(squares / ROBUST**2) if robust else squares))
     return total
 
@@ -232,7 +243,7 @@ class _Normal(NamedTuple):
         diagonal = np.arange(6)
         D = self.D.copy()
         D[:, diagonal, diagonal] *= 1 + damping
-        S, s = self._reduced(self.A + damping * np.diag(np.diag(self.A)), D)
+        S, s = self.reduced(self.A + damping * np.diag(np.diag(self.A)), D)
         cameras = np.zeros(len(self.a))
         scale = 1 / np.sqrt(np.diag(S))
         cameras[self.free] = scale * np.linalg.solve(S * scale[:, None] * scale, scale * s)
@@ -243,12 +254,13 @@ class _Normal(NamedTuple):
         """(q, P) root of the covariance of the cameras' unknowns, the boards integrated out; zero where fixed."""
         if not self.free.any():
             return np.zeros((0, len(self.a)))
-        found, _, _ = solve_normal(*self._reduced(self.A, self.D))
+        S, s = self.reduced(self.A, self.D)
+        found, _, _ = solve_normal(*_definite(S, s))
         root = np.zeros((len(found), len(self.a)))
         root[:, self.free] = found
         return root
 
-    def _reduced(self, A: Floats, D: Floats) -> tuple[Floats, Floats]:
+    def reduced(self, A: Floats, D: Floats) -> tuple[Floats, Floats]:
         """The Schur complement and its right-hand side, for the unknowns that are free."""
         B = self.B[:, self.free]
         pulled = np.linalg.solve(D, np.concatenate([B.swapaxes(1, 2), self.d[..., None]], axis=2))  # (b, 6, P + 1)
@@ -256,6 +268,14 @@ class _Normal(NamedTuple):
         S = A[np.ix_(self.free, self.free)] - flat @ pulled[:, :, :-1].reshape(len(B) * 6, B.shape[1])
         s = self.a[self.free] - flat @ pulled[:, :, -1].reshape(-1)
         return 0.5 * (S + S.T), s
+
+
+def _definite(S: Floats, s: Floats) -> tuple[Floats, Floats]:
+    """The normal matrix, on its diagonal as much more as it takes to be positive definite: rounding may take that where
+    an adjustment has got lost."""
+    scale = np.sqrt(np.maximum(np.diag(S), np.finfo(np.float64).tiny))
+    least = float(np.linalg.eigvalsh(S / scale[:, None] / scale)[0])
+    return S + np.diag(scale**2) * max(NOTHING - least, 0), s
 
 
 def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Floats]:
@@ -274,7 +294,77 @@ def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Flo
     blocks = (stack.uv - seen.uv, seen.by_parameters, by_board)
     if not there.all():
         blocks = (np.nan_to_num(blocks[0]), np.nan_to_num(blocks[1]), np.nan_to_num(blocks[2]))
-    return blocks[0] * weight, blocks[1] * weight[..., None], blocks[2] * weight[..., None]
+    r, J, K = blocks[0] * weight, blocks[1] * weight[..., None], blocks[2] * weight[..., None]
+    if bundle.slack > 0 and not robust:
+        for (_, rows), (Q, size) in zip(stack.sections, _slacks(bundle, c, K), strict=True):
+            less = Q * (1 - 1 / np.sqrt(1 + size**2))
+            for block in (r, J, K):
+                flat = block[rows].reshape(len(Q), -1)
+                block[rows] = (flat - less @ (Q.T @ flat)).reshape(block[rows].shape)
+    return r, J, K
+
+
+def _slacks(bundle: Bundle, c: int, by_board: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """For each view of a camera, the directions (2 n, 6) in which slack moves its whitened pixels, orthonormal, and
+    the sds (6,) of that; by_board (n, 2, 6): how the pixels follow a board's turn and shift."""
+    stack = bundle.views.stacks[c]
+    for k, rows in stack.sections:
+        turned = stack.xyz[rows] @ bundle.boards.rotation[k].T
+        middle = turned.mean(axis=0)
+        radius = max(float(np.sqrt(np.mean(np.sum((turned - middle) ** 2, axis=1)))), 1e-9)
+        flat = by_board[rows].reshape(-1, 6)
+        about = flat[:, :3] - np.cross(middle, flat[:, 3:])  # turned about its middle, not about its first corner
+        Q, size, _ = np.linalg.svd(bundle.slack * np.column_stack([about / radius, flat[:, 3:]]), full_matrices=False)
+        yield Q, size
+
+
+def log_marginal_with_slack(bundle: Bundle) -> float:
+    """Log marginal likelihood of the views for the bundle's slack, cameras and boards integrated out (Laplace)."""
+    normal = _Normal.of(bundle, robust=False)
+    _, _, cameras = solve_normal(*_definite(*normal.reduced(normal.A, normal.D)))
+    total = _cost(bundle, robust=False) + np.sum(np.linalg.slogdet(normal.D)[1]) + cameras
+    plain = replace(bundle, slack=0.0)
+    for c in range(len(bundle.cameras)):
+        for _, size in _slacks(bundle, c, _whitened(plain, c, robust=False)[2]):
+            total += np.sum(np.log1p(size**2))
+    return float(-0.5 * total)
+
+
+def root_with_slack(bundle: Bundle, root: Floats) -> Floats:
+    """(q, P) root of the covariance where there was slack, of cameras that were adjusted without, with root^T root: to
+    each view's own error comes what the slack of its board moved the cameras by."""
+    plain = replace(bundle, slack=0.0)
+    normal, starts, pulls = _Normal.of(plain, robust=False), bundle.starts, []
+    back = np.linalg.solve(normal.D, normal.B.swapaxes(1, 2))  # (b, 6, P): how boards follow the cameras
+    for c in range(len(bundle.cameras)):
+        _, J, K = _whitened(plain, c, robust=False)
+        for (k, rows), (Q, size) in zip(bundle.views.stacks[c].sections, _slacks(bundle, c, K), strict=True):
+            G = (Q * size).T
+            pull = -(G @ K[rows].reshape(len(Q), 6)) @ back[k]
+            pull[:, starts[c] : starts[c + 1]] += G @ J[rows].reshape(len(Q), -1)
+            pulls.append(pull)
+    both = np.vstack([root, np.concatenate(pulls) @ root.T @ root])
+    return np.asarray(np.linalg.qr(both, mode="r"), dtype=np.float64)
+
+
+def unexplained(bundle: Bundle, c: int) -> Floats:
+    """(n,) lengths of the residuals of a camera that its slack does not explain either, in its usual pixels."""
+    r, _, K = _whitened(replace(bundle, slack=0.0), c, robust=False)
+    r = r.copy()
+    for (_, rows), (Q, size) in zip(bundle.views.stacks[c].sections, _slacks(bundle, c, K), strict=True):
+        flat = r[rows].ravel()
+        r[rows] = (flat - Q @ (size**2 / (1 + size**2) * (Q.T @ flat))).reshape(-1, 2)
+    off = np.linalg.norm(r, axis=1) * bundle.noise[c]
+    return np.where(np.isfinite(bundle.lengths(c)), off, np.inf)
+
+
+def log_marginal(bundle: Bundle) -> float:
+    """Log of the integral of exp(-cost / 2) over all unknowns, by Laplace's method where the bundle is: cameras and
+    boards; robust cost."""
+    normal = _Normal.of(bundle, robust=True)
+    boards = np.linalg.slogdet(normal.D)[1]
+    _, _, cameras = solve_normal(*_definite(*normal.reduced(normal.A, normal.D)))
+    return float(-0.5 * (_cost(bundle, robust=True) + np.sum(boards) + cameras))
 
 
 def spreads(bundle: Bundle) -> Floats:
@@ -283,15 +373,22 @@ def spreads(bundle: Bundle) -> Floats:
     return np.array([np.median(bundle.lengths(c)) / rayleigh for c in range(len(bundle.cameras))])
 
 
-def adjust_in_steps(bundle: Bundle, half: Floats, *, progress: Progress = silent) -> Adjusted:
+def adjust_in_steps(bundle: Bundle, half: Floats, *, one_noise: bool = False, progress: Progress = silent) -> Adjusted:
     """Adjusted with the residuals' own size as the noise, which shrinks: far from the answer nothing is an outlier.
 
-    half: (C,) half the longer side of each image, pixels.
+    half: (C,) half the longer side of each image, pixels. one_noise: the same for all cameras.
     """
+
+    def noise_of(bundle: Bundle) -> Floats:
+        own = spreads(bundle)
+        if one_noise:
+            own = np.full(len(own), np.sqrt(np.mean(np.minimum(own, half) ** 2)))
+        return np.minimum(np.maximum(own, 1e-5 * half), half)
+
     for _ in range(4):
-        noise = np.minimum(np.maximum(spreads(bundle), 1e-5 * half), half)
+        noise = noise_of(bundle)
         found = adjust(replace(bundle, noise=noise), progress=progress)
         bundle = found.bundle
-        if np.allclose(noise, np.maximum(spreads(bundle), 1e-5 * half), rtol=0.05):
+        if np.allclose(noise, noise_of(bundle), rtol=0.05):
             break
     return found

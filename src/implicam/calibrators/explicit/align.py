@@ -30,6 +30,9 @@ ROUNDS = 60
 ALIKE = 1.3
 """Two ways to match points by closeness are told apart where one leaves so many times what the other leaves."""
 
+MIRRORED = 0.3
+"""What is left with one axis turned, over what is left as they are: less, and the known points are mirrored."""
+
 HOPELESS = 0.05
 """Part of the extent of the known points that the boards may be off without being of another rig."""
 
@@ -98,7 +101,7 @@ def align(
     left = left + pose.rotation @ (sd[used][:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
     errors, sds = _left_out(pose, Q, G[used], W[used], residual[used], left)
     found = Alignment(pose, used, K, own, errors, sds, _scale(measured[used], xyz[used]))
-    _check(found, residual[there], float(np.sqrt(np.sum(known.xyz.var(axis=0)))))
+    _check(found, residual[there], xyz[there], measured[there], float(np.sqrt(np.sum(known.xyz.var(axis=0)))))
     return found
 
 
@@ -236,11 +239,20 @@ def _scale(measured: Floats, xyz: Floats) -> float:
     return float(np.sqrt(np.sum(b**2) / np.sum(a**2)))
 
 
-def _check(found: Alignment, residual: Floats, extent: float) -> None:
+def _check(found: Alignment, residual: Floats, xyz: Floats, measured: Floats, extent: float) -> None:
     """FitError where boards and known points are not of one rig, or not of one unit."""
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
     if rms < HOPELESS * extent and abs(found.scale - 1) < HOPELESS:
         return
+    _, mirrored = register(xyz * np.array([1.0, 1.0, -1.0]), measured)
+    if mirrored < MIRRORED * min(rms, HOPELESS * extent):
+        raise FitError(
+            f"the known points are as in a mirror: aligned, {rms:.3g} are left; with one axis turned, {mirrored:.2g}.",
+            why="the pictures are flipped (webcams do so), v is counted from below, or the known positions are "
+            "left-handed",
+            fix="write width - 1 - u for u in observations.csv, or height - 1 - v for v, of boards and points; or turn "
+            "the sign of one axis in points.csv",
+        )
     raise FitError(
         f"the boards and the known points contradict each other: aligned, they are {rms:.3g} apart, the known points "
         f"extend over {extent:.3g}.",

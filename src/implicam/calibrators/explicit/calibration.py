@@ -23,12 +23,12 @@ from implicam.calibrators.explicit.boards import boards_of, has_boards
 from implicam.calibrators.explicit.fitted import (
     Fitted,
     by_cameras_of,
-    fit_to_boards,
     fit_to_boards_alone,
     fit_to_points,
 )
+from implicam.calibrators.explicit.from_boards import fit_to_boards
 from implicam.calibrators.explicit.lenses import AUTO, FAMILIES
-from implicam.calibrators.explicit.network import Network, calibrate_network
+from implicam.calibrators.explicit.network import Groups, calibrate_groups
 from implicam.calibrators.forward_gp.rig_map import RigMap
 from implicam.calibrators.protocol import Arrays, Rejected, Unused, solvable
 from implicam.dataset import Dataset, Floats, Observations
@@ -80,23 +80,23 @@ class Explicit:
             elif self.boards is None:
                 fitted = fit_to_points(data, self.lens, progress)
             else:
-                fitted = fit_to_boards(data, self._network(data, progress), self.boards, self.align)
+                fitted = fit_to_boards(data, self._groups(data, progress), self.boards, self.align, progress)
         return ExplicitCalibration(self, data, fitted)
 
-    def _network(self, data: Dataset, progress: Progress) -> Network:
-        """The rig from the boards: adjusted once for all known points of the same cameras in the same unit."""
+    def _groups(self, data: Dataset, progress: Progress) -> Groups:
+        """The cameras from the boards: adjusted once for all known points of the same cameras in the same unit."""
         key = (data.length_unit, data.observations.camera_names)
-        if key not in self._networks:
+        if key not in self._adjusted:
             assert self.boards is not None
             scale = 1.0
             if self.boards.length_unit != data.length_unit:
                 scale = self.boards.metres_per_unit / data.metres_per_unit
             boards = boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)), scale)
-            self._networks[key] = calibrate_network(boards, self.lens, progress)
-        return self._networks[key]
+            self._adjusted[key] = calibrate_groups(boards, self.lens, progress)
+        return self._adjusted[key]
 
     @cached_property
-    def _networks(self) -> dict[tuple[str, tuple[str, ...]], Network]:
+    def _adjusted(self) -> dict[tuple[str, tuple[str, ...]], Groups]:
         return {}
 
 

@@ -1,21 +1,20 @@
-"""The three ways to a classical calibration: from known points, from boards and known points, from boards alone."""
+"""What a classical calibration is; and two ways to it, from known points, and from boards alone."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from implicam.calibrators.explicit.align import Alignment, Known, align, in_frame, in_world
 from implicam.calibrators.explicit.boards import boards_of
 from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.network import Network, calibrate_network
+from implicam.calibrators.explicit.pixels import told
 from implicam.calibrators.forward_gp.diagnosis import NAMED, Diagnosis
-from implicam.calibrators.forward_gp.fit import without_field
+from implicam.calibrators.forward_gp.fit import FittedRig, without_field
 from implicam.calibrators.forward_gp.lens import CentralCamera
-from implicam.calibrators.forward_gp.locate import locate
 from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior
 from implicam.calibrators.forward_gp.problem import Frame, problem_of, stated_noise
 from implicam.calibrators.forward_gp.rig_map import RigMap
@@ -28,9 +27,8 @@ from implicam.calibrators.protocol import (
     point_copy_notes,
     same_cameras,
 )
-from implicam.dataset import Dataset, Floats, KnownPositions, Names, Observations, without_copies
+from implicam.dataset import Dataset, Floats, KnownPositions, Observations, without_copies
 from implicam.errors import FitError
-from implicam.geometry import Bools
 from implicam.progress import Progress
 
 METHOD = "explicit"
@@ -71,80 +69,53 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
         *diagnosis.leave_one_out,
         diagnosis.rejected,
         (*diagnosis.unused, *copied_points(data)),
-        (*point_copy_notes(data), *diagnosis.notes(), *diagnosis.noise_notes()),
-    )
-
-
-def fit_to_boards(data: Dataset, network: Network, boards: Dataset, how: str) -> Fitted:
-    """Cameras from boards, brought into the world by the known points."""
-    copied, notes = copied_points(data), point_copy_notes(data)
-    data = without_copies(data)
-    trained = by_cameras_of(data, boards)
-    known, bundle = data.positions, network.bundle
-    posterior = _posterior(network, bundle.cameras, network.root)
-    in_rig = RigMap(trained, data.length_unit, _UNIT, network.cameras, posterior, misfit_adds=True)
-    uv, noise = in_rig.views(data.observations)
-    found = locate(posterior, uv, noise)
-    uv[found.left_out] = np.nan
-    points = Known(known.xyz, np.nan_to_num(known.sd), known.shots)
-    alignment = align(posterior.models, network.root, uv, noise, found.xyz, points, how)
-    frame = _frame(known.xyz)
-    cameras, root = in_frame(*in_world(bundle.cameras, network.root, alignment), frame.offset, frame.scale)
-    return Fitted(
-        trained,
-        frame,
-        network.cameras,
-        _posterior(network, cameras, root),
-        tuple(network.choices[c] for c in network.cameras),
-        alignment.errors,
-        alignment.sds,
-        _rejected(network, boards),
-        (*_not_used(data, in_rig.measure(data.observations).reason, alignment), *copied),
         (
-            *notes,
-            *_without_boards(data, trained),
-            *_moved_notes(in_rig, found.left_out, np.asarray(np.isfinite(uv).all(axis=2))),
-            *_notes(network, trained, boards),
-            *_alignment_notes(alignment, data.length_unit),
+            *point_copy_notes(data),
+            *diagnosis.notes(),
+            *_pixel_notes(used, fitted, choices),
+            *diagnosis.noise_notes(),
         ),
     )
+
+
+def _pixel_notes(data: Dataset, fitted: FittedRig, choices: Mapping[int, Choice]) -> list[str]:
+    notes = []
+    for c, model in zip(fitted.cameras, fitted.posterior.models, strict=True):
+        assert isinstance(model.camera, CentralCamera)
+        notes += told(data.observations.camera_names[c], model.camera, model.image, choices[c].pixels)
+    return notes
 
 
 def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple[Dataset, Fitted]:
     """Cameras in the frame of the first; and the data with the positions that the boards have there."""
     network = calibrate_network(boards_of(data), family, progress)
     placed = _placed(data, network)
-    posterior = _posterior(network, network.bundle.cameras, network.root)
-    measured = RigMap(data.observations, data.length_unit, _UNIT, network.cameras, posterior, misfit_adds=True).measure(
+    posterior = network_posterior(network, network.bundle.cameras, network.root)
+    measured = RigMap(data.observations, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True).measure(
         placed.observations
     )
     first = data.observations.camera_names[network.cameras[0]]
     fitted = Fitted(
         data.observations,
-        _UNIT,
+        UNIT,
         network.cameras,
         posterior,
         tuple(network.choices[c] for c in network.cameras),
         (measured.xyz - placed.xyz)[measured.measured],
         measured.sd[measured.measured],
-        _rejected(network, data),
+        wrong_corners(network, data),
         (),
         (
             f"Positions are in the frame of {first}: x right, y down, z forward. Known points bring them into a world "
             "of your own: implicam calibrate POINTS --method explicit --boards BOARDS.",
-            *_notes(network, data.observations, data),
+            *network_notes(network, data.observations, data),
         ),
         alone=True,
     )
     return placed, fitted
 
 
-_UNIT = Frame(np.zeros(3), 1.0)
-
-
-def _frame(xyz: Floats) -> Frame:
-    offset = xyz.mean(axis=0)
-    return Frame(offset, float(np.sqrt(np.mean((xyz - offset) ** 2))) or 1.0)
+UNIT = Frame(np.zeros(3), 1.0)
 
 
 def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
@@ -162,13 +133,6 @@ def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
     return trained
 
 
-def _without_boards(data: Dataset, trained: Observations) -> list[str]:
-    missing = [name for name in data.observations.camera_names if name not in trained.camera_names]
-    return [
-        f"{name} is not calibrated, and its views are not used: it is not among the boards' cameras" for name in missing
-    ]
-
-
 def _placed(data: Dataset, network: Network) -> Dataset:
     """The corners that a calibrated camera saw, where the adjustment puts them."""
     xyz = np.full((len(data), 3), np.nan)
@@ -179,7 +143,8 @@ def _placed(data: Dataset, network: Network) -> Dataset:
     return replace(data.select(there), known=known)
 
 
-def _posterior(network: Network, cameras: Sequence[CentralCamera], root: Floats) -> Posterior:
+def network_posterior(network: Network, cameras: Sequence[CentralCamera], root: Floats) -> Posterior:
+    """Cameras of a network, wherever they have been moved to, with the root of their covariance."""
     none = [np.ones(camera.size, dtype=np.bool_) for camera in cameras]  # only a fit asks which views started it
     models = tuple(
         without_field(Started(camera, prior, kept), image, float(noise))
@@ -200,24 +165,27 @@ def posterior_of(models: tuple[CameraModel, ...], root: Floats) -> Posterior:
     return Posterior(models, tuple(parts), np.hstack(parts), (), 0.0)
 
 
-def _rejected(network: Network, boards: Dataset) -> tuple[Rejected, ...]:
+def wrong_corners(network: Network, boards: Dataset) -> tuple[Rejected, ...]:
+    """The corners of boards that are not used, the farthest first."""
     names, points = boards.observations.camera_names, boards.points
     found = [Rejected(str(points[row]), names[c], off) for row, c, off in network.wrong]
     return tuple(sorted(found, key=lambda view: -np.nan_to_num(view.residual, nan=np.inf)))
 
 
-def _not_used(data: Dataset, reasons: Names, alignment: Alignment) -> tuple[Unused, ...]:
-    return tuple(
-        Unused(str(data.points[i]), str(reasons[i]) or "it is not where the others put the world")
-        for i in np.flatnonzero(~alignment.used)
-    )
-
-
-def _notes(network: Network, trained: Observations, boards: Dataset) -> list[str]:
+def network_notes(network: Network, trained: Observations, boards: Dataset) -> list[str]:
+    """What is to be said of the boards: cameras that contradict each other, wrong corners, lenses hardly fixed."""
     names = trained.camera_names
     notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in network.blind]
+    moved = np.sqrt(6) * network.bundle.slack  # along three axes, in either picture
+    notes += [
+        f"{names[one.pair[0]]} and {names[one.pair[1]]} contradict each other on the {one.boards} boards that both saw"
+        f": alone {one.alone:.2g} px, together {one.together:.2g} px, as if boards had moved by about {moved:.1g} "
+        f"{boards.length_unit} from one picture to the other. The pictures are not of the same instants, or a camera "
+        "or the rig moved between them. The error bars allow for it; what moves while it is measured is off by more."
+        for one in network.doubts
+    ]
     if network.wrong:
-        worst = _rejected(network, boards)[:NAMED]
+        worst = wrong_corners(network, boards)[:NAMED]
         named = ", ".join(f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in worst)
         more = f" and {len(network.wrong) - NAMED} more" if len(network.wrong) > NAMED else ""
         count = f"{len(network.wrong)} corner{'s' * (len(network.wrong) != 1)}"
@@ -232,6 +200,7 @@ def _lens_notes(network: Network, trained: Observations) -> list[str]:
     stated = stated_noise(trained)
     for number, c in enumerate(network.cameras):
         name, lens = trained.camera_names[c], bundle.cameras[number].lens
+        notes += told(name, bundle.cameras[number], network.images[number], network.choices[c].pixels)
         loose = float(sd[bundle.starts[number]] / lens.fx)
         if loose > LOOSE:
             notes.append(
@@ -245,33 +214,6 @@ def _lens_notes(network: Network, trained: Observations) -> list[str]:
     if not network.converged:
         notes.append("The bundle adjustment had not settled when it was stopped: look for wrong pictures.")
     return notes
-
-
-def _moved_notes(in_rig: RigMap, left_out: Bools, used: Bools) -> list[str]:
-    """Cameras whose views of the known points are mostly left out: they may have moved since the boards."""
-    notes = []
-    for c, name in enumerate(in_rig.camera_names):
-        away, seen = int(left_out[:, c].sum()), int(left_out[:, c].sum() + used[:, c].sum())
-        if away > 0.3 * seen:
-            notes.append(
-                f"{name}: {away} of its {seen} views of the known points contradict the other cameras. Was it moved "
-                "after the pictures of the boards?"
-            )
-    return notes
-
-
-def _alignment_notes(alignment: Alignment, unit: str) -> list[str]:
-    """Where the world and the rig from the boards differ by more than their error bars."""
-    n = int(alignment.used.sum())
-    # 3 n errors, each with the square of a normal variable: what chance leaves, and four standard errors of it
-    if n < 4 or alignment.misfit**2 < 1 + 4 * np.sqrt(2 / (3 * n)):
-        return []
-    rms = float(np.sqrt(np.mean(np.sum(alignment.errors**2, axis=1))))
-    return [
-        f"The boards and the known points contradict each other: after alignment {rms:.2g} {unit} are left, "
-        f"{alignment.misfit:.1f} times what the error bars say; the known points are {alignment.scale:.5g} times as "
-        "far apart as the boards say. Check the board's square, that no camera moved in between, and the lens models."
-    ]
 
 
 LOOSE = 0.01

@@ -7,13 +7,14 @@ cameras see the same error and are refined together. The equations are those of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from implicam.calibrators.explicit.lenses import Choice, start_with_lens
+from implicam.calibrators.explicit.lenses import Choice
+from implicam.calibrators.explicit.start import MirroredError, start_with_lens
 from implicam.calibrators.forward_gp.evidence import Hyperparameters
 from implicam.calibrators.forward_gp.fit import (
     Bools,
@@ -25,11 +26,15 @@ from implicam.calibrators.forward_gp.fit import (
     without_field,
 )
 from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, spread
-from implicam.calibrators.forward_gp.start import Started
+from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, condition, spread
+from implicam.calibrators.forward_gp.start import FEWEST, Started, levenberg_marquardt
+from implicam.errors import FitError
 from implicam.progress import Progress
 
 ROUNDS = 8
+
+ASTRAY = 2.0
+"""Times what was left: a step to more than that was no step towards the optimum."""
 
 AS_IF = 2.0
 """The stated noise counts like so many residuals; so does the noise of all cameras together where none is stated."""
@@ -44,20 +49,29 @@ def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[Fitte
         started, choices[c] = start_with_lens(points, uv, problem.images[c], family)
         return started
 
-    started, blind = start_rig(problem, start)
+    started, blind = _started(problem, start)
+    fitted = refined(problem, started, blind, progress)
+    return fitted, {c: choices[c] for c in fitted.cameras}
+
+
+def refined(
+    problem: Problem, started: Mapping[int, Started], blind: Sequence[tuple[int, str]], progress: Progress
+) -> FittedRig:
+    """Cameras from where they start, with the noise that the residuals show and without the views that contradict."""
     cameras = tuple(started)
     progress("fitting", 1, 3)
     seen = tuple(problem.sightings[c] for c in cameras)
     kept = tuple(started[c].kept for c in cameras)
     stated = problem.stated[list(cameras)]
     models = tuple(without_field(started[c], problem.images[c]) for c in cameras)
-    models = with_noise(models, _first_noise(problem, models, seen, kept))
+    first = _first_noise(problem, models, seen, kept)
+    models = with_noise(models, first)
     for number in range(ROUNDS):
         used = tuple(
             s.select(k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1))
             for s, k, m in zip(seen, kept, models, strict=True)
         )
-        posterior = settle(models, problem.points, used, problem.errors)
+        posterior = _settled(models, problem, used, first)
         noise = _noise(problem, posterior, used, stated)
         close = np.allclose(noise, [m.noise for m in models], rtol=0.01)
         models = with_noise(posterior.models, noise)
@@ -67,13 +81,73 @@ def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[Fitte
         if number < ROUNDS - 1:
             kept = judged
         progress("fitting", 2, 3)
-    posterior = settle(
-        models, problem.points, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)), problem.errors
-    )
+    posterior = _settled(models, problem, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)), first)
     progress("fitting", 3, 3)
     hyper = Hyperparameters(np.ones(2), np.zeros(len(cameras)), noise)
-    fitted = FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
-    return fitted, {c: choices[c] for c in cameras}
+    return FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
+
+
+def _started(
+    problem: Problem, start: Callable[[int, Floats, Floats], Started]
+) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    """As start_rig; where mirrors are why it fails, the error says so."""
+    mirrored: dict[int, MirroredError] = {}
+
+    def noting(c: int, points: Floats, uv: Floats) -> Started:
+        try:
+            return start(c, points, uv)
+        except MirroredError as error:
+            mirrored[c] = error
+            raise
+
+    try:
+        return start_rig(problem, noting)
+    except FitError as error:
+        if not mirrored:
+            raise
+        names = [problem.names[c] for c in sorted(mirrored)]
+        listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+        everyone = len(names) == sum(len(seen.rows) >= FEWEST for seen in problem.sightings)
+        raise FitError(
+            f"{listed} see{'s' * (len(names) == 1)} the known points as in a mirror.",
+            why=error.why,
+            fix="an axis of the known positions points the other way (a left-handed frame), or v is counted from below"
+            ": turn the sign of one axis in points.csv, or write height - 1 - v for v"
+            if everyone
+            else "pictures flipped left to right (webcams do so) or through a mirror: write width - 1 - u for u of "
+            f"{listed}, or switch the flip off",
+        ) from error
+
+
+def _settled(
+    models: tuple[CameraModel, ...], problem: Problem, used: tuple[Sightings, ...], first: Floats
+) -> Posterior:
+    """As fit.settle; a camera that Gauss-Newton would lead astray, as a lens can that bends much, is taken there by
+    damped steps, and stays. first (C,): the noise at the start, pixels."""
+    posterior = settle(models, problem.points, used, problem.errors)
+
+    def left(model: CameraModel, seen: Sightings) -> float:
+        off = np.sum((seen.uv - model.camera.pixel(problem.points[seen.rows])) ** 2)
+        return float(off) if np.isfinite(off) else np.inf
+
+    astray = [
+        left(after, seen) > (ASTRAY * noise) ** 2 * 2 * len(seen.rows) + left(before, seen)
+        for before, after, seen, noise in zip(models, posterior.models, used, first, strict=True)
+    ]
+    if not any(astray):
+        return posterior
+    damped = []
+    for model, lost, seen in zip(models, astray, used, strict=True):
+        camera = model.camera
+        if lost:
+            camera = levenberg_marquardt(camera, model.prior, problem.points[seen.rows], seen.uv, model.noise)
+        damped.append(replace(model, camera=camera, ruler=camera))
+    posterior = condition(tuple(damped), problem.points, used, problem.errors)
+    ends = (
+        replace(after, camera=before.camera, ruler=before.camera) if lost else after
+        for before, after, lost in zip(damped, posterior.models, astray, strict=True)
+    )
+    return replace(posterior, models=tuple(ends))
 
 
 def with_noise(models: Sequence[CameraModel], noise: Floats) -> tuple[CameraModel, ...]:

@@ -7,8 +7,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image, Prior
-from implicam.calibrators.forward_gp.start import FAR, FEWEST, Started, levenberg_marquardt, start_camera
+from implicam.calibrators.forward_gp.lens import CentralCamera, Floats
+from implicam.calibrators.forward_gp.start import FAR
 from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import FitError
 
@@ -25,15 +25,16 @@ WIDEST = np.radians(75.0)
 
 FOLDS = 5
 
-SHIFTED = 5.0
-"""How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""
+USUAL = "square"
+"""The name of the usual pixels (pixels.py)."""
 
 
 class Choice(NamedTuple):
-    """The lens model a camera got, and rms errors in pixels at views held out, of each that was tried."""
+    """The lens model a camera got; rms errors in pixels at views held out, of each that was tried; and its pixels."""
 
     lens: str
     held_out: Mapping[str, float]
+    pixels: str = USUAL
 
 
 def name_of(camera: CentralCamera) -> str:
@@ -60,13 +61,13 @@ def as_brown_conrady(camera: CentralCamera, points: Floats) -> CentralCamera:
     xy = there[:, :2] / there[:, 2:]
     uv = camera.pixel(points)
     r2 = np.sum(xy**2, axis=1)
-    middle = np.array([camera.lens.cx, camera.lens.cy])
-    flat, target = xy.ravel(), (uv - middle).ravel()
+    middle, shape = np.array([camera.lens.cx, camera.lens.cy]), np.array([1.0, camera.lens.fy / camera.lens.fx])
+    flat, target = xy.ravel(), ((uv - middle) / shape).ravel()
     # u - cx = fx x (1 + k1 r² + k2 r⁴): linear in fx, fx k1, fx k2; no third term, which only invites folds
     powers = np.repeat(r2, 2)[:, None] ** np.arange(3)
     a = np.linalg.lstsq(flat[:, None] * powers, target, rcond=None)[0]
     for k in ((a[1] / a[0], a[2] / a[0]), (a[1] / a[0], 0.0), (0.0, 0.0)):
-        lens = BrownConrady(float(a[0]), float(a[0]), *middle.tolist(), *map(float, k))
+        lens = BrownConrady(float(a[0]), float(a[0] * shape[1]), *middle.tolist(), *map(float, k))
         if a[0] > 0 and lens.pixel_from_camera_point(there)[1].all():
             return CentralCamera(lens, camera.pose)
     raise FitError("no perspective lens sees these points.", fix="use kannala-brandt, or auto, for this camera")
@@ -105,66 +106,6 @@ def chosen(
         if np.mean(gain) > np.std(gain) / np.sqrt(len(gain)):
             best = name
     return started[best], Choice(best, {name: float(np.sqrt(np.mean(s) / 2)) for name, s in squares.items()})
-
-
-def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tuple[Started, Choice]:
-    """A camera from known points (n, 3), all seen at uv (n, 2), and its lens model; FitError as `start_camera`."""
-    first = _freely_centred(start_camera(points, uv, image, "central"), points, uv, image)
-    assert isinstance(first.camera, CentralCamera)
-    bent = first.camera
-
-    def perspective() -> Started:
-        kept = points[first.kept]
-        camera = as_brown_conrady(bent, kept)
-        prior = freely_centred(camera.prior(image, float(angles(bent, kept).max())))
-        fitted = levenberg_marquardt(camera, prior, kept, uv[first.kept], _sd(camera, kept, uv[first.kept], image))
-        return Started(fitted, prior, first.kept)
-
-    candidates: dict[str, Callable[[], Started]] = {"kannala-brandt": lambda: first, "brown-conrady": perspective}
-    return chosen(family, candidates, lambda started: _held_out(started, points, uv, image))
-
-
-def freely_centred(prior: Prior) -> Prior:
-    """The prior without a strong opinion on where the lens stands over the sensor: shifted lenses exist."""
-    precision = prior.precision.copy()
-    precision[2:4, 2:4] /= SHIFTED**2
-    return prior._replace(precision=precision)
-
-
-def _freely_centred(started: Started, points: Floats, uv: Floats, image: Image) -> Started:
-    """The start refined with that prior, and with the views that it then explains."""
-    assert isinstance(started.camera, CentralCamera)
-    prior, kept, camera = freely_centred(started.prior), started.kept, started.camera
-    for _ in range(3):
-        sd = _sd(camera, points[kept], uv[kept], image)
-        fitted = levenberg_marquardt(camera, prior, points[kept], uv[kept], sd)
-        assert isinstance(fitted, CentralCamera)
-        camera = fitted
-        error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        inside = np.asarray(error <= max(FAR * float(np.median(error[kept])), 1e-4 * image.half))
-        if inside.sum() < FEWEST or (inside == kept).all():
-            break
-        kept = inside
-    return Started(camera, prior, kept)
-
-
-def _sd(camera: CentralCamera, points: Floats, uv: Floats, image: Image) -> float:
-    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    return max(float(np.nanmedian(error)), 1e-5 * image.half)
-
-
-def _held_out(started: Started, points: Floats, uv: Floats, image: Image) -> Floats:
-    """(n,) squared errors of views in `FOLDS` random folds, each predicted from the others; far ones count little."""
-    points, uv = points[started.kept], uv[started.kept]
-    assert isinstance(started.camera, CentralCamera)
-    sd = _sd(started.camera, points, uv, image)
-    fold = np.random.default_rng(0).permutation(np.arange(len(points)) % FOLDS)
-    errors = np.full(len(points), np.inf)
-    for k in range(FOLDS):
-        others = fold != k
-        camera = levenberg_marquardt(started.camera, started.prior, points[others], uv[others], sd)
-        errors[~others] = np.linalg.norm(camera.pixel(points[~others]) - uv[~others], axis=1)
-    return clipped(errors) ** 2
 
 
 def clipped(errors: Floats) -> Floats:

@@ -5,15 +5,27 @@ The rig's frame is that of the first camera that is calibrated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
+from implicam.calibrators.explicit.agreement import (
+    CONTRADICT,
+    MIRRORED,
+    TOO_FAR,
+    Agreement,
+    agreements,
+    lengths_alone,
+    loosened,
+    mirrored,
+    with_slack,
+)
 from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import Choice, angles
+from implicam.calibrators.explicit.pixels import prior_of
 from implicam.calibrators.explicit.zhang import STUCK, OneCamera, calibrate_camera, median_error, pose_and_mirror
 from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image
 from implicam.dataset import Names
@@ -28,9 +40,6 @@ FAR = 5.0
 AS_IF = 2.0
 """The stated noise counts like so many residuals."""
 
-CONTRADICT = 0.15
-"""Share of the corners on shared boards that do not fit, beyond which two cameras contradict each other."""
-
 TOLERABLE = 0.02
 """Usual residual of a camera in the whole rig, in half the longer side of its image, beyond which there is no fit."""
 
@@ -39,7 +48,7 @@ TOLERABLE = 0.02
 class Network:
     """cameras: numbers of those calibrated, as in bundle; blind: number and reason of the others; root: of the
     covariance of the cameras' unknowns; wrong: corners not used (row, camera number, pixels off); images: of those
-    calibrated; shots: (n,) of each row of the dataset."""
+    calibrated; shots: (n,) of each row of the dataset; doubts: pairs of cameras that fit alone and not together."""
 
     cameras: tuple[int, ...]
     blind: tuple[tuple[int, str], ...]
@@ -50,28 +59,72 @@ class Network:
     images: tuple[Image, ...]
     shots: Names
     converged: bool
+    doubts: tuple[Agreement, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Cameras that boards join, a network for each group, the largest first; blind: number and reason of the cameras
+    without a lens."""
+
+    networks: tuple[Network, ...]
+    blind: tuple[tuple[int, str], ...]
+
+
+def calibrate_groups(boards: Boards, family: str, progress: Progress = silent) -> Groups:
+    """Every camera that saw enough boards, in the groups that shared boards join; a group may be one camera."""
+    singles, choices, blind = _singles(boards, family, progress)
+    networks = [_network(boards, singles, choices, poses, progress) for poses in _joined(boards, singles)]
+    return Groups(tuple(networks), tuple(sorted(blind)))
 
 
 def calibrate_network(boards: Boards, family: str, progress: Progress = silent) -> Network:
-    """FitError where fewer than two cameras can be calibrated and joined."""
+    """The largest group of cameras that shared boards join. FitError where it is fewer than two cameras."""
     singles, choices, blind = _singles(boards, family, progress)
-    poses, alone = _joined(boards, singles)
-    blind += alone
-    cameras = tuple(sorted(poses))
-    if len(cameras) < 2:
+    groups = _joined(boards, singles)
+    poses = groups[0] if groups and len(groups[0]) > 1 else {}
+    why = "it saw no board at the same time as the others" if len(singles) > 1 else "there is no other camera to join"
+    blind += [(c, why) for c in singles if c not in poses]
+    if len(poses) < 2:
         raise FitError(
-            f"{len(cameras)} of {len(boards.cameras)} cameras can be calibrated together; a position takes two.",
+            f"{len(poses)} of {len(boards.cameras)} cameras can be calibrated together; a position takes two.",
             why="; ".join(f"{boards.names[c]}: {why}" for c, why in blind),
-            fix="show every camera the board in ten places or more, and in half of them to two cameras at once",
+            fix="show every camera the board in ten places or more, and in half of them to two cameras at once; or "
+            "give known points that join them: implicam calibrate POINTS --boards BOARDS",
         )
+    return _network(boards, singles, choices, poses, progress, blind)
+
+
+def _network(
+    boards: Boards,
+    singles: Mapping[int, OneCamera],
+    choices: Mapping[int, Choice],
+    poses: Mapping[int, Pose],
+    progress: Progress,
+    blind: Sequence[tuple[int, str]] = (),
+) -> Network:
+    """Cameras, joined at first_from_camera, adjusted together.
+
+    The noise is one for all until the adjustment has settled: a noise for each would let the boards follow one of two
+    cameras that contradict each other, whichever came first, and call the other bad.
+    """
+    cameras = tuple(sorted(poses))
     half = np.array([boards.images[c].half for c in cameras])
     bundle = _bundle(boards, singles, poses, cameras)
-    found = adjust_in_steps(bundle, half, progress=progress)
+    found = adjust_in_steps(bundle, half, one_noise=True, progress=progress)
     better = _placed_again(found.bundle)
     if better is not None:
-        found = adjust_in_steps(better, half, progress=progress)
-    _check(boards, cameras, found, half)
-    found, wrong = _refined(boards, cameras, found, progress)
+        found = adjust_in_steps(better, half, one_noise=True, progress=progress)
+    agreed = agreements(found.bundle, half, _alone(boards, singles, found.bundle, cameras))
+    doubts = [one for one in agreed if one.contradict]
+    _check_pairs(boards, singles, cameras, doubts)
+    if doubts:
+        found, wrong, doubts = _with_slack(boards, singles, cameras, found.bundle, doubts, progress)
+    else:
+        found = adjust_in_steps(found.bundle, half, progress=progress)
+        _check(boards, cameras, found, half)
+        found, wrong = _refined(boards, cameras, found, progress)
+        found = loosened(found, progress)
     return Network(
         cameras,
         tuple(sorted(blind)),
@@ -82,6 +135,7 @@ def calibrate_network(boards: Boards, family: str, progress: Progress = silent) 
         tuple(boards.images[c] for c in cameras),
         boards.shots,
         found.converged,
+        tuple(one._replace(pair=(cameras[one.pair[0]], cameras[one.pair[1]])) for one in doubts),
     )
 
 
@@ -112,9 +166,9 @@ def _singles(
     return singles, choices, blind
 
 
-def _joined(boards: Boards, singles: Mapping[int, OneCamera]) -> tuple[dict[int, Pose], list[tuple[int, str]]]:
-    """first_from_camera of the cameras that can be joined by boards that two of them saw, over the pairs that share the
-    most; and why not the others."""
+def _joined(boards: Boards, singles: Mapping[int, OneCamera]) -> list[dict[int, Pose]]:
+    """For each group of cameras that boards join, first_from_camera of its cameras, over the pairs that share the most;
+    the largest group first."""
     seen = {c: dict(zip((v.board for v in boards.of_camera(c)), boards.of_camera(c), strict=True)) for c in singles}
     placed = {c: _placed(boards, c, singles[c]) for c in singles}
     shared = {
@@ -122,19 +176,28 @@ def _joined(boards: Boards, singles: Mapping[int, OneCamera]) -> tuple[dict[int,
         for a, b in combinations(singles, 2)
     }
     groups = _trees(list(singles), shared)
-    best = max(groups, key=lambda group: (len(group[0]), -min(group[0])), default=([], []))
-    poses: dict[int, Pose] = {}
-    for a, b in best[1]:  # in an order in which one of the two is placed already
-        if not poses:
-            poses[a] = Pose(np.eye(3), np.zeros(3))
-        known, new = (a, b) if a in poses else (b, a)
-        poses[new] = poses[known] @ _relative(seen, placed, singles, known, new)
-    if poses:
+    joined = []
+    for group, tree in sorted(groups, key=lambda group: (-len(group[0]), min(group[0]))):
+        poses = {tree[0][0] if tree else group[0]: Pose(np.eye(3), np.zeros(3))}
+        for a, b in tree:  # in an order in which one of the two is placed already
+            known, new = (a, b) if a in poses else (b, a)
+            poses[new] = poses[known] @ _relative(seen, placed, singles, known, new)
         first = poses[min(poses)].inverse()
-        poses = {c: first @ pose for c, pose in poses.items()}
-    others = [c for c in singles if c not in poses]
-    why = "it saw no board at the same time as the others" if len(singles) > 1 else "there is no other camera to join"
-    return poses, [(c, why) for c in others]
+        joined.append({c: first @ pose for c, pose in poses.items()})
+    return joined
+
+
+def _alone(
+    boards: Boards, singles: Mapping[int, OneCamera], bundle: Bundle, cameras: tuple[int, ...]
+) -> dict[tuple[int, int], Floats]:
+    """Lengths of the residuals of each view (camera, board), as numbered in the bundle, by its camera alone."""
+    placed = [list(_placed(boards, c, singles[c]).values()) for c in cameras]
+    found, count = {}, [0] * len(cameras)
+    for view in bundle.views.each:  # of each camera in the order in which its boards are placed
+        c = view.camera
+        found[c, view.board] = lengths_alone(singles[cameras[c]].camera, view, placed[c][count[c]])
+        count[c] += 1
+    return found
 
 
 def _placed(boards: Boards, c: int, single: OneCamera) -> dict[int, Pose]:
@@ -195,7 +258,8 @@ def _bundle(
     priors = []
     for c, camera in zip(cameras, there, strict=True):
         own = np.concatenate([rig_from_board[v.board].apply(v.xyz) for v in views if v.camera == number[c]])
-        priors.append(camera.prior(boards.images[c], min(float(np.quantile(angles(camera, own), 0.98)), 3.0)))
+        widest = min(float(np.quantile(angles(camera, own), 0.98)), 3.0)
+        priors.append(prior_of(camera, boards.images[c], widest, singles[c].pixels))
     noise = np.array([singles[c].noise for c in cameras])
     return Bundle(there, tuple(priors), Placed.of(rig_from_board), Views(views, len(cameras)), noise)
 
@@ -243,6 +307,87 @@ def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floa
     if usual[worst] < TOLERABLE * half[worst]:
         return
     raise _contradiction(boards, [cameras[worst]], f"its corners are left {usual[worst]:.3g} px off")
+
+
+def _check_pairs(
+    boards: Boards, singles: Mapping[int, OneCamera], cameras: tuple[int, ...], doubts: Sequence[Agreement]
+) -> None:
+    """FitError where cameras that fit alone are far off together, or fit together in a mirror."""
+    _check_mirrors(boards, singles, cameras, doubts)
+    bad = [one for one in doubts if one.hopeless]
+    if not bad:
+        return
+    culprits = _culprits(bad)
+    worst = max(bad, key=lambda one: one.together / one.alone)
+    raise _contradiction(
+        boards,
+        [cameras[c] for c in culprits],
+        f"alone {worst.alone:.2g} px, together {worst.together:.2g} px",
+    )
+
+
+def _with_slack(
+    boards: Boards,
+    singles: Mapping[int, OneCamera],
+    cameras: tuple[int, ...],
+    bundle: Bundle,
+    doubts: Sequence[Agreement],
+    progress: Progress,
+) -> tuple[Adjusted, list[tuple[int, int, float]], list[Agreement]]:
+    """Cameras that contradict each other adjusted as if the boards had moved; the corners wrong even so; and the doubts
+    with what is left together now. That is the noise of each camera then: whoever measures with this rig is likely to
+    show it pictures of other instants, too."""
+    half = np.array([boards.images[c].half for c in cameras])
+    own = np.maximum([singles[c].noise for c in cameras], 1e-5 * half)
+    found, wrong = with_slack(replace(bundle, noise=own), progress)
+    extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
+    wrong_share = len(wrong) / sum(len(stack.uv) for stack in bundle.views.stacks)
+    if wrong_share > CONTRADICT or found.bundle.slack > TOO_FAR * extent:
+        worst = max(doubts, key=lambda one: one.together / one.alone)
+        told = f"alone {worst.alone:.2g} px, together {worst.together:.2g} px"
+        if found.bundle.slack > TOO_FAR * extent:
+            told += f", as if boards had moved by {np.sqrt(6) * found.bundle.slack:.1g} between their pictures"
+        raise _contradiction(boards, [cameras[c] for c in _culprits(doubts)], told)
+    pairs = {one.pair for one in doubts}
+    now = agreements(found.bundle, half, _alone(boards, singles, bundle, cameras))
+    doubts = [one for one in now if one.pair in pairs]
+    noise = own.copy()
+    for one in doubts:
+        for c in one.pair:
+            noise[c] = max(noise[c], one.together)
+    listed = [(row, cameras[c], off) for row, c, off in wrong]
+    return found._replace(bundle=replace(found.bundle, noise=noise)), listed, doubts
+
+
+def _culprits(bad: Sequence[Agreement]) -> list[int]:
+    """The camera that is in all of two pairs or more, else all of them."""
+    in_all = set(bad[0].pair).intersection(*(one.pair for one in bad))
+    return sorted(in_all if len(bad) > 1 and in_all else {c for one in bad for c in one.pair})
+
+
+def _check_mirrors(
+    boards: Boards, singles: Mapping[int, OneCamera], cameras: tuple[int, ...], doubts: Sequence[Agreement]
+) -> None:
+    """FitError where one of two cameras that contradict each other has mirrored pictures."""
+    seen = {c: {view.board: view for view in boards.of_camera(c)} for c in cameras}
+    placed = {c: _placed(boards, c, singles[c]) for c in cameras}
+    found = []
+    for one in doubts:
+        a, b = (cameras[c] for c in one.pair)
+        left = mirrored(singles[a].camera, seen[a], placed[a], placed[b])
+        if left < MIRRORED * one.together:
+            found.append(one._replace(alone=left))
+    if not found:
+        return
+    names, worst = [boards.names[cameras[c]] for c in _culprits(found)], found[0]
+    how = f"{worst.together:.2g} px are left; with one turned left to right, {worst.alone:.2g} px"
+    raise FitError(
+        f"the pictures of {names[0]} are mirrored: together with the others {how}."
+        if len(names) == 1
+        else f"the pictures of one of {' and '.join(names)} are mirrored: together {how}.",
+        why="a webcam flips its pictures, a camera looks into a mirror, or v is counted from below",
+        fix="switch the flip off, or flip the pictures back before the corners are detected",
+    )
 
 
 def _refined(
@@ -294,12 +439,14 @@ def _check_shared(boards: Boards, cameras: tuple[int, ...], views: Views, kept: 
 def _contradiction(boards: Boards, which: list[int], how: str) -> FitError:
     names = [boards.names[c] for c in which]
     one = len(names) == 1
+    without = " or ".join(f"--without {name}" for name in names)
+    leave_out = f"; or use {without}" if len(boards.cameras) > 2 else ""
     return FitError(
         f"the cameras contradict each other: {' and '.join(names)}: {how}.",
         why="alone it fits its boards; with the others it does not"
         if one
         else "each fits its boards, but not the other",
-        fix=f"see that all pictures are of the same instants and that no camera moved; or use --without {names[0]}",
+        fix=f"see that all pictures are of the same instants and that no camera moved{leave_out}",
     )
 
 

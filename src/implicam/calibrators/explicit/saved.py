@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.explicit.fitted import Fitted
-from implicam.calibrators.explicit.lenses import FAMILIES, Choice, name_of
+from implicam.calibrators.explicit.lenses import FAMILIES, USUAL, Choice, name_of
 from implicam.calibrators.forward_gp.fit import without_field
 from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior
 from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior
@@ -28,7 +28,10 @@ def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[
     posterior, names = fitted.posterior, fitted.trained.camera_names
     table = {
         "calibrated": [names[c] for c in fitted.cameras],
-        "lenses": [{"name": choice.lens, "held_out_px": dict(choice.held_out)} for choice in fitted.choices],
+        "lenses": [
+            {"name": choice.lens, "held_out_px": dict(choice.held_out), "pixels": choice.pixels}
+            for choice in fitted.choices
+        ],
         "notes": list(fitted.notes),
         "alone": fitted.alone,
         "rejected": [[view.point, view.camera, float(view.residual)] for view in fitted.rejected],
@@ -81,7 +84,11 @@ def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[F
         cameras,
         Posterior(tuple(models), tuple(alone), joint, (), 0.0),
         tuple(
-            Choice(str(one["name"]), {str(k): float(v) for k, v in one["held_out_px"].items()})
+            Choice(
+                str(one["name"]),
+                {str(k): float(v) for k, v in one["held_out_px"].items()},
+                str(one.get("pixels", USUAL)),
+            )
             for one in table["lenses"]
         ),
         finite_column(arrays, "errors", (m, 3)),

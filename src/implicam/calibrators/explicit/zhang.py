@@ -13,9 +13,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
+from implicam.calibrators.explicit.adjust import (
+    Adjusted,
+    Bundle,
+    Placed,
+    Views,
+    adjust,
+    adjust_in_steps,
+    log_marginal,
+    spreads,
+)
 from implicam.calibrators.explicit.boards import FEWEST_CORNERS, BoardView, renumbered
 from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
+from implicam.calibrators.explicit.pixels import (
+    ASPECTS,
+    SURPRISING,
+    Pixels,
+    kinds,
+    log_density_at_peak,
+    noise_prior,
+    prior_of,
+    square,
+)
 from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, Image, Prior
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
@@ -23,6 +42,9 @@ from implicam.geometry import Bools, Pose, candidate_rays, rotation_from_vector
 
 FEW = 30
 """Boards that the lens is looked for with; the adjustment has them all."""
+
+FEW_TO_TELL = 6
+"""Boards that the shape of the pixels is first looked for with."""
 
 TOLERABLE = 0.03
 """Median error of a start, in half the longer side of the image, beyond which it is none."""
@@ -37,20 +59,28 @@ SUBSETS = 40
 
 
 class OneCamera(NamedTuple):
-    """A camera at the origin of its own frame, camera_from_board of its boards, and its noise in pixels."""
+    """A camera at the origin of its own frame, camera_from_board of its boards, its noise in pixels, and what its
+    pixels are like."""
 
     camera: CentralCamera
     boards: Placed
     noise: float
+    pixels: Pixels = square()
+
+
+class _Candidate(NamedTuple):
+    adjusted: Adjusted
+    pixels: Pixels
+
+    @property
+    def bundle(self) -> Bundle:
+        return self.adjusted.bundle
 
 
 def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> tuple[OneCamera, Choice]:
     """From the views of one camera, and the lens model it got. FitError where the boards do not fix a lens."""
     own, _ = renumbered([replace(view, camera=0) for view in views])
-    first = _adjusted(*_start(own, image), Views(own, 1), image)
-    better = placed_again(first.bundle)
-    if better is not None:
-        first = _adjusted(better.cameras[0], better.boards, better.views, image)
+    first = _with_pixels(_starts(own, image), Views(own, 1), image)
     left = float(spreads(first.bundle)[0])
     if not left < TOLERABLE * image.half:
         raise FitError(
@@ -58,18 +88,64 @@ def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> t
             fix="look at the overlays of its pictures (detections/), and take out those with wrong corners",
         )
 
-    def perspective() -> Adjusted:
+    def perspective() -> _Candidate:
         camera = as_brown_conrady(first.bundle.cameras[0], first.bundle.corners(0))
-        return _adjusted(camera, first.bundle.boards, first.bundle.views, image)
+        return _with_pixels([(camera, first.bundle.boards)], first.bundle.views, image)
 
-    candidates: dict[str, Callable[[], Adjusted]] = {"kannala-brandt": lambda: first, "brown-conrady": perspective}
-    found, choice = chosen(family, candidates, _held_out)
-    return OneCamera(found.bundle.cameras[0], found.bundle.boards, float(spreads(found.bundle)[0])), choice
+    candidates: dict[str, Callable[[], _Candidate]] = {"kannala-brandt": lambda: first, "brown-conrady": perspective}
+    found, choice = chosen(family, candidates, lambda one: _held_out(one.adjusted))
+    one = OneCamera(found.bundle.cameras[0], found.bundle.boards, float(spreads(found.bundle)[0]), pixels=found.pixels)
+    return one, choice._replace(pixels=found.pixels.name)
 
 
-def _start(views: Sequence[BoardView], image: Image) -> tuple[CentralCamera, Placed]:
-    """The rung of the ladder that fits the boards best, and the poses camera_from_board that go with it."""
-    offsets = [view.uv - image.centre for view in views]
+def _with_pixels(starts: Sequence[tuple[CentralCamera, Placed]], views: Views, image: Image) -> _Candidate:
+    """Adjusted with each prior of the pixels that may be right, and of these the most probable one. starts: with square
+    pixels, and with others where they fit better."""
+    usual, *between, widest = kinds(square())
+
+    def fitted(pixels: Pixels, camera: CentralCamera, boards: Placed) -> _Candidate:
+        found = _adjusted(camera, boards, views, image, pixels)
+        better = placed_again(found.bundle)
+        if better is not None:
+            found = _adjusted(better.cameras[0], better.boards, better.views, image, pixels)
+        return _Candidate(found, pixels)
+
+    def evidence(one: _Candidate) -> float:
+        return log_evidence(one.bundle, image, one.pixels)
+
+    simple = fitted(usual, *starts[0])
+    camera = simple.bundle.cameras[0]
+    if len(starts) == 1:  # two steps tell whether there is anything to gain
+        prior = prior_of(camera, image, _widest(simple.bundle), widest)
+        nearly = adjust(replace(simple.bundle, priors=(prior,)), iterations=2)
+        if evidence(_Candidate(nearly, widest)) < evidence(simple) - SURPRISING:
+            return simple
+    free = fitted(widest, *[(camera, simple.bundle.boards), *starts[1:]][-1])
+    start = (free.bundle.cameras[0], free.bundle.boards)
+    return max([simple, *(fitted(pixels, *start) for pixels in between), free], key=evidence)
+
+
+def log_evidence(bundle: Bundle, image: Image, pixels: Pixels) -> float:
+    """Log marginal likelihood of the views of one camera, lens and boards integrated out (Laplace), at their noise; up
+    to what is the same for all pixels."""
+    noise = max(float(spreads(bundle)[0]), 1e-5 * image.half)
+    corners = len(bundle.views.stacks[0].uv)
+    likelihood = -2 * corners * np.log(noise) + log_marginal(replace(bundle, noise=np.array([noise])))
+    before = log_density_at_peak(bundle.priors[0], bundle.cameras[0], image, pixels) + noise_prior(noise, image)
+    return float(likelihood + before)
+
+
+def _starts(views: Sequence[BoardView], image: Image) -> list[tuple[CentralCamera, Placed]]:
+    """A start with square pixels; and one with others, where they fit better."""
+    some = sorted(views, key=lambda view: -len(view.rows))[:FEW_TO_TELL]
+    best = min(ASPECTS, key=lambda aspect: _start(some, image, aspect)[0])
+    return [_start(views, image, aspect)[1] for aspect in dict.fromkeys((1.0, best))]
+
+
+def _start(views: Sequence[BoardView], image: Image, aspect: float) -> tuple[float, tuple[CentralCamera, Placed]]:
+    """The rung of the ladder that fits the boards best for pixels with this fy / fx, and the poses camera_from_board
+    that go with it; before it, the squared errors that are left."""
+    offsets = [(view.uv - image.centre) / np.array([1.0, aspect]) for view in views]
     outermost = max(float(np.linalg.norm(offset, axis=1).max()) for offset in offsets)
 
     def ladder(offset: Floats) -> tuple[Floats, Bools, Floats]:
@@ -83,12 +159,13 @@ def _start(views: Sequence[BoardView], image: Image) -> tuple[CentralCamera, Pla
         total = total + np.sum(np.minimum(errors, 3 * np.median(errors, axis=1, keepdims=True)) ** 2, axis=1)
     best = int(np.argmin(total))
     k = TANGENT if pinhole[best] else np.zeros(4)
-    lens = KannalaBrandt(float(focal[best]), float(focal[best]), *image.centre.tolist(), *k.tolist())
+    lens = KannalaBrandt(float(focal[best]), float(focal[best] * aspect), *image.centre.tolist(), *k.tolist())
     poses = [
         _trimmed_pose(view.xyz[:, :2], ladder(offset)[2][best], float(focal[best]))
         for view, offset in zip(views, offsets, strict=True)
     ]
-    return CentralCamera(lens, Pose(np.eye(3), np.zeros(3))), Placed.of(poses)
+    left = float(np.ravel(total)[best]) * aspect  # no ratio may win by making pixels large
+    return left, (CentralCamera(lens, Pose(np.eye(3), np.zeros(3))), Placed.of(poses))
 
 
 def planar_poses(flat: Floats, rays: Floats, focal: Floats) -> tuple[list[Pose], Floats]:
@@ -195,11 +272,16 @@ def _mirrored(pose: Pose, middle: Floats) -> Pose:
     return Pose(rotation, centre - rotation @ middle)
 
 
-def _adjusted(camera: CentralCamera, boards: Placed, views: Views, image: Image) -> Adjusted:
+def _widest(bundle: Bundle) -> float:
+    """How far off the axis of a camera its lens is used, radians."""
+    return min(float(np.quantile(angles(bundle.cameras[0], bundle.corners(0)), 0.98)), 3.0)
+
+
+def _adjusted(camera: CentralCamera, boards: Placed, views: Views, image: Image, pixels: Pixels) -> Adjusted:
     """Lens and poses of the boards, refined."""
     bundle = Bundle((camera,), (camera.prior(image, 1.0),), boards, views, np.ones(1))
-    widest = float(np.quantile(angles(camera, bundle.corners(0)), 0.98))
-    return adjust_in_steps(replace(bundle, priors=(camera.prior(image, min(widest, 3.0)),)), np.array([image.half]))
+    prior = prior_of(camera, image, _widest(bundle), pixels)
+    return adjust_in_steps(replace(bundle, priors=(prior,)), np.array([image.half]))
 
 
 def _held_out(adjusted: Adjusted) -> Floats:

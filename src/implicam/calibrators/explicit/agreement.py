@@ -1,0 +1,202 @@
+"""Do the cameras agree? What is left on boards that two of them saw: of each camera alone, and of both together.
+
+Alone, every camera has a pose of its own for each board; together they must share it. Pictures of other instants, a
+camera that was moved, or one whose pictures are mirrored, all fit alone and not together, and no residual says which
+camera is to blame: it depends on which of them is believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from implicam.calibrators.explicit.adjust import (
+    Adjusted,
+    Bundle,
+    adjust,
+    log_marginal_with_slack,
+    root_with_slack,
+    unexplained,
+)
+from implicam.calibrators.explicit.boards import BoardView
+from implicam.calibrators.forward_gp.lens import CentralCamera, Floats
+from implicam.geometry import Pose
+from implicam.progress import Progress, silent
+
+WORSE = 2.0
+"""Together so many times what is left alone: lens models that do not hold their lenses make at most 1.25 of it where
+they leave as much as the noise, 1.7 where they leave three times as much (docs/decisions/0018)."""
+
+ENOUGH_BOARDS = 3
+"""Boards that two cameras must share before what they leave says anything of the rig."""
+
+CONTRADICT = 0.15
+"""Share of the corners that do not fit, beyond which cameras contradict each other and nothing makes up for it."""
+
+TOO_FAR = 0.1
+"""Part of the boards' extent that they may seem to have moved: more is no lag of a camera."""
+
+HOPELESS = 0.01
+"""Usual residual together, in half the longer side of the image, beyond which no error bar makes up for it."""
+
+FAR = 5.0
+"""Standard deviations off, beyond which a corner is wrong: one in 270,000 of good ones."""
+
+LITTLE = (3e-4, 1e-3)
+"""Parts of the extent of the boards that they may have moved without anybody having noticed."""
+
+CLEARLY = 10.0
+"""Log evidence that moved boards must gain."""
+
+MIRRORED = 0.3
+"""Two cameras that leave so many times less with one turned left to right are mirrored."""
+
+RAYLEIGH = 1.1774
+"""Median length of a residual with sd 1 in u and in v."""
+
+
+class Agreement(NamedTuple):
+    """Of two cameras (numbers in the bundle) on the boards that both saw: the usual residual, pixels per coordinate, of
+    each alone and of both together; half: of half the longer side of the image, the larger of both."""
+
+    pair: tuple[int, int]
+    boards: int
+    alone: float
+    together: float
+    half: float
+
+    @property
+    def contradict(self) -> bool:
+        """They fit alone and not together."""
+        return self.boards >= ENOUGH_BOARDS and self.together > WORSE * self.alone
+
+    @property
+    def hopeless(self) -> bool:
+        """They contradict each other, and by so much that it is not for a board held by hand that moved a little."""
+        return self.contradict and self.together > HOPELESS * self.half
+
+
+def agreements(bundle: Bundle, half: Floats, alone: Mapping[tuple[int, int], Floats]) -> list[Agreement]:
+    """For all pairs that share boards. half (C,); alone: (camera, board) -> lengths (k,) of the residuals of its
+    corners when the camera is fitted alone, in its usual pixels."""
+    together: dict[tuple[int, int], Floats] = {}
+    lengths = [bundle.lengths(c) for c in range(len(bundle.cameras))]
+    for c, view, rows in bundle.views.in_stacks():
+        if (c, view.board) in alone:
+            together[c, view.board] = lengths[c][rows]
+    found = []
+    for a, b in combinations(range(len(bundle.cameras)), 2):
+        shared = [k for k in range(len(bundle.boards.translation)) if (a, k) in together and (b, k) in together]
+        if shared:
+            of_each, of_both = (
+                _usual([by[a, k] for k in shared], [by[b, k] for k in shared]) for by in (alone, together)
+            )
+            found.append(Agreement((a, b), len(shared), of_each, of_both, float(max(half[a], half[b]))))
+    return found
+
+
+def _usual(a: Sequence[Floats], b: Sequence[Floats]) -> float:
+    """Root mean square of both cameras' usual residual on a usual board: a few bad pictures do not matter."""
+    sizes = [np.median([np.median(lengths) for lengths in of]) / RAYLEIGH for of in (a, b)]
+    return float(np.hypot(*sizes) / np.sqrt(2))
+
+
+def with_slack(bundle: Bundle, progress: Progress = silent) -> tuple[Adjusted, list[tuple[int, int, float]]]:
+    """The bundle of cameras that contradict each other, adjusted as if every board had moved a little between the
+    pictures of it, and the corners that are wrong even so (row, camera in the bundle, pixels off).
+
+    bundle: with the noise of each camera alone. How far boards moved is found by marginal likelihood. So no camera is
+    believed more than another, the lenses stay as good as each camera alone finds them, and what the rig does not
+    know for it is in its covariance.
+    """
+    everything, wrong = bundle.views, [np.zeros(len(stack.uv), dtype=np.bool_) for stack in bundle.views.stacks]
+    alone = bundle.noise
+    for _ in range(2):
+        bundle = _most_probable(replace(bundle, views=everything.select([~bad for bad in wrong])), progress)
+        whole = replace(bundle, views=everything)
+        off = [unexplained(whole, c) for c in range(len(bundle.cameras))]
+        now = [length > FAR * noise for length, noise in zip(off, alone, strict=True)]
+        same = all((a == b).all() for a, b in zip(now, wrong, strict=True))
+        wrong = now
+        if same or np.mean(np.concatenate(wrong)) > CONTRADICT:
+            break
+    found = adjust(bundle, robust=False)
+    listed = [
+        (int(view.rows[i]), c, float(off[c][rows][i]))
+        for c, view, rows in everything.in_stacks()
+        for i in np.flatnonzero(wrong[c][rows])
+    ]
+    return found, listed
+
+
+def loosened(found: Adjusted, progress: Progress = silent) -> Adjusted:
+    """The same with the covariance that it has if boards moved a little between the pictures of them, where the views
+    clearly say so. Errors that all corners of a view share, those of a lens that its model does not hold, too, are not
+    errors of single corners, which would cancel; the cameras stay as they are, since it is not known which it was."""
+    bundle, seen = found.bundle, np.zeros(len(found.bundle.boards.translation), dtype=np.int64)
+    for view in bundle.views.each:
+        seen[view.board] += 1
+    if np.sum(seen >= 2) < ENOUGH_BOARDS:
+        return found
+    extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
+    before = log_marginal_with_slack(bundle)
+    for part in LITTLE:
+        trial = adjust(replace(bundle, slack=part * extent), robust=False, iterations=4).bundle
+        if log_marginal_with_slack(trial) > before + CLEARLY:
+            slack = _most_probable(trial, progress).slack
+            return found._replace(root=root_with_slack(replace(bundle, slack=slack), found.root))
+    return found
+
+
+def _most_probable(bundle: Bundle, progress: Progress) -> Bundle:
+    """With the slack of the most marginal likelihood."""
+    extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
+    best = bundle
+
+    def loss(log_slack: float) -> float:
+        nonlocal best
+        best = adjust(replace(best, slack=float(np.exp(log_slack))), robust=False, iterations=8).bundle
+        return -log_marginal_with_slack(best)
+
+    progress("looking how far the boards moved", 0, 1)
+    bounds = (np.log(1e-4 * extent), np.log(extent))
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": 0.1, "maxiter": 12})
+    progress("looking how far the boards moved", 1, 1)
+    return adjust(replace(best, slack=float(np.exp(found.x))), robust=False).bundle
+
+
+def mirrored(
+    camera: CentralCamera, seen: Mapping[int, BoardView], placed: Mapping[int, Pose], other: Mapping[int, Pose]
+) -> float:
+    """The usual error in pixels of a camera on the boards (numbers) that another saw as well, if the pictures of one of
+    the two are mirrored. placed, other: camera_from_board of each camera alone.
+
+    A mirrored picture of a board fits as well as a right one, from behind; or from the front, where a detector has
+    counted the corners anew, along the mirrored rows or columns.
+    """
+    common = sorted(placed.keys() & other.keys())
+    flip, best = np.diag([-1.0, 1.0, 1.0]), np.inf
+    extent = np.max([seen[k].xyz.max(axis=0) for k in common], axis=0)
+    for signs in ((1.0, 1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)):
+        counted = np.array(signs)
+        start = np.where(counted < 0, extent, 0) * np.array([1.0, 1.0, 0.0])
+        truly = {}
+        for k in common:
+            rotation = flip @ other[k].rotation * counted
+            truly[k] = Pose(rotation, flip @ other[k].translation - rotation @ start)
+        for k in common:
+            pose = placed[k] @ truly[k].inverse()
+            off = [float(np.median(lengths_alone(camera, seen[j], pose @ truly[j]))) for j in common]
+            best = min(best, float(np.median(off)))
+    return best
+
+
+def lengths_alone(camera: CentralCamera, view: BoardView, pose: Pose) -> Floats:
+    """(k,) of the residuals of a view by a camera at the origin, pixels over the relative noise."""
+    off = np.linalg.norm(camera.pixel(pose.apply(view.xyz)) - view.uv, axis=1) / view.relative
+    return np.where(np.isfinite(off), off, np.inf)

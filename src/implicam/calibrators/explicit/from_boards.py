@@ -1,0 +1,236 @@
+"""Cameras from boards, brought into the world by known points.
+
+Boards join cameras that saw the same ones: such a group is brought into the world as a whole, by the known points that
+it measures. A camera that saw its boards alone has a lens, and known points place it (place.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from implicam.calibrators.explicit.align import MATCHING, Alignment, Known, align, in_frame, in_world
+from implicam.calibrators.explicit.fitted import (
+    UNIT,
+    Fitted,
+    by_cameras_of,
+    network_notes,
+    network_posterior,
+    posterior_of,
+    wrong_corners,
+)
+from implicam.calibrators.explicit.lenses import Choice
+from implicam.calibrators.explicit.network import Groups, Network
+from implicam.calibrators.explicit.place import place
+from implicam.calibrators.forward_gp.diagnosis import Diagnosis
+from implicam.calibrators.forward_gp.locate import locate
+from implicam.calibrators.forward_gp.posterior import CameraModel
+from implicam.calibrators.forward_gp.problem import Frame, problem_of
+from implicam.calibrators.forward_gp.rig_map import RigMap
+from implicam.calibrators.protocol import Rejected, Unused, copied_points, point_copy_notes
+from implicam.dataset import Dataset, Floats, Names, Observations, without_copies
+from implicam.errors import FitError
+from implicam.geometry import Bools
+from implicam.progress import Progress
+
+
+class Part(NamedTuple):
+    """Cameras in the working frame, by number; root (q, P) of their covariance; errors and sds (m, 3) of known points
+    left out in turn."""
+
+    cameras: tuple[int, ...]
+    models: tuple[CameraModel, ...]
+    root: Floats
+    choices: tuple[Choice, ...]
+    errors: Floats
+    sds: Floats
+    rejected: tuple[Rejected, ...]
+    unused: tuple[Unused, ...]
+    notes: tuple[str, ...]
+
+
+def fit_to_boards(data: Dataset, groups: Groups, boards: Dataset, how: str, progress: Progress) -> Fitted:
+    """FitError where fewer than two cameras get a place in the world."""
+    copied, copies_told = copied_points(data), point_copy_notes(data)
+    data = without_copies(data)
+    trained = by_cameras_of(data, boards)
+    frame = _frame(data.positions.xyz)
+    names = trained.camera_names
+    blind = list(groups.blind)
+    parts: list[Part] = []
+    several = [network for network in groups.networks if len(network.cameras) > 1]
+    lone = [network for network in groups.networks if len(network.cameras) == 1]
+    failure: FitError | None = None
+    for network in several:
+        try:
+            parts.append(_aligned(data, trained, network, boards, how, frame))
+        except FitError as error:
+            failure = error
+            blind += [(c, error.what) for c in network.cameras]
+    if lone and how != MATCHING[0]:
+        blind += [(n.cameras[0], "it saw no board at the same time as the others, and icp places none") for n in lone]
+    elif lone:
+        part, left = _placed(data, trained, lone, boards, frame, progress)
+        parts += [part] if part.cameras else []
+        blind += left
+    if sum(len(part.cameras) for part in parts) < 2:
+        if failure is not None and not lone:
+            raise failure
+        raise _too_few(parts, names, blind)
+    told = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in sorted(blind)]
+    fitted = _together(parts, trained, frame, [*copies_told, *_without_boards(data, trained), *told])
+    return replace(fitted, unused=(*fitted.unused, *copied))
+
+
+def _too_few(parts: Sequence[Part], names: tuple[str, ...], blind: Sequence[tuple[int, str]]) -> FitError:
+    count = sum(len(part.cameras) for part in parts)
+    return FitError(
+        f"{count} of {len(names)} cameras can be calibrated together; a position takes two.",
+        why="; ".join(f"{names[c]}: {why}" for c, why in sorted(blind)),
+        fix="show every camera the board in ten places or more, and in half of them to two cameras at once, or four "
+        "known points or more",
+    )
+
+
+def _together(parts: Sequence[Part], trained: Observations, frame: Frame, notes: Sequence[str]) -> Fitted:
+    """One calibration of all parts, cameras in the order of the dataset. Errors that known points share between parts
+    are taken as if each part had its own."""
+    order = np.argsort([c for part in parts for c in part.cameras])
+    models = [model for part in parts for model in part.models]
+    ends = np.cumsum([0, *(model.camera.size for model in models)])
+    columns = np.concatenate([np.arange(ends[i], ends[i + 1]) for i in order])
+    root = np.asarray(block_diag(*(part.root for part in parts)), dtype=np.float64)[:, columns]
+    choices = [choice for part in parts for choice in part.choices]
+    nowhere = set.intersection(*({one.point for one in part.unused} for part in parts))
+    rejected = {(view.point, view.camera): view for part in parts for view in part.rejected}
+    return Fitted(
+        trained,
+        frame,
+        tuple(sorted(c for part in parts for c in part.cameras)),
+        posterior_of(tuple(models[i] for i in order), root),
+        tuple(choices[i] for i in order),
+        np.concatenate([part.errors for part in parts]),
+        np.concatenate([part.sds for part in parts]),
+        tuple(sorted(rejected.values(), key=lambda view: -np.nan_to_num(view.residual, nan=np.inf))),
+        tuple(one for one in parts[0].unused if one.point in nowhere),
+        (*notes, *(note for part in parts for note in part.notes)),
+    )
+
+
+def _aligned(data: Dataset, trained: Observations, network: Network, boards: Dataset, how: str, frame: Frame) -> Part:
+    """A group of cameras that boards join, by the known points that it measures."""
+    known, bundle = data.positions, network.bundle
+    posterior = network_posterior(network, bundle.cameras, network.root)
+    in_rig = RigMap(trained, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True)
+    uv, noise = in_rig.views(data.observations)
+    found = locate(posterior, uv, noise)
+    uv[found.left_out] = np.nan
+    points = Known(known.xyz, np.nan_to_num(known.sd), known.shots)
+    alignment = align(posterior.models, network.root, uv, noise, found.xyz, points, how)
+    cameras, root = in_frame(*in_world(bundle.cameras, network.root, alignment), frame.offset, frame.scale)
+    return Part(
+        network.cameras,
+        network_posterior(network, cameras, root).models,
+        root,
+        tuple(network.choices[c] for c in network.cameras),
+        alignment.errors,
+        alignment.sds,
+        wrong_corners(network, boards),
+        _not_used(data, in_rig.measure(data.observations).reason, alignment),
+        (
+            *_moved_notes(in_rig, found.left_out, np.asarray(np.isfinite(uv).all(axis=2))),
+            *network_notes(network, trained, boards),
+            *_alignment_notes(alignment, data.length_unit),
+        ),
+    )
+
+
+def _placed(
+    data: Dataset,
+    trained: Observations,
+    networks: Sequence[Network],
+    boards: Dataset,
+    frame: Frame,
+    progress: Progress,
+) -> tuple[Part, list[tuple[int, str]]]:
+    """Cameras that saw their boards alone, by the known points; and why not the others."""
+    mine = data.with_cameras(trained.camera_names)
+    problem = problem_of("central", mine, frame, shots_off=False)
+    fitted = place(problem, {network.cameras[0]: network for network in networks}, progress)
+    blind = list(fitted.blind)
+    by_camera = {network.cameras[0]: network for network in networks}
+    if not fitted.cameras:
+        none = np.zeros((0, 3))
+        return Part((), (), np.zeros((0, 0)), (), none, none, (), (), ()), blind
+    diagnosis = Diagnosis(mine, frame, replace(fitted, blind=()))
+    posterior, names = fitted.posterior, trained.camera_names
+    root = posterior.joint if posterior.joint is not None else np.asarray(block_diag(*posterior.alone))
+    used = [by_camera[c] for c in fitted.cameras]
+    notes = [note for network in used for note in network_notes(network, trained, boards)]
+    told = (
+        f"{', '.join(names[c] for c in fitted.cameras)}: the lens is from boards that no other camera saw, the "
+        "place from known points."
+    )
+    return (
+        Part(
+            fitted.cameras,
+            posterior.models,
+            root,
+            tuple(network.choices[c] for network, c in zip(used, fitted.cameras, strict=True)),
+            *diagnosis.leave_one_out,
+            (*(view for network in used for view in wrong_corners(network, boards)), *diagnosis.rejected),
+            diagnosis.unused,
+            (told, *diagnosis.notes(), *notes),
+        ),
+        blind,
+    )
+
+
+def _frame(xyz: Floats) -> Frame:
+    offset = xyz.mean(axis=0)
+    return Frame(offset, float(np.sqrt(np.mean((xyz - offset) ** 2))) or 1.0)
+
+
+def _without_boards(data: Dataset, trained: Observations) -> list[str]:
+    missing = [name for name in data.observations.camera_names if name not in trained.camera_names]
+    return [
+        f"{name} is not calibrated, and its views are not used: it is not among the boards' cameras" for name in missing
+    ]
+
+
+def _not_used(data: Dataset, reasons: Names, alignment: Alignment) -> tuple[Unused, ...]:
+    return tuple(
+        Unused(str(data.points[i]), str(reasons[i]) or "it is not where the others put the world")
+        for i in np.flatnonzero(~alignment.used)
+    )
+
+
+def _moved_notes(in_rig: RigMap, left_out: Bools, used: Bools) -> list[str]:
+    """Cameras whose views of the known points are mostly left out: they may have moved since the boards."""
+    notes = []
+    for c, name in enumerate(in_rig.camera_names):
+        away, seen = int(left_out[:, c].sum()), int(left_out[:, c].sum() + used[:, c].sum())
+        if away > 0.3 * seen:
+            notes.append(
+                f"{name}: {away} of its {seen} views of the known points contradict the other cameras. Was it moved "
+                "after the pictures of the boards?"
+            )
+    return notes
+
+
+def _alignment_notes(alignment: Alignment, unit: str) -> list[str]:
+    """Where the world and the rig from the boards differ by more than their error bars."""
+    n = int(alignment.used.sum())
+    # 3 n errors, each with the square of a normal variable: what chance leaves, and four standard errors of it
+    if n < 4 or alignment.misfit**2 < 1 + 4 * np.sqrt(2 / (3 * n)):
+        return []
+    rms = float(np.sqrt(np.mean(np.sum(alignment.errors**2, axis=1))))
+    return [
+        f"The boards and the known points contradict each other: after alignment {rms:.2g} {unit} are left, "
+        f"{alignment.misfit:.1f} times what the error bars say; the known points are {alignment.scale:.5g} times as "
+        "far apart as the boards say. Check the board's square, that no camera moved in between, and the lens models."
+    ]

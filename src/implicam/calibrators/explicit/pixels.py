@@ -1,0 +1,91 @@
+"""What the pixels of a camera are like: square or not, the lens over the middle of the picture or anywhere.
+
+Most cameras have square pixels and a lens over the middle, and with few views it pays to know that. Resized pictures,
+PAL and anamorphic video, and cut-out pictures do not. Four priors of one camera are told apart by the marginal
+likelihood of its views (MacKay 2003, chapter 28): the wide ones pay for what they allow, and win only where the views
+say so.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from implicam.calibrators.explicit.lenses import USUAL
+from implicam.calibrators.forward_gp.lens import ASPECT, CENTRE, CentralCamera, Image, Prior
+
+ASPECTS = (1.0, 0.5, 0.63, 0.79, 1.26, 1.59, 2.0)
+"""Ratios fy / fx that a start tries: the steps of 26 % are close enough for what follows."""
+
+ANY_ASPECT = 0.35
+"""Prior sd of log(fy / fx) of pixels that need not be square: 0.5 and 2 are two of them away."""
+
+ANYWHERE = 0.4
+"""Prior sd of the principal point of a cut-out picture, as a part of the longer side."""
+
+USUAL_NOISE, NOISE_SPREAD = 3e-4, 2.0
+"""Prior of the noise, median in half the longer side and log sd: without it six views would be explained exactly."""
+
+SURPRISING = 6.0
+"""The widest prior loses less than so much log evidence to the usual one: then those between are looked at, too."""
+
+
+class Pixels(NamedTuple):
+    """A prior: aspect, sd of log(fy / fx); centre, sd of the principal point as a part of the longer side; odds, how
+    many times rarer than the usual it is before a view is seen."""
+
+    name: str
+    aspect: float
+    centre: float
+    odds: float
+
+
+def square(centre: float = CENTRE) -> Pixels:
+    """Square pixels and a lens over the middle of the picture: the usual."""
+    return Pixels(USUAL, ASPECT, centre, 1.0)
+
+
+def kinds(usual: Pixels) -> tuple[Pixels, ...]:
+    """The usual and what else there is; the last allows all."""
+    return (
+        usual,
+        Pixels("stretched", ANY_ASPECT, usual.centre, 20.0),
+        Pixels("cropped", ASPECT, ANYWHERE, 20.0),
+        Pixels("any", ANY_ASPECT, ANYWHERE, 50.0),
+    )
+
+
+def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels) -> Prior:
+    """The prior of a camera's lens (eq. (3) of docs/method.md) with this one of its pixels."""
+    usual = camera.prior(image, widest)
+    mean, precision = usual.mean.copy(), usual.precision.copy()
+    lens = camera.lens
+    # log(fy / fx) about 0, made linear where the lens is: (fy - fx) over their mean has the same slope
+    typical = lens.fx if pixels.aspect == ASPECT else 0.5 * (lens.fx + lens.fy)
+    precision[:2, :2] = np.array([[1, -1], [-1, 1]]) / (pixels.aspect * typical) ** 2
+    precision[2, 2] = precision[3, 3] = 1 / (pixels.centre * 2 * image.half) ** 2
+    return Prior(mean, precision)
+
+
+def told(name: str, camera: CentralCamera, image: Image, pixels: str) -> list[str]:
+    """A note on a camera whose pixels are not the usual ones."""
+    lens, notes = camera.lens, []
+    if pixels in ("stretched", "any"):
+        notes.append(f"its pixels are not square, fy / fx = {lens.fy / lens.fx:.4g}")
+    if pixels in ("cropped", "any"):
+        off = np.array([lens.cx, lens.cy]) - image.centre
+        notes.append(f"its lens is {off[0]:+.3g}, {off[1]:+.3g} px off the middle of the picture")
+    return [f"{name}: {' and '.join(notes)}, as its views clearly say."] if notes else []
+
+
+def log_density_at_peak(prior: Prior, camera: CentralCamera, image: Image, pixels: Pixels) -> float:
+    """Log of the proper part of the prior where it is highest, up to what is the same for all pixels; and its odds."""
+    own = -np.log(pixels.aspect) - 2 * np.log(pixels.centre) - np.log(camera.lens.fx / image.half)
+    distortion = np.linalg.slogdet(prior.precision[4:-6, 4:-6])[1]
+    return float(own + 0.5 * distortion - np.log(pixels.odds))
+
+
+def noise_prior(sd: float, image: Image) -> float:
+    """Log prior of a noise in pixels."""
+    return float(-0.5 * (np.log(sd / (USUAL_NOISE * image.half)) / NOISE_SPREAD) ** 2)

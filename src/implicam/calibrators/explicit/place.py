@@ -1,0 +1,178 @@
+"""Cameras whose lens is known from boards that each saw alone, placed by known points.
+
+The lens that the boards found, with its covariance, is the prior; the known points fix the pose, and refine the lens by
+what they can. The equations are those of from_points.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from implicam.calibrators.explicit.from_points import refined
+from implicam.calibrators.explicit.network import Network
+from implicam.calibrators.forward_gp.evidence import Hyperparameters
+from implicam.calibrators.forward_gp.fit import FittedRig, Problem
+from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Prior
+from implicam.calibrators.forward_gp.posterior import Posterior
+from implicam.calibrators.forward_gp.start import FAR, Started, levenberg_marquardt
+from implicam.errors import FitError
+from implicam.geometry import Bools, Pose, poses_from_rays
+from implicam.progress import Progress
+
+FEWEST = 4
+"""Known points that place a camera whose lens is known: three leave up to four places."""
+
+SPREAD = 0.02
+"""Extent of the known points across their longest line, as a part of that: less is a line."""
+
+TOLERABLE = 0.02
+"""Median error of the best place, in half the longer side of the image, beyond which it is none."""
+
+MIRRORED, MIRROR_FROM = 0.3, 2e-3
+"""A mirror is looked for where more than so much of half the longer side is left; it must leave so many times less."""
+
+AS_GOOD = 9.0
+"""Squared residuals, in the noise, that a second place may have more than the first and be as good."""
+
+SUBSETS = 30
+"""Random sets of five points; with a third of the views wrong, four of them are clean."""
+
+
+def place(problem: Problem, networks: Mapping[int, Network], progress: Progress) -> FittedRig:
+    """The cameras of networks of one camera, by number, placed by the problem's known points; there may be none."""
+    stated = problem.stated.copy()
+    started: dict[int, Started] = {}
+    blind: list[tuple[int, str]] = []
+    images = list(problem.images)
+    for c, network in networks.items():
+        seen, images[c] = problem.sightings[c], network.images[0]
+        if not np.isfinite(stated[c]):
+            stated[c] = network.bundle.noise[0]  # until the residuals of the known points say more
+        try:
+            started[c] = _placed(network, problem.points[seen.rows], seen.uv)
+        except FitError as error:
+            blind.append((c, error.what))
+    problem = replace(problem, stated=stated, images=tuple(images))
+    if not started:
+        none = Hyperparameters(np.ones(2), np.zeros(0), np.zeros(0))
+        return FittedRig(Posterior((), (), None, (), 0.0), (), tuple(blind), (), none, None, None)
+    return refined(problem, started, blind, progress)
+
+
+def _placed(network: Network, points: Floats, uv: Floats) -> Started:
+    """The camera of a network of one, in the place from which it sees points (n, 3) at uv (n, 2)."""
+    known, sd, half = network.bundle.cameras[0], float(network.bundle.noise[0]), network.images[0].half
+    rays, valid = known.lens.ray_from_pixel(uv)
+    _check_spread(points[valid])
+    prior = _prior(network)
+    found = _best(known, prior, points, uv, rays, valid, sd)
+    left = _median(found[0][0], points, uv) if found else np.inf
+    if left > max(FAR * sd, MIRROR_FROM * half):
+        _check_mirror(known, prior, points, uv, rays, valid, sd, left)
+    if not found:
+        raise FitError("from no place does its lens see the known points at these pixels.")
+    (camera, kept), *others = found
+    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+    if not np.median(error) < TOLERABLE * half or kept.sum() < FEWEST:
+        raise FitError(
+            f"with the lens from its boards, the known points are left {np.median(error):.3g} px off: they are not "
+            "where they are said to be, or its pictures are of another size or another zoom."
+        )
+    usual = max(sd, float(np.sqrt(np.mean(error[kept] ** 2) / 2)))
+    for other, _ in others:
+        more = np.sum((other.pixel(points[kept]) - uv[kept]) ** 2) - np.sum(error[kept] ** 2)
+        apart = np.linalg.norm(other.pose.centre - camera.pose.centre) / np.linalg.norm(camera.pose.translation)
+        if more < AS_GOOD * usual**2 and apart > 0.02:
+            raise FitError(
+                f"its {int(kept.sum())} known points place it in two ways: show it more, spread out in depth."
+            )
+    return Started(camera, prior, kept)
+
+
+def _check_mirror(
+    known: CentralCamera, prior: Prior, points: Floats, uv: Floats, rays: Floats, valid: Bools, sd: float, left: float
+) -> None:
+    """FitError where known points seen in a mirror would fit."""
+    other = points * np.array([1.0, 1.0, -1.0])
+    found = _best(known, prior, other, uv, rays, valid, sd)
+    mirrored = _median(found[0][0], other, uv) if found else np.inf
+    if mirrored < MIRRORED * left:
+        raise FitError(
+            f"it sees the known points as in a mirror: as they are {left:.3g} px are left, mirrored {mirrored:.2g} px. "
+            "Are its pictures flipped, or is v counted from below, or are the known positions left-handed?"
+        )
+
+
+def _check_spread(points: Floats) -> None:
+    if len(points) < FEWEST:
+        raise FitError(
+            f"{len(points)} known points are seen; with the lens from its boards it takes {FEWEST} to place it."
+        )
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if extents[1] < SPREAD * extents[0]:
+        raise FitError(f"its {len(points)} known points lie on one line, which does not place it.")
+
+
+def _prior(network: Network) -> Prior:
+    """What the boards say of the lens; nothing of the pose."""
+    camera = network.bundle.cameras[0]
+    p = camera.size - 6
+    precision = np.zeros((camera.size, camera.size))
+    root = network.root[:, :p]
+    scale = np.sqrt(np.sum(root**2, axis=0))
+    precision[:p, :p] = np.linalg.inv((root / scale).T @ (root / scale)) / scale[:, None] / scale
+    return Prior(camera.parameters, precision)
+
+
+def _best(
+    known: CentralCamera, prior: Prior, points: Floats, uv: Floats, rays: Floats, valid: Bools, sd: float
+) -> list[tuple[CentralCamera, Bools]]:
+    """Places, the best first, and the views (n,) that agree with each: from all points, and from a few of them where
+    all do not agree."""
+    found = [_refined(replace(known, pose=pose), prior, points, uv, valid, sd) for pose in _poses(points, rays, valid)]
+    off = min((_median(camera, points, uv) for camera, _ in found), default=np.inf)
+    good = np.flatnonzero(valid)
+    if off > FAR * sd and len(good) > FEWEST + 1:
+        rng = np.random.default_rng(0)
+        some = np.zeros(len(points), dtype=np.bool_)
+        for _ in range(SUBSETS):
+            some[:] = False
+            some[rng.choice(good, FEWEST + 1, replace=False)] = True
+            for pose in _poses(points, rays, some)[:1]:
+                camera = replace(known, pose=pose)
+                error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+                near = valid & (error <= np.nanquantile(error, 0.6))
+                if near.sum() >= FEWEST:
+                    found.append(_refined(camera, prior, points, uv, np.asarray(near), sd))
+    return sorted(found, key=lambda one: _median(one[0], points, uv))
+
+
+def _poses(points: Floats, rays: Floats, some: Bools) -> list[Pose]:
+    return poses_from_rays(points[some], rays[some])[:4]
+
+
+def _median(camera: CentralCamera, points: Floats, uv: Floats) -> float:
+    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+    return float(np.median(np.where(np.isfinite(error), error, np.inf)))
+
+
+def _refined(
+    camera: CentralCamera, prior: Prior, points: Floats, uv: Floats, kept: Bools, sd: float
+) -> tuple[CentralCamera, Bools]:
+    """Levenberg-Marquardt on the views kept, and again without those far off the others."""
+    for _ in range(4):
+        usual = max(sd, _median(camera, points[kept], uv[kept]))
+        if not np.isfinite(usual):
+            break
+        fitted = levenberg_marquardt(camera, prior, points[kept], uv[kept], usual)
+        assert isinstance(fitted, CentralCamera)
+        camera = fitted
+        error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+        inside = np.asarray(error <= FAR * max(float(np.median(error[kept])), sd))
+        if inside.sum() < FEWEST or (inside == kept).all():
+            break
+        kept = inside
+    return camera, kept

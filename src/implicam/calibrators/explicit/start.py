@@ -1,0 +1,214 @@
+"""One camera from known points, from no guess: its lens model and what its pixels are like.
+
+A linear resection tries a ladder of lenses and of pixel shapes (geometry.resect_any_pixels), Levenberg-Marquardt
+refines the winner, evidence chooses among the priors of pixels.py, held-out views among the lens models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
+from implicam.calibrators.explicit.pixels import (
+    ASPECTS,
+    SURPRISING,
+    Pixels,
+    kinds,
+    log_density_at_peak,
+    noise_prior,
+    prior_of,
+    square,
+)
+from implicam.calibrators.forward_gp.lens import CENTRE, TANGENT, CentralCamera, Floats, Image
+from implicam.calibrators.forward_gp.start import FAR, FEWEST, Started, levenberg_marquardt
+from implicam.cameras import KannalaBrandt
+from implicam.errors import FitError
+from implicam.geometry import Bools, resect_any_pixels
+
+SHIFTED = 5.0
+"""How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""
+
+FOLDS = 5
+
+HOPELESS = 100.0
+"""Log evidence that a kind of pixels may lack from one start and still be looked at from others."""
+
+MIRRORED = 0.3
+"""A mirrored picture leaves less than this part of what the picture as it is leaves: then it is mirrored."""
+
+POOR = 2e-3
+"""Median error of a start, in half the longer side, above which the pictures may be mirrored."""
+
+
+class MirroredError(FitError):
+    """The pictures of a camera are mirrored, or the known positions are."""
+
+
+class _Candidate(NamedTuple):
+    """A camera fitted with the prior of some pixels; kept (n,): the views it was fitted to."""
+
+    started: Started
+    camera: CentralCamera
+    pixels: Pixels
+
+    @property
+    def kept(self) -> Bools:
+        return self.started.kept
+
+
+def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tuple[Started, Choice]:
+    """A camera from known points (n, 3), all seen at uv (n, 2), its lens model and pixels; FitError where they do not
+    fix one, MirroredError where a mirrored camera would see them so."""
+    if len(points) < FEWEST:
+        raise FitError(f"{len(points)} known points are seen; a camera needs at least {FEWEST}.")
+    first = _resected(points, uv, image)
+    _check_mirror(first, points, uv, image)
+    tried = _with_pixels([first], points, uv, image)
+    bent = tried[0]
+
+    def perspective() -> _Candidate:
+        starts = [one._replace(camera=as_brown_conrady(one.camera, points[one.kept])) for one in tried]
+        return _with_pixels(starts, points, uv, image)[0]
+
+    candidates = {"kannala-brandt": lambda: bent, "brown-conrady": perspective}
+    found, choice = chosen(family, candidates, lambda one: _held_out(one.started, points, uv, image))
+    return found.started, choice._replace(pixels=found.pixels.name)
+
+
+def _resected(points: Floats, uv: Floats, image: Image) -> _Candidate:
+    """The ladder's best, refined with the usual pixels where they fit, and with any where they do not."""
+    found, aspect = resect_any_pixels(points, uv, middle=image.centre, aspects=ASPECTS)
+    k = TANGENT if found.pinhole else np.zeros(4)
+    lens = KannalaBrandt(found.focal, found.focal * aspect, *image.centre.tolist(), *k.tolist())
+    pixels = square(CENTRE) if aspect == 1 else kinds(square(CENTRE))[1]
+    return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.kept, points, uv, image, 1e-3)
+
+
+def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image: Image) -> list[_Candidate]:
+    """The cameras refined with each prior of their pixels that may be right, the most probable one first; one alone
+    where the usual one is clearly right."""
+    usual, *between, widest = kinds(square(SHIFTED * CENTRE))
+
+    def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
+        return _refined(start.camera, pixels, start.kept, points, uv, image)
+
+    found = [fitted(usual, starts[0]), fitted(widest, starts[0])]
+    simple, free = _evidence(found, points, uv, image)
+    if free < simple - SURPRISING:
+        return found[:1]
+    found = [found[0], *(fitted(pixels, starts[0]) for pixels in between), found[1]]
+    evidence = _evidence(found, points, uv, image)
+    best = found[int(np.argmax(evidence))]
+    found = [one for one, log in zip(found, evidence, strict=True) if log > max(evidence) - HOPELESS]
+    for i, one in enumerate(found):  # an unusual lens has optima that are not the best
+        others = [start for start in (best, *starts[1:]) if start is not one]
+        tries = [one, *(fitted(one.pixels, start) for start in others)]
+        found[i] = tries[int(np.argmax(_evidence(tries, points, uv, image)))]
+    order = np.argsort(_evidence(found, points, uv, image), kind="stable")[::-1]
+    return [found[i] for i in order]
+
+
+def _refined(
+    camera: CentralCamera,
+    pixels: Pixels,
+    kept: Bools,
+    points: Floats,
+    uv: Floats,
+    image: Image,
+    first: float | None = None,
+) -> _Candidate:
+    """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong; first: the noise
+    to begin with in half the longer side, where the start is rough."""
+    sd = _sd(camera, points[kept], uv[kept], image) if first is None else first * image.half
+    for _ in range(4):
+        widest = float(angles(camera, points[kept]).max())
+        prior = prior_of(camera, image, widest, pixels)
+        fitted = levenberg_marquardt(camera, prior, points[kept], uv[kept], sd)
+        assert isinstance(fitted, CentralCamera)
+        camera = fitted
+        error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+        sd = max(float(np.median(error[kept])), 1e-5 * image.half)
+        inside = np.asarray(error <= max(FAR * float(np.median(error[kept])), 1e-4 * image.half))
+        if inside.sum() < FEWEST or (inside == kept).all():
+            break
+        kept = inside
+    return _Candidate(Started(camera, prior, kept), camera, pixels)
+
+
+def _evidence(found: list[_Candidate], points: Floats, uv: Floats, image: Image) -> list[float]:
+    """Log marginal likelihood of each, by Laplace's method at its best noise, on the views that all of them keep."""
+    common = np.logical_and.reduce([one.kept for one in found])
+    if common.sum() < FEWEST:
+        common = found[-1].kept
+    return [_log_evidence(one, points[common], uv[common], image) for one in found]
+
+
+def _log_evidence(one: _Candidate, points: Floats, uv: Floats, image: Image) -> float:
+    camera, prior = one.camera, one.started.prior
+    sd = _sd(camera, points, uv, image)
+    for _ in range(3):
+        fitted = levenberg_marquardt(camera, prior, points, uv, sd)
+        assert isinstance(fitted, CentralCamera)
+        camera = fitted
+        view = camera.view(points)
+        J = view.by_parameters.reshape(-1, camera.size)
+        squares = float(np.sum((uv - view.uv) ** 2))
+        if not np.isfinite(squares) or not np.isfinite(J).all():
+            return -np.inf
+        normal = J.T @ J / sd**2 + prior.precision
+        scale = 1 / np.sqrt(np.diag(normal))
+        used = float(np.trace(np.linalg.solve(normal * scale[:, None] * scale, (J * scale).T @ (J * scale)))) / sd**2
+        now = np.sqrt(max(squares / max(J.shape[0] - used, 1.0), (1e-5 * image.half) ** 2))
+        if abs(np.log(now / sd)) < 0.02:
+            break
+        sd = float(now)
+    off = prior.mean - camera.parameters
+    determinant = np.linalg.slogdet(normal * scale[:, None] * scale)[1] - 2 * np.sum(np.log(scale))
+    likelihood = -J.shape[0] * np.log(sd) - 0.5 * squares / sd**2 - 0.5 * float(off @ prior.precision @ off)
+    before = log_density_at_peak(prior, camera, image, one.pixels) + noise_prior(sd, image)
+    return float(likelihood - 0.5 * determinant + before)
+
+
+def _check_mirror(found: _Candidate, points: Floats, uv: Floats, image: Image) -> None:
+    """MirroredError where the picture turned left to right fits far better than it does as it is."""
+    left = _median(found, points, uv)
+    if left < POOR * image.half:
+        return
+    turned = np.column_stack([2 * image.centre[0] - uv[:, 0], uv[:, 1]])
+    try:
+        other = _resected(points, turned, image)
+    except FitError:
+        return
+    mirrored = _median(other, points, turned)
+    if mirrored < MIRRORED * left:
+        raise MirroredError(
+            f"its pictures are mirrored, or the known positions are: as they are {left:.3g} px are left, mirrored "
+            f"{mirrored:.2g} px."
+        )
+
+
+def _median(one: _Candidate, points: Floats, uv: Floats) -> float:
+    error = np.linalg.norm(one.camera.pixel(points) - uv, axis=1)
+    return float(np.median(np.nan_to_num(error, nan=np.inf)))
+
+
+def _sd(camera: CentralCamera, points: Floats, uv: Floats, image: Image) -> float:
+    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+    return max(float(np.nanmedian(error)), 1e-5 * image.half)
+
+
+def _held_out(started: Started, points: Floats, uv: Floats, image: Image) -> Floats:
+    """(n,) squared errors of views in `FOLDS` random folds, each predicted from the others; far ones count little."""
+    points, uv = points[started.kept], uv[started.kept]
+    assert isinstance(started.camera, CentralCamera)
+    sd = _sd(started.camera, points, uv, image)
+    fold = np.random.default_rng(0).permutation(np.arange(len(points)) % FOLDS)
+    errors = np.full(len(points), np.inf)
+    for k in range(FOLDS):
+        others = fold != k
+        camera = levenberg_marquardt(started.camera, started.prior, points[others], uv[others], sd)
+        errors[~others] = np.linalg.norm(camera.pixel(points[~others]) - uv[~others], axis=1)
+    return clipped(errors) ** 2
