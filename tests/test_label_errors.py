@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import block_diag, expm
 from scipy.stats import multivariate_normal
 
 from implicam.calibrators import ForwardGP, ForwardGPCalibration
@@ -405,3 +405,35 @@ def test_plates_follow_each_other_along_their_normal() -> None:
     shots = Shots.of(points, np.repeat(list("abcde"), 12))
     assert shots is not None
     assert abs(shots.along[0] @ turn[:, 2]) == pytest.approx(1, abs=1e-6)
+
+
+def test_a_calibration_that_grows_finds_them_again() -> None:
+    before, data = dots(), moved(known(), DOTS, 5)
+    grown = before.grown(data)
+    errors, again = before.fitted.label_errors, grown.fitted.label_errors
+    assert errors is not None
+    assert again is not None
+    assert np.trace(again.covariance) == pytest.approx(np.trace(errors.covariance), rel=0.1)
+    assert again.noise == pytest.approx(errors.noise, rel=0.1)
+
+
+def test_what_cameras_see_is_sensitive_to_what_ties_them() -> None:
+    """One table of all cameras, whose products are the covariances between them."""
+    calibration = dots()
+    (found,) = calibration.map.sensitivities(known().xyz[:3])
+    posterior = calibration.posterior
+    joint = np.concatenate([posterior.root(c) for c in range(len(posterior.models))], axis=1)
+    x = calibration.frame.inward(known().xyz[:3])
+    designs = []
+    for model in posterior.models:
+        rows = model.rows(x)
+        m = rows.phi.shape[1]
+        wide = np.zeros((3, 2, model.size))
+        wide[:, :, : model.camera.size] = rows.J
+        wide[:, 0, model.camera.size : model.camera.size + m] = wide[:, 1, model.camera.size + m :] = rows.phi
+        designs.append(wide)
+    for i in range(3):
+        design = block_diag(*(d[i] for d in designs))
+        expected = design @ joint.T @ joint @ design.T
+        np.testing.assert_allclose(found.half[i] @ found.half[i].T, expected, rtol=1e-6, atol=1e-9 * expected.max())
+        assert np.abs(expected[:2, 2:]).max() > 0
