@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from implicam.calibrators.forward_gp.evidence import NOISE
 from implicam.calibrators.forward_gp.families import (
     FAMILIES,
     MAX_CHOICE_VIEWS,
@@ -56,6 +57,12 @@ BEST_STARTS = 3
 CLEARLY_WRONG = 0.3
 """The sign whose best camera leaves the other's median times this is the right one without further question."""
 
+MIN_TOLERATED_NOISES = 10.0
+"""Stated or usual noises that a view may be off and still start the fit, which judges it better."""
+
+FEW_VIEWS = 18
+"""Views fewer than which a camera of 17 numbers may go through most of them, whatever the others say."""
+
 AFFINE_RHOS = (0.02, 0.2)
 """Inverse distances that an affine start tries."""
 
@@ -91,8 +98,11 @@ class Scene(NamedTuple):
         return np.asarray(np.where(np.isnan(away), np.inf, away), dtype=np.float64)
 
     def near(self, error: Floats, kept: Bools) -> Bools:
-        """The views that a camera explains, judged by the median of those kept."""
-        return np.asarray(error <= max(FAR * float(np.median(error[kept])), 1e-4 * self.image.half), dtype=np.bool_)
+        """The views that a camera explains, judged by the median of those kept; of few views, which a camera of
+        seventeen numbers may nearly go through, by the noise."""
+        noise = self.stated if np.isfinite(self.stated) else np.exp(NOISE[0]) * self.image.half
+        limit = max(FAR * float(np.median(error[kept])), MIN_TOLERATED_NOISES * noise)
+        return np.asarray(error <= limit, dtype=np.bool_)
 
 
 def candidates(whole: Scene) -> list[Candidate]:
@@ -306,6 +316,8 @@ def _starts(
 ) -> Iterator[tuple[GeneralCamera, Bools]]:
     if ladder is not None:
         yield ladder
+        if not ladder[1].all() and len(scene.points) < FEW_VIEWS:  # too few to say by themselves which are wrong
+            yield ladder[0], np.ones(len(scene.points), dtype=np.bool_)
     mirrored = _from_ladder(scene, mirrored=True, subsets=linear is None or not linear[0].mirrored)
     if mirrored is not None:
         yield mirrored
