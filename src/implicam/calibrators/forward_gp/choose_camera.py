@@ -100,9 +100,13 @@ class Scene(NamedTuple):
     def near(self, error: Floats, kept: Bools) -> Bools:
         """The views that a camera explains, judged by the median of those kept; of few views, which a camera of
         seventeen numbers may nearly go through, by the noise."""
-        noise = self.stated if np.isfinite(self.stated) else np.exp(NOISE[0]) * self.image.half
-        limit = max(FAR * float(np.median(error[kept])), MIN_TOLERATED_NOISES * noise)
+        limit = max(FAR * float(np.median(error[kept])), MIN_TOLERATED_NOISES * self.noise)
         return np.asarray(error <= limit, dtype=np.bool_)
+
+    @property
+    def noise(self) -> float:
+        """Px, as stated or usual."""
+        return float(self.stated) if np.isfinite(self.stated) else float(np.exp(NOISE[0])) * self.image.half
 
 
 def candidates(whole: Scene) -> list[Candidate]:
@@ -285,9 +289,10 @@ def _kinds(
 
 
 def _score(scene: Scene, camera: GeneralCamera) -> float:
-    """A robust size of the errors at all views, px: wrong views do not count, and a camera cannot win with a few."""
-    error = scene.error(camera)
-    return float(np.median(error)) + 1e-9 * scene.image.half
+    """A robust size of the errors at all views, px, in the middle of their logarithms: wrong views count little, and a
+    camera gains nothing by going through some views better than the noise allows."""
+    error = np.minimum(scene.error(camera), 1e3 * scene.image.half)
+    return scene.noise * float(np.exp(0.5 * np.mean(np.log1p((error / scene.noise) ** 2))))
 
 
 def _common_views(scene: Scene, kept: Bools) -> Views:
