@@ -268,7 +268,8 @@ def depth_of_points(xyz: Floats, uv: Floats, sizes: Floats | None = None) -> Flo
 class Resection(NamedTuple):
     """A camera with an unknown lens, placed roughly: `focal` in pixels; `pinhole` says which of two lens models won.
 
-    rms: in pixels, over the points `kept` (n,), those that were not far off.
+    rms: in pixels, over the points `kept` (n,), those that were not far off. doubtful: many are far off, or all are;
+    wrong views, or a camera unlike both models.
     """
 
     camera_from_world: Pose
@@ -276,6 +277,7 @@ class Resection(NamedTuple):
     pinhole: bool
     rms: float
     kept: Bools
+    doubtful: bool
 
 
 def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, subsets: bool = True) -> Resection:
@@ -297,16 +299,16 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, su
     found, errors, keep = _trimmed(points, offset, np.ones(len(rows), dtype=np.bool_))
     bad = float(np.median(errors))
     tolerable = POOR * float(np.median(np.linalg.norm(offset, axis=1)))
-    if subsets and (bad > tolerable or np.mean(errors > max(SUSPECT * bad, tolerable)) > FEW_SUSPECTS):
+    doubtful = bool(bad > tolerable or np.mean(errors > max(SUSPECT * bad, tolerable)) > FEW_SUSPECTS)
+    if subsets and doubtful:
         for start in _by_subsets(points, offset):
             again = _trimmed(points, offset, start)
             if np.median(again[1]) < np.median(errors):
                 found, errors, keep = again
     kept = np.zeros(len(xyz), dtype=np.bool_)
     kept[rows[keep]] = True
-    return Resection(
-        found.camera_from_world, found.focal, found.pinhole, float(np.sqrt(np.mean(errors[keep] ** 2))), kept
-    )
+    rms = float(np.sqrt(np.mean(errors[keep] ** 2)))
+    return Resection(found.camera_from_world, found.focal, found.pinhole, rms, kept, doubtful)
 
 
 def resect_any_pixels(

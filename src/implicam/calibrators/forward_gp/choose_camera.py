@@ -83,6 +83,14 @@ class Candidate(NamedTuple):
         return self.family, self.camera.mirrored
 
 
+class Start(NamedTuple):
+    """A rough camera and the views (n,) that it explains; doubtful: too many others are far off."""
+
+    camera: GeneralCamera
+    kept: Bools
+    doubtful: bool = False
+
+
 class Scene(NamedTuple):
     """What one camera saw: points (n, 3), pixels (n, 2), relative noise (n,), image, stated noise or NaN."""
 
@@ -114,12 +122,19 @@ def candidates(whole: Scene) -> list[Candidate]:
     if len(whole.points) < FEWEST:
         raise FitError(f"{len(whole.points)} known points are seen; a camera needs at least {FEWEST}.")
     ladder = _from_ladder(whole, mirrored=False, subsets=False)
+    if ladder is not None and not ladder.doubtful:
+        quick = _quick(whole, ladder)
+        if quick is not None:
+            return [quick]
     linear = _from_dlt(whole)
-    # subsets are for wrong views; where a linear projection does well without them, it is the camera that is odd
-    if linear is None or ladder is None or _score(whole, linear[0]) > QUICK_GAIN * _score(whole, ladder[0]):
-        ladder = _from_ladder(whole, mirrored=False)
-    quick = _quick(whole, ladder) if ladder is not None else None
-    return [quick] if quick is not None else _thorough(whole, ladder, linear)
+    if ladder is None or ladder.doubtful:
+        # subsets are for wrong views; where a linear projection does well without them, it is the camera that is odd
+        if ladder is None or linear is None or _score(whole, linear.camera) > QUICK_GAIN * _score(whole, ladder.camera):
+            ladder = _from_ladder(whole, mirrored=False)
+        quick = _quick(whole, ladder) if ladder is not None else None
+        if quick is not None:
+            return [quick]
+    return _thorough(whole, ladder, linear)
 
 
 def choose(rig: Sequence[list[Candidate]]) -> list[Candidate]:
@@ -197,7 +212,7 @@ def _refined(
     return camera, kept
 
 
-def _from_ladder(scene: Scene, *, mirrored: bool, subsets: bool = True) -> tuple[GeneralCamera, Bools] | None:
+def _from_ladder(scene: Scene, *, mirrored: bool, subsets: bool = True) -> Start | None:
     uv, middle = scene.uv, scene.image.centre
     if mirrored:
         uv = uv * [-1.0, 1.0] + [2 * middle[0], 0.0]
@@ -218,21 +233,22 @@ def _from_ladder(scene: Scene, *, mirrored: bool, subsets: bool = True) -> tuple
     if len(kept) > kept.sum() and len(scene.points) > 120:  # the ladder looked at some of many
         error = scene.error(camera)
         kept = scene.near(error, found.kept)
-    return (camera, kept) if kept.sum() >= FEWEST else (camera, found.kept)
+    return Start(camera, kept if kept.sum() >= FEWEST else found.kept, found.doubtful)
 
 
-def _quick(scene: Scene, ladder: tuple[GeneralCamera, Bools]) -> Candidate | None:
+def _quick(scene: Scene, ladder: Start) -> Candidate | None:
     """The ordinary camera, if nothing freer is clearly better."""
-    camera, kept = _refined(ladder[0], "ordinary", scene, ladder[1], FINAL_STEPS * 5, rounds=4)
+    camera, kept = _refined(ladder.camera, "ordinary", scene, ladder.kept, FINAL_STEPS * 5, rounds=4)
     error = scene.error(camera)
     median = float(np.median(error[kept]))
     if kept.sum() < FEWEST or not median < QUICK_MEDIAN * scene.image.half or camera.rho < 4 * SMALLEST_RHO:
         return None
     free, free_kept = _refined(camera, "free", scene, kept, PROBE_STEPS, gain=ROUGH_GAIN)
     free_error = scene.error(free)
-    # what seventeen free numbers gain over eleven by chance is no reason
+    # what seventeen free numbers gain over eleven by chance is no reason; of few views the evidence must do
     by_chance = np.sqrt(max(2 * kept.sum() - 17, 0) / (2 * kept.sum() - 11))
-    if np.median(free_error[kept]) < QUICK_GAIN * by_chance * median or free_kept.sum() > kept.sum():
+    better = kept.sum() >= FEW_VIEWS and np.median(free_error[kept]) < QUICK_GAIN * by_chance * median
+    if better or free_kept.sum() > kept.sum():
         return None
     views = _common_views(scene, kept)
     tight = _evidence(camera, "ordinary", views)
@@ -241,15 +257,13 @@ def _quick(scene: Scene, ladder: tuple[GeneralCamera, Bools]) -> Candidate | Non
     return Candidate(camera, "ordinary", kept, tight)
 
 
-def _thorough(
-    scene: Scene, ladder: tuple[GeneralCamera, Bools] | None, linear: tuple[GeneralCamera, Bools] | None
-) -> list[Candidate]:
+def _thorough(scene: Scene, ladder: Start | None, linear: Start | None) -> list[Candidate]:
     """Every start, the best few of each sign, and each kind from them."""
     starts = list(_starts(scene, ladder, linear))
     if not starts:
         raise FitError("no camera sees the known points at these pixels.", fix="look for wrong detections")
     best: dict[bool, list[tuple[float, GeneralCamera, Bools]]] = {False: [], True: []}
-    for camera, kept in starts:
+    for camera, kept, _ in starts:
         found, explained = _refined(camera, "free", scene, kept, SHORT_STEPS, gain=ROUGH_GAIN)
         best[camera.mirrored].append((_score(scene, found), found, explained))
     for sign, some in best.items():
@@ -271,12 +285,12 @@ def _kinds(
     scene: Scene,
     views: Views,
     best: tuple[float, GeneralCamera, Bools],
-    starts: list[tuple[GeneralCamera, Bools]],
+    starts: list[Start],
     sign: bool,
 ) -> Iterator[Candidate]:
     """Each kind, from the best free camera and from the ladder."""
     _, free, kept = best
-    others = [camera for camera, _ in starts if camera.mirrored == sign][:1]  # the ladder's
+    others = [camera for camera, _, _ in starts if camera.mirrored == sign][:1]  # the ladder's
     for family, kind in FAMILIES.items():
         shape = free.shape if kind.p > 0.01 else np.zeros(2)
         tilt = free.tilt if kind.tilt > 0.01 else np.zeros(2)
@@ -307,30 +321,28 @@ def _evidence(camera: GeneralCamera, family: str, views: Views) -> float:
     return log_evidence(camera, prior, views)
 
 
-def _from_dlt(scene: Scene) -> tuple[GeneralCamera, Bools] | None:
+def _from_dlt(scene: Scene) -> Start | None:
     try:
         P, kept = resect_robustly(scene.points, scene.uv)
     except FitError:
         return None
     camera = _from_linear(P)
-    return None if camera is None else (camera, kept)
+    return None if camera is None else Start(camera, kept)
 
 
-def _starts(
-    scene: Scene, ladder: tuple[GeneralCamera, Bools] | None, linear: tuple[GeneralCamera, Bools] | None
-) -> Iterator[tuple[GeneralCamera, Bools]]:
+def _starts(scene: Scene, ladder: Start | None, linear: Start | None) -> Iterator[Start]:
     if ladder is not None:
         yield ladder
-        if not ladder[1].all() and len(scene.points) < FEW_VIEWS:  # too few to say by themselves which are wrong
-            yield ladder[0], np.ones(len(scene.points), dtype=np.bool_)
-    mirrored = _from_ladder(scene, mirrored=True, subsets=linear is None or not linear[0].mirrored)
+        if not ladder.kept.all() and len(scene.points) < FEW_VIEWS:  # too few to say by themselves which are wrong
+            yield Start(ladder.camera, np.ones(len(scene.points), dtype=np.bool_))
+    mirrored = _from_ladder(scene, mirrored=True, subsets=linear is None or not linear.camera.mirrored)
     if mirrored is not None:
         yield mirrored
     if linear is not None:
         yield linear
-        farther = np.zeros(linear[0].size)
-        farther[RHO] = -0.7 * linear[0].rho
-        yield linear[0].moved(farther), linear[1]  # its perspective is what noise disturbs first
+        farther = np.zeros(linear.camera.size)
+        farther[RHO] = -0.7 * linear.camera.rho
+        yield Start(linear.camera.moved(farther), linear.kept)  # its perspective is what noise disturbs first
     yield from _from_affine(scene)
 
 
@@ -345,7 +357,7 @@ def _from_linear(P: Floats) -> GeneralCamera | None:
     return GeneralCamera(focal, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose)
 
 
-def _from_affine(scene: Scene) -> Iterator[tuple[GeneralCamera, Bools]]:
+def _from_affine(scene: Scene) -> Iterator[Start]:
     """Far cameras: a parallel projection and a guess of the distance, both signs."""
     try:
         A, b, kept = resect_affine(scene.points, scene.uv)
@@ -370,7 +382,8 @@ def _from_affine(scene: Scene) -> Iterator[tuple[GeneralCamera, Bools]]:
             translation = np.append(offset * np.sinc(angle / np.pi), np.cos(angle) / rho)
             pose = Pose(rotation, translation)
             centre = scene.image.centre
-            yield GeneralCamera(scale / rho, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose), kept
+            camera = GeneralCamera(scale / rho, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose)
+            yield Start(camera, kept)
 
 
 def _log_of_shape(B: Floats) -> Floats:
