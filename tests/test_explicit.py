@@ -887,7 +887,7 @@ def test_methods_without_cameras_say_so() -> None:
     rig = build_rig("bar6", seed=2, cameras="2R")
     with pytest.raises(UsageError, match="inverse-gp has no cameras"):
         rig_of(InverseGP().fit(points(rig, 30, 5)))
-    with pytest.raises(UsageError, match="--lens none has no lens models"):
+    with pytest.raises(UsageError, match="has no lens model"):
         rig_of(ForwardGP(lens="none").fit(points(rig, 60, 5)))
 
 

@@ -16,9 +16,9 @@ from scipy.stats import chi2, kstest, multivariate_normal
 from implicam.calibrators import ForwardGP, ForwardGPCalibration, load_calibration
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
 from implicam.calibrators.forward_gp.fit import left_out, squared_distances
+from implicam.calibrators.forward_gp.general_camera import AnyCamera
 from implicam.calibrators.forward_gp.lens import (
     TANGENT,
-    AnyCamera,
     CentralCamera,
     Image,
     Prior,
@@ -1063,7 +1063,7 @@ def test_one_grossly_wrong_view_is_left_out_and_named(bad: int) -> None:
     without = fitted().measure(with_views(data, hide).observations)
     told = without.consistency > 0.01  # else the others are not of one mind either
     assert told.sum() >= 12
-    assert set(spoilt.reason[told].tolist()) == {f"measured without {name}, whose view contradicts the others"}
+    assert set(spoilt.own_reason[told].tolist()) == {f"measured without {name}, whose view contradicts the others"}
     assert (spoilt.views[told] == 3).all()
     np.testing.assert_allclose(spoilt.xyz[told], without.xyz[told], rtol=1e-9)
     np.testing.assert_allclose(spoilt.cov[told], without.cov[told], rtol=1e-6)
@@ -1088,7 +1088,7 @@ def test_two_wrong_views_among_six_are_left_out() -> None:
     told = without.consistency > 0.01
     assert told.sum() >= 9
     why = "measured without cam2 and cam5, whose view contradicts the others"
-    assert set(spoilt.reason[told].tolist()) == {why}
+    assert set(spoilt.own_reason[told].tolist()) == {why}
     assert (spoilt.views[told] == 4).all()
     np.testing.assert_allclose(spoilt.xyz[told], without.xyz[told], rtol=1e-9)
 

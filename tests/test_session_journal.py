@@ -43,9 +43,9 @@ def shot(name: str, seed: int = 0, n: int = 1, extra: str = "", sd: bool = True)
     """One ball (n = 1), or a board of n points; some views missing, awkward numbers."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(0, 47, (n, 3, 2))
-    uv[0, 0] = -0.0, 5e-324  # a zero with a sign, and the smallest number there is
+    uv[0, 0] = -0.0, 5e-324 * (1 + seed)  # a zero with a sign, and the smallest numbers; one pixel for all is a mark
     uv[rng.random((n, 3)) < 0.3] = NAN
-    uv[0, 1] = 1 / 3, 46.999999999999
+    uv[0, 1] = 1 / 3 + seed / 7, 46.999999999999
     stated = np.where(np.isnan(uv), NAN, rng.uniform(0.01, 1, uv.shape)) if sd else np.full(uv.shape, NAN)
     stated[0, 1, 0] = NAN
     points = np.array([name] if n == 1 else [f"{name} corner, {i}" for i in range(n)])
@@ -158,7 +158,7 @@ def test_people_can_read_the_database(tmp_path):
         x, sd_y = db.execute("SELECT y, sd_y FROM points WHERE point = 'p001'").fetchone()
         assert (x, sd_y) == (shot("p001", 1).xyz[0, 1], None)
         views = db.execute("SELECT camera, u, v, sd_u FROM views WHERE camera = 'right'").fetchall()
-        assert views == [("right", 1 / 3, 46.999999999999, None)]
+        assert views == [("right", 1 / 3 + 1 / 7, 46.999999999999, None)]
         assert db.execute("PRAGMA user_version").fetchone() == (1,)
     db.close()
 

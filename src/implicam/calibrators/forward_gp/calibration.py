@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from implicam import calibration_file
 from implicam.calibrators.forward_gp import saved
+from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.diagnosis import Diagnosis
 from implicam.calibrators.forward_gp.fit import AUTO, FittedRig, fit_rig
 from implicam.calibrators.forward_gp.label_fit import with_label_errors
@@ -180,6 +181,7 @@ class ForwardGPCalibration:
         """What the user should know before trusting this calibration; empty where all is well."""
         return [
             *point_copy_notes(self.data),
+            *(kind_notes(self.fitted, self.camera_names) if self.calibrator.lens == AUTO else ()),
             *self.diagnosis.notes(),
             *self._label_notes(),
             *self._plane_notes(),

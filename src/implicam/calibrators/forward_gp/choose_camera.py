@@ -48,6 +48,9 @@ SHORT_STEPS, PROBE_STEPS, LONG_STEPS, FINAL_STEPS = 8, 10, 25, 60
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-7
 """The part of its misfit that a step must gain for another to follow, while starts are compared and in the end."""
 
+MAX_MEDIAN = 0.05
+"""Median error, in half the longer side, beyond which a camera explains nothing."""
+
 FAR_BEHIND = 10.0
 """A start whose errors are so many times the best camera's is no start for the kinds."""
 
@@ -121,7 +124,7 @@ def candidates(whole: Scene) -> list[Candidate]:
     """The kinds of camera that explain the views; one where it is ordinary. FitError where there is none."""
     if len(whole.points) < FEWEST:
         raise FitError(f"{len(whole.points)} known points are seen; a camera needs at least {FEWEST}.")
-    ladder = _from_ladder(whole, mirrored=False, subsets=False)
+    ladder = _ladder(whole, mirrored=False, subsets=False)
     if ladder is not None and not ladder.doubtful:
         quick = _quick(whole, ladder)
         if quick is not None:
@@ -213,15 +216,19 @@ def _refined(
 
 
 def _from_ladder(scene: Scene, *, mirrored: bool, subsets: bool = True) -> Start | None:
+    """The ladder's camera; None where it has none."""
+    try:
+        return _ladder(scene, mirrored=mirrored, subsets=subsets)
+    except FitError:
+        return None
+
+
+def _ladder(scene: Scene, *, mirrored: bool, subsets: bool) -> Start | None:
+    """The same; FitError where the points fix no camera, whatever its lens."""
     uv, middle = scene.uv, scene.image.centre
     if mirrored:
         uv = uv * [-1.0, 1.0] + [2 * middle[0], 0.0]
-    try:
-        found = resect_any_lens(scene.points, uv, middle=middle, subsets=subsets)
-    except FitError:
-        if not mirrored:
-            raise
-        return None
+    found = resect_any_lens(scene.points, uv, middle=middle, subsets=subsets)
     k = TANGENT if found.pinhole else np.zeros(4)
     lens = KannalaBrandt(found.focal, found.focal, *middle.tolist(), *k.tolist())
     central = CentralCamera(lens, found.camera_from_world)
@@ -274,7 +281,7 @@ def _thorough(scene: Scene, ladder: Start | None, linear: Start | None) -> list[
     signs = [sign for sign in best if best[sign] and not leading[sign] * CLEARLY_WRONG > leading[not sign]]
     common = min((best[sign][0] for sign in signs), key=lambda one: one[0])[2]
     views = _common_views(scene, common)
-    found_all = [one for sign in signs for one in _kinds(scene, views, best[sign][0], starts, sign)]
+    found_all = [one for sign in signs for one in _kinds(scene, views, best[sign][0], sign)]
     usable = [one for one in found_all if np.isfinite(one.evidence)]
     if not usable:
         raise FitError("no camera sees the known points at these pixels.", fix="look for wrong detections")
@@ -285,12 +292,13 @@ def _kinds(
     scene: Scene,
     views: Views,
     best: tuple[float, GeneralCamera, Bools],
-    starts: list[Start],
     sign: bool,
 ) -> Iterator[Candidate]:
-    """Each kind, from the best free camera and from the ladder."""
+    """Each kind, from the best free camera and from the ladder of what that one explains."""
     _, free, kept = best
-    others = [camera for camera, _, _ in starts if camera.mirrored == sign][:1]  # the ladder's
+    right = Scene(scene.points[kept], scene.uv[kept], scene.relative[kept], scene.image, scene.stated)
+    ladder = _from_ladder(right, mirrored=sign, subsets=False)
+    others = [] if ladder is None else [ladder.camera]
     for family, kind in FAMILIES.items():
         shape = free.shape if kind.p > 0.01 else np.zeros(2)
         tilt = free.tilt if kind.tilt > 0.01 else np.zeros(2)
@@ -298,7 +306,9 @@ def _kinds(
         near = [one for one in others if family == "ordinary" or _score(scene, one) < FAR_BEHIND * best[0]]
         for camera in (free.with_shape(shape, tilt), *near):
             found, explained = _refined(camera, family, scene, kept, FINAL_STEPS, rounds=2)
-            some.append(Candidate(found, family, explained, _evidence(found, family, views)))
+            plausible = np.median(scene.error(found)[explained]) < MAX_MEDIAN * scene.image.half
+            evidence = _evidence(found, family, views) if plausible else -np.inf
+            some.append(Candidate(found, family, explained, evidence))
         yield max(some, key=lambda one: one.evidence)
 
 

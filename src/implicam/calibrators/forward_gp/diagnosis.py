@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import FittedRig, left_out
 from implicam.calibrators.forward_gp.label_fit import left_out_points
 from implicam.calibrators.forward_gp.posterior import Sightings
@@ -101,11 +100,10 @@ class Diagnosis:
         }
 
     def notes(self) -> list[str]:
-        """Cameras that could not be calibrated or are not ordinary, and views that contradict the others."""
+        """Cameras that could not be calibrated, and views that contradict the others."""
         names = self.data.observations.camera_names
         blind = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in self.fitted.blind]
-        kinds = kind_notes(self.fitted, [names[c] for c in self.fitted.cameras])
-        return [*blind, *kinds, *self._rejected_notes(), *self._tail_notes()]
+        return [*blind, *self._rejected_notes(), *self._tail_notes()]
 
     def _tail_notes(self) -> list[str]:
         if self.fitted.tails is None:

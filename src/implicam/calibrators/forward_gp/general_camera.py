@@ -25,6 +25,9 @@ from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats,
 from implicam.cameras import KannalaBrandt
 from implicam.geometry import Pose, rotation_from_vector
 
+MIN_FOCAL_PX = 0.1
+"""A picture smaller than a pixel: every point is in one place, which fits anything equally badly."""
+
 SMALLEST_RHO = 5e-4
 """Of the inverse distance, in the working frame: farther away nothing shows it, and the evidence loses its digits."""
 
@@ -76,7 +79,7 @@ class GeneralCamera:
     @property
     def sane(self) -> bool:
         """Not inside out, and every number finite."""
-        return bool(np.isfinite(self.focal) and 0 < self.focal < 1e12 and np.abs(self.tilt).max() < 1e3)
+        return bool(MIN_FOCAL_PX < self.focal < 1e12 and np.abs(self.tilt).max() < 1e3)
 
     def moved(self, step: Floats) -> GeneralCamera:
         """The camera with its parameters changed by (17,)."""

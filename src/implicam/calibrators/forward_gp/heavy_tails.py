@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc, gammaln, logsumexp, ndtri
-from scipy.stats import qmc
 
 from implicam.calibrators.forward_gp.lens import Floats
 from implicam.calibrators.forward_gp.posterior import Sightings
@@ -336,6 +335,8 @@ def _inverse_root(H: Floats) -> Floats:
 @lru_cache(maxsize=2)
 def _draws(count: int) -> tuple[Floats, Floats]:
     """(count, 3) places of a spherical t with four degrees of freedom, z and -z, and the log of its density."""
+    from scipy.stats import qmc  # late: `import implicam` is to stay quick
+
     u = np.clip(qmc.Sobol(5, scramble=True, rng=np.random.default_rng(0)).random(count // 2), 1e-6, 1 - 1e-6)
     chi2 = -2 * np.log(u[:, 3] * u[:, 4])  # with four degrees
     z = ndtri(u[:, :3]) / np.sqrt(chi2 / 4)[:, None]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.stats import chi2, f, invgamma
+from scipy.special import chdtri, fdtri, gammainccinv
 
 from implicam.calibrators.forward_gp.lens import Floats
 
@@ -91,7 +91,8 @@ class LabelErrors:
         """(3, 3) of the normal distribution whose 95 % ellipsoid holds 95 % of the errors: more than theirs."""
         if np.isinf(self.freedom):
             return self.scale
-        return np.asarray(self.scale * (3 * f.ppf(LEVEL, 3, self.freedom) / chi2.ppf(LEVEL, 3)), dtype=np.float64)
+        ratio = 3 * fdtri(3, self.freedom, LEVEL) / chdtri(3, 1 - LEVEL)
+        return np.asarray(self.scale * ratio, dtype=np.float64)
 
     @property
     def root(self) -> Floats:
@@ -268,7 +269,7 @@ def _nodes(freedom: float) -> tuple[Floats, Floats]:
     if np.isinf(freedom):
         return np.ones(1), np.ones(1)
     at, weight = np.polynomial.legendre.leggauss(NODES)
-    own = invgamma.ppf(0.5 * (at + 1), freedom / 2, scale=freedom / 2)
+    own = freedom / 2 / gammainccinv(freedom / 2, 0.5 * (at + 1))
     return np.asarray(own, dtype=np.float64), np.asarray(weight / 2, dtype=np.float64)
 
 
