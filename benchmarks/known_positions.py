@@ -4,7 +4,7 @@
 
 *before*: the same fit with the known positions taken as exact, but for shots from four on. ellipsoid: share of the
 held-out points in their 95 % ellipsoids; NEES: 3 is right. By known positions, whose own estimated error is part of the
-bars (`evaluate`), or by the simulated truth. Real sets are given to the method that suits them (multiplane: no lens).
+bars (`evaluate`), or by the simulated truth.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from implicam.progress import silent
 from implicam.simulate import build_rig, moving_board, random_positions, simulate
 
 REAL = {
-    "water-tank-target": ("central", (45, 175), True),
-    "two-sided-tank": ("central", (45,), True),
-    "image-splitter": ("central", (45,), True),
-    "rbc300": ("central", (175, 500), False),
-    "multiplane": ("none", (175, 500), False),
+    "water-tank-target": ("auto", (45, 175), True),
+    "two-sided-tank": ("auto", (45,), True),
+    "image-splitter": ("auto", (45,), True),
+    "rbc300": ("auto", (175, 500), False),
+    "multiplane": ("auto", (175, 500), False),
 }
 """Lens, sizes of random splits, and whether there are 10 folds too."""
 

@@ -203,7 +203,7 @@ def test_wrong_detections_anywhere_are_no_tails() -> None:
 # the whole method
 
 
-@pytest.mark.parametrize(("n", "specs", "better"), [(120, ("bar6", "dome8"), 0.94), (40, ("bar6",), 0.95)])
+@pytest.mark.parametrize(("n", "specs", "better"), [(120, ("bar6", "dome8"), 0.94), (40, ("bar6", "dome8"), 0.95)])
 def test_heavy_tails_are_found_and_measured_with(
     n: int, specs: tuple[str, ...], better: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
