@@ -80,8 +80,10 @@ class Diagnosis:
             H[rows] += D.swapaxes(1, 2) @ WD
             g[rows] += np.einsum("nij,ni->nj", WD, residual[kept])
             views[rows] += 1
-        good = (views >= 2) & (np.linalg.cond(H) < 1e12)
-        cov = np.linalg.inv(H[good])
+        H[~np.isfinite(H).all(axis=(1, 2))] = 0.0
+        size = np.linalg.eigvalsh(H)
+        good = (views >= 2) & (size[:, 0] > 1e-12 * size[:, -1])
+        cov = np.asarray(np.linalg.inv(H[good]), dtype=np.float64)
         error = np.einsum("nij,nj->ni", cov, g[good])
         return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
 

@@ -71,6 +71,9 @@ TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
 TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
 
+LEAST_LEFT = 1e-9
+"""One minus the leverage of a view, at least: below, rounding decides."""
+
 MAX_SETTLING_STEPS = 15
 """Gauss-Newton steps of the cameras; ordinary ones take one to four."""
 
@@ -625,7 +628,8 @@ def settle(
             posterior = condition_scattered(models, points, used, errors, scatter)
         steps = posterior.steps
         small = [_small(step, posterior.root(c)) for c, step in enumerate(steps)]
-        if not misfits and not all(small):
+        tied = posterior.displacement is not None
+        if not all(small) and (tied or not misfits):
             where = points if posterior.displacement is None else points + posterior.displacement
             misfits = [_Misfit.of(model, where, seen) for model, seen in zip(models, used, strict=True)]
         models = tuple(
@@ -730,6 +734,11 @@ class _Misfit(NamedTuple):
         field = np.linalg.solve(self.factor, self.phi.T @ y)
         return float(np.sum(y**2) - np.sum(field**2) + off @ self.prior.precision @ off)
 
+    def weights(self, camera: AnyCamera) -> Floats:
+        """(m, 2) of the field that then fits best: those of a whole step do not belong to half of it."""
+        y = (self.uv - camera.pixel(self.points)) / self.sd[:, None]
+        return np.asarray(np.linalg.solve(self.factor.T, np.linalg.solve(self.factor, self.phi.T @ y)))
+
 
 def _downhill(
     before: CameraModel, after: CameraModel, step: Floats, points: Floats, misfit: _Misfit | None
@@ -740,8 +749,10 @@ def _downhill(
         camera = after.camera if halvings == 0 else before.camera.moved(step * 0.5**halvings)
         fits = misfit is None or misfit(camera) <= now + MISFIT_TOLERANCE
         if fits and camera.sane and np.isfinite(camera.pixel(points)).all():
-            return after if halvings == 0 else replace(after, camera=camera)
-    return before
+            if halvings == 0:
+                return after
+            return replace(after, camera=camera, weights=after.weights if misfit is None else misfit.weights(camera))
+    return before if misfit is None else replace(before, weights=misfit.weights(before.camera))
 
 
 def _small(step: Floats, root: Floats) -> bool:
@@ -784,7 +795,9 @@ def _residuals(posterior: Posterior, c: int, points: Floats, seen: Sightings) ->
 
 def _left_out(at: _Residuals, kept: Bools) -> tuple[Floats, Floats]:
     smooth = at.reach / (at.sd**2)[:, None, None]
-    inside = np.linalg.inv(np.where(kept[:, None, None], np.eye(2) - smooth, np.eye(2)))
+    left = np.where(kept[:, None, None] & np.isfinite(smooth), np.eye(2) - smooth, np.eye(2))
+    values, vectors = np.linalg.eigh(left)  # rounding can make a view that decides alone more than decisive
+    inside = vectors / np.maximum(values, LEAST_LEFT)[:, None, :] @ vectors.swapaxes(1, 2)
     residual = np.einsum("nij,nj->ni", inside, at.residual)
     extra = np.where(kept[:, None, None], 0, at.reach)
     return residual, inside * (at.sd**2)[:, None, None] + extra + at.rest[:, None, None] * np.eye(2)

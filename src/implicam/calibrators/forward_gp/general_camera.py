@@ -28,6 +28,9 @@ from implicam.geometry import Pose, rotation_from_vector
 MIN_FOCAL_PX = 0.1
 """A picture smaller than a pixel: every point is in one place, which fits anything equally badly."""
 
+MAX_SHAPE = 3.0
+"""Of p and q: pixels 400 times as long as wide are none."""
+
 SMALLEST_RHO = 5e-4
 """Of the inverse distance, in the working frame: farther away nothing shows it, and the evidence loses its digits."""
 
@@ -79,7 +82,8 @@ class GeneralCamera:
     @property
     def sane(self) -> bool:
         """Not inside out, and every number finite."""
-        return bool(MIN_FOCAL_PX < self.focal < 1e12 and np.abs(self.tilt).max() < 1e3)
+        whole = np.abs(self.shape).max() < MAX_SHAPE and np.abs(self.tilt).max() < 1e3
+        return bool(MIN_FOCAL_PX < self.focal < 1e12 and whole)
 
     def moved(self, step: Floats) -> GeneralCamera:
         """The camera with its parameters changed by (17,)."""
