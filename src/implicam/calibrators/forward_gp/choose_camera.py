@@ -66,6 +66,10 @@ MIN_TOLERATED_NOISES = 10.0
 FEW_VIEWS = 18
 """Views fewer than which a camera of 17 numbers may go through most of them, whatever the others say."""
 
+WANDERING_NOISES = 5.0
+"""Median error of a free camera, in stated or usual noises, from which its field is so large that it would wander.
+Where it is small, a prior about the camera found would make error bars too small."""
+
 AFFINE_RHOS = (0.02, 0.2)
 """Inverse distances that an affine start tries."""
 
@@ -168,7 +172,8 @@ def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate |
 def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> Started:
     """What the fit starts from; some: all candidates of the camera."""
     prior = family_prior(one.camera, one.family, whole.image, _widest(one.camera, whole.points[one.kept]))
-    if one.family == "free":
+    left = float(np.median(whole.error(one.camera)[one.kept]))
+    if one.family == "free" and left > WANDERING_NOISES * whole.noise:
         prior = near_prior(one.camera, prior, whole.image)
     kept = one.kept & np.isfinite(whole.error(one.camera))
     ordinary = [float(np.median(whole.error(other.camera))) for other in some if other.kind == ("ordinary", False)]
