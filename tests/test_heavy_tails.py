@@ -15,6 +15,7 @@ from implicam.calibrators import ForwardGP, load_calibration
 from implicam.calibrators.forward_gp import fit
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
 from implicam.calibrators.forward_gp.heavy_tails import (
+    _solved,
     consistency,
     degrees_of_agreement,
     information_loss,
@@ -318,3 +319,11 @@ def test_a_state_with_half_of_the_tails_is_refused() -> None:
             ForwardGPCalibration.from_state(calibration.data, table, {**arrays, **change})
     plain = {name: value for name, value in arrays.items() if "tail" not in name}
     assert ForwardGPCalibration.from_state(calibration.data, table, plain).fitted.tails is None
+
+
+def test_a_point_that_its_views_do_not_fix_costs_no_rig() -> None:
+    """A stack with one singular matrix, as a tank gave it, is solved where it can be."""
+    H = np.stack([np.eye(3), np.diag([1.0, 1.0, 0.0])])
+    found = _solved(H, np.ones((2, 3)))
+    np.testing.assert_allclose(found[0], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(found[1, :2], 1.0, rtol=1e-9)

@@ -322,7 +322,7 @@ def _mode(A: Floats, b: Floats, degrees: float, step: Floats) -> Floats:
         left = b - np.einsum("ncij,nj->nci", A, step)
         w = weights_of(np.sum(left**2, axis=2), degrees)
         H = np.einsum("nc,ncij,ncik->njk", w, A, A)
-        step = step + np.linalg.solve(H, np.einsum("nc,ncij,nci->nj", w, A, left)[..., None])[..., 0]
+        step = step + _solved(H, np.einsum("nc,ncij,nci->nj", w, A, left))
     return step
 
 
@@ -330,6 +330,15 @@ def _inverse_root(H: Floats) -> Floats:
     """R with R R^T = H^-1, in stacks."""
     L = np.linalg.cholesky(H)
     return np.asarray(np.linalg.inv(L).swapaxes(1, 2), dtype=np.float64)
+
+
+def _solved(H: Floats, g: Floats) -> Floats:
+    """H^-1 g of stacks (n, 3, 3) and (n, 3); where one is singular, with as much more on the diagonal as rounding."""
+    try:
+        return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)
+    except np.linalg.LinAlgError:
+        more = 1e-12 * np.trace(H, axis1=1, axis2=2) + np.finfo(float).tiny
+        return np.asarray(np.linalg.solve(H + more[:, None, None] * np.eye(3), g[..., None])[..., 0], dtype=np.float64)
 
 
 @lru_cache(maxsize=2)
