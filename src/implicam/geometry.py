@@ -190,19 +190,28 @@ def camera_from_linear(p: Floats) -> tuple[float, Floats, Floats, bool, Pose] | 
     axis = p[2, :3]
     centre = p[:2, :3] @ axis
     across = p[:2, :3] - np.outer(centre, axis)
-    values, vectors = np.linalg.eigh(across @ across.T)
-    if not values[0] > 1e-12 * values[1] > 0:
+    parts = pixel_shape_of(across)
+    if parts is None:
         return None
-    root = vectors * np.sqrt(values) @ vectors.T
+    focal, shape, root = parts
     rows = np.linalg.solve(root, across)
     mirrored = bool(np.cross(rows[0], rows[1]) @ axis < 0)
     sign = np.array([-1.0 if mirrored else 1.0, 1.0])
     rotation = np.vstack([rows * sign[:, None], axis])
     sideways = sign * np.linalg.solve(root, p[:2, 3] - centre * p[2, 3])
-    focal = float(np.sqrt(np.linalg.det(root)))
-    log = vectors * (0.5 * np.log(values) - np.log(focal)) @ vectors.T
-    shape = np.array([0.5 * (log[0, 0] - log[1, 1]), log[0, 1]])
     return focal, shape, centre, mirrored, Pose(rotation, np.append(sideways, p[2, 3]))
+
+
+def pixel_shape_of(across: Floats) -> tuple[float, Floats, Floats] | None:
+    """The symmetric factor (2, 2) of the polar decomposition of a map (2, 3) to pixels, and its parts: the size f and
+    (p, q) of `f exp([[p, q], [q, -p]])`. None where it has no area."""
+    values, vectors = np.linalg.eigh(across @ across.T)
+    if not values[0] > 1e-12 * values[1] > 0:
+        return None
+    size = float(np.prod(values) ** 0.25)
+    log = vectors * (0.5 * np.log(values) - np.log(size)) @ vectors.T
+    shape = np.array([0.5 * (log[0, 0] - log[1, 1]), log[0, 1]])
+    return size, shape, np.asarray(vectors * np.sqrt(values) @ vectors.T, dtype=np.float64)
 
 
 def resect_affine(xyz: Floats, uv: Floats) -> tuple[Floats, Floats, Bools]:

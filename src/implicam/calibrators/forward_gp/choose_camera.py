@@ -28,7 +28,7 @@ from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats,
 from implicam.calibrators.forward_gp.start import FAR, FEWEST, Bools, Started, levenberg_marquardt
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
-from implicam.geometry import Pose, camera_from_linear, resect_affine, resect_any_lens, resect_robustly
+from implicam.geometry import Pose, camera_from_linear, pixel_shape_of, resect_affine, resect_any_lens, resect_robustly
 
 QUICK_MEDIAN = 2e-3
 """Median error of an ordinary camera, in half the longer side; more needs a look at everything else."""
@@ -178,7 +178,7 @@ def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> Start
     kept = one.kept & np.isfinite(whole.error(one.camera))
     ordinary = [float(np.median(whole.error(other.camera))) for other in some if other.kind == ("ordinary", False)]
     left = ordinary[0] if ordinary and one.kind != ("ordinary", False) else float("nan")
-    return Started(one.camera, prior, kept, one.family, one.camera.mirrored, left)
+    return Started(one.camera, prior, kept, one.family, left)
 
 
 def _weight(one: Candidate, others: list[tuple[str, bool]]) -> float:
@@ -378,12 +378,10 @@ def _from_affine(scene: Scene) -> Iterator[Start]:
         A, b, kept = resect_affine(scene.points, scene.uv)
     except FitError:
         return
-    values, vectors = np.linalg.eigh(A @ A.T)
-    if not values[0] > 1e-12 * values[1] > 0:
+    parts = pixel_shape_of(A)
+    if parts is None:
         return
-    root = vectors * np.sqrt(values) @ vectors.T  # scale * B
-    scale = float(np.sqrt(np.linalg.det(root)))
-    shape = _log_of_shape(root / scale)
+    scale, shape, root = parts
     across_rows = np.linalg.solve(root, A)
     for mirrored in (False, True):
         sign = np.array([-1.0 if mirrored else 1.0, 1.0])
@@ -399,10 +397,3 @@ def _from_affine(scene: Scene) -> Iterator[Start]:
             centre = scene.image.centre
             camera = GeneralCamera(scale / rho, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose)
             yield Start(camera, kept)
-
-
-def _log_of_shape(B: Floats) -> Floats:
-    """(p, q) with exp([[p, q], [q, -p]]) = B, symmetric with determinant 1."""
-    values, vectors = np.linalg.eigh(B)
-    log = vectors * np.log(values) @ vectors.T
-    return np.array([0.5 * (log[0, 0] - log[1, 1]), log[0, 1]])

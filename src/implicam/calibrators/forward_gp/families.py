@@ -131,7 +131,8 @@ def log_evidence(camera: GeneralCamera, prior: Prior, views: Views) -> float:
             value, by_signal, by_noise = one.objective(spectrum, *np.exp(median + z))
             return value + 0.5 * float(np.sum((z / sd) ** 2)), np.array([by_signal, by_noise]) + z / sd**2
 
-        start = np.array([0.0, np.clip(np.log(_rms(spectrum)) - median[1], -4, 8)])
+        rms = np.sqrt(np.mean((one.residual / views.relative[:, None]) ** 2))
+        start = np.array([0.0, np.clip(np.log(rms) - median[1], -4, 8)])
         found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(-4, 8), (-6, 10)], options={"ftol": 1e-6})
         proper = np.linalg.slogdet(_scaled(prior.precision[_PROPER, _PROPER]))
     except np.linalg.LinAlgError:
@@ -144,7 +145,3 @@ def log_evidence(camera: GeneralCamera, prior: Prior, views: Views) -> float:
 def _scaled(A: Floats) -> Floats:
     scale = 1 / np.sqrt(np.diag(A))
     return A * scale[:, None] * scale
-
-
-def _rms(spectrum: object) -> float:
-    return float(np.sqrt((np.sum(spectrum.y**2) + spectrum.yy) / max(2 * len(spectrum.y) + spectrum.outside, 1)))  # type: ignore[attr-defined]

@@ -22,7 +22,7 @@ from implicam.calibrators.forward_gp.lens import (
 )
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
-from implicam.geometry import resect, resect_any_lens
+from implicam.geometry import FAR_OUT, resect, resect_any_lens
 
 Bools = NDArray[np.bool_]
 
@@ -33,11 +33,6 @@ FAR = 8.0
 """Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
 
 
-FAR_OUT = 4.0
-"""Times the distance from the median pixel that three quarters of the views keep: what is farther has no say in where
-the image is and how large."""
-
-
 def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
     """The lowest and highest (2,) of pixels (n, 2), wild ones aside."""
     away = np.linalg.norm(uv - np.median(uv, axis=0), axis=1)
@@ -46,14 +41,13 @@ def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
 
 
 class Started(NamedTuple):
-    """A camera that fits, its prior, and the views (n,) it was started from; family and mirrored: what kind it is;
+    """A camera that fits, its prior, and the views (n,) it was started from; family: what kind it is;
     ordinary_px: the median error that an ordinary camera would leave, NaN where none was tried beside it."""
 
     camera: AnyCamera
     prior: Prior
     kept: Bools
     family: str = "ordinary"
-    mirrored: bool = False
     ordinary_px: float = float("nan")
 
 
