@@ -20,7 +20,7 @@ from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.diagnosis import Diagnosis
 from implicam.calibrators.forward_gp.fit import AUTO, FittedRig, fit_rig
-from implicam.calibrators.forward_gp.label_fit import with_label_errors
+from implicam.calibrators.forward_gp.label_fit import with_noise_told_apart
 from implicam.calibrators.forward_gp.levels import untold
 from implicam.calibrators.forward_gp.locate import Labels
 from implicam.calibrators.forward_gp.posterior import Posterior
@@ -73,7 +73,7 @@ class ForwardGP:
         frame = Frame.of(used, self.method)
         with solvable(), blas_threads(1):  # many small matrices, one after the other: two threads would wait
             problem = problem_of(self.lens, used, frame)
-            fitted = with_label_errors(problem, fit_rig(problem, progress), used.shots)
+            fitted = with_noise_told_apart(problem, fit_rig(problem, progress), used.shots)
         return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
 
 
@@ -174,7 +174,7 @@ class ForwardGPCalibration:
         with solvable(), blas_threads(1):
             used = without_copies(data)
             problem = problem_of(self.calibrator.lens, used, self.frame)
-            fitted = with_label_errors(problem, fit_rig(problem, progress, self.fitted), used.shots)
+            fitted = with_noise_told_apart(problem, fit_rig(problem, progress, self.fitted), used.shots)
         return ForwardGPCalibration(self.calibrator, data, self.frame, _copies_named(data, fitted))
 
     def notes(self) -> list[str]:

@@ -323,7 +323,6 @@ def _fit_started(
         progress("fitting", 2, 3)
         if number < rounds - 1:  # the last round's views stay those of its posterior
             state = state._replace(kept=judged)
-    state = _with_heavy_tails(problem, state, seen, images, stated)
     progress("fitting", 3, 3)
     assert state.hyper is not None
     _check_fitted(problem, state, seen)
@@ -336,22 +335,49 @@ def _fit_started(
         state.hyper,
         state.errors,
         state.label_sd,
-        state.tails,
         ordinary_px=ordinary_px,
     )
 
 
-def _with_heavy_tails(
-    problem: Problem, state: _Round, seen: tuple[Sightings, ...], images: tuple[Image, ...], stated: Floats
-) -> _Round:
-    """A few rounds more with views weighted by a t, where the noise of the fit so far clearly is one; else as it is."""
-    for _ in range(REWEIGHTED):
-        found = _tails(problem, state, seen, images)
-        if found is None:
-            return state
-        tails, kept = found
-        state = _round(problem, state._replace(tails=tails, kept=kept), seen, images, stated)
-    return state
+def with_heavy_tails(problem: Problem, fitted: FittedRig) -> FittedRig:
+    """After a few rounds more with views weighted by a t, where the noise of the fit clearly is one; else the same."""
+    cameras = fitted.cameras
+    seen, images = tuple(problem.sightings[c] for c in cameras), tuple(problem.images[c] for c in cameras)
+    stated, hyper, errors = problem.stated[list(cameras)], fitted.hyperparameters, fitted.errors
+    fixed = hyper if errors is not None and not errors.estimated else None
+    state = _Round(
+        hyper,
+        fitted.posterior.models,
+        fitted.posterior,
+        fitted.kept,
+        errors,
+        fitted.label_sd,
+        settled=True,
+        errors=errors,
+        fixed=fixed,
+    )
+    try:
+        for _ in range(REWEIGHTED):
+            found = _tails(problem, state, seen, images)
+            if found is None:
+                break
+            tails, kept = found
+            state = _round(problem, state._replace(tails=tails, kept=kept), seen, images, stated)
+        if state.tails is None:
+            return fitted
+        _check_fitted(problem, state, seen)
+    except np.linalg.LinAlgError:
+        return fitted
+    assert state.hyper is not None
+    return replace(
+        fitted,
+        posterior=state.posterior,
+        kept=state.kept,
+        hyperparameters=state.hyper,
+        errors=state.errors,
+        label_sd=state.label_sd,
+        tails=state.tails,
+    )
 
 
 def _tails(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.fit import OUTLIER, Bools, FittedRig, Problem, left_out, settle
+from implicam.calibrators.forward_gp.fit import OUTLIER, Bools, FittedRig, Problem, left_out, settle, with_heavy_tails
 from implicam.calibrators.forward_gp.label_errors import Agreement, LabelErrors, estimated
 from implicam.calibrators.forward_gp.lens import Floats
 from implicam.calibrators.forward_gp.levels import untold
@@ -28,15 +28,24 @@ LEVERAGE = 3.0
 and not how it is off itself."""
 
 
-def with_label_errors(problem: Problem, fitted: FittedRig, shots: Names) -> FittedRig:
-    """The rig where known positions are off, if they are; else the same. shots: (n,) of the points. What is declared is
-    not estimated."""
+def with_noise_told_apart(problem: Problem, fitted: FittedRig, shots: Names) -> FittedRig:
+    """The rig where what the fit took for normal pixel noise is something else: errors of known positions if all
+    cameras agree on them, else heavy tails; else the same. shots: (n,) of the points.
+
+    Errors of positions come first. A dot that is off makes outliers in all cameras at once, which look like heavy tails
+    to each of them; tails of the pixels, which cameras do not share, never look like dots that are off. What is
+    declared is not estimated.
+    """
     if problem.errors is not None and not problem.errors.estimated:
-        return fitted
+        return with_heavy_tails(problem, fitted)
     planes = untold(problem.points, shots) if problem.errors is None else None
     if planes is not None:
         fitted = replace(fitted, untold_sd=planes.sd)
-    return _with_scatter(problem, fitted)
+    scattered = _with_scatter(problem, fitted)
+    if scattered.label_errors is not None:
+        return scattered
+    heavy = with_heavy_tails(problem, fitted)
+    return fitted if heavy.tails is None else _with_scatter(problem, heavy)
 
 
 def _with_scatter(problem: Problem, fitted: FittedRig) -> FittedRig:
