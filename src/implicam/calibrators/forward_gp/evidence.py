@@ -246,13 +246,18 @@ class RigEvidence:
         objective, sds = self._sizes_objective(spectra, own=True)
         C = len(self.cameras)
         z = self._minimum(objective, np.concatenate([shared, np.zeros(2 * C)])).x
-        h = 1e-3
-        hessian = np.stack([(objective(z + d)[1] - objective(z - d)[1]) / (2 * h) for d in h * np.eye(len(z))])
-        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-        spread = vectors / np.maximum(values, 1 / sds.max() ** 2) @ vectors.T
         to_logs = np.zeros((2 * C, len(z)))  # log signal and log noise of each camera
         to_logs[:C, 0] = to_logs[C:, 1] = 1
         to_logs[:, 2:] = np.eye(2 * C)
+        h = 1e-3
+        blocks = []  # each camera knows of its own sizes only, so all of them may move at once
+        for moved in h * to_logs[:, :2].T:
+            d = np.append([0.0, 0.0], moved)
+            slope = (objective(z + d)[1] - objective(z - d)[1] - 2 * d / sds**2)[2:] / (2 * h)
+            blocks.append(np.concatenate([np.diag(slope[:C]), np.diag(slope[C:])]))
+        hessian = to_logs.T @ np.hstack(blocks) @ to_logs + np.diag(1 / sds**2)
+        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+        spread = vectors / np.maximum(values, 1 / sds.max() ** 2) @ vectors.T
         larger = np.exp(np.einsum("ij,jk,ik->i", to_logs, spread, to_logs))
         signal, noise = self._sizes(z)
         return signal * larger[:C], noise * larger[C:]
@@ -315,9 +320,11 @@ class RigEvidence:
     @staticmethod
     def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats) -> Any:
         bounds = [(-6.0, 6.0)] * len(start)
-        before = objective(start)[0]  # its zero depends on the unit: what counts is what is gained
+        before, slope = objective(start)  # its zero depends on the unit: what counts is what is gained
 
         def gained(z: Floats) -> tuple[float, Floats]:
+            if np.array_equal(z, start):
+                return 0.0, slope
             value, gradient = objective(z)
             return value - before, gradient
 

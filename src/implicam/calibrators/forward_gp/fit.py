@@ -623,6 +623,8 @@ def settle(
     scatter: Scatter | None = None,
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
+    if errors is None and scatter is None and len(models) > 1:
+        return _settled_alone(models, points, used)
     misfits: list[_Misfit] = []
     for _ in range(MAX_SETTLING_STEPS):
         if scatter is None:
@@ -642,6 +644,25 @@ def settle(
         if all(small):
             break
     return replace(posterior, models=models)
+
+
+def _settled_alone(models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...]) -> Posterior:
+    """The same where known positions are exact: no camera takes part in the steps that another still needs."""
+
+    def one(c: int) -> Posterior:
+        try:
+            return settle((models[c],), points, (used[c],), None)
+        except CameraFailedError as error:
+            raise CameraFailedError(c, str(error)) from error
+
+    found = side_by_side(one, range(len(models)))
+    return Posterior(
+        tuple(each.models[0] for each in found),
+        tuple(each.alone[0] for each in found),
+        None,
+        tuple(each.steps[0] for each in found),
+        sum(each.evidence for each in found),
+    )
 
 
 def _sized(
