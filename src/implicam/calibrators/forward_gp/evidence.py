@@ -44,6 +44,12 @@ FTOL = 1e-4
 """Change of the log posterior at which the search for the sizes ends, as a part of what it has gained: hundredths of a
 nat."""
 
+KNOWN_TO = 0.1
+"""What log sizes are known to from a dozen points or more: the first step of the search for them."""
+
+GTOL = 0.02
+"""Slope by such a step at which the search ends while lengthscales are compared: thousandths of a nat."""
+
 DETERMINED = 1e-12
 """Eigenvalues below this part of the largest add nothing."""
 
@@ -207,11 +213,13 @@ class RigEvidence:
         """The most probable hyperparameters; `start` is a good guess, from a moment ago."""
         shared = np.zeros(2)  # log deviations of signal and noise from their prior medians
         known: dict[tuple[float, ...], tuple[float, Floats]] = {}
+        spectra: dict[tuple[float, ...], list[Spectrum]] = {}
 
         def at(log_lengthscale: Floats) -> float:
             nonlocal shared
             inside = np.clip(log_lengthscale, SHORTEST, LONGEST)
-            found = self._minimum(self._sizes_objective(self._spectra(inside), own=False)[0], shared)
+            spectra[tuple(inside)] = self._spectra(inside)
+            found = self._minimum(self._sizes_objective(spectra[tuple(inside)], own=False)[0], shared, GTOL)
             shared = found.x
             penalty = 0.5 * np.sum(((inside - LENGTHSCALE) / LENGTHSCALE_SD) ** 2)
             known[tuple(inside)] = float(found.fun + penalty), shared
@@ -234,7 +242,7 @@ class RigEvidence:
         )
         lengthscale = np.array(min(known, key=lambda key: known[key][0]))
         shared = known[tuple(lengthscale)][1]
-        signal, noise = self._averaged(self._spectra(lengthscale), shared)
+        signal, noise = self._averaged(spectra[tuple(lengthscale)], shared)
         return Hyperparameters(np.tile(np.exp(lengthscale), (len(self.cameras), 1)), signal, noise)
 
     def _averaged(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
@@ -318,16 +326,19 @@ class RigEvidence:
         return objective, sds
 
     @staticmethod
-    def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats) -> Any:
-        bounds = [(-6.0, 6.0)] * len(start)
+    def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats, gtol: float = 1e-5) -> Any:
+        """The sizes z of the least objective near `start`; looked for in steps that sizes are known to."""
+        bounds = [(-6.0 / KNOWN_TO, 6.0 / KNOWN_TO)] * len(start)
         before, slope = objective(start)  # its zero depends on the unit: what counts is what is gained
 
-        def gained(z: Floats) -> tuple[float, Floats]:
-            if np.array_equal(z, start):
-                return 0.0, slope
-            value, gradient = objective(z)
-            return value - before, gradient
+        def gained(u: Floats) -> tuple[float, Floats]:
+            if np.array_equal(u, start / KNOWN_TO):
+                return 0.0, slope * KNOWN_TO
+            value, gradient = objective(u * KNOWN_TO)
+            return value - before, gradient * KNOWN_TO
 
-        found = minimize(gained, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": FTOL})
+        options = {"ftol": FTOL, "gtol": gtol}
+        found = minimize(gained, start / KNOWN_TO, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         found.fun += before
+        found.x = found.x * KNOWN_TO
         return found
