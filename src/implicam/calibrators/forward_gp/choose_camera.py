@@ -39,6 +39,10 @@ QUICK_GAIN = 0.6
 QUICK_NATS = 3.0
 """So does one whose evidence, odds aside, is better by this less."""
 
+QUICK_NOISES, QUICK_LEFT = 2.0, 0.4
+"""Where a camera's evidence is better than a freer one's by as much from where it stands, its median error is below so
+many noises, and one step towards the freer camera leaves so much of the squares, no look from farther on is needed."""
+
 MAX_START_VIEWS = 80
 """Views that starts are refined with."""
 
@@ -257,15 +261,17 @@ def _quick(scene: Scene, ladder: Start) -> Candidate | None:
         return None
     views = _common_views(scene, kept)
     tight, free_from_here = _evidences(camera, ("ordinary", "free"), views)
-    clear = tight > free_from_here + QUICK_NATS  # then one step towards the freer camera tells enough
-    free, free_kept = _refined(camera, "free", scene, kept, 1 if clear else PROBE_STEPS, gain=ROUGH_GAIN)
+    if tight > free_from_here + QUICK_NATS and median < QUICK_NOISES * scene.noise:
+        free, free_kept = _refined(camera, "free", scene, kept, 1, gain=ROUGH_GAIN)
+        left = np.sum(scene.error(free)[kept] ** 2) / np.sum(error[kept] ** 2)
+        if left > QUICK_LEFT and free_kept.sum() <= kept.sum():
+            return Candidate(camera, "ordinary", kept, tight)
+    free, free_kept = _refined(camera, "free", scene, kept, PROBE_STEPS, gain=ROUGH_GAIN)
     free_error = scene.error(free)
     # what seventeen free numbers gain over eleven by chance is no reason; of few views the evidence must do
     by_chance = np.sqrt(max(2 * kept.sum() - 17, 0) / (2 * kept.sum() - 11))
     better = kept.sum() >= FEW_VIEWS and np.median(free_error[kept]) < QUICK_GAIN * by_chance * median
-    if better or free_kept.sum() > kept.sum():
-        return None
-    if not clear and tight < _evidences(free, ("free",), views)[0] - QUICK_NATS:
+    if better or free_kept.sum() > kept.sum() or tight < _evidences(free, ("free",), views)[0] - QUICK_NATS:
         return None
     return Candidate(camera, "ordinary", kept, tight)
 
