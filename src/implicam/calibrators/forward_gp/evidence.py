@@ -209,8 +209,9 @@ class RigEvidence:
     lens: str
     tolerance: float
 
-    def maximise(self, start: Hyperparameters | None = None) -> Hyperparameters:
-        """The most probable hyperparameters; `start` is a good guess, from a moment ago."""
+    def maximise(self, start: Hyperparameters | None = None, *, search: bool = True) -> Hyperparameters:
+        """The most probable hyperparameters; `start` is a good guess, from a moment ago, of which the lengthscales
+        stay where there is nothing to `search`."""
         shared = np.zeros(2)  # log deviations of signal and noise from their prior medians
         known: dict[tuple[float, ...], tuple[float, Floats]] = {}
         spectra: dict[tuple[float, ...], list[Spectrum]] = {}
@@ -225,6 +226,9 @@ class RigEvidence:
             known[tuple(inside)] = float(found.fun + penalty), shared
             return known[tuple(inside)][0] + float(np.sum((log_lengthscale - inside) ** 2))
 
+        if start is not None and not search:
+            at(np.log(start.lengthscale[0]))
+            return self._found(known, spectra)
         if start is None:  # a second, shorter range can be as likely: look everywhere first
             for across in GRID[0]:
                 for along in GRID[1]:
@@ -240,9 +244,14 @@ class RigEvidence:
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": 12},
         )
-        lengthscale = np.array(min(known, key=lambda key: known[key][0]))
-        shared = known[tuple(lengthscale)][1]
-        signal, noise = self._averaged(spectra[tuple(lengthscale)], shared)
+        return self._found(known, spectra)
+
+    def _found(
+        self, known: dict[tuple[float, ...], tuple[float, Floats]], spectra: dict[tuple[float, ...], list[Spectrum]]
+    ) -> Hyperparameters:
+        """The best of the lengthscales looked at."""
+        lengthscale = min(known, key=lambda key: known[key][0])
+        signal, noise = self._averaged(spectra[lengthscale], known[lengthscale][1])
         return Hyperparameters(np.tile(np.exp(lengthscale), (len(self.cameras), 1)), signal, noise)
 
     def _averaged(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
