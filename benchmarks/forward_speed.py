@@ -1,6 +1,7 @@
 """Speed and memory of forward-gp: the second table of docs/speed.md.
 
     python benchmarks/forward_speed.py [-o benchmarks/results/forward_speed.md]
+    python benchmarks/forward_speed.py --stages       only where the processor time of a fit goes
 
 Simulated bar6 rig, six cameras. GPyTorch: the paper's three GPs on the same 157 points (Adam 0.1, 100 steps), as in
 gp_fit.py. Medians of 5 fits. Memory is the peak of the whole process, after the line's work, in a process of its own.
@@ -13,18 +14,38 @@ import resource
 import statistics
 import time
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from multiprocessing import get_context
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
 from implicam.calibrators import ForwardGP
+from implicam.calibrators.forward_gp import calibration, fit
 from implicam.files import write_text
 from implicam.simulate import build_rig, moving_board, random_positions, simulate
+from implicam.verdict import judge
+from odd_rigs import draw
+
+STAGES = {
+    "kinds": (fit, "_started"),
+    "sizes": (fit, "_hyperparameters"),
+    "posterior": (fit, "_conditioned"),
+    "wrong views": (fit, "judged_all"),
+    "tails": (fit, "_with_heavy_tails"),
+    "projections": (fit, "_with_projections"),
+    "known positions": (calibration, "with_label_errors"),
+}
+"""The parts of a fit, each with all that it calls."""
+
+ORDINARY = (("stereo", 17), ("bar6", 17), ("bar6", 157), ("dome8", 157))
+ODD = (("window", 9), ("tilt", 5), ("tank", 10))
+"""Rigs of odd_rigs.py with six or seven cameras and 234 to 915 points."""
 
 
-def known(n):
-    rig = build_rig("bar6", seed=3)
+def known(n, spec="bar6"):
+    rig = build_rig(spec, seed=3)
     return simulate(rig, random_positions(rig, n, np.random.default_rng(1)), seed=4)
 
 
@@ -41,6 +62,52 @@ def fit_seconds(data, runs=5):
 
     once()
     return statistics.median(once() for _ in range(runs))
+
+
+def by_stage(data, runs=3):
+    """Seconds of the processor: of each stage, of the whole fit, and of the verdict. The fastest of some runs, which
+    others on the same machine disturb least."""
+    ForwardGP().fit(data)
+    return min((_by_stage(data) for _ in range(runs)), key=lambda found: found["fit"])
+
+
+def _by_stage(data):
+    spent, inside = dict.fromkeys(STAGES, 0.0), []
+
+    def timed(name, work):
+        def one(*args, **kwargs):
+            if inside:  # part of another stage
+                return work(*args, **kwargs)
+            inside.append(name)
+            start = time.process_time()
+            try:
+                return work(*args, **kwargs)
+            finally:
+                spent[name] += time.process_time() - start
+                inside.pop()
+
+        return one
+
+    with ExitStack() as all_patched:
+        for name, (module, function) in STAGES.items():
+            all_patched.enter_context(patch.object(module, function, timed(name, getattr(module, function))))
+        start = time.process_time()
+        fitted = ForwardGP().fit(data)
+        spent["fit"] = time.process_time() - start
+    start = time.process_time()
+    judge(fitted)
+    return {**spent, "verdict": time.process_time() - start}
+
+
+def stages():
+    yield f"| seconds of the processor | {' | '.join(STAGES)} | fit | verdict |"
+    yield "|---" * (len(STAGES) + 3) + "|"
+    rigs = [(f"{spec}, {n} points", known(n, spec)) for spec, n in ORDINARY]
+    for kind, seed in ODD:
+        data = draw(kind, seed).known
+        rigs.append((f"{kind} {seed}: {len(data.observations.cameras)} cameras, {len(data)} points", data))
+    for name, data in rigs:
+        yield f"| {name} | {' | '.join(f'{seconds:.3f}' for seconds in by_stage(data).values())} |"
 
 
 def gpytorch_seconds():
@@ -91,14 +158,17 @@ def report():
     yield f"| fit, 100,000 points, six cameras | {fitted:.0f} |"
     memory = f"peak memory {after:.2f} GB, {before:.2f} of it the data"
     yield f"| measure the same 100,000 points | {measured:.0f} ({memory}) |"
+    yield ""
+    yield from stages()
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--stages", action="store_true", help="only the table of the stages")
     options = parser.parse_args()
     lines = []
-    for line in report():
+    for line in stages() if options.stages else report():
         print(line, flush=True)
         lines.append(line)
     if options.output:

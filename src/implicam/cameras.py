@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,42 +161,46 @@ class KannalaBrandt:
 
     def pixel_from_camera_point(self, points: Floats) -> tuple[Floats, Bools]:
         """As `BrownConrady.pixel_from_camera_point`; a lens that bends so far sees points behind the camera."""
-        xyz, valid = self._valid(points)
-        r = np.hypot(xyz[:, 0], xyz[:, 1])
-        bent = _odd(np.arctan2(r, xyz[:, 2]), self._radial)
-        across = _ratio(bent, r, 1 / np.where(r > 0, 1.0, xyz[:, 2]))
-        return _pixel_from_plane(self, xyz[:, :2] * across[:, None]), valid
+        at = self._polar(points)
+        return _pixel_from_plane(self, at.xyz[:, :2] * at.across[:, None]), at.valid
 
     def jacobian(self, points: Floats) -> Floats:
         """(n, 2, 3) derivative of the pixels with respect to the points; NaN where there is no pixel."""
-        xyz, _ = self._valid(points)
-        x, y, z = xyz.T
-        r = np.hypot(x, y)
-        theta = np.arctan2(r, z)
-        cos, sin = _ratio(x, r, 1.0), _ratio(y, r, 0.0)
-        across = _ratio(_odd(theta, self._radial), r, 1 / np.where(r > 0, 1.0, z))  # around the axis
-        slope = _odd_slope(theta, self._radial) / (r * r + z * z)
+        return self._by_point(self._polar(points))
+
+    def parameter_jacobian(self, points: Floats) -> Floats:
+        """(n, 2, 8) derivative of the pixels with respect to fx, fy, cx, cy, k1 ... k4; NaN where there is no pixel."""
+        return self._by_parameters(self._polar(points))
+
+    def pixel_and_slopes(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Pixels, `jacobian` and `parameter_jacobian` at once, in half the time."""
+        at = self._polar(points)
+        pixel = _pixel_from_plane(self, at.xyz[:, :2] * at.across[:, None])
+        return pixel, self._by_point(at), self._by_parameters(at)
+
+    def _by_point(self, at: _Polar) -> Floats:
+        x, y, z = at.xyz.T
+        cos, sin = at.outward.T
+        slope = _odd_slope(at.theta, self._radial) / (at.r * at.r + z * z)
         along = slope * z  # away from the axis
-        out = np.empty((len(xyz), 2, 3))
-        out[:, 0, 0] = along * cos * cos + across * sin * sin
-        out[:, 1, 1] = along * sin * sin + across * cos * cos
-        out[:, 0, 1] = out[:, 1, 0] = (along - across) * cos * sin
+        out = np.empty((len(x), 2, 3))
+        out[:, 0, 0] = along * cos * cos + at.across * sin * sin
+        out[:, 1, 1] = along * sin * sin + at.across * cos * cos
+        out[:, 0, 1] = out[:, 1, 0] = (along - at.across) * cos * sin
         out[:, 0, 2], out[:, 1, 2] = -slope * x, -slope * y
         jacobian: Floats = np.array([self.fx, self.fy])[:, None] * out
         return jacobian
 
-    def parameter_jacobian(self, points: Floats) -> Floats:
-        """(n, 2, 8) derivative of the pixels with respect to fx, fy, cx, cy, k1 ... k4; NaN where there is no pixel."""
-        xyz, _ = self._valid(points)
-        r = np.hypot(xyz[:, 0], xyz[:, 1])
-        theta = np.arctan2(r, xyz[:, 2])
-        outward = np.column_stack([_ratio(xyz[:, 0], r, 1.0), _ratio(xyz[:, 1], r, 0.0)])  # on the axis any will do
-        out = np.zeros((len(xyz), 2, 8))
-        diagonal = outward * _odd(theta, self._radial)[:, None]
+    def _by_parameters(self, at: _Polar) -> Floats:
+        out = np.zeros((len(at.xyz), 2, 8))
+        diagonal = at.outward * at.bent[:, None]
         out[:, 0, 0], out[:, 1, 1] = diagonal.T
-        out[:, 0, 2] = out[:, 1, 3] = np.where(np.isnan(theta), np.nan, 1.0)
-        powers = theta[:, None] ** np.arange(3, 11, 2)
-        out[:, :, 4:] = (outward * [self.fx, self.fy])[:, :, None] * powers[:, None, :]
+        out[:, 0, 2] = out[:, 1, 3] = np.where(np.isnan(at.theta), np.nan, 1.0)
+        power = at.outward * [self.fx, self.fy] * at.theta[:, None]
+        squared = (at.theta * at.theta)[:, None]
+        for k in range(4, 8):
+            power = power * squared
+            out[:, :, k] = power
         return out
 
     def ray_from_pixel(self, uv: Floats) -> tuple[Floats, Bools]:
@@ -214,10 +219,33 @@ class KannalaBrandt:
     def _critical_angle(self) -> float:
         return min(_first_turn(self._radial), float(np.pi))
 
-    def _valid(self, points: Floats) -> tuple[Floats, Bools]:
-        theta = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
+    def _polar(self, points: Floats) -> _Polar:
+        r = np.hypot(points[:, 0], points[:, 1])
+        theta = np.arctan2(r, points[:, 2])
         valid = (theta < self._critical_angle) & points.any(axis=1)
-        return np.where(valid[:, None], points, np.nan), valid
+        xyz = points
+        if not valid.all():
+            xyz = np.where(valid[:, None], points, np.nan)
+            r, theta = np.where(valid, r, np.nan), np.where(valid, theta, np.nan)
+        bent = _odd(theta, self._radial)
+        if (r > 0).all():
+            return _Polar(xyz, valid, r, theta, bent, bent / r, xyz[:, :2] / r[:, None])
+        across = _ratio(bent, r, 1 / np.where(r > 0, 1.0, xyz[:, 2]))
+        outward = np.column_stack([_ratio(xyz[:, 0], r, 1.0), _ratio(xyz[:, 1], r, 0.0)])  # on the axis any will do
+        return _Polar(xyz, valid, r, theta, bent, across, outward)
+
+
+class _Polar(NamedTuple):
+    """Of points xyz (n, 3), NaN where not valid (n,): how far off the axis r, at which angle theta, the image's radius
+    bent, bent / r, and the direction away from the axis (n, 2)."""
+
+    xyz: Floats
+    valid: Bools
+    r: Floats
+    theta: Floats
+    bent: Floats
+    across: Floats
+    outward: Floats
 
 
 Lens = BrownConrady | KannalaBrandt
@@ -242,11 +270,19 @@ def _checked_rays(lens: Lens, rays: Floats, uv: Floats) -> tuple[Floats, Bools]:
 
 def _odd(t: Floats, k: tuple[float, ...]) -> Floats:
     """The distortion polynomial t (1 + k1 t² + k2 t⁴ + ...)."""
-    return t * np.polyval([*k[::-1], 1.0], t * t)
+    return t * _polynomial([*k[::-1], 1.0], t * t)
 
 
 def _odd_slope(t: Floats, k: tuple[float, ...]) -> Floats:
-    return np.asarray(np.polyval(_slope_in_square(k), t * t), dtype=np.float64)
+    return _polynomial(_slope_in_square(k), t * t)
+
+
+def _polynomial(coefficients: list[float], x: Floats) -> Floats:
+    """Horner's rule, the highest coefficient first; NumPy's is as long in its preparations."""
+    value = coefficients[0] * x + coefficients[1]
+    for c in coefficients[2:]:
+        value = value * x + c
+    return value
 
 
 def _slope_in_square(k: tuple[float, ...]) -> list[float]:
@@ -256,6 +292,8 @@ def _slope_in_square(k: tuple[float, ...]) -> list[float]:
 
 def _first_turn(k: tuple[float, ...]) -> float:
     """The smallest positive t where the polynomial stops growing; infinite where it never does."""
+    if min(k) >= 0:
+        return float("inf")
     roots = np.roots(_slope_in_square(k))
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(np.sqrt(real.min())) if real.size else float("inf")

@@ -345,8 +345,9 @@ def resect_any_pixels(
 
 def _trimmed(xyz: Floats, offset: Floats, keep: Bools) -> tuple[_Candidate, Floats, Bools]:
     """The best lens for the points kept; those far off left out, others taken in, four times at most."""
+    lenses = candidate_rays(offset)
     for _ in range(4):
-        found, errors = _best_lens(xyz, offset, keep)
+        found, errors = _best_lens(xyz, lenses, keep)
         inside = errors <= 2.5 * np.median(errors)
         if inside.sum() < 2 * FEWEST or _extents(xyz[inside])[2] < FLAT or (inside == keep).all():
             break
@@ -360,12 +361,13 @@ def _by_subsets(xyz: Floats, offset: Floats) -> list[Bools]:
     Of subsets of seven points a hundred hold several clean ones, even where a third of the views is wrong.
     """
     rng = np.random.default_rng(0)
+    lenses = candidate_rays(offset, every=3)
     found = []
     for _ in range(100):
         subset = np.zeros(len(xyz), dtype=np.bool_)
         subset[rng.choice(len(xyz), min(7, len(xyz)), replace=False)] = True
         try:
-            found.append(_best_lens(xyz, offset, subset, every=3)[1])
+            found.append(_best_lens(xyz, lenses, subset)[1])
         except FitError:  # a subset can be degenerate where the points are not
             continue
     best = sorted(found, key=lambda errors: float(np.median(errors)))[:4]
@@ -435,9 +437,10 @@ class _Candidate(NamedTuple):
     pinhole: bool
 
 
-def _best_lens(xyz: Floats, offset: Floats, keep: Bools, *, every: int = 1) -> tuple[_Candidate, Floats]:
-    """The pose for the lens that fits the points kept best, and the errors (n,) of all points in pixels."""
-    focal, pinhole, rays = candidate_rays(offset, every)
+def _best_lens(xyz: Floats, lenses: tuple[Floats, Bools, Floats], keep: Bools) -> tuple[_Candidate, Floats]:
+    """The pose for the lens that fits the points kept best, and the errors (n,) of all points in pixels; lenses: of
+    `candidate_rays`."""
+    focal, pinhole, rays = lenses
     rotations, translations, determined = _resect_many(xyz[keep], rays[:, keep])
     if not determined.any():
         raise _undetermined()

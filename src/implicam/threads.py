@@ -8,11 +8,13 @@ of 0.1 ms. So we give each task few BLAS threads and run independent tasks side 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import copy_context
-from typing import TypeVar
+from functools import lru_cache
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -26,10 +28,17 @@ def cores() -> int:
 @contextmanager
 def blas_threads(count: int) -> Iterator[None]:
     """Limit every BLAS to `count` threads for a while."""
-    from threadpoolctl import threadpool_limits  # late: `import implicam` needs NumPy and SciPy only
-
-    with threadpool_limits(limits=count, user_api="blas"):
+    with _controller(len(sys.modules)).limit(limits=count, user_api="blas"):
         yield
+
+
+@lru_cache(maxsize=1)
+def _controller(modules: int) -> Any:
+    """Of all libraries with threads that are loaded, as of so many modules: a look at them takes 2 ms, which is a tenth
+    of a small fit when many a call asks for it, and new ones come with new modules."""
+    from threadpoolctl import ThreadpoolController  # late: `import implicam` needs NumPy and SciPy only
+
+    return ThreadpoolController()
 
 
 def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
@@ -40,6 +49,8 @@ def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[
     """
     tasks = list(items)
     workers = max(1, min(len(tasks), cores()))
+    if workers == 1:
+        return [work(task) for task in tasks]
     with blas_threads(max(1, cores() // workers)), ThreadPoolExecutor(workers) as pool:
         contexts = [copy_context() for _ in tasks]  # NumPy's error state, among others, is the caller's
         return list(pool.map(lambda pair: pair[0].run(work, pair[1]), zip(contexts, tasks, strict=True)))

@@ -19,7 +19,7 @@ from implicam.calibrators.forward_gp.families import (
     MIRRORED_WEIGHT,
     Views,
     family_prior,
-    log_evidence,
+    log_evidences,
     near_prior,
     widest_angle,
 )
@@ -38,6 +38,10 @@ QUICK_GAIN = 0.6
 
 QUICK_NATS = 3.0
 """So does one whose evidence, odds aside, is better by this less."""
+
+QUICK_NOISES, QUICK_LEFT = 2.0, 0.4
+"""Where a camera's evidence is better than a freer one's by as much from where it stands, its median error is below so
+many noises, and one step towards the freer camera leaves so much of the squares, no look from farther on is needed."""
 
 MAX_START_VIEWS = 80
 """Views that starts are refined with."""
@@ -255,16 +259,19 @@ def _quick(scene: Scene, ladder: Start) -> Candidate | None:
     median = float(np.median(error[kept]))
     if kept.sum() < FEWEST or not median < QUICK_MEDIAN * scene.image.half or camera.rho < 4 * SMALLEST_RHO:
         return None
+    views = _common_views(scene, kept)
+    tight, free_from_here = _evidences(camera, ("ordinary", "free"), views)
+    if tight > free_from_here + QUICK_NATS and median < QUICK_NOISES * scene.noise:
+        free, free_kept = _refined(camera, "free", scene, kept, 1, gain=ROUGH_GAIN)
+        left = np.sum(scene.error(free)[kept] ** 2) / np.sum(error[kept] ** 2)
+        if left > QUICK_LEFT and free_kept.sum() <= kept.sum():
+            return Candidate(camera, "ordinary", kept, tight)
     free, free_kept = _refined(camera, "free", scene, kept, PROBE_STEPS, gain=ROUGH_GAIN)
     free_error = scene.error(free)
     # what seventeen free numbers gain over eleven by chance is no reason; of few views the evidence must do
     by_chance = np.sqrt(max(2 * kept.sum() - 17, 0) / (2 * kept.sum() - 11))
     better = kept.sum() >= FEW_VIEWS and np.median(free_error[kept]) < QUICK_GAIN * by_chance * median
-    if better or free_kept.sum() > kept.sum():
-        return None
-    views = _common_views(scene, kept)
-    tight = _evidence(camera, "ordinary", views)
-    if tight < _evidence(free, "free", views) - QUICK_NATS:
+    if better or free_kept.sum() > kept.sum() or tight < _evidences(free, ("free",), views)[0] - QUICK_NATS:
         return None
     return Candidate(camera, "ordinary", kept, tight)
 
@@ -312,7 +319,7 @@ def _kinds(
         for camera in (free.with_shape(shape, tilt), *near):
             found, explained = _refined(camera, family, scene, kept, FINAL_STEPS, rounds=2)
             plausible = np.median(scene.error(found)[explained]) < MAX_MEDIAN * scene.image.half
-            evidence = _evidence(found, family, views) if plausible else -np.inf
+            evidence = _evidences(found, (family,), views)[0] if plausible else -np.inf
             some.append(Candidate(found, family, explained, evidence))
         yield max(some, key=lambda one: one.evidence)
 
@@ -331,9 +338,10 @@ def _common_views(scene: Scene, kept: Bools) -> Views:
     return Views(scene.points[rows], scene.uv[rows], scene.relative[rows], scene.image, scene.stated)
 
 
-def _evidence(camera: GeneralCamera, family: str, views: Views) -> float:
-    prior = family_prior(camera, family, views.image, _widest(camera, views.points))
-    return log_evidence(camera, prior, views)
+def _evidences(camera: GeneralCamera, families: Sequence[str], views: Views) -> list[float]:
+    widest = _widest(camera, views.points)
+    priors = [family_prior(camera, family, views.image, widest) for family in families]
+    return log_evidences(camera, priors, views)
 
 
 def _from_dlt(scene: Scene) -> Start | None:

@@ -44,6 +44,12 @@ FTOL = 1e-4
 """Change of the log posterior at which the search for the sizes ends, as a part of what it has gained: hundredths of a
 nat."""
 
+KNOWN_TO = 0.1
+"""What log sizes are known to from a dozen points or more: the first step of the search for them."""
+
+GTOL = 0.02
+"""Slope by such a step at which the search ends while lengthscales are compared: thousandths of a nat."""
+
 DETERMINED = 1e-12
 """Eigenvalues below this part of the largest add nothing."""
 
@@ -203,20 +209,26 @@ class RigEvidence:
     lens: str
     tolerance: float
 
-    def maximise(self, start: Hyperparameters | None = None) -> Hyperparameters:
-        """The most probable hyperparameters; `start` is a good guess, from a moment ago."""
+    def maximise(self, start: Hyperparameters | None = None, *, search: bool = True) -> Hyperparameters:
+        """The most probable hyperparameters; `start` is a good guess, from a moment ago, of which the lengthscales
+        stay where there is nothing to `search`."""
         shared = np.zeros(2)  # log deviations of signal and noise from their prior medians
         known: dict[tuple[float, ...], tuple[float, Floats]] = {}
+        spectra: dict[tuple[float, ...], list[Spectrum]] = {}
 
         def at(log_lengthscale: Floats) -> float:
             nonlocal shared
             inside = np.clip(log_lengthscale, SHORTEST, LONGEST)
-            found = self._minimum(self._sizes_objective(self._spectra(inside), own=False)[0], shared)
+            spectra[tuple(inside)] = self._spectra(inside)
+            found = self._minimum(self._sizes_objective(spectra[tuple(inside)], own=False)[0], shared, GTOL)
             shared = found.x
             penalty = 0.5 * np.sum(((inside - LENGTHSCALE) / LENGTHSCALE_SD) ** 2)
             known[tuple(inside)] = float(found.fun + penalty), shared
             return known[tuple(inside)][0] + float(np.sum((log_lengthscale - inside) ** 2))
 
+        if start is not None and not search:
+            at(np.log(start.lengthscale[0]))
+            return self._found(known, spectra)
         if start is None:  # a second, shorter range can be as likely: look everywhere first
             for across in GRID[0]:
                 for along in GRID[1]:
@@ -232,9 +244,14 @@ class RigEvidence:
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": 12},
         )
-        lengthscale = np.array(min(known, key=lambda key: known[key][0]))
-        shared = known[tuple(lengthscale)][1]
-        signal, noise = self._averaged(self._spectra(lengthscale), shared)
+        return self._found(known, spectra)
+
+    def _found(
+        self, known: dict[tuple[float, ...], tuple[float, Floats]], spectra: dict[tuple[float, ...], list[Spectrum]]
+    ) -> Hyperparameters:
+        """The best of the lengthscales looked at."""
+        lengthscale = min(known, key=lambda key: known[key][0])
+        signal, noise = self._averaged(spectra[lengthscale], known[lengthscale][1])
         return Hyperparameters(np.tile(np.exp(lengthscale), (len(self.cameras), 1)), signal, noise)
 
     def _averaged(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
@@ -246,13 +263,18 @@ class RigEvidence:
         objective, sds = self._sizes_objective(spectra, own=True)
         C = len(self.cameras)
         z = self._minimum(objective, np.concatenate([shared, np.zeros(2 * C)])).x
-        h = 1e-3
-        hessian = np.stack([(objective(z + d)[1] - objective(z - d)[1]) / (2 * h) for d in h * np.eye(len(z))])
-        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
-        spread = vectors / np.maximum(values, 1 / sds.max() ** 2) @ vectors.T
         to_logs = np.zeros((2 * C, len(z)))  # log signal and log noise of each camera
         to_logs[:C, 0] = to_logs[C:, 1] = 1
         to_logs[:, 2:] = np.eye(2 * C)
+        h = 1e-3
+        blocks = []  # each camera knows of its own sizes only, so all of them may move at once
+        for moved in h * to_logs[:, :2].T:
+            d = np.append([0.0, 0.0], moved)
+            slope = (objective(z + d)[1] - objective(z - d)[1] - 2 * d / sds**2)[2:] / (2 * h)
+            blocks.append(np.concatenate([np.diag(slope[:C]), np.diag(slope[C:])]))
+        hessian = to_logs.T @ np.hstack(blocks) @ to_logs + np.diag(1 / sds**2)
+        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+        spread = vectors / np.maximum(values, 1 / sds.max() ** 2) @ vectors.T
         larger = np.exp(np.einsum("ij,jk,ik->i", to_logs, spread, to_logs))
         signal, noise = self._sizes(z)
         return signal * larger[:C], noise * larger[C:]
@@ -313,14 +335,19 @@ class RigEvidence:
         return objective, sds
 
     @staticmethod
-    def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats) -> Any:
-        bounds = [(-6.0, 6.0)] * len(start)
-        before = objective(start)[0]  # its zero depends on the unit: what counts is what is gained
+    def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats, gtol: float = 1e-5) -> Any:
+        """The sizes z of the least objective near `start`; looked for in steps that sizes are known to."""
+        bounds = [(-6.0 / KNOWN_TO, 6.0 / KNOWN_TO)] * len(start)
+        before, slope = objective(start)  # its zero depends on the unit: what counts is what is gained
 
-        def gained(z: Floats) -> tuple[float, Floats]:
-            value, gradient = objective(z)
-            return value - before, gradient
+        def gained(u: Floats) -> tuple[float, Floats]:
+            if np.array_equal(u, start / KNOWN_TO):
+                return 0.0, slope * KNOWN_TO
+            value, gradient = objective(u * KNOWN_TO)
+            return value - before, gradient * KNOWN_TO
 
-        found = minimize(gained, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": FTOL})
+        options = {"ftol": FTOL, "gtol": gtol}
+        found = minimize(gained, start / KNOWN_TO, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         found.fun += before
+        found.x = found.x * KNOWN_TO
         return found

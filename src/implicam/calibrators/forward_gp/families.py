@@ -6,12 +6,13 @@ directly: with few points the simplest kind wins, with more the views overrule i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
 
-from implicam.calibrators.forward_gp.evidence import NOISE, SIGNAL, STATED, CameraEvidence
+from implicam.calibrators.forward_gp.evidence import NOISE, SIGNAL, STATED, CameraEvidence, Spectrum
 from implicam.calibrators.forward_gp.general_camera import CENTRE, KAPPA, RHO, SMALLEST_RHO, GeneralCamera
 from implicam.calibrators.forward_gp.lens import BENT, BENT_AT_EDGE, TANGENT, Floats, Image, Prior
 from implicam.calibrators.forward_gp.posterior import field_coordinates
@@ -112,34 +113,44 @@ class Views(NamedTuple):
     stated: float
 
 
-def log_evidence(camera: GeneralCamera, prior: Prior, views: Views) -> float:
-    """Log marginal likelihood of the views, in nats: lens and pose integrated out, sizes at their most probable."""
+def log_evidences(camera: GeneralCamera, priors: Sequence[Prior], views: Views) -> list[float]:
+    """Log marginal likelihood of the views with each prior, in nats: lens and pose integrated out, linear about this
+    camera, sizes at their most probable."""
     view = camera.view(views.points)
     if not np.isfinite(view.by_parameters).all():
-        return -np.inf
-    off = prior.mean - camera.parameters
-    q = field_coordinates(view, views.image)
-    one = CameraEvidence(views.uv - view.uv, view.by_parameters, off, prior, q, views.relative)
+        return [-np.inf for _ in priors]
+    residual, q = views.uv - view.uv, field_coordinates(view, views.image)
+    at = camera.parameters
+    every = [
+        CameraEvidence(residual, view.by_parameters, prior.mean - at, prior, q, views.relative) for prior in priors
+    ]
     try:
-        spectrum = one.spectrum(CHOICE_LENGTHSCALE, 1e-6)
-        stated = np.isfinite(views.stated)
-        median = np.log([np.exp(SIGNAL["general"][0]) * views.image.half, 1.0])
-        median[1] = np.log(views.stated) if stated else NOISE[0] + np.log(views.image.half)
-        sd = np.array([CHOICE_SIGNAL_LOG_SD, STATED if stated else NOISE[1]])
+        spectrum = every[0].spectrum(CHOICE_LENGTHSCALE, 1e-6)
+    except np.linalg.LinAlgError:
+        return [-np.inf for _ in priors]
+    at_infinity = AT_INFINITY if camera.rho < 1.01 * SMALLEST_RHO else 0.0
+    return [_log_evidence(one, spectrum, views) - at_infinity for one in every]
 
-        def loss(z: Floats) -> tuple[float, Floats]:
-            value, by_signal, by_noise = one.objective(spectrum, *np.exp(median + z))
-            return value + 0.5 * float(np.sum((z / sd) ** 2)), np.array([by_signal, by_noise]) + z / sd**2
 
-        rms = np.sqrt(np.mean((one.residual / views.relative[:, None]) ** 2))
-        start = np.array([0.0, np.clip(np.log(rms) - median[1], -4, 8)])
+def _log_evidence(one: CameraEvidence, spectrum: Spectrum, views: Views) -> float:
+    stated = np.isfinite(views.stated)
+    median = np.log([np.exp(SIGNAL["general"][0]) * views.image.half, 1.0])
+    median[1] = np.log(views.stated) if stated else NOISE[0] + np.log(views.image.half)
+    sd = np.array([CHOICE_SIGNAL_LOG_SD, STATED if stated else NOISE[1]])
+
+    def loss(z: Floats) -> tuple[float, Floats]:
+        value, by_signal, by_noise = one.objective(spectrum, *np.exp(median + z))
+        return value + 0.5 * float(np.sum((z / sd) ** 2)), np.array([by_signal, by_noise]) + z / sd**2
+
+    rms = np.sqrt(np.mean((one.residual / views.relative[:, None]) ** 2))
+    start = np.array([0.0, np.clip(np.log(rms) - median[1], -4, 8)])
+    try:
         found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(-4, 8), (-6, 10)], options={"ftol": 1e-6})
-        proper = np.linalg.slogdet(_scaled(prior.precision[_PROPER, _PROPER]))
+        proper = np.linalg.slogdet(_scaled(one.prior.precision[_PROPER, _PROPER]))
     except np.linalg.LinAlgError:
         return -np.inf
-    logs = float(proper[1] + np.sum(np.log(np.diag(prior.precision)[_PROPER])))
-    at_infinity = AT_INFINITY if camera.rho < 1.01 * SMALLEST_RHO else 0.0
-    return -float(found.fun) + 0.5 * logs - at_infinity
+    logs = float(proper[1] + np.sum(np.log(np.diag(one.prior.precision)[_PROPER])))
+    return -float(found.fun) + 0.5 * logs
 
 
 def _scaled(A: Floats) -> Floats:

@@ -99,6 +99,10 @@ AUTO = "auto"
 """The kind of each camera is chosen by the data."""
 
 ROUNDS, ROUNDS_WITH_SHOTS = 6, 18
+SEARCHED = 2
+"""Of these, those that look for lengthscales, where known positions are exact: the few views that change later tell
+nothing new of how smooth a field is."""
+
 REWEIGHTED = 3
 """Rounds more where the noise has heavy tails."""
 
@@ -314,7 +318,7 @@ def _fit_started(
     tied = problem.errors is not None and not problem.errors.estimated
     state = _Round(hyper, models, None, kept, problem.errors, None, settled=False, fixed=hyper if tied else None)
     for number in range(rounds):
-        state = _round(problem, state, seen, images, stated)
+        state = _round(problem, state, seen, images, stated, search=number < SEARCHED)
         judged = state.kept
         if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
             judged = judged_all(state.posterior, problem.points, seen, state.kept)
@@ -481,16 +485,22 @@ class _Round(NamedTuple):
 
 
 def _round(
-    problem: Problem, last: _Round, seen: tuple[Sightings, ...], images: tuple[Image, ...], stated: Floats
+    problem: Problem,
+    last: _Round,
+    seen: tuple[Sightings, ...],
+    images: tuple[Image, ...],
+    stated: Floats,
+    *,
+    search: bool,
 ) -> _Round:
-    """Sizes, posterior, and how far the shots are off."""
+    """Sizes, posterior, and how far the shots are off. search: for other lengthscales too."""
     kept = tuple(
         k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
         for k, m, s in zip(last.kept, last.models, seen, strict=True)
     )
     used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=False), kept, strict=True))
     moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
-    hyper = last.fixed or _hyperparameters(problem, last.models, used, images, stated, last.hyper, moved)
+    hyper = last.fixed or _hyperparameters(problem, last.models, used, images, stated, last.hyper, moved, search)
     errors = last.next_errors
     used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=True), kept, strict=True))
     posterior = _conditioned(problem, last.models, used, hyper, errors)
@@ -572,6 +582,7 @@ def _hyperparameters(
     stated: Floats,
     before: Hyperparameters | None,
     moved: Floats | None,
+    search: bool,
 ) -> Hyperparameters:
     found = Hyperparameters(np.ones((len(models), 2)), np.ones(len(models)), np.ones(len(models)))
     groups = []
@@ -581,7 +592,7 @@ def _hyperparameters(
         kind = models[numbers[0]].camera.kind
         rig = RigEvidence(evidence, half, stated[numbers], kind, TOLERANCE[kind])
         guess = None if before is None else Hyperparameters(*(values[numbers] for values in before))
-        for values, part in zip(found, rig.maximise(guess), strict=True):
+        for values, part in zip(found, rig.maximise(guess, search=search or moved is not None), strict=True):
             values[numbers] = part
         groups.append((numbers, rig))
     if problem.errors is None or problem.errors.estimated:
@@ -649,6 +660,8 @@ def settle(
     scatter: Scatter | None = None,
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
+    if errors is None and scatter is None and len(models) > 1:
+        return _settled_alone(models, points, used)
     misfits: list[_Misfit] = []
     for _ in range(MAX_SETTLING_STEPS):
         if scatter is None:
@@ -668,6 +681,25 @@ def settle(
         if all(small):
             break
     return replace(posterior, models=models)
+
+
+def _settled_alone(models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...]) -> Posterior:
+    """The same where known positions are exact: no camera takes part in the steps that another still needs."""
+
+    def one(c: int) -> Posterior:
+        try:
+            return settle((models[c],), points, (used[c],), None)
+        except CameraFailedError as error:
+            raise CameraFailedError(c, str(error)) from error
+
+    found = side_by_side(one, range(len(models)))
+    return Posterior(
+        tuple(each.models[0] for each in found),
+        tuple(each.alone[0] for each in found),
+        None,
+        tuple(each.steps[0] for each in found),
+        sum(each.evidence for each in found),
+    )
 
 
 def _sized(

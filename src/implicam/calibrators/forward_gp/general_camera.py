@@ -21,7 +21,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, ProjectiveCamera, View
+from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, ProjectiveCamera, View, cross
 from implicam.cameras import KannalaBrandt
 from implicam.geometry import Pose, rotation_from_vector
 
@@ -91,7 +91,7 @@ class GeneralCamera:
         rho = max(float(x[RHO]), SMALLEST_RHO)
         across = x[12:14]
         angle = rho * float(np.hypot(*across))
-        translation = np.append(across * np.sinc(angle / np.pi), np.cos(angle) / rho)
+        translation = np.append(across * _sinc(angle), np.cos(angle) / rho)
         turn = rotation_from_vector(step[14:])
         return GeneralCamera(
             float(np.exp(min(x[0], 50.0)) / rho),
@@ -116,15 +116,15 @@ class GeneralCamera:
         n = len(points)
         turned = points @ self.pose.rotation.T
         there = turned + self.pose.translation
-        bent, _ = self._lens.pixel_from_camera_point(there)
+        bent, by_there, by_lens = self._lens.pixel_and_slopes(there)
         uv, y, w = self._image(bent)
         sign = np.array([-1.0 if self.mirrored else 1.0, 1.0])
         B, by_p, by_q = self._pixels
         by_y = self.focal * B
         # y by m: (I - y tilt^T) / w
         by_m = (by_y @ (np.eye(2) - y[:, :, None] * self.tilt)) / w[:, None, None] * sign
-        slope = by_m @ self._lens.jacobian(there)
-        by_k = by_m @ self._lens.parameter_jacobian(there)[:, :, 4:]
+        slope = by_m @ by_there
+        by_k = by_m @ by_lens[:, :, 4:]
         rho = self.rho
         by_across, by_rho = self._translation_slopes()
         out = np.empty((n, 2, self.size))
@@ -136,7 +136,7 @@ class GeneralCamera:
         out[:, :, KAPPA] = by_k / rho**_POWERS
         out[:, :, RHO] = -away / rho + slope @ by_rho - by_k @ (_POWERS * (self.k - 0.5 * TANGENT) / rho)
         out[:, :, 12:14] = slope @ by_across
-        out[:, :, 14:] = np.cross(turned[:, None, :], slope)  # slope . (omega x turned)
+        out[:, :, 14:] = cross(turned[:, None, :], slope)  # slope . (omega x turned)
         squared = np.sum(there**2, axis=1)
         return View(
             uv,
@@ -232,7 +232,7 @@ class GeneralCamera:
         outward = direction[:2] / sine if sine > 0 else np.array([1.0, 0.0])
         sideways = np.array([-outward[1], outward[0]])
         radial = np.append(outward * cosine, -sine)
-        around = np.append(sideways * np.sinc(angle / np.pi), 0.0)
+        around = np.append(sideways * _sinc(angle), 0.0)
         by_across = np.outer(radial, outward) + np.outer(around, sideways)
         arc = angle / rho
         by_rho = radial * arc / rho - direction / rho**2
@@ -240,6 +240,10 @@ class GeneralCamera:
 
 
 AnyCamera = CentralCamera | ProjectiveCamera | GeneralCamera
+
+
+def _sinc(angle: float) -> float:
+    return float(np.sin(angle)) / angle if angle else 1.0
 
 
 def _pixel_shape(shape: Floats) -> tuple[Floats, Floats, Floats]:

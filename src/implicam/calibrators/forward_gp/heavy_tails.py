@@ -31,7 +31,10 @@ CLEAR = 5.0
 thousand times."""
 
 STEPS = 40
-"""Of EM for scale and share of wrong detections, at each number of degrees."""
+"""Of EM for scale and share of wrong detections, at each number of degrees ..."""
+
+STILL = 1e-6
+"""... or fewer, where no scale squared changes by this part any more."""
 
 AGREED = 2.0
 """The same of what cameras say among themselves, which is less, and only has to confirm it."""
@@ -119,26 +122,35 @@ def looks_heavy(distance: Floats, background: Floats) -> bool:
     q, b = distance[good], background[good]
     if len(q) < FEWEST:
         return False
-    normal, _, _ = _likelihood(q, b, np.inf)
-    value, _, wrong = max(_likelihood(q, b, degrees) for degrees in DEGREES)
-    return bool(value > normal + CLEAR and wrong < WRONG)
+    normal = _likelihoods(q, b, np.array([np.inf]))[0]
+    found = _likelihoods(q, b, np.array(DEGREES))
+    best = found[np.argmax(found[:, 0])]
+    return bool(best[0] > normal[0] + CLEAR and best[2] < WRONG)
 
 
-def _likelihood(q: Floats, background: Floats, degrees: float) -> tuple[float, float, float]:
-    """Largest log likelihood, over the scale squared and the share of wrong detections; and these. By EM."""
-    scale, wrong = max(float(np.median(q)) / (2 * np.log(2)), 1e-300), 0.01
-    density = np.zeros_like(q)
+def _likelihoods(q: Floats, background: Floats, degrees: Floats) -> Floats:
+    """(k, 3) for each of the degrees (k,), all finite or none: the largest log likelihood, over the scale squared and
+    the share of wrong detections; and these. By EM."""
+    t = degrees[:, None]
+    scale = np.full(t.shape, max(float(np.median(q)) / (2 * np.log(2)), 1e-300))
+    wrong = np.full(t.shape, 0.01)
     for _ in range(STEPS):
-        if np.isinf(degrees):
-            density, w = np.exp(-0.5 * q / scale) / scale, np.ones_like(q)
+        before = scale
+        if np.isinf(degrees).all():
+            density, w = np.exp(-0.5 * q / scale) / scale, np.ones_like(scale)
         else:
-            density = np.exp(-0.5 * (degrees + 2) * np.log1p(q / (degrees * scale))) / scale
-            w = weights_of(q / scale, degrees)
-        both = (1 - wrong) * density + wrong * background
-        right = (1 - wrong) * density / both
-        scale = max(float(np.sum(right * w * q) / (2 * np.sum(right))), 1e-300)
-        wrong = float(np.clip(1 - right.mean(), 1e-6, 0.9))
-    return float(np.sum(np.log((1 - wrong) * density + wrong * background))), scale, wrong
+            apart = q / scale
+            density = np.exp(-0.5 * (t + 2) * np.log1p(apart / t)) / scale
+            w = (t + 2) / (t + apart)
+        good = (1 - wrong) * density
+        right = good / (good + wrong * background)
+        share = right.mean(axis=1, keepdims=True)
+        scale = np.maximum((right * w) @ q[:, None] / (2 * len(q) * share), 1e-300)
+        wrong = np.clip(1 - share, 1e-6, 0.9)
+        if (np.abs(scale - before) <= STILL * scale).all():
+            break
+    values = np.sum(np.log((1 - wrong) * density + wrong * background), axis=1, keepdims=True)
+    return np.concatenate([values, scale, wrong], axis=1)
 
 
 def consistency(distance: Floats, seen: Bools, degrees: float) -> Floats:
@@ -266,7 +278,7 @@ def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
     found = [_most_likely(A, b, views, degrees, usual) for degrees in DEGREES]
     k = int(np.argmax([value for value, _ in found]))
     value, scale = found[k]
-    alone = _likelihood(np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), DEGREES[k])[1]
+    alone = _likelihoods(np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), np.array(DEGREES[k : k + 1]))[0, 1]
     return DEGREES[k] if value > normal + AGREED and scale > SHARED * alone else None
 
 

@@ -133,7 +133,7 @@ class _Found(NamedTuple):
 def _evidence(agreement: Agreement, found: _Found) -> float:
     """Log of how much more probable the views are with errors of any size than with none: Laplace, the noise at its
     most probable either way, eq. (25)."""
-    alone = min(_noise_alone(agreement, u) for u in np.linspace(*NOISE_BOUNDS, 121))
+    alone = float(_noise_alone(agreement, np.linspace(*NOISE_BOUNDS, 121)).min())
     prior = np.array([_prior(z)[1] - _prior(0 * z)[1] for z in np.eye(7)])
     shrunk = np.linalg.slogdet(prior[:6, :6])[1] - np.linalg.slogdet(_curvature(agreement, found)[:6, :6])[1]
     return float(alone - found.value + 0.5 * shrunk)
@@ -147,9 +147,10 @@ def _curvature(agreement: Agreement, found: _Found) -> Floats:
     return np.asarray(turned * np.maximum(values, LEAST_CURVED) @ turned.T, dtype=np.float64)
 
 
-def _noise_alone(agreement: Agreement, log_noise: float) -> float:
-    terms = agreement.squares * np.exp(-2 * log_noise) + 2 * agreement.coordinates * log_noise
-    return float(0.5 * np.sum(terms) + 0.5 * (log_noise / LESS_NOISE) ** 2)
+def _noise_alone(agreement: Agreement, log_noise: Floats) -> Floats:
+    squares, coordinates = float(agreement.squares.sum()), float(agreement.coordinates.sum())
+    terms = squares * np.exp(-2 * log_noise) + 2 * coordinates * log_noise + (log_noise / LESS_NOISE) ** 2
+    return np.asarray(0.5 * terms, dtype=np.float64)
 
 
 def _most_probable(agreement: Agreement, freedom: float, start: Floats | None) -> _Found:
@@ -159,7 +160,7 @@ def _most_probable(agreement: Agreement, freedom: float, start: Floats | None) -
         trials = [np.array([*np.full(3, 2 * np.log(size)), 0, 0, 0, noise]) for size, noise in sizes]
         start = min(trials, key=lambda z: objective(z)[0])
     bounds = [SIZE_BOUNDS] * 3 + [(-10.0, 10.0)] * 3 + [NOISE_BOUNDS]
-    z = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-7}).x
+    z = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-6}).x
     return _Found(z, freedom, objective(z)[0])
 
 

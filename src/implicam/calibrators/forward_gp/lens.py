@@ -92,7 +92,7 @@ class CentralCamera:
         slope = self.lens.jacobian(there)
         by_parameters = np.empty((len(points), 2, self.size))
         by_parameters[:, :, :-6] = self.lens.parameter_jacobian(there)
-        by_parameters[:, :, -6:-3] = np.cross(turned[:, None, :], slope)  # slope . (omega x turned)
+        by_parameters[:, :, -6:-3] = cross(turned[:, None, :], slope)  # slope . (omega x turned)
         by_parameters[:, :, -3:] = slope
         squared = np.sum(there**2, axis=1)
         return View(
@@ -159,6 +159,12 @@ class CentralCamera:
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
             raise ValueError("a camera's rotation is not one")
         return cls(lens(*array[:-12].tolist()), Pose(rotation, array[-3:]))
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross products (..., 3) of a and b; NumPy's takes several times as long for few."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    return np.stack([y * b[..., 2] - z * b[..., 1], z * b[..., 0] - x * b[..., 2], x * b[..., 1] - y * b[..., 0]], -1)
 
 
 def lens_parameters(lens: Lens) -> Floats:
