@@ -361,12 +361,13 @@ def with_heavy_tails(problem: Problem, fitted: FittedRig) -> FittedRig:
         fixed=fixed,
     )
     try:
-        for _ in range(REWEIGHTED):
+        for number in range(REWEIGHTED):
             found = _tails(problem, state, seen, images)
             if found is None:
                 break
             tails, kept = found
-            state = _round(problem, state._replace(tails=tails, kept=kept), seen, images, stated)
+            again = state._replace(tails=tails, kept=kept)
+            state = _round(problem, again, seen, images, stated, search=number == 0)
         if state.tails is None:
             return fitted
         _check_fitted(problem, state, seen)
