@@ -173,7 +173,7 @@ def require_two_values(xyz: NDArray[np.float64], method: str) -> None:
     same = [axis for axis, values in zip("xyz", xyz.T, strict=True) if np.ptp(values) == 0]
     if same:
         axes = " and ".join(same)
-        value = ", ".join(f"{axis} = {xyz[0, 'xyz'.index(axis)]:g}" for axis in same)
+        value = ", ".join(f"{axis} = {xyz[0, 'xyz'.index(axis)] + 0.0:g}" for axis in same)
         raise FitError(
             f"all {len(xyz)} usable points have the same {value}.",
             why=f"{method} learns {axes} from examples, and has seen one value only",
