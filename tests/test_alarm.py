@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import implicam as ic
-from implicam.calibrators.alarm import _inexplicable
+from implicam.calibrators.alarm import Table, _inexplicable, _misfit
 from implicam.cli import main
 from implicam.dataset import Floats, Observations
 from implicam.geometry import Pose, rotation_from_vector
@@ -101,6 +101,7 @@ def one_row_late(uv: Floats) -> Floats:
         (lambda uv: np.stack([uv[..., 0], 1023 - uv[..., 1]], axis=-1), "is v counted from below"),
         (lambda uv: uv[..., ::-1], "are u and v exchanged?"),
         (lambda uv: (uv + 0.5) / 2 - 0.5, "are the pictures half the size"),
+        (lambda uv: (uv + 0.5) / 1.5 - 0.5, "are the pictures two thirds the size"),
     ],
 )
 def test_likely_causes_are_named(change: Callable[[Floats], Floats], said: str) -> None:
@@ -126,3 +127,15 @@ def test_a_few_points_are_not_a_table() -> None:
 @pytest.mark.parametrize(("views", "share"), [(2, 0.36), (3, 0.104), (5, 0.05792)])
 def test_how_many_points_no_wrong_view_explains(views: int, share: float) -> None:
     assert _inexplicable(views) == pytest.approx(share)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_cause_of_which_most_views_are_nowhere_warns_nobody() -> None:
+    """A quantile between two infinities is no number, and NumPy says so in the middle of the table."""
+    seen = table(build_rig("stereo", seed=5), 20)
+    looks = [(np.array([x, 0.0, 0.0]), np.tile([0.0, 0.0, 1.0], (20, 1))) for x in (0.0, 100.0)]
+    nothing = Table(
+        seen.cameras, seen.uv, np.ones((20, 2)), np.zeros(20), np.zeros((20, 2), dtype=bool),
+        lambda uv: np.zeros(len(uv), dtype=bool), lambda uv: iter(looks), lambda x: np.full((len(x), 2, 2), np.nan),
+    )  # fmt: skip
+    assert _misfit(nothing, np.arange(20), seen.uv, np.ones((20, 2))) == np.inf

@@ -1211,3 +1211,29 @@ def test_a_neural_network_says_what_its_numbers_are(made: Path, cli: Cli) -> Non
     ran = cli("calibrate", made / "rig", "--method", "mlp", "-o", "n.implicam")
     assert "of them that it was not trained on are predicted within" in ran.out
     assert "dropout" in ran.err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "measure rig.implicam rig/check -o rig/check/observations.csv",
+        "measure rig.implicam new.csv -o new.csv",
+        "measure rig.implicam new.csv -o new.csv.toml",
+        "measure rig.implicam new.csv -o rig.implicam",
+        "evaluate rig.implicam rig/check --report rig.implicam",
+        "report rig.implicam -o rig.implicam",
+        "export rig.implicam --to opencv -o rig.implicam",
+        "suggest rig.implicam -o rig.implicam",
+    ],
+)
+def test_no_command_replaces_what_it_reads(made: Path, cli: Cli, words: str) -> None:
+    """Pixels that took a day to gather were gone, and a table of positions stood in their place."""
+    for name in ("rig", "rig.implicam"):
+        copy = shutil.copytree if (made / name).is_dir() else shutil.copy
+        copy(made / name, name)
+    cli("convert", "rig/check", "new.csv")
+    before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+    ran = cli(*words.split())
+    assert ran.code == 2
+    assert "would be replaced: this command reads it" in ran.err
+    assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before

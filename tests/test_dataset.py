@@ -1043,6 +1043,13 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
             '  fix: name them u_cam1,v_cam1,u_cam2,v_cam2, ...'
         ),
     ),
+    'no heading': (
+        "1,2,3,10,20\n1,2,4,11,21\n",
+        (
+            '{at}/w.csv, line 1: the first line holds numbers, and no names of columns.\n'
+            '  fix: write x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ... as its first line'
+        ),
+    ),
     'half a camera': (
         "x,y,z,u_a,v_b\n1,2,3,4,5\n",
         (
@@ -1100,6 +1107,21 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
             '{at}/w.csv, line 2: sd_x = -0.1 must be at least zero.\n'
             '  why: it is a standard uncertainty\n'
             '  fix: leave the cell empty where no uncertainty is stated'
+        ),
+    ),
+    'a word for a view that is missing': (
+        WIDE.replace("10,20", "n/a,n/a"),
+        (
+            "{at}/w.csv, line 2: u_cam1 = 'n/a' is not a number.\n"
+            '  fix: leave the cell empty where there is no value'
+        ),
+    ),
+    'a comma at the end': (
+        WIDE.replace("\n", ",\n"),
+        (
+            '{at}/w.csv, line 1: a column has no name.\n'
+            '  why: a comma at the end of a line, or an empty column of a spreadsheet, makes one more column\n'
+            '  fix: remove the comma or the column from every line, or give it a name'
         ),
     ),
     'text': (

@@ -1585,3 +1585,16 @@ def test_a_table_that_does_not_fit_is_refused() -> None:
     for key in table:
         with pytest.raises(KeyError):
             ForwardGPCalibration.from_state(fitted().data, {k: v for k, v in table.items() if k != key}, arrays)
+
+
+def test_what_is_said_of_one_camera_and_of_points_on_an_axis() -> None:
+    """More points are no cure for one camera, and other y alone would leave the points on a plane."""
+    rig = build_rig("bar3", seed=1)
+    data = simulate(rig, random_positions(rig, 20, np.random.default_rng(1)), seed=1)
+    with pytest.raises(FitError, match="use two cameras or more"):
+        ForwardGP().fit(data.with_cameras(data.observations.camera_names[:1]))
+    assert data.known is not None
+    flat = replace(data, known=replace(data.known, xyz=data.xyz * [1.0, 0.0, 0.0]))
+    with pytest.raises(FitError, match="same y = 0, z = 0") as told:
+        ForwardGP().fit(flat)
+    assert "add points with other y and z" in str(told.value)

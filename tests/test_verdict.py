@@ -82,6 +82,27 @@ def test_a_camera_that_moved_halfway_is_named() -> None:
     assert "cam3" in " ".join(verdict.reasons)
 
 
+def test_one_of_two_cameras_that_slips_is_named() -> None:
+    """The median of two is their mean, and no camera is ten times as bad as a mean that it is half of."""
+    data = rig(35, "stereo")
+    uv = data.observations.uv.copy()
+    uv[:, 1] += np.linspace(0, 12, len(uv))[:, None]
+    silent = replace(data, observations=replace(data.observations, uv=uv, sd=np.full_like(uv, np.nan)))
+    verdict = ic.judge(ic.ForwardGP().fit(silent))
+    assert verdict.word == DOUBTFUL
+    assert "cam2 misses its own known points" in " ".join(verdict.reasons)
+
+
+def test_two_pictures_of_one_camera_are_not_usable_though_the_error_bars_are_honest() -> None:
+    """Detected twice, so that no pixel is the same to the last bit: no depth, and error bars as large as the room."""
+    data = rig(35, "stereo")
+    uv = data.observations.uv.copy()
+    uv[:, 1] = uv[:, 0] + 0.1 * np.random.default_rng(4).normal(size=uv[:, 0].shape)
+    verdict = ic.judge(ic.ForwardGP().fit(with_pixels(data, uv)))
+    assert verdict.word != USABLE
+    assert "different directions" in " ".join(verdict.reasons) or "no measurement" in " ".join(verdict.reasons)
+
+
 def test_marks_that_came_by_the_api_are_said() -> None:
     data = rig(25)
     uv = data.observations.uv.copy()

@@ -235,6 +235,12 @@ def _of_held_out(found: HeldOut | None, calibration: Calibration) -> Iterator[Fi
         yield Finding(True, f"{said}, and all of them lie within {extent:.2g} {unit}: this is no measurement. {_LOOK}")
     elif found.nees > HOPELESS_NEES and found.inside < 0.5:
         yield Finding(True, f"{said}, where the error bars say {found.stated:.2g}: they mean nothing. {_LOOK}")
+    elif found.rms > USELESS * extent:  # honest error bars make no measurement of it
+        yield Finding(
+            False,
+            f"{said}, and all of them lie within {extent:.2g} {unit}: the cameras hardly fix a position. Look whether "
+            "they see the points from different directions, and whether two of them are one camera.",
+        )
     elif found.nees > WORST_NEES:
         yield Finding(
             False,
@@ -332,8 +338,9 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
     )
     stated = stated_noise(data.observations)
     declared = bool((data.positions.sd > 0).any())  # then the fit explains what the positions are off by
-    usual = np.nanmedian(medians) if np.isfinite(medians).any() else np.nan
-    for name, median, sd in zip(data.observations.camera_names, medians, stated, strict=True):
+    for c, (name, median, sd) in enumerate(zip(data.observations.camera_names, medians, stated, strict=True)):
+        others = np.delete(medians, c)
+        usual = np.nanmedian(others) if np.isfinite(others).any() else np.nan
         if np.isfinite(sd) and median > RESIDUAL_RATIO * sd and not declared:
             yield Finding(
                 False,
@@ -343,7 +350,7 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
         elif not np.isfinite(sd) and median > max(UNLIKE_OTHERS * usual, UNLIKE_OTHERS_PIXELS):
             yield Finding(
                 False,
-                f"{name} misses its own known points by {median:.2g} px in the median, the cameras together by "
+                f"{name} misses its own known points by {median:.2g} px in the median, the other cameras by "
                 f"{usual:.2g}: look at its pictures, or leave it out with --without {name}.",
             )
 

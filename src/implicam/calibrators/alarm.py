@@ -54,6 +54,12 @@ EXPLAINS, BETTER = 0.6, 0.3
 MOST_PAIRS = 2000
 """Pairs of cameras that are tried; of more, the neighbours."""
 
+SIZES = (
+    (2.0, "half"), (0.5, "twice"), (1.5, "two thirds"), (2 / 3, "one and a half times"), (3.0, "a third"),
+    (1 / 3, "three times"), (4 / 3, "three quarters"), (0.75, "four thirds"), (2.25, "four ninths"), (4 / 9, "9/4"),
+)  # fmt: skip
+"""Factors from one usual height of a video (480, 720, 1080, 1440, 2160 rows) to another, and the words for it."""
+
 CONFIRMED = 3
 """The likeliest causes, which are put to the full test."""
 
@@ -176,7 +182,7 @@ def _misfit(table: Table, rows: NDArray[np.int64], uv: Floats, noise: Floats) ->
     x = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], dtype=np.float64)
     off = np.asarray(np.linalg.norm(table.pixels(x) - uv[rows], axis=2) / noise[rows], dtype=np.float64)
     worst = np.where(np.isnan(uv[rows, :, 0]), 0.0, np.nan_to_num(off, nan=np.inf)).max(axis=1)
-    return float(np.quantile(worst, EXPLAINS))
+    return float(np.sort(worst)[int(EXPLAINS * len(worst))])  # some are infinite, so nothing is interpolated
 
 
 Guess = tuple[str, Floats, Floats, float]
@@ -225,6 +231,6 @@ def _other_pixels(table: Table) -> Iterator[Guess]:
         uv[..., 1] = height - 1 - uv[..., 1]
         yield "is v counted from below here, and was not when the rig was calibrated? So {share}", uv, table.noise, 1.0
     yield "are u and v exchanged? The other way round {share}", table.uv[..., ::-1].copy(), table.noise, 1.0
-    for factor, words in ((2.0, "half"), (0.5, "twice")):
+    for factor, words in SIZES:
         uv = factor * (table.uv + 0.5) - 0.5
         yield f"are the pictures {words} the size they were? Resized {{share}}", uv, factor * table.noise, 1.0

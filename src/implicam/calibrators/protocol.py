@@ -170,13 +170,15 @@ def require_volume(xyz: NDArray[np.float64], method: str) -> None:
 
 def require_two_values(xyz: NDArray[np.float64], method: str) -> None:
     """FitError where all points (n, 3) have the same x, y or z."""
-    for axis, values in zip("xyz", xyz.T, strict=True):
-        if np.ptp(values) == 0:
-            raise FitError(
-                f"all {len(xyz)} usable points have the same {axis} = {values[0]:g}.",
-                why=f"{method} learns {axis} from examples, and has seen one value only",
-                fix=f"add points with other {axis}, for example a second position of the board",
-            )
+    same = [axis for axis, values in zip("xyz", xyz.T, strict=True) if np.ptp(values) == 0]
+    if same:
+        axes = " and ".join(same)
+        value = ", ".join(f"{axis} = {xyz[0, 'xyz'.index(axis)] + 0.0:g}" for axis in same)
+        raise FitError(
+            f"all {len(xyz)} usable points have the same {value}.",
+            why=f"{method} learns {axes} from examples, and has seen one value only",
+            fix=f"add points with other {axes}, for example a second position of the board",
+        )
 
 
 @contextmanager

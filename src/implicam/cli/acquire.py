@@ -12,7 +12,7 @@ import typer
 
 from implicam.calibrators import load_calibration
 from implicam.cli import show
-from implicam.cli.app import Json, Seed, command
+from implicam.cli.app import Json, Seed, command, must_not_replace
 from implicam.dataset import Floats
 from implicam.dataset.folder import csv_text
 from implicam.errors import ImplicamError, UsageError, import_extra
@@ -56,6 +56,8 @@ def suggest_command(
     from implicam.active import suggest, workspace_from
     from implicam.active.acquisition import DEFAULT
 
+    if output is not None:
+        must_not_replace(output, calibration)
     fitted = load_calibration(calibration)
     if reach is not None and not reach > 0:
         raise UsageError(f"a reach of {reach:g} is no length.", fix="give one greater than zero")

@@ -44,6 +44,7 @@ EXAMPLES = {
 
 CALIBRATION_SUFFIX = ".implicam"
 FILE_SUFFIXES = (".csv", ".parquet", ".npz")
+FOLDER_FILES = ("dataset.toml", "points.csv", "observations.csv")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -129,6 +130,21 @@ def must_be_calibration(output: Path) -> None:
         raise UsageError(
             f"{output} is no name for a calibration.", fix=f"end it in {CALIBRATION_SUFFIX}: -o {output.stem}.implicam"
         )
+
+
+def must_not_replace(output: Path, *sources: Path | None) -> None:
+    """UsageError where writing `output` would destroy what the command reads: a file, or a file of a dataset folder."""
+    target = output.resolve()
+    for source in sources:
+        if source is None:
+            continue
+        own = {source.resolve(), source.with_name(f"{source.name}.toml").resolve()}  # a wide CSV and its description
+        if source.is_dir():
+            own |= {(source / name).resolve() for name in FOLDER_FILES}
+        if target in own:
+            raise UsageError(
+                f"{output} would be replaced: this command reads it.", fix="give another name to write to (-o)"
+            )
 
 
 def must_be_shot(leave_out: str | None) -> None:

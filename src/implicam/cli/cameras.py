@@ -10,7 +10,7 @@ import typer
 from implicam.calibrators import load_calibration
 from implicam.calibrators.explicit import calibration_of, rig_of
 from implicam.cli import show
-from implicam.cli.app import Json, command, must_be_calibration
+from implicam.cli.app import Json, command, must_be_calibration, must_not_replace
 from implicam.exchange import FORMATS, UNKNOWN, export_cameras, import_cameras
 
 
@@ -22,6 +22,7 @@ def export_command(
     json: Json = False,
 ) -> None:
     """Write the cameras for another program: lenses and places, as far as its format holds them."""
+    must_not_replace(output, calibration)
     rig, lost = rig_of(load_calibration(calibration))
     notes = [*lost, *export_cameras(rig, to, output)]
     if json:
@@ -48,6 +49,7 @@ def import_command(
 ) -> None:
     """Make a calibration of another program's cameras, to measure with them and to check them."""
     must_be_calibration(output)
+    must_not_replace(output, cameras)
     rig = import_cameras(cameras, kind)
     rig = rig.in_unit(unit) if unit and rig.length_unit != UNKNOWN else import_cameras(cameras, kind, unit=unit)
     calibration = calibration_of(rig, cameras.stem, noise)

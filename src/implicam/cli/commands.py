@@ -45,6 +45,7 @@ from implicam.cli.app import (
     must_be_calibration,
     must_be_folder,
     must_be_shot,
+    must_not_replace,
     need_plotly,
     read,
 )
@@ -255,6 +256,7 @@ def measure_command(
     json: Json = False,
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
+    must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
     data = _read_to_measure(dataset, unit, fitted.data.length_unit)
@@ -327,6 +329,7 @@ def evaluate_command(
     _check_evaluate(dataset, cv, leave_out, wanted.given)
     if report is not None:
         need_plotly()
+        must_not_replace(report, file, dataset)
     with show.progress(json) as progress:
         if dataset is not None:
             evaluation = evaluate(load_calibration(file), read(dataset, unit, cameras, without))
@@ -412,6 +415,7 @@ def report_command(
 ) -> None:
     """Write a one-page HTML report with an interactive 3D view."""
     need_plotly()
+    must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     with show.progress(json) as progress:
         if dataset is None:

@@ -240,8 +240,9 @@ class Dataset:
         if self.known is None:
             raise DatasetError(
                 f"dataset {self.name!r} has no known positions.",
-                why="there is no points.csv (or no x, y, z columns)",
-                fix="add points.csv with point,shot,x,y,z; without it a dataset can only be measured",
+                why="there is no points.csv (in a table of one file: no columns named x, y and z, in small letters)",
+                fix="add points.csv with point,shot,x,y,z, or the columns x, y and z; without them a dataset can only "
+                "be measured",
             )
         return self.known
 

@@ -135,6 +135,12 @@ def _check_header(path: Path, header: list[str], required: Sequence[str]) -> Non
                 why="cells beyond the last name may be empty" if name == "" else "",
                 fix="give every column a name of its own",
             )
+        if name == "":
+            raise DatasetError(
+                f"{path}, line 1: a column has no name.",
+                why="a comma at the end of a line, or an empty column of a spreadsheet, makes one more column",
+                fix="remove the comma or the column from every line, or give it a name",
+            )
         with naming(f"{path}, line 1"):
             check_name(name, "column name")
 
@@ -167,6 +173,10 @@ def name_in(text: str, what: str, place: str) -> str:
     return name
 
 
+NO_VALUE = ("", "-", "--", "n/a", "na", "#n/a", "none", "null", "missing")
+"""What people and spreadsheets write where there is no value; refused, with the cure that belongs to it."""
+
+
 def number(text: str, place: str, column: str, *, cure_nan: str) -> float:
     """A finite number, or an error that names the place, the value and the cure."""
     text = text.strip()
@@ -182,7 +192,7 @@ def number(text: str, place: str, column: str, *, cure_nan: str) -> float:
             fix="write it with a decimal point"
             if comma
             else cure_nan
-            if text == ""
+            if text.lower() in NO_VALUE
             else "correct the value or remove the row",
         ) from None
     if not math.isfinite(value):

@@ -67,6 +67,11 @@ def _sidecar(path: Path) -> Path:
 
 
 def _layout(header: list[str], description: dict[str, Any] | None, path: Path, unit: str | None) -> _Layout:
+    if not _cameras_named(header) and any(map(_is_number, header)):
+        raise DatasetError(
+            f"{path}, line 1: the first line holds numbers, and no names of columns.",
+            fix="write x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ... as its first line",
+        )
     extra: dict[str, Any] = {}
     view_extra: tuple[str, ...] = ()
     if description is None:
@@ -104,6 +109,14 @@ def _layout(header: list[str], description: dict[str, Any] | None, path: Path, u
     taken |= {f"{q}_{c.name}" for c in cameras for q in ("u", "v", *SD_VIEW, *view_extra)}
     point_extra = tuple(column for column in header if column not in taken)
     return _Layout(cameras, view_extra, point_extra, name, unit, extra)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _refuse_unpaired(header: list[str], path: Path) -> None:

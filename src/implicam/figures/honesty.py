@@ -11,6 +11,9 @@ from implicam.coverage import Coverage, Estimate
 from implicam.dataset import Floats, Names
 from implicam.figures.style import BLUE, CLEAR, GREY, VERMILLION, axis, graph_objects, layout, number, plain
 
+TOOLBAR_PX = 36
+"""Height of plotly's toolbar, which otherwise lies on the legend and on the names of the lines."""
+
 
 def reliability(coverage: Coverage) -> Any:
     """Observed against nominal coverage with 95 % intervals, in per cent: the 3D ellipsoid, and all axes together."""
@@ -37,6 +40,7 @@ def reliability(coverage: Coverage) -> Any:
         ),
         yaxis=axis("observed: so many % were", range=[max(-2.0, bottom), 102]),
         legend={"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom", "bgcolor": CLEAR},
+        margin={"t": TOOLBAR_PX + 30},
     )
     _remark(figure, "error bars too large", 0.03, 0.97, "left")
     _remark(figure, "error bars too small", 0.97, 0.03, "right")
@@ -62,6 +66,7 @@ def error_against_sd(error: Floats, spread: Floats, *, names: Names | Sequence[s
     )  # fmt: skip
     figure = go.Figure([cloud], layout(showlegend=False))
     figure.update_layout(
+        margin={"t": TOOLBAR_PX},
         xaxis=axis(f"stated uncertainty ({unit})", type="log", **_ticks(x)),
         yaxis=axis(f"error ({unit})", type="log", **_ticks(y)),
     )

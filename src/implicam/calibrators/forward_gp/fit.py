@@ -556,7 +556,9 @@ def _require_two(problem: Problem, started: dict[int, Started], blind: list[tupl
         raise FitError(
             f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
             why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
-            fix="show the cameras more known points, in the whole volume",
+            fix="show the cameras more known points, in the whole volume"
+            if blind
+            else "use two cameras or more: a position is where their lines of sight meet",
         )
 
 
