@@ -22,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 
 from implicam.calibrators import ForwardGP
-from implicam.calibrators.forward_gp import calibration, fit
+from implicam.calibrators.forward_gp import calibration, fit, label_fit
 from implicam.files import write_text
 from implicam.simulate import build_rig, moving_board, random_positions, simulate
 from implicam.verdict import judge
@@ -33,9 +33,9 @@ STAGES = {
     "sizes": (fit, "_hyperparameters"),
     "posterior": (fit, "_conditioned"),
     "wrong views": (fit, "judged_all"),
-    "tails": (fit, "_with_heavy_tails"),
+    "tails": (label_fit, "with_heavy_tails"),
     "projections": (fit, "_with_projections"),
-    "known positions": (calibration, "with_label_errors"),
+    "known positions": (calibration, "with_noise_told_apart"),
 }
 """The parts of a fit, each with all that it calls."""
 

@@ -15,8 +15,8 @@ from scipy.stats import chi2, kstest, multivariate_normal
 
 from implicam.calibrators import ForwardGP, ForwardGPCalibration, load_calibration
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
-from implicam.calibrators.forward_gp.fit import left_out, squared_distances
 from implicam.calibrators.forward_gp.general_camera import AnyCamera
+from implicam.calibrators.forward_gp.leave_one_out import left_out, squared_distances
 from implicam.calibrators.forward_gp.lens import (
     TANGENT,
     CentralCamera,

@@ -16,15 +16,8 @@ from scipy.optimize import minimize_scalar
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.start import MirroredError, start_with_lens
 from implicam.calibrators.forward_gp.evidence import Hyperparameters
-from implicam.calibrators.forward_gp.fit import (
-    Bools,
-    FittedRig,
-    Problem,
-    judged_all,
-    settle,
-    start_rig,
-    without_field,
-)
+from implicam.calibrators.forward_gp.fit import FittedRig, Problem, settle, start_rig, without_field
+from implicam.calibrators.forward_gp.leave_one_out import Bools, judged_all
 from implicam.calibrators.forward_gp.lens import Floats
 from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, condition, spread
 from implicam.calibrators.forward_gp.start import FEWEST, Started, levenberg_marquardt

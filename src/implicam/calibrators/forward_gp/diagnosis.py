@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.fit import FittedRig, left_out
+from implicam.calibrators.forward_gp.fit import FittedRig
 from implicam.calibrators.forward_gp.label_fit import left_out_points
+from implicam.calibrators.forward_gp.leave_one_out import left_out
 from implicam.calibrators.forward_gp.posterior import Sightings
 from implicam.calibrators.forward_gp.problem import Frame, sightings_of, stated_noise
 from implicam.calibrators.protocol import Rejected, Unused

@@ -34,6 +34,15 @@ from implicam.calibrators.forward_gp.heavy_tails import (
     whitened,
 )
 from implicam.calibrators.forward_gp.label_errors import LabelErrors
+from implicam.calibrators.forward_gp.leave_one_out import (
+    OUTLIER,
+    Bools,
+    judged_all,
+    left_out,
+    left_out_from,
+    left_out_positions,
+    residuals_of,
+)
 from implicam.calibrators.forward_gp.lens import Floats, Image, Prior, ProjectiveCamera
 from implicam.calibrators.forward_gp.posterior import (
     CameraFailedError,
@@ -45,7 +54,6 @@ from implicam.calibrators.forward_gp.posterior import (
     condition,
     empty_field,
     field_coordinates,
-    spread,
 )
 from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
 from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
@@ -54,25 +62,17 @@ from implicam.errors import FitError
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
 
-Bools = NDArray[np.bool_]
-
 MOST = 300
 """Points of one camera that the hyperparameters are found from; more cost time and tell little more."""
 
 MOST_UNCERTAIN = 50
 """The same where every point has an error of its own: three unknowns each."""
 
-OUTLIER = 25.0
-"""Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
-
 TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
 """Median error of a start, in half the extent of the pixels, beyond which it is none."""
 
 TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
-
-LEAST_LEFT = 1e-9
-"""One minus the leverage of a view, at least: below, rounding decides."""
 
 MAX_SETTLING_STEPS = 15
 """Gauss-Newton steps of the cameras; ordinary ones take one to four."""
@@ -94,6 +94,9 @@ LARGE_FIELD = 3e-3
 
 CLEAR_NATS = 3.0
 """By how much left-out views must at least be more probable without a lens model."""
+
+MAX_SQUARES = 20.0
+"""Squared errors of known points, in their median, beyond which more does not count when fits are compared."""
 
 AUTO = "auto"
 """The kind of each camera is chosen by the data."""
@@ -214,6 +217,8 @@ def _with_projections(problem: Problem, fitted: FittedRig, started: dict[int, St
         other = _fit_started(problem, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, blind)
     except np.linalg.LinAlgError:
         return fitted
+    if _measures_better(problem, other, fitted):
+        return other
     better = {
         c for number, c in enumerate(fitted.cameras) if c in tried and _predicts_better(problem, other, fitted, number)
     }
@@ -231,6 +236,22 @@ def _predicts_better(problem: Problem, one: FittedRig, other: FittedRig, number:
     gain = _left_out_log_densities(problem, one, number) - _left_out_log_densities(problem, other, number)
     clearly = 2 * float(np.std(gain)) * np.sqrt(len(gain))
     return bool(np.sum(gain) > max(clearly, CLEAR_NATS))
+
+
+def _measures_better(problem: Problem, one: FittedRig, other: FittedRig) -> bool:
+    """Whether known points, measured without themselves, are clearly nearer to their positions in one fit than in
+    another. A view of a steep camera says little of depth, so its density is not all that counts."""
+    squares = []
+    for fitted in (one, other):
+        seen = tuple(problem.sightings[c] for c in fitted.cameras)
+        error = left_out_positions(fitted.posterior, problem.points, seen, fitted.kept)
+        squares.append(np.sum(error**2, axis=1))
+    one_squares, other_squares = np.array(squares)[:, np.isfinite(squares).all(axis=0)]
+    if len(one_squares) < FEWEST_WITHOUT_LENS:
+        return False
+    limit = MAX_SQUARES * float(np.median(other_squares))  # a wrong point says nothing of either
+    gain = np.minimum(other_squares, limit) - np.minimum(one_squares, limit)
+    return bool(np.sum(gain) > 2 * float(np.std(gain)) * np.sqrt(len(gain)))
 
 
 def _left_out_log_densities(problem: Problem, fitted: FittedRig, number: int) -> Floats:
@@ -433,9 +454,9 @@ class _Predicted(NamedTuple):
     def of(
         cls, posterior: Posterior, c: int, points: Floats, seen: Sightings, weighted: Sightings, kept: Bools
     ) -> _Predicted:
-        at = _residuals(posterior, c, points, weighted)
+        at = residuals_of(posterior, c, points, weighted)
         variance = (posterior.models[c].noise * seen.relative) ** 2
-        residual, covariance = _left_out(at, kept)
+        residual, covariance = left_out_from(at, kept)
         covariance = covariance - (at.sd**2 - variance)[:, None, None] * np.eye(2)
         distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
         sound = np.isfinite(distance) & (covariance[:, 0, 0] > 0) & (np.linalg.det(covariance) > 0)
@@ -822,63 +843,3 @@ def _downhill(
 def _small(step: Floats, root: Floats) -> bool:
     sd = np.sqrt(np.sum(root[:, : len(step)] ** 2, axis=0))
     return bool(np.all(np.abs(step) <= 0.02 * sd))
-
-
-def squared_distances(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> Floats:
-    """(n,) how far each view is from what the others predict: closed form for the views used, eq. (18)."""
-    residual, covariance = left_out(posterior, c, points, seen, kept)
-    inverse = np.linalg.inv(covariance)
-    distance = np.einsum("ni,nij,nj->n", residual, inverse, residual)
-    return np.asarray(np.where(np.isfinite(distance), distance, np.inf), dtype=np.float64)
-
-
-def left_out(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> tuple[Floats, Floats]:
-    """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px."""
-    return _left_out(_residuals(posterior, c, points, seen), kept)
-
-
-class _Residuals(NamedTuple):
-    """Of one camera's views: residual (n, 2) from the posterior mean, reach (n, 2, 2) its covariance, rest (n,) what
-    the features leave out, sd (n,) of the noise."""
-
-    residual: Floats
-    reach: Floats
-    rest: Floats
-    sd: Floats
-
-
-def _residuals(posterior: Posterior, c: int, points: Floats, seen: Sightings) -> _Residuals:
-    model = posterior.models[c]
-    where = points[seen.rows]
-    if posterior.displacement is not None:
-        where = where + posterior.displacement[seen.rows]
-    rows = model.rows(where)
-    half = spread(rows, posterior.alone[c])
-    return _Residuals(seen.uv - rows.mean, half @ half.swapaxes(1, 2), rows.rest, model.noise * seen.relative)
-
-
-def _left_out(at: _Residuals, kept: Bools) -> tuple[Floats, Floats]:
-    smooth = at.reach / (at.sd**2)[:, None, None]
-    left = np.where(kept[:, None, None] & np.isfinite(smooth), np.eye(2) - smooth, np.eye(2))
-    values, vectors = np.linalg.eigh(left)  # rounding can make a view that decides alone more than decisive
-    inside = vectors / np.maximum(values, LEAST_LEFT)[:, None, :] @ vectors.swapaxes(1, 2)
-    residual = np.einsum("nij,nj->ni", inside, at.residual)
-    extra = np.where(kept[:, None, None], 0, at.reach)
-    return residual, inside * (at.sd**2)[:, None, None] + extra + at.rest[:, None, None] * np.eye(2)
-
-
-def judged_all(
-    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
-) -> tuple[Bools, ...]:
-    """Per camera, the views to use next: not those that contradict the others."""
-
-    def one(c: int) -> Bools:
-        return _judged(squared_distances(posterior, c, points, seen[c], kept[c]), kept[c])
-
-    return tuple(side_by_side(one, range(len(seen))))
-
-
-def _judged(distance: Floats, kept: Bools) -> Bools:
-    """The views to use next: the far ones go, the worst tenth at a time, those that agree come back."""
-    worst = np.quantile(distance[kept], 0.9) if kept.any() else 0.0
-    return np.asarray(np.where(kept, distance <= max(OUTLIER, worst), distance <= OUTLIER), dtype=np.bool_)

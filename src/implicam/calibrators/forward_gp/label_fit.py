@@ -7,25 +7,20 @@ judged again, and the cameras are conditioned once more, with less noise and tie
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.fit import OUTLIER, Bools, FittedRig, Problem, left_out, settle, with_heavy_tails
+from implicam.calibrators.forward_gp.fit import FittedRig, Problem, settle, with_heavy_tails
 from implicam.calibrators.forward_gp.label_errors import Agreement, LabelErrors, estimated
+from implicam.calibrators.forward_gp.leave_one_out import OUTLIER, Bools, LeftOut, left_out_views
 from implicam.calibrators.forward_gp.lens import Floats
 from implicam.calibrators.forward_gp.levels import untold
-from implicam.calibrators.forward_gp.posterior import Posterior, Sightings, spread
+from implicam.calibrators.forward_gp.posterior import Sightings, spread
 from implicam.calibrators.forward_gp.scatter import Scatter
 from implicam.dataset import Names
 
 MOST = 400
 """Points that the errors are estimated from; more cost time and tell little more."""
-
-LEVERAGE = 3.0
-"""Variance of a view predicted without its own point over that of the noise: beyond it the point says how a camera is,
-and not how it is off itself."""
 
 
 def with_noise_told_apart(problem: Problem, fitted: FittedRig, shots: Names) -> FittedRig:
@@ -52,7 +47,7 @@ def _with_scatter(problem: Problem, fitted: FittedRig) -> FittedRig:
     seen = tuple(problem.sightings[c] for c in fitted.cameras)
     if fitted.tails is not None:
         seen = fitted.tails.weighted(seen, told=True)
-    views = _left_out(fitted.posterior, problem.points, seen, fitted.kept)
+    views = left_out_views(fitted.posterior, problem.points, seen, fitted.kept)
     kept, n = fitted.kept, len(problem.points)
     found = _estimated(views, kept, n)
     if found is None:
@@ -71,40 +66,13 @@ def _with_scatter(problem: Problem, fitted: FittedRig) -> FittedRig:
     return replace(fitted, posterior=posterior, kept=kept, label_errors=errors)
 
 
-class _LeftOut(NamedTuple):
-    """Per view of one camera, predicted without it: rows (n,) of the points; residual (n, 2) and covariance inverse
-    (n, 2, 2); slope (n, 2, 3) by the position; high (n,) whether its point says how the camera is."""
-
-    rows: NDArray[np.int64]
-    residual: Floats
-    inverse: Floats
-    slope: Floats
-    high: Bools
-
-
-def _left_out(
-    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
-) -> list[_LeftOut]:
-    found = []
-    where = points if posterior.displacement is None else points + posterior.displacement
-    for c, (one, k) in enumerate(zip(seen, kept, strict=True)):
-        residual, covariance = left_out(posterior, c, points, one, k)
-        slope = posterior.models[c].predict(where[one.rows])[1]
-        noise2 = (posterior.models[c].noise * one.relative) ** 2
-        values = np.linalg.eigvalsh(covariance) / noise2[:, None]
-        high = ~((values > 0) & (values < LEVERAGE)).all(axis=1)  # negative: rounding, at a leverage of one
-        inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        found.append(_LeftOut(one.rows, residual, inverse, slope, np.asarray(high, dtype=np.bool_)))
-    return found
-
-
-def _sums(views: list[_LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
+def _sums(views: list[LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
     """Of all points, and which of them may be used: seen twice, and not of high leverage."""
     total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
     high = np.zeros(n, dtype=np.bool_)
     for view, k in zip(views, kept, strict=True):
         rows = view.rows[k]  # a camera sees a point once
-        information, pull = _own(view)
+        information, pull = view.information, view.pull
         total.information[rows] += information[k]
         total.pull[rows] += pull[k]
         total.squares[rows] += np.einsum("ni,nij,nj->n", view.residual, view.inverse, view.residual)[k]
@@ -113,13 +81,7 @@ def _sums(views: list[_LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[Agree
     return total, (total.coordinates >= 4) & ~high
 
 
-def _own(view: _LeftOut) -> tuple[Floats, Floats]:
-    """What each view says of the displacement of its point: information (n, 3, 3) and pull (n, 3)."""
-    weighted = view.inverse @ view.slope
-    return view.slope.swapaxes(1, 2) @ weighted, np.einsum("nij,ni->nj", weighted, view.residual)
-
-
-def _estimated(views: list[_LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[LabelErrors, Floats] | None:
+def _estimated(views: list[LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[LabelErrors, Floats] | None:
     """The errors, and (n,) how much larger than usual each point's own scale is."""
     agreement, good = _sums(views, kept, n)
     rows = np.flatnonzero(good).astype(np.int64)
@@ -132,14 +94,14 @@ def _estimated(views: list[_LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[
     return errors, size
 
 
-def _judged(views: list[_LeftOut], kept: tuple[Bools, ...], found: LabelErrors, n: int) -> tuple[Bools, ...]:
+def _judged(views: list[LeftOut], kept: tuple[Bools, ...], found: LabelErrors, n: int) -> tuple[Bools, ...]:
     """The views to use: those that agree with what the others say of where their point is."""
     total, _ = _sums(views, kept, n)
     noise2 = found.noise**2
     prior = np.linalg.inv(found.covariance)
     judged = []
     for view, k in zip(views, kept, strict=True):
-        information, pull = _own(view)
+        information, pull = view.information, view.pull
         others = (total.information[view.rows] - np.where(k[:, None, None], information, 0)) / noise2 + prior
         drawn = (total.pull[view.rows] - np.where(k[:, None], pull, 0)) / noise2
         where = np.linalg.inv(others)

@@ -1,0 +1,143 @@
+"""Known points and views without themselves: what all others predict of them, in closed form, eq. (18)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.lens import Floats
+from implicam.calibrators.forward_gp.posterior import Posterior, Sightings, spread
+from implicam.threads import side_by_side
+
+Bools = NDArray[np.bool_]
+
+OUTLIER = 25.0
+"""Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
+
+LEAST_LEFT = 1e-9
+"""One minus the leverage of a view, at least: below, rounding decides."""
+
+MAX_LEVERAGE = 3.0
+"""Variance of a view predicted without its own point over that of the noise: beyond it the point says how a camera is,
+and not how it is off itself."""
+
+
+def squared_distances(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> Floats:
+    """(n,) how far each view is from what the others predict: closed form for the views used, eq. (18)."""
+    residual, covariance = left_out(posterior, c, points, seen, kept)
+    inverse = np.linalg.inv(covariance)
+    distance = np.einsum("ni,nij,nj->n", residual, inverse, residual)
+    return np.asarray(np.where(np.isfinite(distance), distance, np.inf), dtype=np.float64)
+
+
+def left_out(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> tuple[Floats, Floats]:
+    """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px."""
+    return left_out_from(residuals_of(posterior, c, points, seen), kept)
+
+
+class Residuals(NamedTuple):
+    """Of one camera's views: residual (n, 2) from the posterior mean, reach (n, 2, 2) its covariance, rest (n,) what
+    the features leave out, sd (n,) of the noise."""
+
+    residual: Floats
+    reach: Floats
+    rest: Floats
+    sd: Floats
+
+
+def residuals_of(posterior: Posterior, c: int, points: Floats, seen: Sightings) -> Residuals:
+    """Of all views of camera c."""
+    model = posterior.models[c]
+    where = points[seen.rows]
+    if posterior.displacement is not None:
+        where = where + posterior.displacement[seen.rows]
+    rows = model.rows(where)
+    half = spread(rows, posterior.alone[c])
+    return Residuals(seen.uv - rows.mean, half @ half.swapaxes(1, 2), rows.rest, model.noise * seen.relative)
+
+
+def left_out_from(at: Residuals, kept: Bools) -> tuple[Floats, Floats]:
+    """As `left_out`; kept: the views that the posterior is from."""
+    smooth = at.reach / (at.sd**2)[:, None, None]
+    left = np.where(kept[:, None, None] & np.isfinite(smooth), np.eye(2) - smooth, np.eye(2))
+    values, vectors = np.linalg.eigh(left)  # rounding can make a view that decides alone more than decisive
+    inside = vectors / np.maximum(values, LEAST_LEFT)[:, None, :] @ vectors.swapaxes(1, 2)
+    residual = np.einsum("nij,nj->ni", inside, at.residual)
+    extra = np.where(kept[:, None, None], 0, at.reach)
+    return residual, inside * (at.sd**2)[:, None, None] + extra + at.rest[:, None, None] * np.eye(2)
+
+
+def judged_all(
+    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
+) -> tuple[Bools, ...]:
+    """Per camera, the views to use next: not those that contradict the others."""
+
+    def one(c: int) -> Bools:
+        return _judged(squared_distances(posterior, c, points, seen[c], kept[c]), kept[c])
+
+    return tuple(side_by_side(one, range(len(seen))))
+
+
+def _judged(distance: Floats, kept: Bools) -> Bools:
+    """The views to use next: the far ones go, the worst tenth at a time, those that agree come back."""
+    worst = np.quantile(distance[kept], 0.9) if kept.any() else 0.0
+    return np.asarray(np.where(kept, distance <= max(OUTLIER, worst), distance <= OUTLIER), dtype=np.bool_)
+
+
+class LeftOut(NamedTuple):
+    """Per view of one camera, predicted without it: rows (n,) of the points; residual (n, 2) and covariance inverse
+    (n, 2, 2); slope (n, 2, 3) by the position; high (n,) whether its point says how the camera is."""
+
+    rows: NDArray[np.int64]
+    residual: Floats
+    inverse: Floats
+    slope: Floats
+    high: Bools
+
+    @property
+    def information(self) -> Floats:
+        """(n, 3, 3) what each view says of the displacement of its point."""
+        return np.asarray(self.slope.swapaxes(1, 2) @ self.inverse @ self.slope, dtype=np.float64)
+
+    @property
+    def pull(self) -> Floats:
+        """(n, 3) the information times the displacement that each view asks for."""
+        return np.asarray(np.einsum("nki,nkj,nj->ni", self.slope, self.inverse, self.residual), dtype=np.float64)
+
+
+def left_out_views(
+    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
+) -> list[LeftOut]:
+    """Per camera."""
+    found = []
+    where = points if posterior.displacement is None else points + posterior.displacement
+    for c, (one, k) in enumerate(zip(seen, kept, strict=True)):
+        residual, covariance = left_out(posterior, c, points, one, k)
+        slope = posterior.models[c].predict(where[one.rows])[1]
+        noise2 = (posterior.models[c].noise * one.relative) ** 2
+        values = np.linalg.eigvalsh(covariance) / noise2[:, None]
+        high = ~((values > 0) & (values < MAX_LEVERAGE)).all(axis=1)  # negative: rounding, at a leverage of one
+        inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        found.append(LeftOut(one.rows, residual, inverse, slope, np.asarray(high, dtype=np.bool_)))
+    return found
+
+
+def left_out_positions(
+    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
+) -> Floats:
+    """(n, 3) how far each known point is measured off its position by views predicted without it; NaN where fewer than
+    two cameras see it."""
+    n = len(points)
+    information, pull, views = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
+    for view, k in zip(left_out_views(posterior, points, seen, kept), kept, strict=True):
+        rows = view.rows[k]  # a camera sees a point once
+        information[rows] += view.information[k]
+        pull[rows] += view.pull[k]
+        views[rows] += 1
+    values = np.linalg.eigvalsh(np.where(np.isfinite(information), information, 0))
+    good = (views >= 2) & (values[:, 0] > LEAST_LEFT * values[:, 2]) & np.isfinite(pull).all(axis=1)
+    error = np.full((n, 3), np.nan)
+    error[good] = np.linalg.solve(information[good], pull[good][..., None])[..., 0]
+    return error
