@@ -213,6 +213,9 @@ class RigEvidence:
         """The most probable hyperparameters; `start` is a good guess, from a moment ago, of which the lengthscales
         stay where there is nothing to `search`."""
         shared = np.zeros(2)  # log deviations of signal and noise from their prior medians
+        if start is not None:  # two pairs of them can be likely, a large field and large noise: stay with that found
+            logs = [np.log(found / median) for found, median in zip(start[1:], self._medians(), strict=True)]
+            shared = np.clip(np.mean(logs, axis=1), -6.0, 6.0)
         known: dict[tuple[float, ...], tuple[float, Floats]] = {}
         spectra: dict[tuple[float, ...], list[Spectrum]] = {}
 

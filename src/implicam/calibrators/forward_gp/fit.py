@@ -41,6 +41,7 @@ from implicam.calibrators.forward_gp.leave_one_out import (
     left_out,
     left_out_from,
     left_out_positions,
+    next_inliers,
     residuals_of,
 )
 from implicam.calibrators.forward_gp.lens import Floats, Image, Prior, ProjectiveCamera
@@ -102,9 +103,9 @@ AUTO = "auto"
 """The kind of each camera is chosen by the data."""
 
 ROUNDS, ROUNDS_WITH_SHOTS = 6, 18
-SEARCHED = 2
-"""Of these, those that look for lengthscales, where known positions are exact: the few views that change later tell
-nothing new of how smooth a field is."""
+SEARCHED, FEW_CHANGED = 2, 0.01
+"""Of these, those that look for lengthscales in any case, where known positions are exact; and the part of the views
+which, when they change later, tell nothing new of how smooth a field is."""
 
 REWEIGHTED = 3
 """Rounds more where the noise has heavy tails."""
@@ -338,12 +339,15 @@ def _fit_started(
     hyper = before.hyperparameters if before is not None and before.cameras == cameras else None
     tied = problem.errors is not None and not problem.errors.estimated
     state = _Round(hyper, models, None, kept, problem.errors, None, settled=False, fixed=hyper if tied else None)
+    changed = 1.0  # part of the views
     for number in range(rounds):
-        state = _round(problem, state, seen, images, stated, search=number < SEARCHED)
+        search = number < SEARCHED or changed > FEW_CHANGED
+        state = _round(problem, state, seen, images, stated, search=search)
         judged = state.kept
         if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
             judged = judged_all(state.posterior, problem.points, seen, state.kept)
-        if state.settled and all((j == k).all() for j, k in zip(judged, state.kept, strict=True)):
+        changed = float(np.mean(np.concatenate(judged) != np.concatenate(state.kept)))
+        if state.settled and not changed:
             break
         progress("fitting", 2, 3)
         if number < rounds - 1:  # the last round's views stay those of its posterior
@@ -435,7 +439,8 @@ def _tails(
         return None
     every = [one(c, len(problem.points)) for c in range(len(seen))]
     limit = outlier_distance(degrees, OUTLIER)
-    return Tails(degrees, tuple(weights_of(p.own, degrees) for p in every)), tuple(p.distance <= limit for p in every)
+    judged = tuple(next_inliers(p.distance, k, limit) for p, k in zip(every, state.kept, strict=True))
+    return Tails(degrees, tuple(weights_of(p.own, degrees) for p in every)), judged
 
 
 class _Predicted(NamedTuple):
@@ -520,6 +525,9 @@ def _round(
         k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
         for k, m, s in zip(last.kept, last.models, seen, strict=True)
     )
+    for number, k in enumerate(kept):
+        if k.sum() < FEWEST:
+            raise CameraFailedError(number, f"{k.sum()} of its {len(k)} views agree with the others")
     used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=False), kept, strict=True))
     moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
     hyper = last.fixed or _hyperparameters(problem, last.models, used, images, stated, last.hyper, moved, search)

@@ -75,15 +75,15 @@ def judged_all(
     """Per camera, the views to use next: not those that contradict the others."""
 
     def one(c: int) -> Bools:
-        return _judged(squared_distances(posterior, c, points, seen[c], kept[c]), kept[c])
+        return next_inliers(squared_distances(posterior, c, points, seen[c], kept[c]), kept[c])
 
     return tuple(side_by_side(one, range(len(seen))))
 
 
-def _judged(distance: Floats, kept: Bools) -> Bools:
+def next_inliers(distance: Floats, kept: Bools, limit: float = OUTLIER) -> Bools:
     """The views to use next: the far ones go, the worst tenth at a time, those that agree come back."""
     worst = np.quantile(distance[kept], 0.9) if kept.any() else 0.0
-    return np.asarray(np.where(kept, distance <= max(OUTLIER, worst), distance <= OUTLIER), dtype=np.bool_)
+    return np.asarray(np.where(kept, distance <= max(limit, worst), distance <= limit), dtype=np.bool_)
 
 
 class LeftOut(NamedTuple):
