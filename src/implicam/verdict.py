@@ -367,7 +367,7 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
 def _of_rows(data: Dataset, suspected: str) -> Iterator[Finding]:
     """Cameras whose pixels and known positions do not belong together, row by row; `suspected`: what else speaks
     against some of them."""
-    if not len(data):
+    if data.known is None:
         return
     for c, name in enumerate(data.observations.camera_names):
         uv = data.observations.uv[:, c]
