@@ -338,8 +338,8 @@ class Dataset:
         if not 2 <= k <= places:
             raise DatasetError(
                 f"cannot make {k} folds of {len(self)} points"
-                + (f" at {places} places." if places < len(self) else "."),
-                fix=f"choose a number from 2 to {places}",
+                + (f" at {places} place{'s' * (places != 1)}." if places < len(self) else "."),
+                fix=f"choose a number from 2 to {places}" if places > 1 else "add points elsewhere",
             )
         fold = np.random.default_rng(seed).permutation(np.arange(len(self)) % k)[self.places]
         for i in np.unique(fold).tolist():
