@@ -360,7 +360,8 @@ def test_splits_are_partitions(n: int, data: Any) -> None:
 def numbered(n: int) -> Dataset:
     points = np.array([f"p{i:03d}" for i in range(n)])
     uv = np.arange(4.0 * n).reshape(n, 2, 2)
-    known = KnownPositions(np.array([f"s{i % 3}" for i in range(n)]), np.ones((n, 3)), np.full((n, 3), np.nan))
+    xyz = np.arange(3.0 * n).reshape(n, 3)
+    known = KnownPositions(np.array([f"s{i % 3}" for i in range(n)]), xyz, np.full((n, 3), np.nan))
     return Dataset("n", "mm", Observations(points, (Camera("a"), Camera("b")), uv, np.full(uv.shape, np.nan)), known)
 
 

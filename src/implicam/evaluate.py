@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from implicam.calibrators import Calibration
 from implicam.coverage import Coverage, assess, tercile_labels
 from implicam.dataset import Dataset, Floats, Names, Observations, copies_of
-from implicam.dataset.copies import fingerprints
+from implicam.dataset.model import fingerprints
 from implicam.errors import DatasetError
 from implicam.geometry import depth_of_points
 from implicam.measurement import Measurement
@@ -177,8 +177,11 @@ def _judge(
 def _label_covariance(calibration: Calibration, data: Dataset) -> Floats:
     """(n, 3, 3) of the errors of the known positions that are judged by: as declared, or else as the calibration has
     estimated them; none of simulated true positions."""
-    if data.truth is not None:
-        return np.zeros((len(data), 3, 3))
+    return np.zeros((len(data), 3, 3)) if data.truth is not None else known_position_covariance(calibration, data)
+
+
+def known_position_covariance(calibration: Calibration, data: Dataset) -> Floats:
+    """(n, 3, 3) of the errors of known positions: as declared, or else as the calibration has estimated them."""
     if _declared(data) or not isinstance(calibration, KnowsLabelErrors):
         return np.asarray(np.nan_to_num(data.positions.sd)[:, :, None] ** 2 * np.eye(3), dtype=np.float64)
     return calibration.known_position_covariance(data.xyz)

@@ -156,7 +156,7 @@ def resect_robustly(xyz: Floats, uv: Floats) -> tuple[Floats, Bools]:
         except FitError:
             continue
         if np.median(error) < best:
-            best, kept = float(np.median(error)), error <= np.quantile(error, 0.7)
+            best, kept = float(np.median(error)), error <= np.sort(error)[int(0.7 * len(error))]  # some may be infinite
     if not np.isfinite(best):
         raise _undetermined()
     for _ in range(3):

@@ -20,9 +20,11 @@ from scipy.special import bdtrc, chdtri
 
 from implicam.calibrators import MLP, Calibration, InverseGP
 from implicam.calibrators.forward_gp.problem import stated_noise
+from implicam.calibrators.forward_gp.wrong_rows import slipped, what_is_wrong
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
+from implicam.evaluate import known_position_covariance
 from implicam.progress import Progress, silent
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
@@ -62,6 +64,11 @@ FEWEST_JUDGED = 6
 
 USELESS = 0.3
 """rms error of held-out points, in the rms distance of the known points from their middle, that is no measurement."""
+
+
+NOTHING = 0.8
+"""The same, above which nothing was learned, whatever the error bars say: the middle of the known points, guessed for
+all, is off by 1."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +116,8 @@ def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
     """Judge a calibration by its known points: a few fits without some of them, and what the data show."""
     held_out, failed = _held_out(calibration, progress)
     findings = [*failed, *_of_held_out(held_out, calibration), *_of_data(calibration.data)]
-    findings += [*_of_rejected(calibration), *_of_residuals(calibration)]
+    suspects = [*_of_rejected(calibration), *_of_residuals(calibration)]
+    findings += [*suspects, *_of_rows(calibration.data, " ".join(finding.reason for finding in suspects))]
     reasons = tuple(finding.reason for finding in sorted(findings, key=lambda finding: not finding.grave))
     word = NOT_USABLE if any(finding.grave for finding in findings) else DOUBTFUL if findings else USABLE
     return Verdict(word, reasons, held_out)
@@ -141,12 +149,16 @@ def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | N
     if n < FEWEST_JUDGED:
         return None, []
     plan = _plan(calibration, n)
-    fold = np.random.default_rng(0).permutation(np.arange(n) % plan.folds)
+    places = calibration.data.places
+    fold = np.random.default_rng(0).permutation(np.arange(n) % plan.folds)[data.places]
     found: list[_Measured] = []
     failures: list[ImplicamError] = []
     for i in range(plan.done):
         progress("checking", i, plan.done)
-        others = calibration.data.select(~np.isin(calibration.data.points, data.points[fold == i]))
+        if not (fold == i).any():  # all at a few places
+            continue
+        held = np.isin(calibration.data.points, data.points[fold == i])
+        others = calibration.data.select(~np.isin(places, places[held]))
         try:
             again = calibration.refit(_at_most(others, plan.train))
         except UsageError:  # made without known points: nothing can be held out
@@ -156,8 +168,8 @@ def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | N
             continue
         found.append(_measured(again, data.select(fold == i)))
     progress("checking", plan.done, plan.done)
-    if len(failures) > plan.done / 2 or (failures and n < ENOUGH_POINTS):
-        return None, _not_repeatable(n, failures[0])
+    if not found or len(failures) > plan.done / 2 or (failures and n < ENOUGH_POINTS):
+        return None, _not_repeatable(n, failures[0]) if failures else []
     how = f"{len(found)} fits from nothing without {'a fifth' if plan.folds == 5 else 'a third'} of the known points"
     return _summary(found, how + (f", at most {plan.train} points each" if n > plan.train else "")), []
 
@@ -200,8 +212,7 @@ def _measured(calibration: Calibration, data: Dataset) -> _Measured:
     measured = calibration.measure(data.observations)
     own = measured.own_reason
     fine = measured.measured & (own == "")
-    sd = np.nan_to_num(data.positions.sd)
-    cov = measured.cov + sd[:, :, None] ** 2 * np.eye(3)
+    cov = measured.cov + known_position_covariance(calibration, data)
     contradicting = ~fine & (~np.isnan(measured.consistency) | measured.measured)
     return _Measured((measured.xyz - data.xyz)[fine], cov[fine], contradicting)
 
@@ -231,8 +242,11 @@ def _of_held_out(found: HeldOut | None, calibration: Calibration) -> Iterator[Fi
     unit = calibration.data.length_unit
     said = f"{found.points} known points that a fit had not seen are off by {found.rms:.2g} {unit} rms"
     extent = float(np.sqrt(np.mean(np.sum((calibration.data.xyz - calibration.data.xyz.mean(axis=0)) ** 2, axis=1))))
-    if found.rms > USELESS * extent and found.nees > WORST_NEES:
-        yield Finding(True, f"{said}, and all of them lie within {extent:.2g} {unit}: this is no measurement. {_LOOK}")
+    within = f"{said}, and all of them lie within {extent:.2g} {unit}"
+    if found.rms > NOTHING * extent or (found.rms > USELESS * extent and found.nees > WORST_NEES):
+        yield Finding(True, f"{within}: this is no measurement. {_LOOK}")
+    elif found.rms > USELESS * extent:
+        yield Finding(False, f"{within}: this is hardly a measurement, as the error bars say. {_LOOK}")
     elif found.nees > HOPELESS_NEES and found.inside < 0.5:
         yield Finding(True, f"{said}, where the error bars say {found.stated:.2g}: they mean nothing. {_LOOK}")
     elif found.rms > USELESS * extent:  # honest error bars make no measurement of it
@@ -279,9 +293,11 @@ def _of_network(calibration: Calibration) -> Iterator[Finding]:
 
 def _of_data(data: Dataset) -> Iterator[Finding]:
     copies = copies_of(data)
-    n = int((~copies.points & data.observations.seen.any(axis=1)).sum())
-    if 0 < n < FEW_POINTS:
-        yield Finding(False, f"{n} known points are few: show the cameras {FEW_POINTS} or more, better 17, all over.")
+    seen = ~copies.points & data.observations.seen.any(axis=1)
+    n, places = int(seen.sum()), len(np.unique(data.places[seen]))
+    if 0 < places < FEW_POINTS:
+        what = f"{n} known points are" if places == n else f"{n} known points at {places} different positions are"
+        yield Finding(False, f"{what} few: show the cameras {FEW_POINTS} or more, better 17, all over.")
     for note in copy_notes(data):
         yield Finding(False, note)
     for note in without_marks(data).notes[len(data.notes) :]:
@@ -353,6 +369,18 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
                 f"{name} misses its own known points by {median:.2g} px in the median, the other cameras by "
                 f"{usual:.2g}: look at its pictures, or leave it out with --without {name}.",
             )
+
+
+def _of_rows(data: Dataset, suspected: str) -> Iterator[Finding]:
+    """Cameras whose pixels and known positions do not belong together, row by row; `suspected`: what else speaks
+    against some of them."""
+    if data.known is None:
+        return
+    for c, name in enumerate(data.observations.camera_names):
+        uv = data.observations.uv[:, c]
+        why = (what_is_wrong if name in suspected.split() else slipped)(data.xyz, uv)
+        if why:
+            yield Finding(False, f"{name}: {why}. Look at the order of its pictures and of the rows.")
 
 
 def _beyond(count: int, n: int, share: float) -> bool:

@@ -225,11 +225,14 @@ def _late(values: Floats, rows: int) -> Floats:
 
 def _other_pixels(table: Table) -> Iterator[Guess]:
     """The ways in which other programs count pixels."""
-    if all(camera.height is not None for camera in table.cameras):
+    if all(camera.width is not None and camera.height is not None for camera in table.cameras):
         height = np.array([camera.height for camera in table.cameras], dtype=np.float64)
         uv = table.uv.copy()
         uv[..., 1] = height - 1 - uv[..., 1]
         yield "is v counted from below here, and was not when the rig was calibrated? So {share}", uv, table.noise, 1.0
+        ends = np.array([[camera.width, camera.height] for camera in table.cameras], dtype=np.float64) - 1
+        words = "are the pictures upside down here, and were not when the rig was calibrated? Turned by 180° {share}"
+        yield words, ends - table.uv, table.noise, 1.0
     yield "are u and v exchanged? The other way round {share}", table.uv[..., ::-1].copy(), table.noise, 1.0
     for factor, words in SIZES:
         uv = factor * (table.uv + 0.5) - 0.5

@@ -158,7 +158,7 @@ def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]
     per_camera = ", ".join(f"{name} sees {count}" for name, count in zip(names, seen.sum(axis=0), strict=True))
     least = 5  # fewer than a line and a noise can be learned from
     why = f"only points seen by every camera can be used; of {len(data)} points, {per_camera}" if unused else ""
-    require_points(int(complete.sum()), least, method, why)
+    require_points(len(np.unique(data.places[complete])), least, method, why)
     usable = data.select(complete)
     require_two_values(usable.xyz, method)
     return usable, (*unused, *copied)
@@ -331,6 +331,11 @@ class InverseGPCalibration:
         if error < THIN * thickness:
             return []
         unit = self.data.length_unit
+        errors = self.map.leave_one_out()[0] * self.positions.scale
+        if (np.sqrt(np.mean(errors**2, axis=0)) > THIN * np.std(self._usable.xyz, axis=0)).all():
+            return [
+                "The pixels tell little of any coordinate of the known positions: they are too few, or some are wrong."
+            ]
         return [
             f"The known positions lie nearly in one plane: {thickness:.2g} {unit} (rms) thick, of which the pixels "
             f"tell to {error:.2g} {unit}. Positions off it are not measured but guessed: add known points in front of "

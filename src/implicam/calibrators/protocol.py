@@ -128,7 +128,9 @@ def same_cameras(trained: Observations, observations: Observations) -> Observati
                 f"camera {camera.name!r} has images of {other.width} x {other.height} pixels; it was calibrated with "
                 f"{camera.width} x {camera.height}.",
                 why="a calibration holds for one image size",
-                fix="record with the size of the calibration, or calibrate again",
+                fix="turn the pictures back as they were: width and height are exchanged"
+                if (other.width, other.height) == (camera.height, camera.width)
+                else "record with the size of the calibration, or calibrate again",
             )
     return ordered
 

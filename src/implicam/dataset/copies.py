@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset.model import Dataset, Floats, Observations
+from implicam.dataset.model import Dataset, Floats, Observations, first_same
 
 Integers = NDArray[np.int64]
 
@@ -53,17 +53,10 @@ def copies_of(data: Dataset) -> Copies:
     own = np.flatnonzero(camera_of == np.arange(cameras))
     observations = data.observations
     views = observations.seen[:, own].sum(axis=1)
-    marks = fingerprints(np.concatenate([observations.uv[:, own].reshape(n, 2 * len(own)), data.known.xyz], axis=1))
-    first: dict[bytes, int] = {}
-    point_of = np.array([first.setdefault(mark, i) for i, mark in enumerate(marks)], dtype=np.int64)
+    point_of = first_same(np.concatenate([observations.uv[:, own].reshape(n, 2 * len(own)), data.known.xyz], axis=1))
     proven = (views >= 2) & (point_of != np.arange(n))
     believed = (views >= 1) if proven.any() else proven
     return Copies(np.where(believed, point_of, np.arange(n)), camera_of)
-
-
-def fingerprints(values: Floats) -> list[bytes]:
-    """Per row (n, k) its numbers as bytes, with one NaN and one zero."""
-    return [row.tobytes() for row in np.where(np.isnan(values), np.nan, values + 0.0)]
 
 
 def _camera_of(observations: Observations) -> Integers:

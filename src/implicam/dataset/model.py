@@ -189,6 +189,17 @@ class KnownPositions:
         return KnownPositions(self.shots[i], self.xyz[i], self.sd[i], extra)
 
 
+def fingerprints(values: Floats) -> list[bytes]:
+    """Per row (n, k) its numbers as bytes, with one NaN and one zero."""
+    return [row.tobytes() for row in np.where(np.isnan(values), np.nan, values + 0.0)]
+
+
+def first_same(values: Floats) -> NDArray[np.int64]:
+    """(n,) of rows (n, k): the number of the first that is the same to the last bit; its own where none is before."""
+    first: dict[bytes, int] = {}
+    return np.array([first.setdefault(mark, i) for i, mark in enumerate(fingerprints(values))], dtype=np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class Truth:
     """What only a simulation knows: the true positions (n, 3), and the Cramer-Rao limit of each, (n, 3, 3)."""
@@ -257,6 +268,14 @@ class Dataset:
         return self.positions.shots
 
     @property
+    def places(self) -> NDArray[np.int64]:
+        """(n,) the number of the first point at the same known position, to the last bit; its own where none is before.
+
+        A place that was measured again, or clicked again, is news of the pixel noise and none of the rig.
+        """
+        return np.arange(len(self)) if self.known is None else first_same(self.known.xyz)
+
+    @property
     def truth(self) -> Truth | None:
         """The simulated truth, where the dataset carries it."""
         columns = self.known.extra if self.known else {}
@@ -315,13 +334,16 @@ class Dataset:
         return self.select(np.sort(order[:n])), self.select(np.sort(order[n:]))
 
     def folds(self, k: int, *, seed: int) -> Iterator[tuple[str, Dataset, Dataset]]:
-        """`k` random folds: name, the others, the fold; each point is held out once."""
-        if not 2 <= k <= len(self):
+        """`k` random folds: name, the others, the fold; each point is held out once, with all at the same position."""
+        places = len(np.unique(self.places))
+        if not 2 <= k <= places:
             raise DatasetError(
-                f"cannot make {k} folds of {len(self)} points.", fix=f"choose a number from 2 to {len(self)}"
+                f"cannot make {k} folds of {len(self)} points"
+                + (f" at {places} place{'s' * (places != 1)}." if places < len(self) else "."),
+                fix=f"choose a number from 2 to {places}" if places > 1 else "add points elsewhere",
             )
-        fold = np.random.default_rng(seed).permutation(np.arange(len(self)) % k)
-        for i in range(k):
+        fold = np.random.default_rng(seed).permutation(np.arange(len(self)) % k)[self.places]
+        for i in np.unique(fold).tolist():
             yield f"fold {i + 1}", self.select(fold != i), self.select(fold == i)
 
     def leave_out_shots(self) -> Iterator[tuple[str, Dataset, Dataset]]:

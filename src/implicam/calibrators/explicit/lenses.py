@@ -81,7 +81,8 @@ def chosen(
 ) -> tuple[Made, Choice]:
     """The named family, or of all that can be started the one with the least squared errors (n,) at held-out views.
 
-    A later candidate must be better than the first by more than the standard error of the difference: where there is
+    A view that one of them keeps and another does not (NaN) counts as far off for that one, as `clipped` has it. A
+    later candidate must be better than the first by more than the standard error of the difference: where there is
     little to tell them apart, the first is the safer one.
     """
     if family != AUTO:
@@ -100,12 +101,19 @@ def chosen(
         ((name, only),) = started.items()
         return only, Choice(name, {})
     squares = {name: held_out(one) for name, one in started.items()}
+    kept = ~np.logical_and.reduce([np.isnan(s) for s in squares.values()])
+    squares = {name: _with_far(s[kept]) for name, s in squares.items()}
     best, *others = squares
     for name in others:
         gain = squares[best] - squares[name]
         if np.mean(gain) > np.std(gain) / np.sqrt(len(gain)):
             best = name
     return started[best], Choice(best, {name: float(np.sqrt(np.mean(s) / 2)) for name, s in squares.items()})
+
+
+def _with_far(squares: Floats) -> Floats:
+    """(n,) squared errors, with NaN replaced by what `clipped` makes of an error that is far off."""
+    return np.where(np.isnan(squares), FAR**2 * np.nanmedian(squares), squares)
 
 
 def clipped(errors: Floats) -> Floats:

@@ -201,7 +201,9 @@ def _sd(camera: CentralCamera, points: Floats, uv: Floats, image: Image) -> floa
 
 
 def _held_out(started: Started, points: Floats, uv: Floats, image: Image) -> Floats:
-    """(n,) squared errors of views in `FOLDS` random folds, each predicted from the others; far ones count little."""
+    """(n,) squared errors of views in `FOLDS` random folds, each predicted from the others; far ones count little, and
+    views that the camera could not keep are NaN."""
+    squares = np.full(len(points), np.nan)
     points, uv = points[started.kept], uv[started.kept]
     assert isinstance(started.camera, CentralCamera)
     sd = _sd(started.camera, points, uv, image)
@@ -211,4 +213,5 @@ def _held_out(started: Started, points: Floats, uv: Floats, image: Image) -> Flo
         others = fold != k
         camera = levenberg_marquardt(started.camera, started.prior, points[others], uv[others], sd)
         errors[~others] = np.linalg.norm(camera.pixel(points[~others]) - uv[~others], axis=1)
-    return clipped(errors) ** 2
+    squares[started.kept] = clipped(errors) ** 2
+    return squares

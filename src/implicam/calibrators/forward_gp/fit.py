@@ -58,6 +58,7 @@ from implicam.calibrators.forward_gp.posterior import (
 )
 from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
 from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
+from implicam.calibrators.forward_gp.wrong_rows import what_is_wrong
 from implicam.calibrators.forward_gp.wrong_views import Linear
 from implicam.errors import FitError
 from implicam.progress import Progress, silent
@@ -68,6 +69,9 @@ MOST = 300
 
 MOST_UNCERTAIN = 50
 """The same where every point has an error of its own: three unknowns each."""
+
+ENOUGH_VIEWS = 12
+"""Views of a camera that are too many to call too few the reason why nothing fits them."""
 
 TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
 """Median error of a start, in half the extent of the pixels, beyond which it is none."""
@@ -564,11 +568,14 @@ def start_rig(
     def one(c: int) -> Started | FitError:
         seen = problem.sightings[c]
         try:
+            _check_places(problem.points[seen.rows])
             started = start(c, problem.points[seen.rows], seen.uv)
             _check_start(started, problem.points[seen.rows], seen.uv, problem)
             return started
+        except np.linalg.LinAlgError:
+            return FitError(f"the known points do not fix it.{_why(problem, c)}")
         except FitError as error:
-            return error
+            return type(error)(error.what + _why(problem, c), why=error.why, fix=error.fix)
 
     started, blind = {}, []
     for c, found in enumerate(side_by_side(one, range(len(problem.sightings)))):
@@ -585,10 +592,32 @@ def _require_two(problem: Problem, started: dict[int, Started], blind: list[tupl
         raise FitError(
             f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
             why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
-            fix="show the cameras more known points, in the whole volume"
-            if blind
-            else "use two cameras or more: a position is where their lines of sight meet",
+            fix=_cure(problem, blind),
         )
+
+
+def _why(problem: Problem, c: int) -> str:
+    """What its rows say of a camera that no model fits, as a sentence after another."""
+    seen = problem.sightings[c]
+    uv = np.full((len(problem.points), 2), np.nan)
+    uv[seen.rows] = seen.uv
+    why = what_is_wrong(problem.points, uv)
+    return f" {why[0].upper()}{why[1:]}." if why else ""
+
+
+def _check_places(points: Floats) -> None:
+    """FitError for many views of few places: to click a point again says nothing new of the camera."""
+    places = len(np.unique(points, axis=0))
+    if places < FEWEST <= len(points):
+        raise FitError(f"its {len(points)} views are of {places} different positions, and it takes {FEWEST}.")
+
+
+def _cure(problem: Problem, blind: list[tuple[int, str]]) -> str:
+    if not blind:
+        return "use two cameras or more: a position is where their lines of sight meet"
+    if sum(len(seen.rows) >= ENOUGH_VIEWS for seen in problem.sightings) >= 2:
+        return "look whether pixels and known positions belong together: order of the rows, names, axes, units"
+    return "show the cameras more known points, in the whole volume"
 
 
 def _check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:

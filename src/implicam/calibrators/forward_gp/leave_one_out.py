@@ -33,8 +33,15 @@ def squared_distances(posterior: Posterior, c: int, points: Floats, seen: Sighti
 
 
 def left_out(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> tuple[Floats, Floats]:
-    """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px."""
-    return left_out_from(residuals_of(posterior, c, points, seen), kept)
+    """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px.
+
+    A lens is extrapolated behind the camera, to pixels that may be anything, with a spread to match. A view that is
+    off by more than the picture is none of that point, whatever the spread: its covariance is that of the noise.
+    """
+    at = residuals_of(posterior, c, points, seen)
+    residual, covariance = left_out_from(at, kept)
+    elsewhere = ~kept & ~(np.linalg.norm(at.residual, axis=1) <= 2 * posterior.models[c].image.half)
+    return residual, np.where(elsewhere[:, None, None], (at.sd**2)[:, None, None] * np.eye(2), covariance)
 
 
 class Residuals(NamedTuple):

@@ -29,8 +29,11 @@ class Frame:
         _ = data.positions  # a clear error where there are none
         counts = data.observations.seen.sum(axis=0)
         why = ", ".join(f"{n} sees {k}" for n, k in zip(data.observations.camera_names, counts, strict=True))
-        require_points(int(seen.sum()), FEWEST, method, why)
         xyz = data.xyz[seen]
+        places = len(np.unique(data.places[seen]))
+        if places < len(xyz):
+            why += f"; {len(xyz)} known points stand at {places} different positions"
+        require_points(places, FEWEST, method, why)
         require_volume(xyz, method)
         offset = xyz.mean(axis=0)
         return cls(offset, float(np.sqrt(np.mean((xyz - offset) ** 2))))
