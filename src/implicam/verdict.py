@@ -23,6 +23,7 @@ from implicam.calibrators.forward_gp.problem import stated_noise
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
+from implicam.mistakes import mistakes_in
 from implicam.progress import Progress, silent
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
@@ -272,6 +273,7 @@ def _of_network(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _of_data(data: Dataset) -> Iterator[Finding]:
+    yield from (Finding(mistake.grave, mistake.reason) for mistake in mistakes_in(data))
     copies = copies_of(data)
     n = int((~copies.points & data.observations.seen.any(axis=1)).sum())
     if 0 < n < FEW_POINTS:

@@ -57,6 +57,9 @@ MOST_PAIRS = 2000
 CONFIRMED = 3
 """The likeliest causes, which are put to the full test."""
 
+PLAUSIBLE = 50.0
+"""Misfit beyond which a cause is not put to it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Table:
@@ -142,14 +145,15 @@ def _cause(table: Table, tested: Bools, moved: Sequence[str]) -> str:
         rows = np.sort(np.random.default_rng(0).choice(rows, TRIED, replace=False))
     now = (table.p[rows] >= DISAGREE) & ~table.left_out[rows].any(axis=1)
     least = max(EXPLAINS, BETTER + float(now.mean()))
-    guesses = [
-        (_misfit(table, rows, uv, noise) * handicap, words, uv) for words, uv, noise, handicap in _guesses(table)
-    ]
-    for _, words, uv in sorted(guesses, key=lambda guess: guess[0])[:CONFIRMED]:
-        testable = rows[_views(uv[rows]) >= 2]
-        agree = table.agree(uv[testable])
-        if len(testable) and agree.mean() >= least:
-            return words.format(share=f"{100 * agree.mean():.0f} % of those tried agree")
+    guesses = [(_misfit(table, rows, uv, noise), words, uv) for words, uv, noise in _guesses(table)]
+    without = [(_misfit(table, rows, uv, table.noise), words, uv) for words, uv in _without_one(table)]
+    for likely in (guesses, without):  # without the one at fault the others agree whatever its fault is
+        plausible = sorted((guess for guess in likely if guess[0] < PLAUSIBLE), key=lambda guess: guess[0])
+        for _, words, uv in plausible[:CONFIRMED]:
+            testable = rows[_views(uv[rows]) >= 2]
+            agree = table.agree(uv[testable])
+            if len(testable) and agree.mean() >= least:
+                return words.format(share=f"{100 * agree.mean():.0f} % of those tried agree")
     if moved and len(moved) < len(table.cameras) - 1:
         return f"most views of {' and '.join(moved)} contradict the other cameras. Has it been moved or refocused?"
     return (
@@ -179,29 +183,31 @@ def _misfit(table: Table, rows: NDArray[np.int64], uv: Floats, noise: Floats) ->
     return float(np.quantile(worst, EXPLAINS))
 
 
-Guess = tuple[str, Floats, Floats, float]
-"""Words with a place for the share that agrees; pixels and noise as they would be; a factor on the misfit: a camera
-less, or a row less, fits better by itself."""
+def _without_one(table: Table) -> Iterator[tuple[str, Floats]]:
+    """Words with a place for the share that agrees, and the pixels without one camera."""
+    for c, name in enumerate(table.names if len(table.names) > 2 else ()):
+        uv = table.uv.copy()
+        uv[:, c] = np.nan
+        yield f"has {name} been moved or refocused, or are its pictures cropped? Without it {{share}}", uv
 
 
-def _guesses(table: Table) -> Iterator[Guess]:
+def _guesses(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
+    """What would make all views agree: words with a place for the share that does, pixels and noise as they would be.
+
+    None of it can make views agree that were right before."""
     names = table.names
     for c, name in enumerate(names):
-        if len(names) > 2:
-            uv = table.uv.copy()
-            uv[:, c] = np.nan
-            yield f"has {name} been moved or refocused? Without it {{share}}", uv, table.noise, 3.0
         for late in (1, -1):
             uv = table.uv.copy()
             uv[:, c] = _late(uv[:, c], late)
             when = "later" if late > 0 else "earlier"
-            yield f"is {name} a picture {when} than the others? One row on {{share}}", uv, table.noise, 1.5
+            yield f"is {name} a picture {when} than the others? One row on {{share}}", uv, table.noise
     pairs = list(combinations(range(len(names)), 2))
     for a, b in pairs if len(pairs) <= MOST_PAIRS else pairs[: len(names) - 1] + _neighbours(len(names)):
         order = np.arange(len(names))
         order[[a, b]] = b, a
         words = f"are {names[a]} and {names[b]} exchanged? With the two the other way round {{share}}"
-        yield words, table.uv[:, order], table.noise[:, order], 1.0
+        yield words, table.uv[:, order], table.noise[:, order]
     yield from _other_pixels(table)
 
 
@@ -217,14 +223,24 @@ def _late(values: Floats, rows: int) -> Floats:
     return moved
 
 
-def _other_pixels(table: Table) -> Iterator[Guess]:
-    """The ways in which other programs count pixels."""
-    if all(camera.height is not None for camera in table.cameras):
-        height = np.array([camera.height for camera in table.cameras], dtype=np.float64)
+def _other_pixels(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
+    """The ways in which other programs count pixels: of all cameras, or of one."""
+    every = slice(None)
+    for cameras, whose in [(every, ""), *((slice(c, c + 1), f" of {name}") for c, name in enumerate(table.names))]:
+        heights = [camera.height for camera in table.cameras[cameras]]
+        if None not in heights:
+            uv = table.uv.copy()
+            uv[:, cameras, 1] = np.array(heights, dtype=np.float64) - 1 - uv[:, cameras, 1]
+            yield (
+                f"is v{whose} counted from below here, and was not when the rig was calibrated? So {{share}}",
+                uv,
+                table.noise,
+            )
         uv = table.uv.copy()
-        uv[..., 1] = height - 1 - uv[..., 1]
-        yield "is v counted from below here, and was not when the rig was calibrated? So {share}", uv, table.noise, 1.0
-    yield "are u and v exchanged? The other way round {share}", table.uv[..., ::-1].copy(), table.noise, 1.0
-    for factor, words in ((2.0, "half"), (0.5, "twice")):
-        uv = factor * (table.uv + 0.5) - 0.5
-        yield f"are the pictures {words} the size they were? Resized {{share}}", uv, factor * table.noise, 1.0
+        uv[:, cameras] = uv[:, cameras, ::-1]
+        yield f"are u and v{whose} exchanged? The other way round {{share}}", uv, table.noise
+        for factor, words in ((2.0, "half"), (0.5, "twice")):
+            uv, noise = table.uv.copy(), table.noise.copy()
+            uv[:, cameras] = factor * (uv[:, cameras] + 0.5) - 0.5
+            noise[:, cameras] *= factor
+            yield f"are the pictures{whose} {words} the size they were? Resized {{share}}", uv, noise
