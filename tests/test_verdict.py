@@ -21,9 +21,11 @@ from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _of_data
 CASES = Path(__file__).parent / "data" / "cases"
 
 
-def rig(points: int, spec: str = "bar3", seed: int = 3, **how: float) -> Dataset:
+def rig(points: int, spec: str = "bar3", seed: int = 3, noise_of_positions: float = 0.0, **how: float) -> Dataset:
     built = build_rig(spec, seed=seed)
-    return simulate(built, random_positions(built, points, np.random.default_rng(seed)), seed=seed, **how)
+    data = simulate(built, random_positions(built, points, np.random.default_rng(seed)), seed=seed, **how)
+    off = noise_of_positions * np.random.default_rng(seed + 1).normal(size=(points, 3))
+    return replace(data, known=replace(data.positions, xyz=data.xyz + off))
 
 
 def with_pixels(data: Dataset, uv: Floats) -> Dataset:
@@ -38,6 +40,17 @@ def test_an_ordinary_rig_is_usable(spec: str, points: int) -> None:
     assert verdict.held_out.points >= points - 5
     assert verdict.held_out.inside > 0.8
     assert verdict.held_out.rms < 3 * verdict.held_out.stated
+
+
+def test_known_positions_that_are_slightly_off_are_no_doubt_where_the_fit_has_found_it() -> None:
+    """What was held out are known positions, whose errors are estimated by the fit though nobody states them."""
+    data = rig(50, noise_of_positions=0.1)
+    calibration = ic.ForwardGP().fit(data)
+    assert calibration.fitted.label_errors is not None
+    verdict = ic.judge(calibration)
+    assert (verdict.word, verdict.reasons) == (USABLE, ())
+    assert verdict.held_out is not None
+    assert 0.1 < verdict.held_out.rms < 1.5 * verdict.held_out.stated
 
 
 def test_explicit_is_judged_too() -> None:

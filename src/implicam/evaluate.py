@@ -174,14 +174,16 @@ def _judge(
     return Evaluation(calibration.method, data, measurement, true_xyz, known_xyz, coverage, how, against, notes)
 
 
-def _label_covariance(calibration: Calibration, data: Dataset) -> Floats:
-    """(n, 3, 3) of the errors of the known positions that are judged by: as declared, or else as the calibration has
-    estimated them; none of simulated true positions."""
-    if data.truth is not None:
-        return np.zeros((len(data), 3, 3))
+def label_covariance(calibration: Calibration, data: Dataset) -> Floats:
+    """(n, 3, 3) of the errors of known positions, as declared, or else as the calibration has estimated them."""
     if _declared(data) or not isinstance(calibration, KnowsLabelErrors):
         return np.asarray(np.nan_to_num(data.positions.sd)[:, :, None] ** 2 * np.eye(3), dtype=np.float64)
     return calibration.known_position_covariance(data.xyz)
+
+
+def _label_covariance(calibration: Calibration, data: Dataset) -> Floats:
+    """The same of what is judged by, which has no errors where it is the simulated truth."""
+    return np.zeros((len(data), 3, 3)) if data.truth is not None else label_covariance(calibration, data)
 
 
 def _declared(data: Dataset) -> bool:

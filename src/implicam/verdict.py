@@ -23,6 +23,7 @@ from implicam.calibrators.forward_gp.problem import stated_noise
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
+from implicam.evaluate import label_covariance
 from implicam.mistakes import mistakes_in
 from implicam.progress import Progress, silent
 
@@ -201,8 +202,7 @@ def _measured(calibration: Calibration, data: Dataset) -> _Measured:
     measured = calibration.measure(data.observations)
     own = measured.own_reason
     fine = measured.measured & (own == "")
-    sd = np.nan_to_num(data.positions.sd)
-    cov = measured.cov + sd[:, :, None] ** 2 * np.eye(3)
+    cov = measured.cov + label_covariance(calibration, data)
     contradicting = ~fine & (~np.isnan(measured.consistency) | measured.measured)
     return _Measured((measured.xyz - data.xyz)[fine], cov[fine], contradicting)
 
@@ -328,11 +328,12 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
     predicted = predict(data.xyz)
     if predicted.shape != uv.shape:
         return
+    stated = stated_noise(data.observations)
     off = np.linalg.norm(predicted - uv, axis=2)
+    off = off / np.sqrt(1 + _seen_of_labels(calibration, predict) / np.where(np.isfinite(stated), stated, np.inf) ** 2)
     medians = np.array(
         [np.median(column[~np.isnan(column)]) if (~np.isnan(column)).any() else np.nan for column in off.T]
     )
-    stated = stated_noise(data.observations)
     declared = bool((data.positions.sd > 0).any())  # then the fit explains what the positions are off by
     usual = np.nanmedian(medians) if np.isfinite(medians).any() else np.nan
     for name, median, sd in zip(data.observations.camera_names, medians, stated, strict=True):
@@ -348,6 +349,16 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
                 f"{name} misses its own known points by {median:.2g} px in the median, the cameras together by "
                 f"{usual:.2g}: look at its pictures, or leave it out with --without {name}.",
             )
+
+
+def _seen_of_labels(calibration: Calibration, predict: Callable[[Floats], Floats]) -> Floats:
+    """(n, cameras) variance in pixels that errors of the known positions, as far as they are estimated, give a view."""
+    xyz, covariance = calibration.data.xyz, label_covariance(calibration, calibration.data)
+    if not covariance.any():
+        return np.zeros((len(xyz), 1))
+    step = np.sqrt(np.trace(covariance, axis1=1, axis2=2).max() / 3)
+    slope = np.stack([(predict(xyz + d) - predict(xyz - d)) / (2 * step) for d in step * np.eye(3)], axis=-1)
+    return np.asarray(np.nan_to_num(np.einsum("ncij,njk,ncik->nc", slope, covariance, slope) / 2), dtype=np.float64)
 
 
 def _beyond(count: int, n: int, share: float) -> bool:
