@@ -10,7 +10,7 @@ alarm: "doubtful" or "not usable", or an alarm of `measure`, where the rig is ri
 
 Then one rig in --every (of all kinds but "odd") is damaged: some kinds of DAMAGED_TABLE, in turn, are done to tables of
 10-80 new points each, measured with the untouched calibration; and of DAMAGED_KNOWN some are done to the known points,
-which are calibrated and judged again, and an untouched table of 100 points is measured. What it costs:
+which are calibrated and judged again, and a table of 100 points is measured with the rig as it is then. What it costs:
 the median distance of the measured positions from the true ones, in their own error bars, over that of honest ones (1
 is right); a table with no number left counts as one that costs, and is found. Damage that costs less than COSTS is not
 counted as missed. Found by a refusal, "not usable", "doubtful", an alarm, or by a reason in nine of ten rows that are
@@ -271,41 +271,43 @@ def with_views(data, uv, sd):
 
 
 def damaged_known(case, kind, rng):
-    """The known points with this damage."""
+    """The known points with this damage, and the rig as it is afterwards."""
     data, n = case.known, len(case.known)
     o, xyz = data.observations, np.array(data.xyz)
     uv, sd = np.array(o.uv), np.array(o.sd)
     c = int(rng.integers(len(o.cameras)))
     if kind == "labels one row on":
-        return replace(data, known=replace(data.positions, xyz=np.roll(xyz, 1, axis=0)))
+        return replace(data, known=replace(data.positions, xyz=np.roll(xyz, 1, axis=0))), case.rig
     if kind == "half in metres":
         xyz[: n // 2] /= 1000
-        return replace(data, known=replace(data.positions, xyz=xyz))
+        return replace(data, known=replace(data.positions, xyz=xyz)), case.rig
     if kind == "two labels exchanged":
         a, b = rng.choice(n, 2, replace=False)
         xyz[[a, b]] = xyz[[b, a]]
-        return replace(data, known=replace(data.positions, xyz=xyz))
+        return replace(data, known=replace(data.positions, xyz=xyz)), case.rig
     if kind == "rows duplicated":
         rows = np.concatenate([np.arange(n), np.arange(n // 2)])
         names = np.array([*data.points, *(f"{name}-again" for name in data.points[: n // 2])])
         extra = {key: value[rows] for key, value in o.extra.items()}
         k = data.positions
         known = KnownPositions(names, k.xyz[rows], k.sd[rows], {key: value[rows] for key, value in k.extra.items()})
-        return replace(data, observations=Observations(names, o.cameras, uv[rows], sd[rows], extra), known=known)
+        return replace(
+            data, observations=Observations(names, o.cameras, uv[rows], sd[rows], extra), known=known
+        ), case.rig
     if kind == "a camera copied":
         again = replace(o.cameras[c], name="again")
         extra = {key: np.concatenate([value, value[:, [c]]], axis=1) for key, value in o.extra.items()}
         uv, sd = (np.concatenate([x, x[:, [c]]], axis=1) for x in (uv, sd))
-        return replace(data, observations=Observations(o.points, (*o.cameras, again), uv, sd, extra))
+        return replace(data, observations=Observations(o.points, (*o.cameras, again), uv, sd, extra)), case.rig
     if kind == "one camera late":
         uv[1:, c], sd[1:, c] = uv[:-1, c], sd[:-1, c]
-        return with_views(data, uv, sd)
+        return with_views(data, uv, sd), case.rig
     assert kind.startswith("knocked"), kind
     rig = turned(case.rig, c, float(kind.split()[1]), 0.0, rng)
     before, after = (camera.pixel_from_world(data.truth.xyz) for camera in (case.rig.cameras[c], rig.cameras[c]))
     uv[n // 2 :, c] += (after[0] - before[0])[n // 2 :]
     uv[~after[1], c] = np.nan
-    return with_views(data, uv, sd)
+    return with_views(data, uv, sd), rig
 
 
 # --- judging ---------------------------------------------------------------------------------------------------------
@@ -381,16 +383,16 @@ def of_damaged_known(case, name, rng):
     row = {"what": "damaged known", "name": name, "refused": "", "alarm": "", "verdict": "", "reasons": []}
     notes = []
     try:
-        data = damaged_known(case, name, rng)
+        data, rig = damaged_known(case, name, rng)
         calibration = ForwardGP().fit(data)
         notes = calibration.notes()
         verdict = judge(calibration)
         row |= {"verdict": verdict.word, "reasons": verdict.reasons, "notes": notes}
-        table = case.table(positions(case.rig, 100, grid=False, rng=rng), rng)
+        table = case.table(positions(case.rig, 100, grid=False, rng=rng), rng, rig)
         o = table.observations
         if name == "a camera copied":
             table = replace(case, known=table)
-            table = damaged_known(table, name, np.random.default_rng(0))
+            table, _ = damaged_known(table, name, np.random.default_rng(0))
             o = table.observations
         found = calibration.measure(o)
         row |= {"alarm": found.alarm} | cost_of(found, table.truth)

@@ -16,7 +16,7 @@ from implicam.dataset import Dataset, Floats
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.measurement import Measurement
 from implicam.simulate import build_rig, random_positions, simulate
-from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _of_data
+from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _moved_at, _of_data
 
 CASES = Path(__file__).parent / "data" / "cases"
 
@@ -92,7 +92,20 @@ def test_a_camera_that_moved_halfway_is_named() -> None:
     uv[15:] = after.observations.uv[15:]
     verdict = ic.judge(ic.ForwardGP().fit(with_pixels(before, uv)))
     assert verdict.word != USABLE
-    assert "cam3" in " ".join(verdict.reasons)
+    assert "From random016 on the views of cam3 are off otherwise than before" in " ".join(verdict.reasons)
+
+
+def test_residuals_with_two_means_are_a_move_and_a_few_wrong_views_are_none() -> None:
+    rng = np.random.default_rng(0)
+    for n in (12, 30, 200):
+        honest = rng.normal(size=(n, 2))
+        assert _moved_at(honest) is None
+        assert _moved_at(np.linspace(-1, 1, n)[:, None] + 0.7 * honest) is None  # a lens, seen along a lattice
+        wild = honest.copy()
+        wild[-2] += 500
+        assert _moved_at(wild) is None
+        assert _moved_at(honest + 10.0 * (np.arange(n) >= 5)[:, None]) == 5
+    assert _moved_at(np.zeros((11, 2))) is None
 
 
 def test_marks_that_came_by_the_api_are_said() -> None:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, chdtri
+from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import MLP, Calibration, InverseGP
 from implicam.calibrators.forward_gp.problem import stated_noise
@@ -49,6 +49,10 @@ RESIDUAL_RATIO = 4.0
 
 UNLIKE_OTHERS, UNLIKE_OTHERS_PIXELS = 10.0, 2.0
 """The same where no noise is stated: in the median error of the other cameras, and at least so many pixels."""
+
+MOVED, FEWEST_IN_PART = 0.5, 4
+"""Share of a camera's residuals that a move explains at least: a lens that is not quite understood leaves some that
+depend on the place, and so on the order of a lattice. Views before and after a move."""
 
 WORST_NEES, HOPELESS_NEES = 7.0, 60.0
 """Mean NEES of held-out points, 3 is right, above which error bars are doubtful, and above which they are nothing."""
@@ -319,7 +323,7 @@ def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
-    """Cameras that miss their own known points."""
+    """Cameras that miss their own known points, all of them or from one on."""
     predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
     data = calibration.data
     if predict is None or not len(data):
@@ -328,6 +332,16 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
     predicted = predict(data.xyz)
     if predicted.shape != uv.shape:
         return
+    for c, name in enumerate(data.observations.camera_names):
+        rows = np.flatnonzero(np.isfinite(uv[:, c, 0] - predicted[:, c, 0]))
+        first = _moved_at(uv[rows, c] - predicted[rows, c])
+        if first is not None:
+            yield Finding(
+                False,
+                f"From {data.points[rows[first]]} on the views of {name} are off otherwise than before: was it moved "
+                "or refocused there? Take the known points of one of the two parts, or leave it out with "
+                f"--without {name}.",
+            )
     stated = stated_noise(data.observations)
     off = np.linalg.norm(predicted - uv, axis=2)
     off = off / np.sqrt(1 + _seen_of_labels(calibration, predict) / np.where(np.isfinite(stated), stated, np.inf) ** 2)
@@ -349,6 +363,23 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
                 f"{name} misses its own known points by {median:.2g} px in the median, the cameras together by "
                 f"{usual:.2g}: look at its pictures, or leave it out with --without {name}.",
             )
+
+
+def _moved_at(residual: Floats) -> int | None:
+    """The row from which residuals (n, 2) are about another mean than before, in the order in which they were taken:
+    where two means explain more than half of them, and chance (F, for any of the rows) would not. None where not."""
+    n = len(residual)
+    if n < FEW_POINTS:
+        return None
+    centred = residual - residual.mean(axis=0)
+    total = float(np.sum(centred**2))
+    k = np.arange(FEWEST_IN_PART, n - FEWEST_IN_PART + 1)
+    between = np.sum(np.cumsum(centred, axis=0)[k - 1] ** 2, axis=1) * n / (k * (n - k))
+    best = int(np.argmax(between))
+    explained = float(between[best]) / max(total, 1e-300)
+    F = 0.5 * explained / max((1 - explained) / (2 * n - 4), 1e-300)
+    by_chance = len(k) * float(fdtrc(2, 2 * n - 4, F))
+    return int(k[best]) if explained > MOVED and by_chance < RARE else None
 
 
 def _seen_of_labels(calibration: Calibration, predict: Callable[[Floats], Floats]) -> Floats:
