@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import chdtrc
 
 import implicam as ic
-from implicam.calibrators.alarm import _inexplicable
+from implicam.calibrators.alarm import DISAGREE, MANY, _inexplicable, _uneven
 from implicam.cli import main
 from implicam.dataset import Floats, Observations
 from implicam.errors import DatasetError
@@ -155,6 +156,29 @@ def test_one_camera_that_was_moved_is_named_and_left_out() -> None:
         "has cam2 been moved or refocused, or are its pictures cropped? Without it 100 % of those tried agree"
         in found.alarm
     )
+
+
+def test_a_camera_moved_a_little_needs_no_point_that_fails() -> None:
+    """Two cameras: each point disagrees a little, and that so many do is the sign."""
+    rig, calibration = fitted("stereo")
+    target = random_positions(rig, 40, np.random.default_rng(2))
+    found = calibration.measure(simulate(knocked(rig, 1, 0.04), target, seed=2).observations)
+    assert (found.consistency < DISAGREE).mean() < MANY
+    assert "points agree badly" in found.alarm
+    assert "has a camera been moved or refocused a little" in found.alarm
+
+
+@pytest.mark.parametrize("views", [2, 3, 8])
+def test_error_bars_somewhat_too_small_are_no_alarm(views: int) -> None:
+    """Honest points whose chi-squared is 1.25 squared too large: alarms are as rare as promised."""
+    rng = np.random.default_rng(views)
+    alarms = 0
+    for n in (10, 30, 100, 300) * 250:
+        p = chdtrc(2 * views - 3, 1.25**2 * rng.chisquare(2 * views - 3, size=n))
+        alarms += _uneven(p, np.full(n, views)) is not None
+    assert alarms <= 3  # of 1000
+    wide = chdtrc(2 * views - 3, 2.5**2 * rng.chisquare(2 * views - 3, size=60))
+    assert _uneven(wide, np.full(60, views)) is not None
 
 
 def test_a_few_points_are_not_a_table() -> None:
