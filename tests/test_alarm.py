@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import chdtrc
 
 import implicam as ic
-from implicam.calibrators.alarm import Table, _inexplicable, _misfit
+from implicam.calibrators.alarm import DISAGREE, MANY, Table, _inexplicable, _misfit, _uneven
 from implicam.cli import main
 from implicam.dataset import Floats, Observations
+from implicam.errors import DatasetError
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.measurement import DOUBTFUL
 from implicam.simulate import Rig, build_rig, random_positions, simulate
@@ -112,10 +114,72 @@ def test_likely_causes_are_named(change: Callable[[Floats], Floats], said: str) 
     assert said in calibration.measure(replace(seen, uv=uv)).alarm
 
 
+def of_one(change: Callable[[Floats], Floats], camera: int = 1) -> Callable[[Floats], Floats]:
+    def changed(uv: Floats) -> Floats:
+        uv = uv.copy()
+        uv[:, camera] = change(uv[:, camera])
+        return uv
+
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("spec", "change", "said"),
+    [
+        ("stereo", lambda uv: np.clip(uv[:, ::-1], 0, 1023), "are u and v of cam2 exchanged?"),
+        ("bar3", lambda uv: np.clip(uv[:, ::-1], 0, 799), "are u and v of cam2 exchanged?"),
+        ("stereo", lambda uv: (uv + 0.5) / 2 - 0.5, "are the pictures of cam2 half the size"),
+        ("bar3", lambda uv: (uv + 0.5) / 2 - 0.5, "are the pictures of cam2 half the size"),
+        ("bar3", lambda uv: np.stack([uv[:, 0], 799 - uv[:, 1]], axis=1), "is v of cam2 counted from below"),
+        ("stereo", lambda uv: np.roll(uv, 1, axis=0), "One row on"),  # two cameras: the one late, or the other early
+        ("bar3", lambda uv: np.roll(uv, 1, axis=0), "is cam2 a picture later than the others?"),
+    ],
+)
+def test_what_was_done_to_one_camera_is_named_before_it_is_called_moved(
+    spec: str, change: Callable[[Floats], Floats], said: str
+) -> None:
+    rig, calibration = fitted(spec)
+    seen = table(rig)
+    assert said in calibration.measure(replace(seen, uv=of_one(change)(seen.uv))).alarm
+
+
+def test_many_views_outside_of_the_image_are_no_slip() -> None:
+    rig, _ = fitted("stereo")
+    seen = table(rig)
+    with pytest.raises(DatasetError, match="are its u and v exchanged, are these the pixels of another camera"):
+        replace(seen, uv=seen.uv[..., ::-1] + [0, 300])
+
+
 def test_one_camera_that_was_moved_is_named_and_left_out() -> None:
     rig, calibration = fitted("bar3")
     found = calibration.measure(table(knocked(rig, 1, 0.5)))
-    assert "has cam2 been moved or refocused? Without it 100 % of those tried agree" in found.alarm
+    assert (
+        "has cam2 been moved or refocused, or are its pictures cropped? Without it 100 % of those tried agree"
+        in found.alarm
+    )
+
+
+def test_a_camera_moved_a_little_needs_no_point_that_fails() -> None:
+    """Two cameras: each point disagrees a little, and that so many do is the sign."""
+    rig, calibration = fitted("stereo")
+    target = random_positions(rig, 40, np.random.default_rng(2))
+    found = calibration.measure(simulate(knocked(rig, 1, 0.04), target, seed=2).observations)
+    assert (found.consistency < DISAGREE).mean() < MANY
+    assert "points agree badly" in found.alarm
+    assert "has a camera been moved or refocused a little" in found.alarm
+
+
+@pytest.mark.parametrize("views", [2, 3, 8])
+def test_error_bars_somewhat_too_small_are_no_alarm(views: int) -> None:
+    """Honest points whose chi-squared is 1.25 squared too large: alarms are as rare as promised."""
+    rng = np.random.default_rng(views)
+    alarms = 0
+    for n in (10, 30, 100, 300) * 250:
+        p = chdtrc(2 * views - 3, 1.25**2 * rng.chisquare(2 * views - 3, size=n))
+        alarms += _uneven(p, np.full(n, views)) is not None
+    assert alarms <= 3  # of 1000
+    wide = chdtrc(2 * views - 3, 2.5**2 * rng.chisquare(2 * views - 3, size=60))
+    assert _uneven(wide, np.full(60, views)) is not None
 
 
 def test_a_few_points_are_not_a_table() -> None:

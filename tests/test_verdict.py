@@ -16,14 +16,16 @@ from implicam.dataset import Dataset, Floats
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.measurement import Measurement
 from implicam.simulate import build_rig, random_positions, simulate
-from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _of_data
+from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _moved_at, _of_data
 
 CASES = Path(__file__).parent / "data" / "cases"
 
 
-def rig(points: int, spec: str = "bar3", seed: int = 3, **how: float) -> Dataset:
+def rig(points: int, spec: str = "bar3", seed: int = 3, noise_of_positions: float = 0.0, **how: float) -> Dataset:
     built = build_rig(spec, seed=seed)
-    return simulate(built, random_positions(built, points, np.random.default_rng(seed)), seed=seed, **how)
+    data = simulate(built, random_positions(built, points, np.random.default_rng(seed)), seed=seed, **how)
+    off = noise_of_positions * np.random.default_rng(seed + 1).normal(size=(points, 3))
+    return replace(data, known=replace(data.positions, xyz=data.xyz + off))
 
 
 def with_pixels(data: Dataset, uv: Floats) -> Dataset:
@@ -38,6 +40,17 @@ def test_an_ordinary_rig_is_usable(spec: str, points: int) -> None:
     assert verdict.held_out.points >= points - 5
     assert verdict.held_out.inside > 0.8
     assert verdict.held_out.rms < 3 * verdict.held_out.stated
+
+
+def test_known_positions_that_are_slightly_off_are_no_doubt_where_the_fit_has_found_it() -> None:
+    """What was held out are known positions, whose errors are estimated by the fit though nobody states them."""
+    data = rig(50, noise_of_positions=0.1)
+    calibration = ic.ForwardGP().fit(data)
+    assert calibration.fitted.label_errors is not None
+    verdict = ic.judge(calibration)
+    assert (verdict.word, verdict.reasons) == (USABLE, ())
+    assert verdict.held_out is not None
+    assert 0.1 < verdict.held_out.rms < 1.5 * verdict.held_out.stated
 
 
 def test_explicit_is_judged_too() -> None:
@@ -79,7 +92,20 @@ def test_a_camera_that_moved_halfway_is_named() -> None:
     uv[15:] = after.observations.uv[15:]
     verdict = ic.judge(ic.ForwardGP().fit(with_pixels(before, uv)))
     assert verdict.word != USABLE
-    assert "cam3" in " ".join(verdict.reasons)
+    assert "From random016 on the views of cam3 are off otherwise than before" in " ".join(verdict.reasons)
+
+
+def test_residuals_with_two_means_are_a_move_and_a_few_wrong_views_are_none() -> None:
+    rng = np.random.default_rng(0)
+    for n in (12, 30, 200):
+        honest = rng.normal(size=(n, 2))
+        assert _moved_at(honest) is None
+        assert _moved_at(np.linspace(-1, 1, n)[:, None] + 0.7 * honest) is None  # a lens, seen along a lattice
+        wild = honest.copy()
+        wild[-2] += 500
+        assert _moved_at(wild) is None
+        assert _moved_at(honest + 10.0 * (np.arange(n) >= 5)[:, None]) == 5
+    assert _moved_at(np.zeros((11, 2))) is None
 
 
 def test_one_of_two_cameras_that_slips_is_named() -> None:

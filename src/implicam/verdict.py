@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, chdtri
+from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import MLP, Calibration, InverseGP
 from implicam.calibrators.forward_gp.problem import stated_noise
@@ -25,6 +25,7 @@ from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluate import known_position_covariance
+from implicam.mistakes import mistakes_in
 from implicam.progress import Progress, silent
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
@@ -49,6 +50,10 @@ RESIDUAL_RATIO = 4.0
 
 UNLIKE_OTHERS, UNLIKE_OTHERS_PIXELS = 10.0, 2.0
 """The same where no noise is stated: in the median error of the other cameras, and at least so many pixels."""
+
+MOVED, FEWEST_IN_PART = 0.5, 4
+"""Share of a camera's residuals that a move explains at least: a lens that is not quite understood leaves some that
+depend on the place, and so on the order of a lattice. Views before and after a move."""
 
 WORST_NEES, HOPELESS_NEES = 7.0, 60.0
 """Mean NEES of held-out points, 3 is right, above which error bars are doubtful, and above which they are nothing."""
@@ -292,6 +297,7 @@ def _of_network(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _of_data(data: Dataset) -> Iterator[Finding]:
+    yield from (Finding(mistake.grave, mistake.reason) for mistake in mistakes_in(data))
     copies = copies_of(data)
     seen = ~copies.points & data.observations.seen.any(axis=1)
     n, places = int(seen.sum()), len(np.unique(data.places[seen]))
@@ -339,7 +345,7 @@ def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
-    """Cameras that miss their own known points."""
+    """Cameras that miss their own known points, all of them or from one on."""
     predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
     data = calibration.data
     if predict is None or not len(data):
@@ -348,11 +354,22 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
     predicted = predict(data.xyz)
     if predicted.shape != uv.shape:
         return
+    for c, name in enumerate(data.observations.camera_names):
+        rows = np.flatnonzero(np.isfinite(uv[:, c, 0] - predicted[:, c, 0]))
+        first = _moved_at(uv[rows, c] - predicted[rows, c])
+        if first is not None:
+            yield Finding(
+                False,
+                f"From {data.points[rows[first]]} on the views of {name} are off otherwise than before: was it moved "
+                "or refocused there? Take the known points of one of the two parts, or leave it out with "
+                f"--without {name}.",
+            )
+    stated = stated_noise(data.observations)
     off = np.linalg.norm(predicted - uv, axis=2)
+    off = off / np.sqrt(1 + _seen_of_labels(calibration, predict) / np.where(np.isfinite(stated), stated, np.inf) ** 2)
     medians = np.array(
         [np.median(column[~np.isnan(column)]) if (~np.isnan(column)).any() else np.nan for column in off.T]
     )
-    stated = stated_noise(data.observations)
     declared = bool((data.positions.sd > 0).any())  # then the fit explains what the positions are off by
     for c, (name, median, sd) in enumerate(zip(data.observations.camera_names, medians, stated, strict=True)):
         others = np.delete(medians, c)
@@ -381,6 +398,33 @@ def _of_rows(data: Dataset, suspected: str) -> Iterator[Finding]:
         why = (what_is_wrong if name in suspected.split() else slipped)(data.xyz, uv)
         if why:
             yield Finding(False, f"{name}: {why}. Look at the order of its pictures and of the rows.")
+
+
+def _moved_at(residual: Floats) -> int | None:
+    """The row from which residuals (n, 2) are about another mean than before, in the order in which they were taken:
+    where two means explain more than half of them, and chance (F, for any of the rows) would not. None where not."""
+    n = len(residual)
+    if n < FEW_POINTS:
+        return None
+    centred = residual - residual.mean(axis=0)
+    total = float(np.sum(centred**2))
+    k = np.arange(FEWEST_IN_PART, n - FEWEST_IN_PART + 1)
+    between = np.sum(np.cumsum(centred, axis=0)[k - 1] ** 2, axis=1) * n / (k * (n - k))
+    best = int(np.argmax(between))
+    explained = float(between[best]) / max(total, 1e-300)
+    F = 0.5 * explained / max((1 - explained) / (2 * n - 4), 1e-300)
+    by_chance = len(k) * float(fdtrc(2, 2 * n - 4, F))
+    return int(k[best]) if explained > MOVED and by_chance < RARE else None
+
+
+def _seen_of_labels(calibration: Calibration, predict: Callable[[Floats], Floats]) -> Floats:
+    """(n, cameras) variance in pixels that errors of the known positions, as far as they are estimated, give a view."""
+    xyz, covariance = calibration.data.xyz, known_position_covariance(calibration, calibration.data)
+    if not covariance.any():
+        return np.zeros((len(xyz), 1))
+    step = np.sqrt(np.trace(covariance, axis1=1, axis2=2).max() / 3)
+    slope = np.stack([(predict(xyz + d) - predict(xyz - d)) / (2 * step) for d in step * np.eye(3)], axis=-1)
+    return np.asarray(np.nan_to_num(np.einsum("ncij,njk,ncik->nc", slope, covariance, slope) / 2), dtype=np.float64)
 
 
 def _beyond(count: int, n: int, share: float) -> bool:

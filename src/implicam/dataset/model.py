@@ -35,6 +35,9 @@ MAX_DEPTH = 50
 # A centroid may lie a little outside: half of the ball is still in the image.
 OUTSIDE_SHARE, OUTSIDE_PIXELS = 0.02, 2.0
 
+MANY_OUTSIDE = 3
+"""Views of a camera outside of its image from which on it is no slip of one of them."""
+
 TRUTH_COLUMNS = (
     "true_x", "true_y", "true_z", "limit_sd_x", "limit_sd_y", "limit_sd_z",
     "limit_cov_xy", "limit_cov_xz", "limit_cov_yz",
@@ -452,10 +455,17 @@ def check_inside(uv: Floats, cameras: Sequence[Camera], place: Callable[[int, in
         outside = (uv[:, k] < -0.5 - margin) | (uv[:, k] > size - 0.5 + margin)
         for i in np.flatnonzero(outside.any(axis=1))[:1]:
             u, v = uv[i, k]
+            why = "u is the column and v the row, counted from 0 at the centre of the top-left pixel"
+            many, seen = int(outside.any(axis=1).sum()), int((~np.isnan(uv[:, k, 0])).sum())
+            if many >= MANY_OUTSIDE:
+                why += (
+                    f"; {many} of its {seen} views are outside: are its u and v exchanged, are these the pixels of "
+                    "another camera, or were its pictures resized or cropped?"
+                )
             raise DatasetError(
                 f"{place(int(i), k)}: pixel u = {u:g}, v = {v:g} is far outside the {camera.width} x {camera.height} "
                 f"image of {camera.name!r}.",
-                why="u is the column and v the row, counted from 0 at the centre of the top-left pixel",
+                why=why,
                 fix="correct the value, remove the row, or correct width and height in dataset.toml",
             )
 

@@ -34,6 +34,7 @@ from implicam.calibrators.protocol import Arrays, Rejected, Unused, solvable
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError, did_you_mean
 from implicam.measurement import Measurement
+from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.threads import blas_threads
 
@@ -69,7 +70,7 @@ class Explicit:
         A dataset of boards at places nobody knows is calibrated in the frame of its first camera; its boards then have
         the positions that the adjustment gives them.
         """
-        with solvable(), blas_threads(1):
+        with mistakes_named(data), solvable(), blas_threads(1):
             if self.boards is None and self.align != MATCHING[0]:
                 raise UsageError(
                     f"align {self.align!r} is for boards, and there are none.",

@@ -40,6 +40,7 @@ from implicam.calibrators.protocol import (
 from implicam.dataset import Dataset, Floats, Observations, without_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.measurement import Measurement
+from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.threads import blas_threads
 
@@ -70,8 +71,9 @@ class ForwardGP:
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """Fit to all known points that any camera saw."""
         used = without_copies(data)
-        frame = Frame.of(used, self.method)
-        with solvable(), blas_threads(1):  # many small matrices, one after the other: two threads would wait
+        # many small matrices, one after the other: two threads would wait
+        with mistakes_named(data), solvable(), blas_threads(1):
+            frame = Frame.of(used, self.method)
             problem = problem_of(self.lens, used, frame)
             fitted = with_noise_told_apart(problem, fit_rig(problem, progress), used.shots)
         return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
