@@ -24,6 +24,9 @@ ITERATIONS = 12
 CONVERGED = 1e-3
 """Of a step, in standard deviations of the position."""
 
+LEAST_INFORMATION = 1e-14
+"""Of a position, in its worst direction over that in its best: what is less is rounding, and may be negative."""
+
 REWEIGHTED = 3
 """Times that the views of tied cameras are weighted, where their noise has heavy tails."""
 
@@ -188,6 +191,8 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
     H, g, squares = weights.normal(x, uv, seen)
     step = _solved(H, g)
     found = done & np.isfinite(H).all(axis=(1, 2)) & np.isfinite(step).all(axis=1)
+    information = np.linalg.eigvalsh(np.where(found[:, None, None], H, np.eye(3)))
+    found &= information[:, 0] > LEAST_INFORMATION * information[:, 2]
     covariance = _inverted(H)
     found &= np.isfinite(covariance).all(axis=(1, 2))
     x = x + step
