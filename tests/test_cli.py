@@ -85,20 +85,19 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulated = "simulate rig --cameras 2R --positions random --points 40 --check 30 --seed 1"
     photos = "simulate photos --images --cameras 2R --positions random --points 3"
     cameras = "export rig.implicam --to aniposelib -o cameras.toml"
-    for words in (f"{simulated}", "calibrate rig -o rig.implicam", photos, cameras):
-        real(words, folder, check=True)
+    with contextlib.chdir(folder):
+        for words in (simulated, "calibrate rig -o rig.implicam", photos, cameras):
+            with pytest.raises(SystemExit) as end:
+                main(words.split())
+            assert not end.value.code
     return folder
 
 
-def real(words: str, cwd: Path, *, check: bool = False, **env: str) -> Ran:
+def real(words: str, cwd: Path) -> Ran:
     """The installed command, in a process of its own."""
     executable = shutil.which("implicam", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     assert executable, "implicam is not installed: pip install -e ."
-    told = subprocess.run(
-        [executable, *shlex.split(words)], cwd=cwd, env={**UNWATCHED, **env}, capture_output=True, text=True
-    )
-    if check:
-        assert told.returncode == 0, told.stderr
+    told = subprocess.run([executable, *shlex.split(words)], cwd=cwd, env=UNWATCHED, capture_output=True, text=True)
     return Ran(told.returncode, told.stdout, told.stderr)
 
 
@@ -157,34 +156,55 @@ def test_the_version(cli: Cli) -> None:
     assert (ran.code, ran.out.split()) == (0, ["implicam", calibration_file.package_version()])
 
 
+HEAVY_EXAMPLES = ("demo", "compare", "paper")
+"""Those that take 20 to 50 seconds of work each: with `make test-slow`."""
+
+
+def example(command: str, folder: Path) -> Ran:
+    """Run the example of a command, as installed, and look at what it leaves."""
+    before = {path.name for path in folder.iterdir()}
+    name, *words = shlex.split(EXAMPLES[command])
+    assert name == "implicam"
+    ran = real(shlex.join(words), folder)
+    assert ran.code == 0, ran.err
+    assert ran.out.strip()
+    assert "Warning" not in ran.err
+    after = {path.name for path in folder.iterdir()}
+    assert after - before == MAKES[command] - before
+    assert MAKES[command] <= after
+    assert not [path for path in folder.rglob("*") if "partial" in path.name]
+    return ran
+
+
 def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path) -> None:
-    for module in ("plotly", "matplotlib", "torch", "gpytorch", "joblib"):
+    for module in ("plotly", "matplotlib"):
         pytest.importorskip(module)
     real("simulate my-photos --images --cameras 2R --grid 3x2x2", tmp_path)
-    for command, example in EXAMPLES.items():
-        before = {path.name for path in tmp_path.iterdir()}
-        name, *words = shlex.split(example)
-        assert name == "implicam"
-        ran = real(shlex.join(words), tmp_path)
-        assert ran.code == 0, ran.err
-        assert ran.out.strip()
-        assert "Warning" not in ran.err
-        after = {path.name for path in tmp_path.iterdir()}
-        assert after - before == MAKES[command] - before
-        assert MAKES[command] <= after
-        assert not [path for path in tmp_path.rglob("*") if "partial" in path.name]
-        if command == "demo":
-            check_readme(ran.out)
+    for command in EXAMPLES:
+        if command not in HEAVY_EXAMPLES:
+            example(command, tmp_path)
     assert len(read_dataset(tmp_path / "my-rig")) == 157
     assert len(read_dataset(tmp_path / "my-rig.csv")) == 157
     assert len(read_measured(tmp_path / "measured.csv")) == 300
     load_calibration(tmp_path / "my-rig.implicam")
-    assert (tmp_path / "compare.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "report.html").read_text().rstrip().endswith("</html>")
-    assert {path.name for path in (tmp_path / "implicam-demo").iterdir()} == {
-        "dataset.toml", "points.csv", "observations.csv", "truth.toml", "check", "rig.implicam", "measured.csv",
-        "report.html", "images", "detections", "observations.before-detect.csv",
-    }  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", HEAVY_EXAMPLES)
+def test_every_heavy_example_runs_and_leaves_what_it_names(command: str, tmp_path: Path) -> None:
+    for module in ("plotly", "matplotlib", "torch", "gpytorch", "joblib"):
+        pytest.importorskip(module)
+    example("simulate", tmp_path)  # the rig that compare takes
+    ran = example(command, tmp_path)
+    if command == "demo":
+        check_readme(ran.out)
+        assert {path.name for path in (tmp_path / "implicam-demo").iterdir()} == {
+            "dataset.toml", "points.csv", "observations.csv", "truth.toml", "check", "rig.implicam", "measured.csv",
+            "report.html", "images", "detections", "observations.before-detect.csv",
+        }  # fmt: skip
+    if command == "compare":
+        assert (tmp_path / "compare.png").read_bytes().startswith(b"\x89PNG")
 
 
 def check_readme(printed: str) -> None:
@@ -1003,12 +1023,15 @@ VICTIMS = [
 ]
 
 KILLER = '''
-import os, signal, sys
+import os, shutil, sys
 sys.dont_write_bytecode = True
-import implicam.cli.commands, implicam.cli.show, implicam.demo, tomli_w, threadpoolctl  # once, not in every child
 from implicam.cli import main
-for name in sys.argv[1].split(","):
-    __import__(name)
+
+folder, copies = sys.argv[1:3]
+count, copying = 0, False
+
+def inside(path):
+    return not isinstance(path, int) and os.path.abspath(os.fsdecode(path)).startswith(folder)
 
 def writes(event, args):
     """Whether an audit event is about to change a file in the working folder."""
@@ -1016,48 +1039,32 @@ def writes(event, args):
         return bool(args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)) and inside(args[0])
     return event in ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.chmod") and inside(args[0])
 
-def inside(path):
-    if isinstance(path, int):
-        return False
-    return os.path.abspath(os.fsdecode(path)).startswith(os.getcwd())
+def strike():
+    """Keep the folder as it is now: what a kill at this instant would leave."""
+    global count, copying
+    if not copying:
+        copying, count = True, count + 1
+        shutil.copytree(folder, os.path.join(copies, str(count)))
+        copying = False
 
-def child(n):
-    """Run the command; die before its n-th change."""
-    count = 0
-    def strike():
-        nonlocal count
-        count += 1
-        if count == n:
-            os.kill(os.getpid(), signal.SIGKILL)
-    fsync = os.fsync
-    def before_and_after(handle):
-        strike()
-        fsync(handle)
-    os.fsync = before_and_after
-    sys.addaudithook(lambda event, args: strike() if writes(event, args) else None)
-    sys.stdout = sys.stderr = open(os.devnull, "w")
+fsync = os.fsync
+def before_and_after(handle):
+    strike()
+    fsync(handle)
+os.fsync = before_and_after
+os.chdir(folder)
+sys.addaudithook(lambda event, args: strike() if writes(event, args) else None)
+out, sys.stdout = sys.stdout, open(os.devnull, "w")
+try:
     main(sys.argv[3:])
-
-n = 0
-while True:
-    n += 1
-    os.chdir(os.path.join(sys.argv[2], str(n)))
-    pid = os.fork()
-    if pid == 0:
-        try:
-            child(n)
-        finally:
-            os._exit(9)  # main leaves by SystemExit
-    _, status = os.waitpid(pid, 0)
-    if not os.WIFSIGNALED(status):
-        print(n)
-        break
+finally:
+    print(count, file=out)
 '''
 
 
 def victims_folder(made: Path, folder: Path) -> Path:
     """Everything the victims need, and in place of their output something old and good."""
-    shutil.copytree(made, folder, dirs_exist_ok=True)
+    shutil.copytree(made, folder, ignore=shutil.ignore_patterns("photos"))
     rig = build_rig("bar6", seed=9, cameras="2R")
     old = simulate(rig, random_positions(rig, 25, np.random.default_rng(0)), seed=9)
     for name in ("old", "old-folder", "old.npz", "old.csv"):
@@ -1105,24 +1112,25 @@ def check_kill(folder: Path, victim: Victim, old: Any, new: Any, sources: dict[s
     return outcome
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.parametrize("victim", VICTIMS, ids=str)
 def test_killed_before_any_of_its_changes_the_old_or_the_new_is_there(
     victim: Victim, made: Path, tmp_path: Path
 ) -> None:
-    """A child per file operation (open, write to disk, rename, remove, ...), killed just before it."""
+    """One run; before each of its file operations (open, write to disk, rename, remove, ...) the folder is copied.
+
+    A copy holds what a process killed at that instant leaves behind: what is on its way to a file is in neither.
+    """
     pytest.importorskip(victim.needs)
     template = victims_folder(made, tmp_path / "template")
-    most = 60
-    for n in range(1, most + 1):
-        shutil.copytree(template, tmp_path / str(n), copy_function=os.link)  # nothing is changed in place
+    shutil.copytree(template, tmp_path / "run")
     told = subprocess.run(
-        [sys.executable, "-c", KILLER, victim.needs, str(tmp_path), *shlex.split(victim.words)],
+        [sys.executable, "-c", KILLER, str(tmp_path / "run"), str(tmp_path), *shlex.split(victim.words)],
         env=UNWATCHED, capture_output=True, text=True,
     )  # fmt: skip
     assert told.returncode == 0, told.stderr
-    survived = int(told.stdout)
-    assert 2 < survived <= most
+    survived = int(told.stdout) + 1
+    assert 2 < survived <= 60
+    shutil.move(tmp_path / "run", tmp_path / str(survived))
     old, new = state(template, victim.target), state(tmp_path / str(survived), victim.target)
     assert old != new
     sources = {name: state(template, name) for name in ("rig", "rig.implicam")}
