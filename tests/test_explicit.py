@@ -446,14 +446,20 @@ def test_corners_that_are_wrong_are_listed() -> None:
 # into the world
 
 
-def fit_boards(**options: Any) -> ExplicitCalibration:
-    rig, data = pair()
-    return Explicit(boards=data, **options).fit(points(rig, 30, 5))
+@cache
+def on_boards(align: str = "points") -> Explicit:
+    """The cameras of pair() from its boards: one method, which adjusts them once for all known points."""
+    return Explicit(boards=pair()[1], align=align)
 
 
 @cache
 def from_boards() -> ExplicitCalibration:
-    return fit_boards()
+    return on_boards().fit(points(pair()[0], 30, 5))
+
+
+@cache
+def from_boards_alone() -> ExplicitCalibration:
+    return Explicit().fit(fisheyes()[1])
 
 
 def test_from_boards_it_measures_close_to_the_limit_with_true_error_bars() -> None:
@@ -478,7 +484,7 @@ def test_from_boards_it_measures_close_to_the_limit_with_true_error_bars() -> No
 
 def test_icp_is_the_closed_form_where_the_names_are_right() -> None:
     rig, _ = pair()
-    a, b = from_boards(), fit_boards(align="icp")
+    a, b = from_boards(), on_boards("icp").fit(points(rig, 30, 5))
     others = points(rig, 40, 6).observations
     np.testing.assert_allclose(a.measure(others).xyz, b.measure(others).xyz, atol=1e-6)
     # Fifteen points, some of them misnamed among neighbours: the closest points still are the right ones
@@ -494,24 +500,24 @@ def test_icp_is_the_closed_form_where_the_names_are_right() -> None:
 
 
 def test_icp_needs_no_names() -> None:
-    rig, data = pair()
+    rig, _ = pair()
     known = points(rig, 30, 5)
     mixed = np.random.default_rng(3).permutation(30)
     renamed = replace(known, known=replace(known.positions, xyz=known.xyz[mixed], extra={}))
     others = points(rig, 40, 6)
     expected = from_boards().measure(others.observations)
-    found = Explicit(boards=data, align="icp").fit(renamed).measure(others.observations)
+    found = on_boards("icp").fit(renamed).measure(others.observations)
     np.testing.assert_allclose(found.xyz, expected.xyz, atol=1e-6)
     np.testing.assert_allclose(found.cov, expected.cov, rtol=1e-6, atol=1e-12)
     with pytest.raises(FitError, match="contradict each other"):
-        Explicit(boards=data).fit(renamed)
+        on_boards().fit(renamed)
     lattice = simulate(rig, ball_grid(rig, (3, 3, 4)), seed=4)  # turned by half a turn it is the same
     turned = replace(
         lattice, known=replace(lattice.positions, xyz=lattice.xyz[np.random.default_rng(3).permutation(36)], extra={})
     )
     with pytest.raises(FitError, match="in more than one way"):
-        Explicit(boards=data, align="icp").fit(turned)
-    named = Explicit(boards=data, align="icp").fit(lattice).measure(others.observations)
+        on_boards("icp").fit(turned)
+    named = on_boards("icp").fit(lattice).measure(others.observations)
     assert np.sqrt(np.mean((named.xyz - others.truth.xyz) ** 2)) < 0.5
 
 
@@ -534,7 +540,7 @@ def test_cameras_that_hardly_meet_have_error_bars_that_say_so() -> None:
 def test_a_wrong_square_is_told_with_its_size() -> None:
     rig, data = pair()
     known = points(rig, 40, 5)
-    assert not any("contradict" in note for note in Explicit(boards=data).fit(known).notes())
+    assert not any("contradict" in note for note in on_boards().fit(known).notes())
     target = data.extra["target"]
 
     def with_square(factor: float) -> Dataset:
@@ -576,7 +582,7 @@ def test_corners_of_a_board_share_its_declared_error() -> None:
 
 
 def test_boards_alone_hold_nothing_out() -> None:
-    calibration = Explicit().fit(fisheyes()[1])
+    calibration = from_boards_alone()
     assert calibration.residuals()["held_out"] == "the corners of the boards are measured"
     with pytest.raises(UsageError, match="made without known points"):
         calibration.refit(calibration.data)
@@ -607,12 +613,11 @@ def test_a_shifted_lens_is_no_wrong_lens() -> None:
 
 def test_the_error_of_the_alignment_is_in_the_error_bars() -> None:
     """Three or four known points align badly: the error bars of what is measured must grow, and stay true."""
-    rig, data = pair()
-    method = Explicit(boards=data)
+    rig, _ = pair()
     distances, sizes = [], []
     others = points(rig, 60, 77)
     for seed in range(25):
-        measured = method.fit(points(rig, 4, 500 + seed)).measure(others.observations)
+        measured = on_boards().fit(points(rig, 4, 500 + seed)).measure(others.observations)
         error = measured.xyz - others.truth.xyz
         ok = measured.measured
         distances.append(np.mean(np.einsum("ni,nij,nj->n", error[ok], np.linalg.inv(measured.cov[ok]), error[ok])))
@@ -622,12 +627,12 @@ def test_the_error_of_the_alignment_is_in_the_error_bars() -> None:
 
 
 def test_a_wrong_known_point_does_not_turn_the_world() -> None:
-    rig, data = pair()
+    rig, _ = pair()
     known = points(rig, 30, 5)
     xyz = known.xyz.copy()
     xyz[7] += 15.0
     wrong = replace(known, known=replace(known.positions, xyz=xyz))
-    calibration = Explicit(boards=data).fit(wrong)
+    calibration = on_boards().fit(wrong)
     assert [(one.point, "the world" in one.reason) for one in calibration.unused] == [(str(known.points[7]), True)]
     others = points(rig, 40, 6).observations
     shift = calibration.measure(others).xyz - from_boards().measure(others).xyz
@@ -635,8 +640,8 @@ def test_a_wrong_known_point_does_not_turn_the_world() -> None:
 
 
 def test_boards_alone_are_measured_in_the_frame_of_the_first_camera() -> None:
-    rig, data = fisheyes()
-    calibration = Explicit().fit(data)
+    rig, _ = fisheyes()
+    calibration = from_boards_alone()
     others = points(rig, 40, 6)
     measured = calibration.measure(others.observations)
     expected = rig.cameras[0].camera_from_world.apply(others.truth.xyz)
@@ -757,8 +762,10 @@ def test_a_calibration_from_boards_is_saved_whole(tmp_path: Path) -> None:
 
 
 def test_the_same_data_give_the_same_bits() -> None:
-    others = points(pair()[0], 20, 6).observations
-    np.testing.assert_array_equal(fit_boards().measure(others).cov, from_boards().measure(others).cov)
+    rig, data = pair()
+    others = points(rig, 20, 6).observations
+    again = Explicit(boards=data).fit(points(rig, 30, 5))
+    np.testing.assert_array_equal(again.measure(others).cov, from_boards().measure(others).cov)
 
 
 @pytest.mark.parametrize(
@@ -836,9 +843,8 @@ def test_boards_of_other_cameras_or_sizes_are_a_clear_error() -> None:
 
 
 def test_too_few_known_points_cannot_align() -> None:
-    rig, data = pair()
     with pytest.raises(FitError, match="2 known points can be measured"):
-        Explicit(boards=data).fit(points(rig, 2, 1))
+        on_boards().fit(points(pair()[0], 2, 1))
 
 
 def test_nothing_in_common_is_a_clear_error_without_known_points() -> None:

@@ -106,7 +106,9 @@ def with_square_pixels() -> float:
     return rms_held_out(stretched(1.0))
 
 
-@pytest.mark.parametrize("ratio", [0.75, 1.067, 1.333, 1.5])
+@pytest.mark.parametrize(
+    "ratio", [pytest.param(0.75, marks=pytest.mark.slow), 1.067, pytest.param(1.333, marks=pytest.mark.slow), 1.5]
+)
 def test_pixels_of_any_shape_cost_nothing(ratio: float) -> None:
     assert with_square_pixels() == pytest.approx(0.211, abs=0.005)
     assert rms_held_out(stretched(ratio)) == pytest.approx(with_square_pixels(), rel=0.05)
