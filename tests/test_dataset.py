@@ -10,7 +10,6 @@ import math
 import os
 import random
 import sys
-import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -326,14 +325,6 @@ def test_values_are_copies_and_read_only() -> None:
 
 def test_sd_of_a_missing_view_is_not_kept() -> None:
     assert np.isnan(tiny(sd=np.ones((2, 2, 2))).observations.sd[1, 1]).all()
-
-
-def test_checking_100k_names_is_quick() -> None:
-    n = 100_000
-    points = np.array([f"p{i}" for i in range(n)])
-    start = time.perf_counter()
-    Observations(points, (Camera("a"),), np.zeros((n, 1, 2)), np.full((n, 1, 2), np.nan))
-    assert time.perf_counter() - start < 2  # measured: 0.05 s
 
 
 # --- split, folds, shots, cameras, join ----------------------------------------------------------------------------
@@ -1160,11 +1151,9 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
 def test_mistakes_in_a_folder(mistake: str, tmp_path: Path) -> None:
     files, expected = MISTAKES[mistake]
     path = folder(tmp_path, files)
-    start = time.perf_counter()
     with pytest.raises(DatasetError) as caught:
         read_dataset(path)
     assert str(caught.value).replace(str(tmp_path), "{at}") == expected
-    assert time.perf_counter() - start < 2
 
 
 @pytest.mark.parametrize("mistake", WIDE_MISTAKES)
@@ -1263,7 +1252,6 @@ def header_then_zeros(path: Path) -> None:
 def test_a_gigabyte_of_something_else(name: str, make: Callable[[Path], None], tmp_path: Path) -> None:
     path = folder(tmp_path) if name in FILES else tmp_path
     make(path / name)
-    start = time.perf_counter()
     tracemalloc.start()
     try:
         with pytest.raises(DatasetError, match=name):
@@ -1272,7 +1260,6 @@ def test_a_gigabyte_of_something_else(name: str, make: Callable[[Path], None], t
     finally:
         tracemalloc.stop()
         (path / name).unlink()
-    assert time.perf_counter() - start < 2
     assert peak < 10 << 20
 
 
@@ -1439,7 +1426,6 @@ def test_fuzz(form: str, tmp_path: Path) -> None:
         file = rng.choice(files)
         content = mutated(originals[file], rng)
         file.write_bytes(content)
-        start = time.perf_counter()
         said = ""
         try:
             assert isinstance(read_dataset(path), Dataset)
@@ -1447,6 +1433,5 @@ def test_fuzz(form: str, tmp_path: Path) -> None:
             refused += 1
             said = error.what
         assert not said or path.name in said, (said, content)
-        assert time.perf_counter() - start < 2
         file.write_bytes(originals[file])
     assert refused > 300

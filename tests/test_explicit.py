@@ -521,6 +521,7 @@ def test_icp_needs_no_names() -> None:
     assert np.sqrt(np.mean((named.xyz - others.truth.xyz) ** 2)) < 0.5
 
 
+@pytest.mark.slow
 def test_cameras_that_hardly_meet_have_error_bars_that_say_so() -> None:
     """Two shared boards only: errors of lenses and poses are far larger than those of the pixels."""
     distances = []
@@ -567,6 +568,7 @@ def test_boards_may_be_in_another_unit() -> None:
     np.testing.assert_allclose(method.fit(in_m).measure(others).xyz * 1000, a.xyz, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_corners_of_a_board_share_its_declared_error() -> None:
     """A board on a slide that is off by 0.5 mm as a whole: six errors, not five hundred."""
     distances = []
@@ -611,6 +613,7 @@ def test_a_shifted_lens_is_no_wrong_lens() -> None:
     assert overall.rmse_over_limit < 1.35
 
 
+@pytest.mark.slow
 def test_the_error_of_the_alignment_is_in_the_error_bars() -> None:
     """Three or four known points align badly: the error bars of what is measured must grow, and stay true."""
     rig, _ = pair()
