@@ -1,4 +1,4 @@
-# make demo   the main job on a simulated rig          make test   every test
+# make demo   the main job on a simulated rig          make test   every test that takes seconds; make test-slow the others
 # make check  all that CI checks                        make bench  speed against the limits
 # make real   the table of docs/real-data.md            make rigs   the tables of docs/choose.md on forward-gp
 # make methods   all methods side by side, the first table of docs/choose.md
@@ -16,11 +16,14 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint
 demo: $(VENV)/.demo
 	$(BIN)/implicam demo
 
+# A process for each core, so one thread each; a file in one process, because its tests share rigs and fits.
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --durations 10 --durations-min 5
+
 test: $(VENV)/.dev
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow"
+	$(PYTEST) --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.dev
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
+	$(PYTEST) --dist worksteal -m slow
 
 check: lint test
 
@@ -34,6 +37,7 @@ bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/gp_fit.py
 	$(BIN)/python benchmarks/forward_speed.py
 	$(BIN)/python benchmarks/active_speed.py
+	$(BIN)/python benchmarks/reading.py
 
 odd: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/odd_rigs.py -o benchmarks/results/odd_rigs.md

@@ -12,7 +12,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import time
 import tomllib
 import tracemalloc
 import zipfile
@@ -387,13 +386,11 @@ ARRAY_EDITS: dict[str, Callable[[np.ndarray], bytes]] = {
 def test_array_edits(edit: str, saved: Path, tmp_path: Path) -> None:
     """Every array in turn is replaced by something wrong, with a right checksum."""
     table, members = contents(saved)
-    start = time.perf_counter()
     for name in members:
         array = np.load(io.BytesIO(members[name]))
         changed = ARRAY_EDITS[edit](array)
         if changed != members[name]:
             fails(forge(tmp_path / "x.implicam", table, zipped({**members, name: changed})))
-    assert time.perf_counter() - start < 5
 
 
 PRESET_NUMBERS = {
@@ -499,9 +496,7 @@ RAW_TOML: dict[str, str | bytes] = {
 @pytest.mark.parametrize("name", RAW_TOML)
 def test_raw_toml(name: str, saved: Path, tmp_path: Path) -> None:
     _, members = contents(saved)
-    start = time.perf_counter()
     fails(forge(tmp_path / "x.implicam", RAW_TOML[name], zipped(members)))
-    assert time.perf_counter() - start < 4
 
 
 DESCRIPTIONS = {
@@ -697,13 +692,11 @@ for path in sys.argv[1:]:
 """
     if not Path("/proc/self/statm").exists():
         pytest.skip("needs /proc")
-    start = time.perf_counter()
     run = subprocess.run(
         [sys.executable, "-c", code, *map(str, paths), str(tmp_path / "3.implicam")],
         capture_output=True, text=True, check=False, timeout=60,
     )  # fmt: skip
     assert run.stdout.split() == ["refused", "refused", "refused", "loaded"], run.stdout + run.stderr
-    assert time.perf_counter() - start < 20
 
 
 # --- forged at random ----------------------------------------------------------------------------------------------

@@ -2,110 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
-import json
-import os
 import re
 import shlex
-import shutil
-import signal
 import subprocess
 import sys
-import time
-import tomllib
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from command_line import UNWATCHED, Cli, Ran, cli, files, made, read_measured, real  # noqa: F401  fixtures
 from implicam import calibration_file, demo
 from implicam.calibrators import load_calibration
-from implicam.cli import main, show
+from implicam.cli import show
 from implicam.cli.commands import EXAMPLES, app
 from implicam.coverage import Estimate
-from implicam.dataset import read_dataset, write_dataset
-from implicam.files import left_behind
-from implicam.measurement import MEASURED_COLUMNS
-from implicam.simulate import build_rig, random_positions, simulate
+from implicam.dataset import read_dataset
 
 COMMANDS = sorted(command.name for command in app.registered_commands)
-UNWATCHED = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80", "NO_COLOR": "1"}
 HEAVY = ["viser", "plotly", "matplotlib", "torch", "gpytorch", "pyarrow", "cv2", "sklearn"]
-
-with contextlib.suppress(ImportError), warnings.catch_warnings(action="ignore"):
-    import gpytorch  # noqa: F401  now, because it warns of PyTorch when it is imported first
-
-
-@dataclass(frozen=True)
-class Ran:
-    """What a command did."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        def refuse(word: str) -> None:
-            raise ValueError(f"{word} is not JSON")
-
-        return json.loads(self.out, parse_constant=refuse)
-
-
-Cli = Callable[..., Ran]
-
-
-@pytest.fixture
-def cli(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
-    """Runs a command in this process, in a folder of its own."""
-    monkeypatch.chdir(tmp_path)
-    for key in ("COLUMNS", "NO_COLOR"):
-        monkeypatch.setenv(key, UNWATCHED[key])
-
-    def run(*words: object) -> Ran:
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            main([str(word) for word in words])
-        told = capsys.readouterr()
-        return Ran(int(end.value.code or 0), told.out, told.err)
-
-    return run
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated rig of two cameras with check points and a calibration, to be read only."""
-    folder = tmp_path_factory.mktemp("made")
-    simulated = "simulate rig --cameras 2R --positions random --points 40 --check 30 --seed 1"
-    photos = "simulate photos --images --cameras 2R --positions random --points 3"
-    cameras = "export rig.implicam --to aniposelib -o cameras.toml"
-    for words in (f"{simulated}", "calibrate rig -o rig.implicam", photos, cameras):
-        real(words, folder, check=True)
-    return folder
-
-
-def real(words: str, cwd: Path, *, check: bool = False, **env: str) -> Ran:
-    """The installed command, in a process of its own."""
-    executable = shutil.which("implicam", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
-    assert executable, "implicam is not installed: pip install -e ."
-    told = subprocess.run(
-        [executable, *shlex.split(words)], cwd=cwd, env={**UNWATCHED, **env}, capture_output=True, text=True
-    )
-    if check:
-        assert told.returncode == 0, told.stderr
-    return Ran(told.returncode, told.stdout, told.stderr)
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder: name -> content."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
 
 # examples and help
 
@@ -157,34 +74,56 @@ def test_the_version(cli: Cli) -> None:
     assert (ran.code, ran.out.split()) == (0, ["implicam", calibration_file.package_version()])
 
 
+HEAVY_EXAMPLES = ("demo", "compare", "report", "acquire", "paper")
+"""Those that take 7 to 50 seconds of work each: with `make test-slow`."""
+
+
+def example(command: str, folder: Path) -> Ran:
+    """Run the example of a command, as installed, and look at what it leaves."""
+    before = {path.name for path in folder.iterdir()}
+    name, *words = shlex.split(EXAMPLES[command])
+    assert name == "implicam"
+    ran = real(shlex.join(words), folder)
+    assert ran.code == 0, ran.err
+    assert ran.out.strip()
+    assert "Warning" not in ran.err
+    after = {path.name for path in folder.iterdir()}
+    assert after - before == MAKES[command] - before
+    assert MAKES[command] <= after
+    assert not [path for path in folder.rglob("*") if "partial" in path.name]
+    return ran
+
+
 def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path) -> None:
-    for module in ("plotly", "matplotlib", "torch", "gpytorch", "joblib"):
+    for module in ("plotly", "matplotlib"):
         pytest.importorskip(module)
     real("simulate my-photos --images --cameras 2R --grid 3x2x2", tmp_path)
-    for command, example in EXAMPLES.items():
-        before = {path.name for path in tmp_path.iterdir()}
-        name, *words = shlex.split(example)
-        assert name == "implicam"
-        ran = real(shlex.join(words), tmp_path)
-        assert ran.code == 0, ran.err
-        assert ran.out.strip()
-        assert "Warning" not in ran.err
-        after = {path.name for path in tmp_path.iterdir()}
-        assert after - before == MAKES[command] - before
-        assert MAKES[command] <= after
-        assert not [path for path in tmp_path.rglob("*") if "partial" in path.name]
-        if command == "demo":
-            check_readme(ran.out)
+    for command in EXAMPLES:
+        if command not in HEAVY_EXAMPLES:
+            example(command, tmp_path)
     assert len(read_dataset(tmp_path / "my-rig")) == 157
     assert len(read_dataset(tmp_path / "my-rig.csv")) == 157
     assert len(read_measured(tmp_path / "measured.csv")) == 300
     load_calibration(tmp_path / "my-rig.implicam")
-    assert (tmp_path / "compare.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "report.html").read_text().rstrip().endswith("</html>")
-    assert {path.name for path in (tmp_path / "implicam-demo").iterdir()} == {
-        "dataset.toml", "points.csv", "observations.csv", "truth.toml", "check", "rig.implicam", "measured.csv",
-        "report.html", "images", "detections", "observations.before-detect.csv",
-    }  # fmt: skip
+    assert (tmp_path / "report.html").read_text().rstrip().endswith("</html>")  # that of evaluate
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", HEAVY_EXAMPLES)
+def test_every_heavy_example_runs_and_leaves_what_it_names(command: str, tmp_path: Path) -> None:
+    for module in ("plotly", "matplotlib", "torch", "gpytorch", "joblib"):
+        pytest.importorskip(module)
+    for needed in {"compare": ["simulate"], "report": ["simulate", "calibrate"]}.get(command, []):
+        example(needed, tmp_path)
+    ran = example(command, tmp_path)
+    if command == "demo":
+        check_readme(ran.out)
+        assert {path.name for path in (tmp_path / "implicam-demo").iterdir()} == {
+            "dataset.toml", "points.csv", "observations.csv", "truth.toml", "check", "rig.implicam", "measured.csv",
+            "report.html", "images", "detections", "observations.before-detect.csv",
+        }  # fmt: skip
+    if command == "compare":
+        assert (tmp_path / "compare.png").read_bytes().startswith(b"\x89PNG")
 
 
 def check_readme(printed: str) -> None:
@@ -199,13 +138,6 @@ def check_readme(printed: str) -> None:
         assert number.sub("", ours).split() == number.sub("", readme).split()
         values = ([float(value) for value in number.findall(line)] for line in (ours, readme))
         assert next(values) == pytest.approx(next(values), rel=0.02)
-
-
-def read_measured(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        rows = csv.DictReader(file)
-        assert tuple(rows.fieldnames or ()) == MEASURED_COLUMNS
-        return list(rows)
 
 
 def test_importing_implicam_costs_numpy_and_scipy_only() -> None:
@@ -590,650 +522,3 @@ def test_compare_without_gpytorch_says_what_it_left_out(made: Path, cli: Cli, mo
     assert ran.code == 0
     assert "left out inverse-gp:paper" in ran.err
     assert "inverse-gp:paper" not in ran.out
-
-
-# simulate
-
-
-def test_simulate_writes_rig_truth_and_check_points(cli: Cli) -> None:
-    ran = cli("simulate", "rig", "--cameras", "2R2W", "--grid", "2x3x4", "--check", "7", "--seed", "3")
-    assert ran.code == 0
-    data, check = read_dataset("rig"), read_dataset("rig/check")
-    assert (len(data), len(check)) == (24, 7)
-    assert data.observations.camera_names == ("cam2", "cam3", "cam4", "cam5")
-    assert data.truth is not None
-    assert check.truth is not None
-    assert "rig: 24 points, " in ran.out
-    assert "4 cameras" in ran.out
-    assert (Path("rig") / "truth.toml").is_file()
-    np.testing.assert_allclose(check.truth.xyz, check.xyz)
-
-
-def test_simulate_options_do_what_they_say(cli: Cli) -> None:
-    def simulated(*options: object) -> Any:
-        name = f"rig{len(list(Path.cwd().iterdir()))}"
-        assert cli("simulate", name, "--rig", "stereo", *options).code == 0
-        return read_dataset(name)
-
-    plain = simulated()
-    assert len(plain) == 175
-    assert plain.length_unit == "mm"
-    share = 1 - simulated("--missing", 0.3).observations.seen.mean() / plain.observations.seen.mean()
-    assert 0.2 < share < 0.4
-    wrong = (simulated("--outliers", 0.2).observations.extra["outlier"] == "1").mean()
-    assert 0.1 < wrong < 0.3
-    noisy = simulated("--robot-noise", 0.5)
-    assert np.std(noisy.xyz - noisy.truth.xyz) == pytest.approx(0.5, rel=0.15)
-    assert (noisy.known.sd == 0.5).all()
-    np.testing.assert_allclose(simulated("--unit", "m").xyz, plain.xyz / 1000)
-    assert np.ptp(simulated("--frame", "random").xyz, axis=0) != pytest.approx(np.ptp(plain.xyz, axis=0), rel=0.01)
-    board = simulated("--target", "board", "--boards", 3)
-    assert len(np.unique(board.shots)) == 3
-    quiet = simulated("--noise", 0, "--lens-error", 0)
-    assert (
-        np.abs(quiet.observations.uv - quiet.observations.extra["true_u"].astype(float)[..., None])[..., 0].max() == 0
-    )
-    np.testing.assert_array_equal(simulated().observations.uv, plain.observations.uv)
-    again, other = simulated("--shots-seed", 7), simulated("--seed", 7)
-    np.testing.assert_array_equal(again.xyz, plain.xyz)
-    assert np.abs(again.observations.uv - plain.observations.uv).max() < 5  # the same rig, other noise
-    assert np.abs(other.observations.uv - plain.observations.uv).max() > 5  # another rig
-    assert len(simulated("--rig", "dome5", "--positions", "random", "--points", 12).cameras) == 5
-
-
-def test_simulate_makes_cameras_that_are_not_ordinary(cli: Cli) -> None:
-    odd = ["--tilt", "5", "--mirror", "cam2", "--aspect", "1.25", "--window", "15"]
-    assert cli("simulate", "odd", "--rig", "stereo", "--noise", 0, *odd).code == 0
-    assert cli("simulate", "plain", "--rig", "stereo", "--noise", 0).code == 0
-    truth, plain_truth = (tomllib.loads((Path(name) / "truth.toml").read_text()) for name in ("odd", "plain"))
-    assert (truth["tilt"], truth["mirror"], truth["aspect"], truth["window"]) == (5, "cam2", 1.25, 15)
-    assert not set(truth) - set(plain_truth) - {"tilt", "mirror", "aspect", "window"}
-    cam1, cam2 = truth["cameras"]
-    assert "mirrored" not in cam1
-    assert cam2["mirrored"]
-    assert cam1["height"] == 1280
-    assert cam1["window"]["thickness"] == 15
-    data, plain = read_dataset("odd"), read_dataset("plain")
-    np.testing.assert_array_equal(data.xyz, plain.xyz)
-    assert data.truth is not None
-    assert np.isfinite(data.truth.limit[data.observations.seen.all(axis=1)]).all()
-
-
-def test_simulate_refuses_to_overwrite_unless_told(cli: Cli) -> None:
-    assert cli("simulate", "rig", "--rig", "stereo", "--check", 5).code == 0
-    before = files(Path("rig"))
-    ran = cli("simulate", "rig", "--rig", "stereo", "--seed", 1)
-    assert ran.code == 1
-    assert "add --overwrite" in ran.err
-    assert files(Path("rig")) == before
-    assert cli("simulate", "rig", "--rig", "stereo", "--seed", 1, "--overwrite").code == 0
-    after = files(Path("rig"))
-    assert after["observations.csv"] != before["observations.csv"]
-    assert not [name for name in after if name.startswith("check")]
-
-
-# calibrate, measure, evaluate, convert, info
-
-
-def test_the_default_method_is_forward_gp(made: Path, cli: Cli) -> None:
-    assert "forward-gp from 40 points" in cli("calibrate", made / "rig", "-o", "x.implicam").out
-    told = cli("info", "x.implicam", "--json").json
-    assert (told["method"], told["options"]["lens"]) == ("forward-gp", "auto")
-    assert "(default forward-gp)" in " ".join(cli("calibrate", "--help").out.replace("│", " ").split())
-    assert cli("evaluate", made / "rig", "--cv", "3", "--json").json["method"] == "forward-gp"
-    # an option that only the other method has means that method
-    assert "inverse-gp from 40" in cli("calibrate", made / "rig", "-o", "x.implicam", "--kernel", "matern-5/2").out
-
-
-def test_the_lens_is_an_option_of_forward_gp(made: Path, cli: Cli) -> None:
-    ran = cli("calibrate", made / "rig", "-o", "none.implicam", "--lens", "none")
-    assert ran.code == 0
-    assert "forward-gp from 40 points" in ran.out
-    assert cli("info", "none.implicam", "--json").json["options"]["lens"] == "none"
-    assert cli("measure", "none.implicam", made / "rig" / "check").out.startswith("measured.csv: 30 rows, 30 measured")
-    assert cli("calibrate", made / "rig", "-o", "auto.implicam", "--lens", "auto").code == 0
-    assert Path("auto.implicam").read_bytes() == (made / "rig.implicam").read_bytes()
-    by_lens = [cli("evaluate", made / "rig", "--cv", "3", "--lens", lens, "--json") for lens in ("central", "none")]
-    assert [ran.code for ran in by_lens] == [0, 0]
-    assert by_lens[0].json["rows"] != by_lens[1].json["rows"]
-
-
-def test_compare_takes_forward_gp_with_either_lens(made: Path, cli: Cli) -> None:
-    methods = ["forward-gp", "forward-gp:none", "inverse-gp"]
-    words = ("compare", made / "rig", "--train", "12,30", "--seeds", "1", "--methods", ",".join(methods))
-    told = cli(*words, "--json").json
-    assert [(row["known"], row["method"], row["failures"]) for row in told["rows"]] == [
-        (known, method, []) for known in (12, 30) for method in methods
-    ]
-    rmse = {(row["known"], row["method"]): row["mean"]["rmse"] for row in told["rows"]}
-    assert len(set(rmse.values())) == 6
-    assert rmse[12, "forward-gp"] < rmse[12, "inverse-gp"] / 5
-    assert "forward-gp:none" in cli(*words).out
-
-
-def displaced(folder: Path, views: dict[int, str], pixels: float = 30.0) -> list[tuple[str, str]]:
-    """Move views (row of the point -> camera) of a dataset that far; the names of the points, and the cameras."""
-    data = read_dataset(folder)
-    uv = data.observations.uv.copy()
-    for row, camera in views.items():
-        uv[row, data.observations.camera_names.index(camera)] += pixels / np.sqrt(2)
-    moved = replace(data, observations=replace(data.observations, uv=uv))
-    write_dataset(moved, folder, overwrite=True)
-    return [(str(data.points[row]), camera) for row, camera in views.items()]
-
-
-def four_cameras(cli: Cli) -> None:
-    """A rig of cam2, cam3, cam4, cam5 with 40 known points and 30 to check."""
-    cli("simulate", "rig", "--cameras", "2R2W", "--positions", "random", "--points", 40, "--check", 30, "--seed", 1)
-    shutil.move("rig/check", "check")
-
-
-def test_calibrate_says_which_views_it_rejected(cli: Cli) -> None:
-    four_cameras(cli)
-    wrong = displaced(Path("rig"), {3: "cam3", 17: "cam5"})
-    ran = cli("calibrate", "rig", "-o", "x.implicam")
-    assert ran.code == 0
-    assert "contradict" not in ran.out
-    (note,) = [line for line in ran.err.splitlines() if "views contradict the others and are not used" in line]
-    assert note.startswith("note: 2 of ")
-    for point, camera in wrong:
-        assert f"{point} in {camera} (" in note
-    told = cli("calibrate", "rig", "-o", "x.implicam", "--json").json
-    assert {(view["point"], view["camera"]) for view in told["rejected"]} == set(wrong)
-    assert len(told["rejected"]) == 2
-    assert [view["residual"] for view in told["rejected"]] == pytest.approx([30, 30], abs=3)
-    assert told["unused"] == []
-    assert cli("calibrate", "check", "-o", "y.implicam", "--json").json["rejected"] == []
-    assert cli("calibrate", "rig", "-o", "x.implicam", "--method", "inverse-gp", "--json").json["rejected"] == []
-
-
-def test_a_point_measured_without_a_contradicting_view_counts_as_measured(cli: Cli) -> None:
-    four_cameras(cli)
-    cli("calibrate", "rig", "-o", "x.implicam")
-    (one,) = displaced(Path("check"), {8: "cam4"})
-    ran = cli("measure", "x.implicam", "check")
-    assert ran.out.startswith("measured.csv: 30 rows, 30 measured, ")
-    assert ran.err == "note: 1 point measured without cam4, whose view contradicts the others\n"
-    rows = {row["point"]: row for row in read_measured(Path("measured.csv"))}
-    assert rows[one[0]]["reason"] == "measured without cam4, whose view contradicts the others"
-    assert rows[one[0]]["views"] == "3"
-    assert rows[one[0]]["x"] != ""
-    displaced(Path("check"), {11: "cam4", 12: "cam2"})
-    ran = cli("measure", "x.implicam", "check")
-    assert ran.err.splitlines() == [
-        "note: 3 points measured without a view that contradicts the others; of these:",
-        "note: 2 points measured without cam4, whose view contradicts the others",
-        "note: 1 point measured without cam2, whose view contradicts the others",
-    ]
-    told = cli("measure", "x.implicam", "check", "--json").json
-    assert (told["points_measured"], told["not_measured"], len(told["views_left_out"])) == (30, [], 3)
-    ran = cli("evaluate", "x.implicam", "check")
-    assert "note: 3 points measured without a view" in ran.err
-    assert "not measured" not in ran.out + ran.err
-    told = cli("evaluate", "x.implicam", "check", "--json").json
-    assert (told["rows"][0]["n"], told["rows"][0]["unmeasured"], told["not_measured"]) == (30, 0, [])
-    assert len(told["views_left_out"]) == 3
-
-
-def test_measure_does_without_a_camera_that_is_not_there(cli: Cli) -> None:
-    four_cameras(cli)
-    check = read_dataset("check")
-    write_dataset(check.without(["cam4"]), "three")
-    cli("calibrate", "rig", "-o", "x.implicam")
-    ran = cli("measure", "x.implicam", "three")
-    assert ran.out.startswith("measured.csv: 30 rows, 30 measured, ")
-    assert ran.err == ""
-    rows = read_measured(Path("measured.csv"))
-    assert {row["views"] for row in rows} == {"3"}
-    xyz = np.array([[float(row[axis]) for axis in "xyz"] for row in rows])
-    assert np.sqrt(np.mean((xyz - check.xyz) ** 2)) < 1
-    cli("calibrate", "rig", "-o", "x.implicam", "--method", "inverse-gp")
-    ran = cli("measure", "x.implicam", "three")
-    assert ran.code == 1
-    assert "the observations have no camera 'cam4'" in ran.err
-
-
-def test_one_camera_alone_measures_nothing_and_says_why(cli: Cli) -> None:
-    four_cameras(cli)
-    cli("calibrate", "rig", "-o", "x.implicam")
-    write_dataset(read_dataset("check").with_cameras(["cam4"]), "alone")
-    ran = cli("measure", "x.implicam", "alone")
-    assert ran.code == 0
-    assert ran.out == "measured.csv: 30 rows, 0 measured\n"
-    assert ran.err == "note: 30 points not measured: only cam4 saw it; a position takes two cameras\n"
-
-
-@pytest.mark.parametrize(("method", "why", "testable"), [
-    ("forward-gp", "only cam3 saw it; a position takes two cameras", True),
-    ("inverse-gp", "inverse-gp needs every camera; not seen by cam2", False),
-])  # fmt: skip
-def test_measure_keeps_every_row(method: str, why: str, testable: bool, made: Path, cli: Cli) -> None:
-    cli("calibrate", made / "rig", "-o", "rig.implicam", "--method", method)
-    check = read_dataset(made / "rig" / "check")
-    folder = Path("new-points")
-    shutil.copytree(made / "rig" / "check", folder)
-    (folder / "points.csv").unlink()  # to be measured: nobody knows where they are
-    lines = (folder / "observations.csv").read_text().splitlines(keepends=True)
-    (folder / "observations.csv").write_text("".join(lines[:1] + lines[2:]))  # the first point keeps one view
-    ran = cli("measure", "rig.implicam", folder, "-o", "deep/measured.csv")
-    assert ran.code == 0
-    rows = read_measured(Path("deep/measured.csv"))
-    assert [row["point"] for row in rows] == [str(name) for name in read_dataset(folder).points]
-    one, *others = rows
-    assert (one["views"], one["x"], one["sd_z"], one["cov_xy"]) == ("1", "", "", "")
-    assert one["reason"] == why
-    direct = load_calibration("rig.implicam").measure(check.observations)
-    at = {str(name): i for i, name in enumerate(check.points)}
-    for row in others:
-        i = at[row["point"]]
-        assert [float(row[axis]) for axis in "xyz"] == pytest.approx(direct.xyz[i], rel=1e-9)
-        assert float(row["sd_x"]) == pytest.approx(direct.sd[i, 0], rel=1e-6)
-        assert (row["views"], row["reason"]) == ("2", "")
-        assert (row["consistency"] != "") is testable  # one map from all pixels has nothing to hold them against
-        if testable:
-            assert float(row["consistency"]) == pytest.approx(direct.consistency[i], rel=1e-9)
-    assert "29 measured" in ran.out
-
-
-def test_measure_from_every_form_gives_the_same(made: Path, cli: Cli) -> None:
-    forms = ["check.csv", "check.npz", "check-folder"]
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError:
-        pass
-    else:
-        forms.append("check.parquet")
-    assert cli("measure", made / "rig.implicam", made / "rig" / "check").code == 0
-    expected = Path("measured.csv").read_bytes()
-    for form in forms:
-        assert cli("convert", made / "rig" / "check", form).code == 0
-        assert cli("measure", made / "rig.implicam", form, "-o", "again.csv").code == 0
-        assert Path("again.csv").read_bytes() == expected
-
-
-def test_a_wide_csv_of_a_stranger(made: Path, cli: Cli) -> None:
-    """No description beside it: measuring needs none, learning must know the unit."""
-    cli("convert", made / "rig", "rig.csv")
-    Path("rig.csv.toml").unlink()
-    ran = cli("calibrate", "rig.csv", "-o", "x.implicam")
-    assert ran.code == 1
-    assert "add --unit mm" in ran.err
-    assert cli("calibrate", "rig.csv", "-o", "x.implicam", "--unit", "mm").code == 0
-    ran = cli("measure", "x.implicam", "rig.csv")
-    assert ran.code == 0
-    assert "40 measured" in ran.out
-    ran = cli("evaluate", "x.implicam", made / "rig" / "check")
-    assert ran.code == 0
-
-
-def test_the_unit_of_what_is_measured_does_not_matter_and_that_of_known_points_does(made: Path, cli: Cli) -> None:
-    cli("simulate", "in-m", "--cameras", "2R", "--positions", "random", "--points", "10", "--unit", "m", "--seed", "1")
-    assert cli("measure", made / "rig.implicam", "in-m").code == 0
-    ran = cli("evaluate", made / "rig.implicam", "in-m")
-    assert ran.code == 1
-    assert "is in m, and the calibration is in mm" in ran.err
-
-
-def test_cameras_and_without(cli: Cli) -> None:
-    cli("simulate", "rig", "--positions", "random", "--points", "60", "--check", "20")
-    assert cli("calibrate", "rig", "-o", "a.implicam", "--cameras", "cam2, cam3").code == 0
-    assert cli("calibrate", "rig", "-o", "b.implicam", "--without", "cam1,cam4,cam5,cam6").code == 0
-    assert Path("a.implicam").read_bytes() == Path("b.implicam").read_bytes()
-    told = cli("info", "a.implicam", "--json").json
-    assert [camera["name"] for camera in told["cameras"]] == ["cam2", "cam3"]
-    told = cli("evaluate", "a.implicam", "rig/check", "--json").json
-    assert told["rows"][0]["rmse_over_limit"] is None  # the limit written beside the points is that of six cameras
-    # a calibration file carries its data, and the choice of cameras holds for those, too
-    assert cli("calibrate", "rig", "-o", "all.implicam").code == 0
-    of_file = cli("evaluate", "all.implicam", "--cv", "3", "--cameras", "cam2,cam3", "--json").json
-    of_data = cli("evaluate", "rig", "--cv", "3", "--without", "cam1,cam4,cam5,cam6", "--json").json
-    assert of_file["rows"] == of_data["rows"]
-
-
-def test_points_kept_back_are_there_to_evaluate(made: Path, cli: Cli) -> None:
-    assert cli("calibrate", made / "rig", "-o", "x.implicam", "--points", "25").code == 0
-    ran = cli("evaluate", "x.implicam", made / "rig")
-    assert ran.code == 0
-    assert "15 points not used in the fit; 25 of this dataset were, and are left out" in ran.out
-    other = cli("calibrate", made / "rig", "-o", "y.implicam", "--points", "25", "--seed", "1")
-    assert other.code == 0
-    points = [set(load_calibration(f"{name}.implicam").data.points) for name in "xy"]
-    assert points[0] != points[1]
-    assert cli("calibrate", made / "rig", "-o", "all.implicam", "--points", "40").code == 0
-
-
-def test_evaluate_in_turn_by_file_or_by_dataset(made: Path, cli: Cli) -> None:
-    by_file = cli("evaluate", made / "rig.implicam", "--cv", "4", "--json").json
-    by_data = cli("evaluate", made / "rig", "--cv", "4", "--json").json
-    assert by_file["rows"] == by_data["rows"]
-    assert by_file["how"] == "4-fold cross-validation (seed 0)"
-    assert cli("evaluate", made / "rig", "--cv", "4", "--seed", "9", "--json").json["rows"] != by_data["rows"]
-    inverse = cli("evaluate", made / "rig", "--cv", "4", "--method", "inverse-gp", "--json").json
-    other = cli("evaluate", made / "rig", "--cv", "4", "--kernel", "matern-5/2", "--json").json
-    assert inverse["method"] == other["method"] == "inverse-gp"
-    assert other["rows"] != inverse["rows"]
-    cli("simulate", "board", "--rig", "stereo", "--target", "board", "--boards", "4", "--seed", "2")
-    ran = cli("evaluate", "board", "--leave-out", "shot", "--json").json
-    assert ran["how"] == "each of 4 shots left out in turn"
-    assert ran["rows"][0]["cluster_kind"] == "shots"
-
-
-def test_the_verdict_says_how_much(made: Path, cli: Cli) -> None:
-    ran = cli("evaluate", made / "rig.implicam", made / "rig" / "check")
-    assert re.search(
-        r"^error bars: (too small|right|too large|cannot tell); the mean NEES is [\d.]+ \[[\d.]+,\s?[\d.]+\], and 3 is "
-        r"right; the 95 % ellipsoids hold [\d.]+ %, and [\d.]+ times as large would hold 95 %$",
-        ran.out,
-        re.MULTILINE,
-    )
-
-
-def test_convert_round_trip_loses_nothing(made: Path, cli: Cli) -> None:
-    original = files(made / "rig" / "check")
-    for form in ("a.csv", "b.npz", "c"):
-        assert cli("convert", made / "rig" / "check", form).code == 0
-        ran = cli("convert", form, f"back-{form.replace('.', '-')}")
-        assert ran.code == 0
-        assert "30 points, 2 cameras" in ran.out
-        assert files(Path(f"back-{form.replace('.', '-')}")) == original
-
-
-def test_info_shows_the_readable_part(made: Path, cli: Cli) -> None:
-    ran = cli("info", made / "rig.implicam")
-    assert 'method = "forward-gp"' in ran.out
-    assert "known_points = 40" in ran.out
-    damaged = Path("damaged.implicam")
-    damaged.write_bytes((made / "rig.implicam").read_bytes()[:-100])
-    assert cli("info", damaged).code == 1
-
-
-def test_report_of_a_calibration_alone_and_with_points(made: Path, cli: Cli) -> None:
-    pytest.importorskip("plotly")
-    ran = cli("report", made / "rig.implicam")
-    assert ran.code == 0
-    assert "report.html: 10-fold cross-validation" in ran.out
-    assert "10-fold" in Path("report.html").read_text()
-    assert cli("report", made / "rig.implicam", made / "rig" / "check", "-o", "b.html").code == 0
-    assert "30 points not used in the fit" in Path("b.html").read_text()
-
-
-def test_the_same_command_writes_the_same_bytes(made: Path, cli: Cli) -> None:
-    cli("calibrate", made / "rig", "-o", "again.implicam")
-    assert Path("again.implicam").read_bytes() == (made / "rig.implicam").read_bytes()
-    cli(
-        "simulate",
-        "again",
-        "--cameras",
-        "2R",
-        "--positions",
-        "random",
-        "--points",
-        "40",
-        "--check",
-        "30",
-        "--seed",
-        "1",
-    )
-    assert files(Path("again")) == files(made / "rig")
-
-
-# kill -9: the old or the new, nothing between
-
-
-@dataclass(frozen=True)
-class Victim:
-    """A command that replaces something old. OLD holds the rig of another seed; FILES what it may touch."""
-
-    words: str
-    target: str
-    needs: str = "numpy"
-
-    def __str__(self) -> str:
-        return self.words.split()[0] + "-" + self.target
-
-
-VICTIMS = [
-    Victim("calibrate rig -o old.implicam", "old.implicam"),
-    Victim("measure rig.implicam rig/check -o old-measured.csv", "old-measured.csv"),
-    Victim("evaluate rig.implicam rig/check --report old.html", "old.html", "plotly"),
-    Victim("simulate old --cameras 2R --positions random --points 20 --check 10 --seed 1 --overwrite", "old"),
-    Victim("convert rig old-folder --overwrite", "old-folder"),
-    Victim("convert rig old.npz", "old.npz"),
-    Victim("convert rig old.csv", "old.csv"),
-]
-
-KILLER = '''
-import os, signal, sys
-sys.dont_write_bytecode = True
-import implicam.cli.commands, implicam.cli.show, implicam.demo, tomli_w, threadpoolctl  # once, not in every child
-from implicam.cli import main
-for name in sys.argv[1].split(","):
-    __import__(name)
-
-def writes(event, args):
-    """Whether an audit event is about to change a file in the working folder."""
-    if event == "open":
-        return bool(args[2] & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)) and inside(args[0])
-    return event in ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.chmod") and inside(args[0])
-
-def inside(path):
-    if isinstance(path, int):
-        return False
-    return os.path.abspath(os.fsdecode(path)).startswith(os.getcwd())
-
-def child(n):
-    """Run the command; die before its n-th change."""
-    count = 0
-    def strike():
-        nonlocal count
-        count += 1
-        if count == n:
-            os.kill(os.getpid(), signal.SIGKILL)
-    fsync = os.fsync
-    def before_and_after(handle):
-        strike()
-        fsync(handle)
-    os.fsync = before_and_after
-    sys.addaudithook(lambda event, args: strike() if writes(event, args) else None)
-    sys.stdout = sys.stderr = open(os.devnull, "w")
-    main(sys.argv[3:])
-
-n = 0
-while True:
-    n += 1
-    os.chdir(os.path.join(sys.argv[2], str(n)))
-    pid = os.fork()
-    if pid == 0:
-        try:
-            child(n)
-        finally:
-            os._exit(9)  # main leaves by SystemExit
-    _, status = os.waitpid(pid, 0)
-    if not os.WIFSIGNALED(status):
-        print(n)
-        break
-'''
-
-
-def victims_folder(made: Path, folder: Path) -> Path:
-    """Everything the victims need, and in place of their output something old and good."""
-    shutil.copytree(made, folder, dirs_exist_ok=True)
-    rig = build_rig("bar6", seed=9, cameras="2R")
-    old = simulate(rig, random_positions(rig, 25, np.random.default_rng(0)), seed=9)
-    for name in ("old", "old-folder", "old.npz", "old.csv"):
-        write_dataset(old, folder / name)
-    shutil.copy(folder / "rig.implicam", folder / "old.implicam")
-    calibration = load_calibration(folder / "rig.implicam")
-    calibration.refit(old).save(folder / "old.implicam")
-    calibration.measure(old.observations).write_csv(folder / "old-measured.csv")
-    (folder / "old.html").write_text("<html>an older report</html>")
-    return folder
-
-
-def state(folder: Path, name: str) -> Any:
-    """What stands under a name now: content of a file, or of all files of a folder; None for nothing."""
-    path = folder / name
-    return files(path) if path.is_dir() else path.read_bytes() if path.exists() else None
-
-
-def load(path: Path) -> None:
-    """Read what a command wrote, as the next command would."""
-    if path.suffix == ".implicam":
-        load_calibration(path)
-    elif path.name.endswith("measured.csv"):
-        read_measured(path)
-    elif path.suffix == ".html":
-        assert path.read_text().rstrip().endswith("</html>")
-    else:
-        read_dataset(path)
-
-
-def check_kill(folder: Path, victim: Victim, old: Any, new: Any, sources: dict[str, Any]) -> str:
-    """After a kill: the old or the new, whole; or, between the two renames of a folder, the old beside its place."""
-    now, outcome = state(folder, victim.target), "old"
-    if now is None:
-        beside = left_behind(folder / victim.target)
-        assert beside is not None, f"{victim.target} is lost"
-        assert files(beside) == old
-        outcome = "beside"
-    else:
-        assert now in (old, new), f"{victim.target} is neither the old nor the new"
-        load(folder / victim.target)
-        outcome = "new" if now == new else "old"
-    for name, content in sources.items():
-        assert state(folder, name) == content
-    return outcome
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-@pytest.mark.parametrize("victim", VICTIMS, ids=str)
-def test_killed_before_any_of_its_changes_the_old_or_the_new_is_there(
-    victim: Victim, made: Path, tmp_path: Path
-) -> None:
-    """A child per file operation (open, write to disk, rename, remove, ...), killed just before it."""
-    pytest.importorskip(victim.needs)
-    template = victims_folder(made, tmp_path / "template")
-    most = 60
-    for n in range(1, most + 1):
-        shutil.copytree(template, tmp_path / str(n), copy_function=os.link)  # nothing is changed in place
-    told = subprocess.run(
-        [sys.executable, "-c", KILLER, victim.needs, str(tmp_path), *shlex.split(victim.words)],
-        env=UNWATCHED, capture_output=True, text=True,
-    )  # fmt: skip
-    assert told.returncode == 0, told.stderr
-    survived = int(told.stdout)
-    assert 2 < survived <= most
-    old, new = state(template, victim.target), state(tmp_path / str(survived), victim.target)
-    assert old != new
-    sources = {name: state(template, name) for name in ("rig", "rig.implicam")}
-    outcomes = [check_kill(tmp_path / str(n), victim, old, new, sources) for n in range(1, survived + 1)]
-    assert outcomes[0] == "old"
-    assert outcomes[-1] == "new"
-    assert outcomes == sorted(outcomes, key=["old", "beside", "new"].index)  # never back
-    assert outcomes.count("beside") <= 1
-    # what is left of the last kill is in nobody's way
-    last = tmp_path / str(survived - 1)
-    assert real(victim.words, last).code == 0
-    assert state(last, victim.target) == new
-
-
-def killed_at(victim: Victim, folder: Path, delay: float) -> bool:
-    """Start the real command, kill its whole process group after a while; whether that was in time."""
-    executable = str(Path(sys.executable).parent / "implicam")
-    process = subprocess.Popen(
-        [executable, *shlex.split(victim.words)], cwd=folder, env=UNWATCHED,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
-    )  # fmt: skip
-    time.sleep(delay)
-    in_time = process.poll() is None
-    if in_time:
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    return in_time
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("victim", VICTIMS, ids=str)
-def test_killed_at_any_moment_the_old_or_the_new_is_there(victim: Victim, made: Path, tmp_path: Path) -> None:
-    """Two dozen delays over the last part of a measured run, where the files are written."""
-    pytest.importorskip(victim.needs)
-    template = victims_folder(made, tmp_path / "template")
-    whole = tmp_path / "whole"
-    shutil.copytree(template, whole)
-    start = time.perf_counter()
-    assert real(victim.words, whole).code == 0
-    seconds = time.perf_counter() - start
-    old, new = state(template, victim.target), state(whole, victim.target)
-    sources = {name: state(template, name) for name in ("rig", "rig.implicam")}
-    in_time = 0
-    for i, delay in enumerate(np.linspace(0.3 * seconds, 1.1 * seconds, 24)):
-        folder = tmp_path / str(i)
-        shutil.copytree(template, folder)
-        in_time += killed_at(victim, folder, float(delay))
-        check_kill(folder, victim, old, new, sources)
-        assert real(victim.words, folder).code == 0
-        assert state(folder, victim.target) == new
-    assert in_time > 5
-
-
-def test_the_classical_way_on_the_command_line(made: Path, cli: Cli) -> None:
-    assert cli("simulate", "boards", "--target", "boards", "--cameras", "2R", "--seed", "1", "--pairs", "6").code == 0
-    ran = cli("calibrate", made / "rig", "--boards", "boards", "-o", "b.implicam")  # nobody means another method
-    assert ran.code == 0
-    assert ran.out.startswith("b.implicam: explicit from 40 points\neach left out in turn is predicted from the rest")
-    same = cli("calibrate", made / "rig", "--boards", "boards", "--align", "icp", "-o", "c.implicam", "--json").json
-    assert set(same["residuals"]["lens"]) == {"cam2", "cam3"}
-    told = cli("evaluate", "b.implicam", made / "rig" / "check", "--json").json
-    assert told["rows"][0]["rmse_over_limit"] < 3
-    alone = cli("calibrate", "boards", "--method", "explicit", "-o", "alone.implicam")
-    assert "Positions are in the frame of cam2" in alone.err
-    turned = cli("evaluate", made / "rig", "--cv", "4", "--boards", "boards", "--json").json
-    assert (turned["method"], turned["rows"][0]["n"]) == ("explicit", 40)
-    assert cli("calibrate", made / "rig", "--lens", "kannala-brandt", "-o", "k.implicam").out.startswith(
-        "k.implicam: explicit from 40 points"
-    )
-    for to, name in (("opencv", "b.yaml"), ("kalibr", "camchain.yaml"), ("colmap", "model"), ("dlt", "b.csv")):
-        ran = cli("export", "b.implicam", "--to", to, "-o", name)
-        assert ran.code == 0
-        assert ran.out.startswith(f"{name}: 2 cameras as ")
-    for name, more in (("b.yaml", []), ("camchain.yaml", []), ("model", ["--unit", "mm"]), ("b.csv", [])):
-        assert cli("import", name, "-o", "i.implicam", *more).code == 0
-        assert cli("measure", "i.implicam", made / "rig" / "check").code == 0
-    assert cli("import", "b.yaml", "-o", "i.implicam", "--unit", "mm").code == 0  # written in metres, as OpenCV has it
-    same = cli("evaluate", "i.implicam", made / "rig" / "check", "--json").json
-    assert same["rows"][0]["rmse"] == pytest.approx(told["rows"][0]["rmse"], rel=0.05)
-    assert cli("calibrate", "boards", "-o", "c.implicam").out.startswith("c.implicam: explicit from")
-    assert "made without known points" in cli("evaluate", "c.implicam", "--cv", "3").err
-
-
-def test_a_neural_network_says_what_its_numbers_are(made: Path, cli: Cli) -> None:
-    pytest.importorskip("torch")
-    ran = cli("calibrate", made / "rig", "--method", "mlp", "-o", "n.implicam")
-    assert "of them that it was not trained on are predicted within" in ran.out
-    assert "dropout" in ran.err
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "measure rig.implicam rig/check -o rig/check/observations.csv",
-        "measure rig.implicam new.csv -o new.csv",
-        "measure rig.implicam new.csv -o new.csv.toml",
-        "measure rig.implicam new.csv -o rig.implicam",
-        "evaluate rig.implicam rig/check --report rig.implicam",
-        "report rig.implicam -o rig.implicam",
-        "export rig.implicam --to opencv -o rig.implicam",
-        "suggest rig.implicam -o rig.implicam",
-    ],
-)
-def test_no_command_replaces_what_it_reads(made: Path, cli: Cli, words: str) -> None:
-    """Pixels that took a day to gather were gone, and a table of positions stood in their place."""
-    for name in ("rig", "rig.implicam"):
-        copy = shutil.copytree if (made / name).is_dir() else shutil.copy
-        copy(made / name, name)
-    cli("convert", "rig/check", "new.csv")
-    before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
-    ran = cli(*words.split())
-    assert ran.code == 2
-    assert "would be replaced: this command reads it" in ran.err
-    assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before

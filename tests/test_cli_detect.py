@@ -158,7 +158,6 @@ def test_bad_pictures_are_named_and_the_rest_goes_on(photos: Path, cli: Cli) -> 
     ("detect PHOTOS --target dots", 2, "labels.csv does not exist"),
     ("detect PHOTOS --pattern {shot}", 2, "must contain {camera}"),
     ("detect PHOTOS --radius 8 --calibration PHOTOS/none.implicam", 1, "none.implicam"),
-    ("detect PHOTOS --target board --board 8x11", 1, "nothing was found in any of the 24 pictures"),
     ("simulate OUT --images --outliers 0.1", 2, "cannot be photographed"),
 ])  # fmt: skip
 def test_what_is_wrong_is_said_with_its_cure(words: str, code: int, says: str, photos: Path, cli: Cli) -> None:
@@ -170,6 +169,18 @@ def test_what_is_wrong_is_said_with_its_cure(words: str, code: int, says: str, p
     assert "fix:" in err
     assert (photos / "observations.csv").read_bytes() == before
     assert not (photos.parent / "out").exists()
+
+
+def test_photographs_without_a_board_say_so(photos: Path, cli: Cli) -> None:
+    before = (photos / "observations.csv").read_bytes()
+    for picture in (photos / "images").rglob("*.png"):
+        if picture.name > "ball002.png":
+            picture.unlink()
+    code, _, err = cli("detect", photos, "--target", "board", "--board", "8x11")
+    assert code == 1
+    assert "nothing was found in any of the 4 pictures" in err
+    assert "fix:" in err
+    assert (photos / "observations.csv").read_bytes() == before
 
 
 def test_a_board_from_photograph_to_numbered_corners(tmp_path: Path, cli: Cli) -> None:

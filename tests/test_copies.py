@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -207,11 +206,10 @@ def test_a_camera_does_not_vanish_for_a_typo(column: str, tmp_path: Path) -> Non
 
 
 def test_a_header_of_many_columns_is_read_in_linear_time(tmp_path: Path) -> None:
+    """Where it is quadratic it takes longer than conftest.py lets a test take."""
     ic.write_dataset(rig(5), tmp_path / "d")
     path = tmp_path / "d" / "points.csv"
     lines = path.read_text().splitlines()
     wide = [lines[0] + "".join(f",c{i}" for i in range(30_000)), *(line + ",1" * 30_000 for line in lines[1:])]
     path.write_text("\n".join(wide))
-    start = time.process_time()
     assert len(ic.read_dataset(tmp_path / "d").positions.extra) > 29_999
-    assert time.process_time() - start < 6  # 60 s and more where it is quadratic

@@ -106,7 +106,9 @@ def with_square_pixels() -> float:
     return rms_held_out(stretched(1.0))
 
 
-@pytest.mark.parametrize("ratio", [0.75, 1.067, 1.333, 1.5])
+@pytest.mark.parametrize(
+    "ratio", [pytest.param(0.75, marks=pytest.mark.slow), 1.067, pytest.param(1.333, marks=pytest.mark.slow), 1.5]
+)
 def test_pixels_of_any_shape_cost_nothing(ratio: float) -> None:
     assert with_square_pixels() == pytest.approx(0.211, abs=0.005)
     assert rms_held_out(stretched(ratio)) == pytest.approx(with_square_pixels(), rel=0.05)
@@ -211,7 +213,9 @@ def test_neither_camera_is_to_blame() -> None:
     assert baselines[0] == pytest.approx(120, abs=6)
 
 
-@pytest.mark.parametrize(("moved", "doubted"), [(0.0, False), (0.1, False), (3.0, True)])
+@pytest.mark.parametrize(("moved", "doubted"), [
+    (0.0, False), (0.1, False), pytest.param(3.0, True, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_error_bars_hold_what_moved_between_two_pictures(moved: float, doubted: bool) -> None:
     """Six rigs; without the boards' own movement in the covariance 0.3 mm made this 55 instead of 6."""
     found = [calibrate_network(boards_of(held(seed, moved=moved)), "brown-conrady") for seed in range(6)]
@@ -328,6 +332,7 @@ def test_separate_intrinsics() -> None:
         assert camera.lens.fx == pytest.approx(900, rel=0.01)
 
 
+@pytest.mark.slow
 def test_few_known_points_place_cameras_with_true_error_bars() -> None:
     distances = []
     others = in_the_room(60, 99, noise=0.05)

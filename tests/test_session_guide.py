@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -28,6 +29,24 @@ def guide(tmp_path: Path) -> Iterator[Guide]:
     with open_guide(tmp_path / "session", SETUP) as made:
         made.start()
         yield made
+
+
+@pytest.fixture(scope="module")
+def ten_points(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a session that was closed after ten points, to be copied."""
+    folder = tmp_path_factory.mktemp("ten") / "session"
+    with open_guide(folder, SETUP) as made:
+        made.start()
+        measured(made, 10)
+    return folder
+
+
+@pytest.fixture
+def after_ten(ten_points: Path, tmp_path: Path) -> Iterator[Guide]:
+    with open_guide(Path(shutil.copytree(ten_points, tmp_path / "ten")), None) as again:
+        again.start()
+        assert again.loop.points == 10
+        yield again
 
 
 def measured(guide: Guide, points: int) -> Guide:
@@ -63,18 +82,18 @@ def test_a_session_from_start_to_report(guide: Guide) -> None:
     assert pictures == [f"p{i:03d}.png" for i in range(1, 13)]
 
 
-def test_the_reticle_is_where_the_ball_will_be(guide: Guide) -> None:
-    measured(guide, 10)
-    guide.go()
-    for look in guide.state.looks:
+def test_the_reticle_is_where_the_ball_will_be(after_ten: Guide) -> None:
+    after_ten.go()
+    assert len(after_ten.state.looks) == 2
+    for look in after_ten.state.looks:
         assert np.linalg.norm(look.uv - look.expected) < 5
 
 
-def test_the_live_ball_is_measured(guide: Guide) -> None:
+def test_the_live_ball_is_measured(guide: Guide, after_ten: Guide) -> None:
     assert np.isnan(guide.measured_live).all()  # nothing is known yet
-    measured(guide, 10)
-    guide.live()
-    assert np.linalg.norm(guide.measured_live - guide.equipment.robot.position()) < 2
+    after_ten.go()
+    after_ten.live()
+    assert np.linalg.norm(after_ten.measured_live - after_ten.equipment.robot.position()) < 2
 
 
 def test_a_covered_camera_costs_one_view(guide: Guide) -> None:
@@ -444,8 +463,8 @@ class SeesALamp:
 
 
 @pytest.mark.parametrize("keeps", [True, False])
-def test_another_thing_is_not_taken_for_the_ball(guide: Guide, keeps: bool) -> None:
-    measured(guide, 10)
+def test_another_thing_is_not_taken_for_the_ball(after_ten: Guide, keeps: bool) -> None:
+    guide = after_ten
     lamp = SeesALamp(Ball(), "cam2", keeps)
     guide.equipment = replace(guide.equipment, detector=lamp)
     assert isinstance(guide.equipment, Equipment)
