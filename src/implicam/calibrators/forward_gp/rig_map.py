@@ -75,7 +75,8 @@ class RigMap:
             self.length_unit,
         )
         cameras = tuple(self.trained.cameras[c] for c in self.cameras)
-        table = Table(cameras, uv, noise, found.p, found.left_out, self._agree, self._lines, self._pixels)
+        checked = len(self.trained) > 0
+        table = Table(cameras, uv, noise, found.p, found.left_out, self._agree, self._lines, self._pixels, checked)
         return measured.with_alarm(alarm_of(table))
 
     def _agree(self, uv: Floats) -> NDArray[np.bool_]:
