@@ -14,7 +14,7 @@ Three signs, each a binomial tail beyond what chance shows (`FALSE_ALARM`) in a 
 
 The first and third hold whatever the points have in common, as the errors of a calibration: where each fails with
 probability `DISAGREE` at most, more than MANY of them do with DISAGREE / MANY at most (Markov), 3 in 10 000. The second
-counts points as independent; tables of rigs with 12 known points stay 5 times below its limit (benchmarks/alarms.py).
+counts points as independent, but at most INDEPENDENT of them: 285 points of a rig with 16 known ones shared its errors.
 What moves every view along the lines on which two cameras would see it nobody can find in the pixels of two cameras.
 
 Then the likeliest causes are tried on some of the points, and the one that makes them agree is named.
@@ -54,6 +54,9 @@ SMALL = (0.05, 0.01, 0.001)
 
 TOO_SMALL = 1.3
 """By how much error bars may be too small without an alarm."""
+
+INDEPENDENT = 50
+"""Points of a table that count as independent at most: all share what is not known of the cameras."""
 
 WRONG = 1e-10
 """A point with a p-value below has a wrong view, and says nothing of small errors."""
@@ -155,7 +158,8 @@ def _uneven(p: Floats, views: NDArray[np.int64]) -> tuple[float, int] | None:
     for level in SMALL:
         usual = float(np.mean(chdtrc(degrees, chdtri(degrees, level) / TOO_SMALL**2)))
         count = int((p < level).sum())
-        found.append((_tail(count, len(p), usual), level, count))
+        some = min(len(p), INDEPENDENT)
+        found.append((_tail(count * some // len(p), some, usual), level, count))
     tail, level, count = min(found)
     return (level, count) if tail < FALSE_ALARM else None
 
