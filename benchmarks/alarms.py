@@ -69,7 +69,7 @@ DAMAGED_TABLE = {
     "one resized": "half the size|resized",
     "one cropped": "moved or refocused|cropped",
     "another rig": "another|No single one|several",
-    "one instant late": "a picture later|a picture earlier|instant",
+    "one instant late": "1 row late|1 row early|instant",
 }
 """Kind -> a pattern of the words that name it."""
 DAMAGED_KNOWN = {

@@ -99,7 +99,7 @@ def one_row_late(uv: Floats) -> Floats:
     ("change", "said"),
     [
         (lambda uv: uv[:, ::-1], "are cam1 and cam2 exchanged?"),
-        (one_row_late, "One row on"),
+        (one_row_late, "1 row"),
         (lambda uv: np.stack([uv[..., 0], 1023 - uv[..., 1]], axis=-1), "is v counted from below"),
         (lambda uv: uv[..., ::-1], "are u and v exchanged?"),
         (lambda uv: (uv + 0.5) / 2 - 0.5, "are the pictures half the size"),
@@ -131,8 +131,8 @@ def of_one(change: Callable[[Floats], Floats], camera: int = 1) -> Callable[[Flo
         ("stereo", lambda uv: (uv + 0.5) / 2 - 0.5, "are the pictures of cam2 half the size"),
         ("bar3", lambda uv: (uv + 0.5) / 2 - 0.5, "are the pictures of cam2 half the size"),
         ("bar3", lambda uv: np.stack([uv[:, 0], 799 - uv[:, 1]], axis=1), "is v of cam2 counted from below"),
-        ("stereo", lambda uv: np.roll(uv, 1, axis=0), "One row on"),  # two cameras: the one late, or the other early
-        ("bar3", lambda uv: np.roll(uv, 1, axis=0), "is cam2 a picture later than the others?"),
+        ("stereo", lambda uv: np.roll(uv, 1, axis=0), "1 row"),  # two cameras: the one late, or the other early
+        ("bar3", lambda uv: np.roll(uv, 1, axis=0), "are the pictures of cam2 1 row late?"),
     ],
 )
 def test_what_was_done_to_one_camera_is_named_before_it_is_called_moved(

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import implicam as ic
-from implicam.calibrators.forward_gp.wrong_rows import slipped, what_is_wrong
 from implicam.dataset import Floats
 from implicam.geometry import look_at
+from implicam.row_order import order_of, what_is_wrong
 
 SIZE = np.array([1920, 1080])
 NOISE = 0.3
@@ -191,7 +191,7 @@ def test_nothing_is_said_of_rows_that_are_right(where: Floats, wild: float) -> N
         somewhere = rng.random(uv.shape[:2]) < wild
         uv[somewhere] = rng.uniform(0, 1000, size=(int(somewhere.sum()), 2))
         for c in range(4):
-            assert slipped(where, uv[:, c]) == ""
+            assert order_of(where, uv[:, c]) is None
             assert what_is_wrong(where, uv[:, c]) == ""
 
 

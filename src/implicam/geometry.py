@@ -139,26 +139,13 @@ def resect(xyz: Floats, uv: Floats) -> Floats:
     return p if in_front else -p
 
 
-def resect_robustly(xyz: Floats, uv: Floats) -> tuple[Floats, Bools]:
+def resect_robustly(xyz: Floats, uv: Floats, *, subsets: bool = True) -> tuple[Floats, Bools]:
     """As `resect`, where some views may be wrong; and the views (n,) that agree. Points (n, 3), all seen at (n, 2).
 
     Of random subsets of seven points the one with the least median error (always the same subsets), then three times
-    what agrees with it.
+    what agrees with it. Without `subsets` it starts from all points: ten times faster, for few wrong views.
     """
-    rng = np.random.default_rng(0)
-    best, kept = np.inf, np.ones(len(xyz), dtype=np.bool_)
-    subsets = [np.arange(len(xyz))]
-    if len(xyz) >= 2 * FEWEST:
-        subsets += [rng.choice(len(xyz), FEWEST + 1, replace=False) for _ in range(SUBSETS_OF_LINEAR)]
-    for rows in subsets:
-        try:
-            error = _linear_error(resect(xyz[rows], uv[rows]), xyz, uv)
-        except FitError:
-            continue
-        if np.median(error) < best:
-            best, kept = float(np.median(error)), error <= np.sort(error)[int(0.7 * len(error))]  # some may be infinite
-    if not np.isfinite(best):
-        raise _undetermined()
+    kept = _of_best_subset(xyz, uv) if subsets else np.ones(len(xyz), dtype=np.bool_)
     for _ in range(3):
         p = resect(xyz[kept], uv[kept])
         error = _linear_error(p, xyz, uv)
@@ -167,6 +154,25 @@ def resect_robustly(xyz: Floats, uv: Floats) -> tuple[Floats, Bools]:
             break
         kept = inside
     return p, np.asarray(kept, dtype=np.bool_)
+
+
+def _of_best_subset(xyz: Floats, uv: Floats) -> Bools:
+    """(n,) the seven tenths of the views that agree best with the subset that leaves the least median error."""
+    rng = np.random.default_rng(0)
+    best, kept = np.inf, np.ones(len(xyz), dtype=np.bool_)
+    starts = [np.arange(len(xyz))]
+    if len(xyz) >= 2 * FEWEST:
+        starts += [rng.choice(len(xyz), FEWEST + 1, replace=False) for _ in range(SUBSETS_OF_LINEAR)]
+    for rows in starts:
+        try:
+            error = _linear_error(resect(xyz[rows], uv[rows]), xyz, uv)
+        except FitError:
+            continue
+        if np.median(error) < best:
+            best, kept = float(np.median(error)), error <= np.sort(error)[int(0.7 * len(error))]  # some may be infinite
+    if not np.isfinite(best):
+        raise _undetermined()
+    return np.asarray(kept, dtype=np.bool_)
 
 
 def _linear_error(p: Floats, xyz: Floats, uv: Floats) -> Floats:

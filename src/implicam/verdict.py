@@ -20,13 +20,13 @@ from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import MLP, Calibration, InverseGP
 from implicam.calibrators.forward_gp.problem import stated_noise
-from implicam.calibrators.forward_gp.wrong_rows import slipped, what_is_wrong
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluate import known_position_covariance
-from implicam.mistakes import mistakes_in
+from implicam.mistakes import Finding, mistakes_in, of_rows
 from implicam.progress import Progress, silent
+from implicam.row_order import change_of, other_camera
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
 
@@ -110,19 +110,11 @@ class Verdict:
         return table
 
 
-class Finding(NamedTuple):
-    """Something that speaks against a calibration."""
-
-    grave: bool
-    reason: str
-
-
 def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
     """Judge a calibration by its known points: a few fits without some of them, and what the data show."""
     held_out, failed = _held_out(calibration, progress)
     findings = [*failed, *_of_held_out(held_out, calibration), *_of_data(calibration.data)]
-    suspects = [*_of_rejected(calibration), *_of_residuals(calibration)]
-    findings += [*suspects, *_of_rows(calibration.data, " ".join(finding.reason for finding in suspects))]
+    findings += _of_cameras(calibration, {name for finding in findings for name in finding.cameras})
     reasons = tuple(finding.reason for finding in sorted(findings, key=lambda finding: not finding.grave))
     word = NOT_USABLE if any(finding.grave for finding in findings) else DOUBTFUL if findings else USABLE
     return Verdict(word, reasons, held_out)
@@ -297,7 +289,7 @@ def _of_network(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _of_data(data: Dataset) -> Iterator[Finding]:
-    yield from (Finding(mistake.grave, mistake.reason) for mistake in mistakes_in(data))
+    yield from mistakes_in(data)
     copies = copies_of(data)
     seen = ~copies.points & data.observations.seen.any(axis=1)
     n, places = int(seen.sum()), len(np.unique(data.places[seen]))
@@ -321,6 +313,20 @@ def _of_data(data: Dataset) -> Iterator[Finding]:
         )
 
 
+def _of_cameras(calibration: Calibration, explained: set[str]) -> Iterator[Finding]:
+    """Cameras that do not fit the rest, each with what its rows say of it where they say something; explained: cameras
+    of which it is known why."""
+    rejected, missed = list(_of_rejected(calibration)), list(_of_residuals(calibration))
+    yield from rejected
+    data = calibration.data
+    for c, name in enumerate(data.observations.camera_names):
+        own = [finding for finding in missed if name in finding.cameras]
+        if name in explained or not (own or any(name in finding.cameras for finding in rejected)):
+            continue
+        why = change_of(data.xyz, data.observations.uv[:, c])
+        yield from [of_rows(name, why)] if why else own
+
+
 def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
     """Cameras of which too many views contradict the rest."""
     data = calibration.data
@@ -328,19 +334,20 @@ def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
     names = data.observations.camera_names
     rejected = [view.camera for view in calibration.rejected if view.point in points]
     seen = data.observations.seen.sum(axis=0)
-    bad = []
+    bad = {}
     for name, n in zip(names, seen.tolist(), strict=True):
         k = rejected.count(name)
         if k > MANY_REJECTED * n and _beyond(k, n, USUAL_WRONG):
-            bad.append(f"{name} ({k} of {n})")
+            bad[name] = f"{name} ({k} of {n})"
     if not bad:
         return
     most = len(rejected) > 0.5 * seen.sum()
     yield Finding(
         most,
-        f"Too many views contradict the known positions: {', '.join(bad)}. Was the camera moved in between, are its "
-        "views matched to other points, does no lens model hold it, or is the detection wrong? Leave it out with "
-        "--without NAME to see.",
+        f"Too many views contradict the known positions: {', '.join(bad.values())}. Was the camera moved in between, "
+        "are its views matched to other points, does no lens model hold it, or is the detection wrong? Leave it out "
+        "with --without NAME to see.",
+        tuple(bad),
     )
 
 
@@ -354,16 +361,13 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
     predicted = predict(data.xyz)
     if predicted.shape != uv.shape:
         return
+    moved = set()
     for c, name in enumerate(data.observations.camera_names):
         rows = np.flatnonzero(np.isfinite(uv[:, c, 0] - predicted[:, c, 0]))
         first = _moved_at(uv[rows, c] - predicted[rows, c])
         if first is not None:
-            yield Finding(
-                False,
-                f"From {data.points[rows[first]]} on the views of {name} are off otherwise than before: was it moved "
-                "or refocused there? Take the known points of one of the two parts, or leave it out with "
-                f"--without {name}.",
-            )
+            moved.add(name)
+            yield of_rows(name, other_camera(int(rows[first])))
     stated = stated_noise(data.observations)
     off = np.linalg.norm(predicted - uv, axis=2)
     off = off / np.sqrt(1 + _seen_of_labels(calibration, predict) / np.where(np.isfinite(stated), stated, np.inf) ** 2)
@@ -372,6 +376,8 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
     )
     declared = bool((data.positions.sd > 0).any())  # then the fit explains what the positions are off by
     for c, (name, median, sd) in enumerate(zip(data.observations.camera_names, medians, stated, strict=True)):
+        if name in moved:
+            continue
         others = np.delete(medians, c)
         usual = np.nanmedian(others) if np.isfinite(others).any() else np.nan
         if np.isfinite(sd) and median > RESIDUAL_RATIO * sd and not declared:
@@ -379,25 +385,15 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
                 False,
                 f"{name} misses its own known points by {median:.2g} px in the median, and its views state {sd:.2g} "
                 "px: the stated sd is wrong, known positions are off, or the camera is not understood.",
+                (name,),
             )
         elif not np.isfinite(sd) and median > max(UNLIKE_OTHERS * usual, UNLIKE_OTHERS_PIXELS):
             yield Finding(
                 False,
                 f"{name} misses its own known points by {median:.2g} px in the median, the other cameras by "
                 f"{usual:.2g}: look at its pictures, or leave it out with --without {name}.",
+                (name,),
             )
-
-
-def _of_rows(data: Dataset, suspected: str) -> Iterator[Finding]:
-    """Cameras whose pixels and known positions do not belong together, row by row; `suspected`: what else speaks
-    against some of them."""
-    if data.known is None:
-        return
-    for c, name in enumerate(data.observations.camera_names):
-        uv = data.observations.uv[:, c]
-        why = (what_is_wrong if name in suspected.split() else slipped)(data.xyz, uv)
-        if why:
-            yield Finding(False, f"{name}: {why}. Look at the order of its pictures and of the rows.")
 
 
 def _moved_at(residual: Floats) -> int | None:

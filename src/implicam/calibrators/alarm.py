@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtrc, chdtri
 
 from implicam.dataset import Camera, Floats
+from implicam.row_order import late_or_early, moved_up
 
 Bools = NDArray[np.bool_]
 
@@ -250,11 +251,10 @@ def _guesses(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
     None of it can make views agree that were right before."""
     names = table.names
     for c, name in enumerate(names):
-        for late in (1, -1):
+        for rows in (1, -1):
             uv = table.uv.copy()
-            uv[:, c] = _late(uv[:, c], late)
-            when = "later" if late > 0 else "earlier"
-            yield f"is {name} a picture {when} than the others? One row on {{share}}", uv, table.noise
+            uv[:, c] = moved_up(uv[:, c], rows)
+            yield f"are the pictures of {name} {late_or_early(rows)}? Put right {{share}}", uv, table.noise
     pairs = list(combinations(range(len(names)), 2))
     for a, b in pairs if len(pairs) <= MOST_PAIRS else pairs[: len(names) - 1] + _neighbours(len(names)):
         order = np.arange(len(names))
@@ -267,13 +267,6 @@ def _guesses(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
 def _neighbours(cameras: int) -> list[tuple[int, int]]:
     """Of very many cameras: those that follow each other, which are exchanged most easily."""
     return [(c, c + 1) for c in range(1, cameras - 1)]
-
-
-def _late(values: Floats, rows: int) -> Floats:
-    """Each row with the values of the one `rows` after it; the last has none."""
-    moved = np.roll(values, -rows, axis=0)
-    moved[-1 if rows > 0 else 0] = np.nan
-    return moved
 
 
 def _other_pixels(table: Table) -> Iterator[tuple[str, Floats, Floats]]:

@@ -58,10 +58,10 @@ from implicam.calibrators.forward_gp.posterior import (
 )
 from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
 from implicam.calibrators.forward_gp.start import FEWEST, Started, pixel_extent, start_again, start_camera
-from implicam.calibrators.forward_gp.wrong_rows import what_is_wrong
 from implicam.calibrators.forward_gp.wrong_views import Linear
 from implicam.errors import FitError
 from implicam.progress import Progress, silent
+from implicam.row_order import what_is_wrong
 from implicam.threads import side_by_side
 
 MOST = 300
