@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import implicam as ic
-from implicam.calibrators.forward_gp.wrong_rows import slipped, what_is_wrong
 from implicam.dataset import Floats
 from implicam.geometry import look_at
+from implicam.rig_model.wrong_rows import slipped, what_is_wrong
 
 SIZE = np.array([1920, 1080])
 NOISE = 0.3

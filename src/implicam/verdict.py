@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import MLP, Calibration, InverseGP
-from implicam.calibrators.forward_gp.problem import stated_noise
-from implicam.calibrators.forward_gp.wrong_rows import slipped, what_is_wrong
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluate import known_position_covariance
 from implicam.mistakes import mistakes_in
 from implicam.progress import Progress, silent
+from implicam.rig_model.training_data import stated_noise
+from implicam.rig_model.wrong_rows import slipped, what_is_wrong
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
 

@@ -30,9 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtrc, chdtri
 
-from implicam.dataset import Camera, Floats
-
-Bools = NDArray[np.bool_]
+from implicam.dataset import Camera
+from implicam.geometry import Bools, Floats
 
 FEWEST_POINTS = 10
 """Of fewer points that can be tested nothing is said."""

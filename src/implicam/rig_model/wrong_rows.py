@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.lens import Floats
 from implicam.errors import FitError
-from implicam.geometry import Bools, resect, resect_robustly
+from implicam.geometry import Bools, Floats, resect, resect_robustly
 
 SLIPPED = 3
 """By so many rows the pixels may be late or early."""
