@@ -22,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 
 from implicam.calibrators import ForwardGP
-from implicam.calibrators.forward_gp import calibration, fit, label_fit
+from implicam.calibrators.forward_gp import calibration, fit, position_error_fit, rounds
 from implicam.files import write_text
 from implicam.simulate import build_rig, moving_board, random_positions, simulate
 from implicam.verdict import judge
@@ -30,10 +30,10 @@ from odd_rigs import draw
 
 STAGES = {
     "kinds": (fit, "_started"),
-    "sizes": (fit, "_hyperparameters"),
-    "posterior": (fit, "_conditioned"),
+    "sizes": (rounds, "estimate_hyperparameters"),
+    "posterior": (rounds, "condition_with_new_fields"),
     "wrong views": (fit, "judged_all"),
-    "tails": (label_fit, "with_heavy_tails"),
+    "tails": (position_error_fit, "with_heavy_tails"),
     "projections": (fit, "_with_projections"),
     "known positions": (calibration, "with_noise_told_apart"),
 }

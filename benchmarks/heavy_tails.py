@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from implicam.calibrators import ForwardGP
-from implicam.calibrators.forward_gp import fit
+from implicam.calibrators.forward_gp import heavy_tail_fit
 from implicam.dataset import Observations
 from implicam.files import write_text
 from implicam.simulate import build_rig, random_positions, simulate
@@ -28,7 +28,7 @@ RIGS = [("bar3", 0), ("bar3", 1), ("bar4", 0), ("bar4", 1), ("bar6", 0), ("bar6"
 RIGS += [("dome8", 1), ("dome8", 2)]
 STEREO = [("stereo", seed) for seed in range(5)]
 SCALE = 0.2
-TOLD = fit.looks_heavy
+TOLD = heavy_tail_fit.looks_heavy
 
 
 def drawn(kind, shape, draw):
@@ -49,7 +49,7 @@ def dataset(spec, seed, n, kind, which):
 
 
 def trial(data, judged, heavy):
-    fit.looks_heavy = TOLD if heavy else lambda *_: False
+    heavy_tail_fit.looks_heavy = TOLD if heavy else lambda *_: False
     start = time.process_time()
     calibration = ForwardGP().fit(data)
     seconds = time.process_time() - start

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from implicam.calibrators import ForwardGP
-from implicam.calibrators.forward_gp.locate import locate
 from implicam.files import write_text
+from implicam.rig_model.triangulate import locate
 from implicam.simulate import build_rig, random_positions, simulate
 
 RIGS = {"bar3": 400, "bar4": 400, "bar6": 400, "dome8": 400, "dome30": 120, "dome100": 40}

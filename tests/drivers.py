@@ -11,9 +11,7 @@ import pytest
 
 from implicam import hardware
 from implicam.errors import ImplicamError
-from implicam.hardware import (
-    SimulatedRobot,
-)
+from implicam.hardware import SimulatedRobot
 from implicam.simulate import build_rig
 
 BOX = ((0.0, 0.0, 0.0), (600.0, 600.0, 600.0))

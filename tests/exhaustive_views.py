@@ -6,9 +6,9 @@ from itertools import combinations
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.locate import _Seen
-from implicam.calibrators.forward_gp.posterior import Posterior
-from implicam.calibrators.forward_gp.wrong_views import AGREE, CLEARLY, DISAGREE
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.triangulate import _Seen
+from implicam.rig_model.wrong_views import AGREE, CLEARLY, DISAGREE
 
 
 def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most: int = 2) -> tuple[np.ndarray, ...]:

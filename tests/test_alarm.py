@@ -13,12 +13,12 @@ import pytest
 from scipy.special import chdtrc
 
 import implicam as ic
-from implicam.calibrators.alarm import DISAGREE, MANY, Table, _inexplicable, _misfit, _uneven
 from implicam.cli import main
 from implicam.dataset import Floats, Observations
 from implicam.errors import DatasetError
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.measurement import DOUBTFUL
+from implicam.rig_model.alarm import DISAGREE, MANY, Table, _inexplicable, _misfit, _uneven
 from implicam.simulate import Rig, build_rig, random_positions, simulate
 
 CASES = Path(__file__).parent / "data" / "cases"

@@ -14,15 +14,11 @@ from implicam.calibrators.explicit.adjust import Bundle, Placed, Views, _Normal,
 from implicam.calibrators.explicit.boards import BoardView, boards_of
 from implicam.calibrators.explicit.lenses import as_brown_conrady
 from implicam.calibrators.explicit.zhang import calibrate_camera, planar_poses
-from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior
 from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Pose, candidate_rays, rotation_from_vector
-from implicam.simulate import (
-    Rig,
-    build_rig,
-    simulate_boards,
-)
+from implicam.rig_model.camera import CentralCamera, Image, Prior
+from implicam.simulate import Rig, build_rig, simulate_boards
 
 # a small bundle, made by hand
 

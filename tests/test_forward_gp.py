@@ -15,34 +15,22 @@ from scipy.stats import chi2, kstest, multivariate_normal
 
 from implicam.calibrators import ForwardGP, ForwardGPCalibration, load_calibration
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
-from implicam.calibrators.forward_gp.general_camera import AnyCamera
-from implicam.calibrators.forward_gp.leave_one_out import left_out, squared_distances
-from implicam.calibrators.forward_gp.lens import (
-    TANGENT,
-    CentralCamera,
-    Image,
-    Prior,
-    ProjectiveCamera,
-)
-from implicam.calibrators.forward_gp.locate import locate
-from implicam.calibrators.forward_gp.posterior import (
-    LIKELY,
-    CameraModel,
-    Posterior,
-    ShotErrors,
-    Sightings,
-    condition,
-    empty_field,
-)
-from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
-from implicam.calibrators.forward_gp.shots import SMOOTH, Shots
-from implicam.calibrators.forward_gp.start import start_camera
 from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, join
 from implicam.errors import FitError, UsageError
 from implicam.geometry import Pose, look_at
 from implicam.gp.low_rank import LowRank
 from implicam.measurement import Measurement
+from implicam.rig_model.camera import TANGENT, CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.field import empty_field
+from implicam.rig_model.general_camera import AnyCamera
+from implicam.rig_model.initialise import start_camera
+from implicam.rig_model.leave_one_out import left_out, squared_distances
+from implicam.rig_model.posterior import Posterior, condition
+from implicam.rig_model.shot_errors import LIKELY, SMOOTH, ShotErrors, Shots
+from implicam.rig_model.tied import Scatter, condition_scattered
+from implicam.rig_model.triangulate import locate
 from implicam.simulate import Rig, Target, build_rig, moving_board, random_positions, simulate
 
 IMAGE = Image(np.array([639.5, 399.5]), 640.0)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from implicam.calibrators.forward_gp.general_camera import SMALLEST_RHO, GeneralCamera
-from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera
 from implicam.cameras import KannalaBrandt
 from implicam.geometry import Pose, rotation_from_vector
+from implicam.rig_model.camera import TANGENT, CentralCamera
+from implicam.rig_model.general_camera import SMALLEST_RHO, GeneralCamera
 
 RNG = np.random.default_rng(0)
 

@@ -22,12 +22,7 @@ import pytest
 from drivers import ONE, SHAPE, nothing_left, number_in, picture, says_all, simulated_robot, write_film  # noqa: F401
 from implicam import hardware
 from implicam.errors import HardwareError
-from implicam.hardware import (
-    FolderCamera,
-    GenICamCamera,
-    OpenCVCamera,
-    simulated_rig,
-)
+from implicam.hardware import FolderCamera, GenICamCamera, OpenCVCamera, simulated_rig
 from implicam.hardware.genicam import to_grey
 from implicam.images import write_picture
 

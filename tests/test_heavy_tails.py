@@ -12,9 +12,11 @@ from scipy import integrate
 from scipy.stats import chi2, kstest
 
 from implicam.calibrators import ForwardGP, load_calibration
-from implicam.calibrators.forward_gp import fit
+from implicam.calibrators.forward_gp import heavy_tail_fit
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
-from implicam.calibrators.forward_gp.heavy_tails import (
+from implicam.dataset import Dataset, KnownPositions, Observations
+from implicam.measurement import Measurement
+from implicam.rig_model.heavy_tails import (
     _solved,
     consistency,
     degrees_of_agreement,
@@ -25,9 +27,7 @@ from implicam.calibrators.forward_gp.heavy_tails import (
     taken_as_normal,
     weights_of,
 )
-from implicam.calibrators.forward_gp.wrong_views import Linear
-from implicam.dataset import Dataset, KnownPositions, Observations
-from implicam.measurement import Measurement
+from implicam.rig_model.wrong_views import Linear
 from implicam.simulate import build_rig, random_positions, simulate
 
 SCALE = 0.2
@@ -61,7 +61,7 @@ def heavy(spec: str, n: int, seed: int = 0) -> ForwardGPCalibration:
 def normal_fit(data: Dataset, monkeypatch: pytest.MonkeyPatch) -> ForwardGPCalibration:
     """As if noise were always normal."""
     with monkeypatch.context() as patch:
-        patch.setattr(fit, "looks_heavy", lambda *_: False)
+        patch.setattr(heavy_tail_fit, "looks_heavy", lambda *_: False)
         return ForwardGP().fit(data)
 
 

@@ -11,7 +11,12 @@ from scipy.linalg import block_diag, expm
 from scipy.stats import multivariate_normal
 
 from implicam.calibrators import ForwardGP, ForwardGPCalibration
-from implicam.calibrators.forward_gp.label_errors import (
+from implicam.dataset import Dataset, KnownPositions
+from implicam.evaluate import cross_validate, evaluate
+from implicam.rig_model.camera_model import Sightings
+from implicam.rig_model.leave_one_out import left_out_points
+from implicam.rig_model.level_errors import LEVEL, SHOT, levels, untold
+from implicam.rig_model.position_errors import (
     Agreement,
     LabelErrors,
     _evidence,
@@ -22,14 +27,9 @@ from implicam.calibrators.forward_gp.label_errors import (
     _symmetric,
     estimated,
 )
-from implicam.calibrators.forward_gp.label_fit import left_out_points
-from implicam.calibrators.forward_gp.levels import LEVEL, SHOT, levels, untold
-from implicam.calibrators.forward_gp.posterior import Sightings
-from implicam.calibrators.forward_gp.problem import sightings_of, stated_noise
-from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
-from implicam.calibrators.forward_gp.shots import Shots
-from implicam.dataset import Dataset, KnownPositions
-from implicam.evaluate import cross_validate, evaluate
+from implicam.rig_model.shot_errors import Shots
+from implicam.rig_model.tied import Scatter, condition_scattered
+from implicam.rig_model.training_data import sightings_of, stated_noise
 from implicam.simulate import Rig, Target, build_rig, moving_board, random_positions, simulate
 
 

@@ -12,15 +12,9 @@ import pytest
 from exhaustive_views import by_trying_all
 from implicam.calibrators import ForwardGP
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
-from implicam.calibrators.forward_gp.locate import Located, _Seen, locate
-from implicam.calibrators.forward_gp.wrong_views import (
-    DISAGREE,
-    Linear,
-    _Choices,
-    most_wrong,
-    without_wrong_views,
-)
 from implicam.dataset import Dataset, Observations
+from implicam.rig_model.triangulate import Located, _Seen, locate
+from implicam.rig_model.wrong_views import DISAGREE, Linear, _Choices, most_wrong, without_wrong_views
 from implicam.simulate import build_rig, random_positions, simulate
 
 

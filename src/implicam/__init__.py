@@ -26,15 +26,7 @@ from implicam.calibrators import (
     load_calibration,
 )
 from implicam.coverage import Coverage, assess
-from implicam.dataset import (
-    Camera,
-    Dataset,
-    KnownPositions,
-    Observations,
-    join,
-    read_dataset,
-    write_dataset,
-)
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations, join, read_dataset, write_dataset
 from implicam.errors import (
     CalibrationFileError,
     DatasetError,

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import MLP, Calibration, InverseGP
-from implicam.calibrators.forward_gp.problem import stated_noise
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluate import known_position_covariance
 from implicam.mistakes import Finding, mistakes_in, of_rows
 from implicam.progress import Progress, silent
+from implicam.rig_model.training_data import stated_noise
 from implicam.row_order import change_of, other_camera
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"

@@ -29,10 +29,10 @@ from implicam.calibrators import (
     InverseGP,
     InverseGPCalibration,
 )
-from implicam.calibrators.forward_gp.start import FEWEST
 from implicam.dataset import Dataset, Floats, join
 from implicam.errors import FitError, ImplicamError, UsageError
 from implicam.progress import Progress, silent
+from implicam.rig_model.training_data import FEWEST
 from implicam.threads import blas_threads
 
 GROWTH = 1.25

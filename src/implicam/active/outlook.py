@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from implicam.calibrators import Calibration, ExplicitCalibration, ForwardGPCalibration, InverseGPCalibration
-from implicam.calibrators.forward_gp.rig_map import RigMap, Sensitivity
 from implicam.calibrators.inverse_maps import Part
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
 from implicam.gp.linalg import solve_lower
+from implicam.rig_model.rig import RigMap, Sensitivity
 
 Bools = NDArray[np.bool_]
 

@@ -11,7 +11,8 @@ from implicam.calibrators.explicit import Explicit, ExplicitCalibration
 from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.inverse_gp import PRESETS, InverseGP, InverseGPCalibration
 from implicam.calibrators.mlp import MLP, MLPCalibration
-from implicam.calibrators.protocol import Calibration, Calibrator, Rejected, Unused
+from implicam.calibrators.protocol import Calibration, Calibrator
+from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import CalibrationFileError, UsageError, did_you_mean, import_extra
 
 METHODS: dict[str, tuple[type[Any], type[Any]]] = {

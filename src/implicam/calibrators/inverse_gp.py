@@ -25,19 +25,10 @@ from numpy.typing import NDArray
 from implicam import calibration_file
 from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_principal, learn_smooth
 from implicam.calibrators.pixel_cloud import FAR, FAR_FROM_A_PLANE, PixelCloud
-from implicam.calibrators.protocol import (
-    FLAT,
-    Arrays,
-    Rejected,
-    Unused,
-    copied_points,
-    finite_column,
-    require_points,
-    require_two_values,
-    same_cameras,
-    why_not_all_seen,
-)
+from implicam.calibrators.protocol import Arrays, finite_column, why_not_all_seen
 from implicam.dataset import Dataset, Floats, Names, Observations, copy_notes, without_copies
+from implicam.dataset.requirements import FLAT, require_points, require_two_values, same_cameras
+from implicam.dataset.unused import Rejected, Unused, copied_points
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
 from implicam.measurement import Measurement

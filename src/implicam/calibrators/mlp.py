@@ -33,8 +33,10 @@ from implicam.calibrators.inverse_gp import (
 )
 from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import Examples, train
-from implicam.calibrators.protocol import Arrays, Rejected, Unused, finite_column, same_cameras
+from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_copies
+from implicam.dataset.requirements import same_cameras
+from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import FitError, UsageError
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent

@@ -20,15 +20,7 @@ from typing import Any
 
 from implicam.calibration_file import package_version
 from implicam.errors import ImplicamError, UsageError
-from implicam.experiments.stored import (
-    Stored,
-    Values,
-    canonical,
-    decode,
-    failure_file,
-    result_file,
-    write_result,
-)
+from implicam.experiments.stored import Stored, Values, canonical, decode, failure_file, result_file, write_result
 from implicam.experiments.workers import DaskCluster, LocalProcesses, Task, attempts
 from implicam.files import write_text
 from implicam.progress import Progress, silent

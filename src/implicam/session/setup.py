@@ -14,12 +14,12 @@ import numpy as np
 from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition, workspace_from
 from implicam.active.acquisition import DEFAULT
 from implicam.calibrators import DEFAULT_METHOD, METHODS, named
-from implicam.calibrators.forward_gp.start import FEWEST
 from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import FrameSource, Robot, Trigger, camera_from, exposed, robot_from, simulated_rig, trigger_from
+from implicam.rig_model.training_data import FEWEST
 from implicam.session.folder import is_session
 from implicam.session.guide import Equipment, Guide
 from implicam.session.journal import Session

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.explicit.boards import BoardView
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Prior
-from implicam.calibrators.forward_gp.posterior import solve_normal
-from implicam.geometry import Bools, Pose, rotation_from_vector
+from implicam.geometry import Bools, Floats, Pose, rotation_from_vector
 from implicam.progress import Progress, silent
+from implicam.rig_model.camera import CentralCamera, Prior
+from implicam.rig_model.normal_equations import solve_normal
 
 ROBUST = 3.0
 """Residuals, in standard deviations, beyond which a view counts less: Cauchy's loss."""

@@ -24,9 +24,9 @@ from implicam.calibrators.explicit.adjust import (
     unexplained,
 )
 from implicam.calibrators.explicit.boards import BoardView
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats
-from implicam.geometry import Pose
+from implicam.geometry import Floats, Pose
 from implicam.progress import Progress, silent
+from implicam.rig_model.camera import CentralCamera
 
 WORSE = 2.0
 """Together so many times what is left alone: lens models that do not hold their lenses make at most 1.25 of it where

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats
-from implicam.calibrators.forward_gp.posterior import CameraModel
 from implicam.dataset import Names
 from implicam.errors import FitError
-from implicam.geometry import Bools, Pose, register, rotation_from_vector
+from implicam.geometry import Bools, Floats, Pose, register, rotation_from_vector
+from implicam.rig_model.camera import CentralCamera
+from implicam.rig_model.camera_model import CameraModel
 
 FAR = 25.0
 """Squared distance, in its own covariance, of a known point from where it should be: one in 65,000 of good ones."""

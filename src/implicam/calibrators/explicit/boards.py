@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.lens import Image
-from implicam.calibrators.forward_gp.problem import image_of, relative_noise, stated_noise
-from implicam.dataset import Camera, Dataset, Floats, Names
+from implicam.dataset import Camera, Dataset, Names
 from implicam.errors import FitError
+from implicam.geometry import Floats
+from implicam.rig_model.camera import Image
+from implicam.rig_model.training_data import image_of, relative_noise, stated_noise
 
 FEWEST_CORNERS = 12
 """Corners of one picture; with fewer it says little more than that there is a board."""

@@ -20,22 +20,19 @@ from implicam import calibration_file
 from implicam.calibrators.explicit import saved
 from implicam.calibrators.explicit.align import MATCHING
 from implicam.calibrators.explicit.boards import boards_of, has_boards
-from implicam.calibrators.explicit.fitted import (
-    Fitted,
-    by_cameras_of,
-    fit_to_boards_alone,
-    fit_to_points,
-)
+from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_boards_alone, fit_to_points
 from implicam.calibrators.explicit.from_boards import fit_to_boards
 from implicam.calibrators.explicit.lenses import AUTO, FAMILIES
 from implicam.calibrators.explicit.network import Groups, calibrate_groups
-from implicam.calibrators.forward_gp.rig_map import RigMap
-from implicam.calibrators.protocol import Arrays, Rejected, Unused, solvable
-from implicam.dataset import Dataset, Floats, Observations
+from implicam.calibrators.protocol import Arrays, solvable
+from implicam.dataset import Dataset, Observations
+from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import UsageError, did_you_mean
+from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
+from implicam.rig_model.rig import RigMap
 from implicam.threads import blas_threads
 
 

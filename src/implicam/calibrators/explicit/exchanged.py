@@ -10,15 +10,14 @@ from implicam.calibrators.explicit.calibration import Explicit, ExplicitCalibrat
 from implicam.calibrators.explicit.fitted import Fitted, posterior_of
 from implicam.calibrators.explicit.lenses import Choice, name_of
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
-from implicam.calibrators.forward_gp.fit import without_field
-from implicam.calibrators.forward_gp.general_camera import GeneralCamera
-from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior
-from implicam.calibrators.forward_gp.problem import Frame
-from implicam.calibrators.forward_gp.start import Started, levenberg_marquardt
-from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import UsageError
 from implicam.exchange import UNKNOWN, ExplicitCamera, Rig
-from implicam.geometry import Pose
+from implicam.geometry import Floats, Pose
+from implicam.rig_model.camera import CentralCamera, Image, Prior
+from implicam.rig_model.general_camera import GeneralCamera
+from implicam.rig_model.initialise import Started, levenberg_marquardt, without_field
+from implicam.rig_model.training_data import Frame
 
 DRAWN = 2000
 """Positions in the workspace at which a lens is fitted to what forward-gp predicts."""

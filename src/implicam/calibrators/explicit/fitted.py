@@ -12,24 +12,20 @@ from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.network import Network, calibrate_network
 from implicam.calibrators.explicit.pixels import told
-from implicam.calibrators.forward_gp.diagnosis import NAMED, Diagnosis
-from implicam.calibrators.forward_gp.fit import FittedRig, without_field
-from implicam.calibrators.forward_gp.lens import CentralCamera
-from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior
-from implicam.calibrators.forward_gp.problem import Frame, problem_of, stated_noise
-from implicam.calibrators.forward_gp.rig_map import RigMap
-from implicam.calibrators.forward_gp.start import Started
-from implicam.calibrators.protocol import (
-    Rejected,
-    Unused,
-    blind_with_copies,
-    copied_points,
-    point_copy_notes,
-    same_cameras,
-)
-from implicam.dataset import Dataset, Floats, KnownPositions, Observations, without_copies
+from implicam.dataset import Dataset, KnownPositions, Observations, without_copies
+from implicam.dataset.requirements import same_cameras
+from implicam.dataset.unused import Rejected, Unused, blind_with_copies, copied_points, point_copy_notes
 from implicam.errors import FitError
+from implicam.geometry import Floats
 from implicam.progress import Progress
+from implicam.rig_model.camera import CentralCamera
+from implicam.rig_model.camera_model import CameraModel
+from implicam.rig_model.diagnostics import NAMED, Diagnosis
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.initialise import Started, without_field
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.rig import RigMap
+from implicam.rig_model.training_data import Frame, problem_of, stated_noise
 
 METHOD = "explicit"
 

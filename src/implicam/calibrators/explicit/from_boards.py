@@ -26,16 +26,16 @@ from implicam.calibrators.explicit.fitted import (
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.network import Groups, Network
 from implicam.calibrators.explicit.place import place
-from implicam.calibrators.forward_gp.diagnosis import Diagnosis
-from implicam.calibrators.forward_gp.locate import locate
-from implicam.calibrators.forward_gp.posterior import CameraModel
-from implicam.calibrators.forward_gp.problem import Frame, problem_of
-from implicam.calibrators.forward_gp.rig_map import RigMap
-from implicam.calibrators.protocol import Rejected, Unused, copied_points, point_copy_notes
-from implicam.dataset import Dataset, Floats, Names, Observations, without_copies
+from implicam.dataset import Dataset, Names, Observations, without_copies
+from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes
 from implicam.errors import FitError
-from implicam.geometry import Bools
+from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
+from implicam.rig_model.camera_model import CameraModel
+from implicam.rig_model.diagnostics import Diagnosis
+from implicam.rig_model.rig import RigMap
+from implicam.rig_model.training_data import Frame, problem_of
+from implicam.rig_model.triangulate import locate
 
 
 class Part(NamedTuple):

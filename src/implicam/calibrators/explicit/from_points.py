@@ -15,14 +15,17 @@ from scipy.optimize import minimize_scalar
 
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.start import MirroredError, start_with_lens
-from implicam.calibrators.forward_gp.evidence import Hyperparameters
-from implicam.calibrators.forward_gp.fit import FittedRig, Problem, settle, start_rig, without_field
-from implicam.calibrators.forward_gp.leave_one_out import Bools, judged_all
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior, Sightings, condition, spread
-from implicam.calibrators.forward_gp.start import FEWEST, Started, levenberg_marquardt
 from implicam.errors import FitError
+from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
+from implicam.rig_model.camera_model import CameraModel, Sightings, spread
+from implicam.rig_model.field import Hyperparameters
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.initialise import Started, levenberg_marquardt, start_rig, without_field
+from implicam.rig_model.leave_one_out import judged_all
+from implicam.rig_model.linearise import settle
+from implicam.rig_model.posterior import Posterior, condition
+from implicam.rig_model.training_data import FEWEST, Problem
 
 ROUNDS = 8
 

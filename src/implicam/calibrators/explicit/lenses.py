@@ -7,10 +7,11 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats
-from implicam.calibrators.forward_gp.start import FAR
 from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import FitError
+from implicam.geometry import Floats
+from implicam.rig_model.camera import CentralCamera
+from implicam.rig_model.initialise import FAR
 
 FAMILIES: dict[str, type[BrownConrady] | type[KannalaBrandt]] = {
     "brown-conrady": BrownConrady,

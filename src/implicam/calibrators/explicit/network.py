@@ -27,11 +27,11 @@ from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, 
 from implicam.calibrators.explicit.lenses import Choice, angles
 from implicam.calibrators.explicit.pixels import prior_of
 from implicam.calibrators.explicit.zhang import STUCK, OneCamera, calibrate_camera, median_error, pose_and_mirror
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Image
 from implicam.dataset import Names
 from implicam.errors import FitError
-from implicam.geometry import Bools, Pose
+from implicam.geometry import Bools, Floats, Pose
 from implicam.progress import Progress, silent
+from implicam.rig_model.camera import CentralCamera, Image
 from implicam.threads import side_by_side
 
 FAR = 5.0

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.calibrators.explicit.lenses import USUAL
-from implicam.calibrators.forward_gp.lens import ASPECT, CENTRE, CentralCamera, Image, Prior
+from implicam.rig_model.camera import ASPECT, CENTRE, CentralCamera, Image, Prior
 
 ASPECTS = (1.0, 0.5, 0.63, 0.79, 1.26, 1.59, 2.0)
 """Ratios fy / fx that a start tries: the steps of 26 % are close enough for what follows."""

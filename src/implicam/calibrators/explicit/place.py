@@ -13,14 +13,15 @@ import numpy as np
 
 from implicam.calibrators.explicit.from_points import refined
 from implicam.calibrators.explicit.network import Network
-from implicam.calibrators.forward_gp.evidence import Hyperparameters
-from implicam.calibrators.forward_gp.fit import FittedRig, Problem
-from implicam.calibrators.forward_gp.lens import CentralCamera, Floats, Prior
-from implicam.calibrators.forward_gp.posterior import Posterior
-from implicam.calibrators.forward_gp.start import FAR, Started, levenberg_marquardt
 from implicam.errors import FitError
-from implicam.geometry import Bools, Pose, poses_from_rays
+from implicam.geometry import Bools, Floats, Pose, poses_from_rays
 from implicam.progress import Progress
+from implicam.rig_model.camera import CentralCamera, Prior
+from implicam.rig_model.field import Hyperparameters
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.initialise import FAR, Started, levenberg_marquardt
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.training_data import Problem
 
 FEWEST = 4
 """Known points that place a camera whose lens is known: three leave up to four places."""

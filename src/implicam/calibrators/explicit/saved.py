@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from implicam.calibrators.explicit.fitted import Fitted
 from implicam.calibrators.explicit.lenses import FAMILIES, USUAL, Choice, name_of
-from implicam.calibrators.forward_gp.fit import without_field
-from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior
-from implicam.calibrators.forward_gp.posterior import CameraModel, Posterior
-from implicam.calibrators.forward_gp.problem import Frame
-from implicam.calibrators.forward_gp.start import Started
-from implicam.calibrators.protocol import Arrays, Rejected, Unused, finite_column
+from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
+from implicam.dataset.unused import Rejected, Unused
+from implicam.rig_model.camera import CentralCamera, Image, Prior
+from implicam.rig_model.camera_model import CameraModel
+from implicam.rig_model.initialise import Started, without_field
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.training_data import Frame
 
 BOARDS = "boards/"
 

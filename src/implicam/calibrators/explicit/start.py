@@ -22,11 +22,12 @@ from implicam.calibrators.explicit.pixels import (
     prior_of,
     square,
 )
-from implicam.calibrators.forward_gp.lens import CENTRE, TANGENT, CentralCamera, Floats, Image
-from implicam.calibrators.forward_gp.start import FAR, FEWEST, Started, levenberg_marquardt
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
-from implicam.geometry import Bools, resect_any_pixels
+from implicam.geometry import Bools, Floats, resect_any_pixels
+from implicam.rig_model.camera import CENTRE, TANGENT, CentralCamera, Image
+from implicam.rig_model.initialise import FAR, Started, levenberg_marquardt
+from implicam.rig_model.training_data import FEWEST
 
 SHIFTED = 5.0
 """How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""

@@ -35,10 +35,10 @@ from implicam.calibrators.explicit.pixels import (
     prior_of,
     square,
 )
-from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, Image, Prior
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
-from implicam.geometry import Bools, Pose, candidate_rays, rotation_from_vector
+from implicam.geometry import Bools, Floats, Pose, candidate_rays, rotation_from_vector
+from implicam.rig_model.camera import TANGENT, CentralCamera, Image, Prior
 
 FEW = 30
 """Boards that the lens is looked for with; the adjustment has them all."""

@@ -18,30 +18,24 @@ from numpy.typing import NDArray
 from implicam import calibration_file
 from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.camera_notes import kind_notes
-from implicam.calibrators.forward_gp.diagnosis import Diagnosis
-from implicam.calibrators.forward_gp.fit import AUTO, FittedRig, fit_rig
-from implicam.calibrators.forward_gp.label_fit import with_noise_told_apart
-from implicam.calibrators.forward_gp.levels import untold
-from implicam.calibrators.forward_gp.locate import Labels
-from implicam.calibrators.forward_gp.posterior import Posterior
-from implicam.calibrators.forward_gp.problem import Frame, problem_of
-from implicam.calibrators.forward_gp.rig_map import RigMap
-from implicam.calibrators.forward_gp.shots import Shots
-from implicam.calibrators.protocol import (
-    Arrays,
-    Rejected,
-    Unused,
-    blind_with_copies,
-    copied_points,
-    finite_column,
-    point_copy_notes,
-    solvable,
-)
-from implicam.dataset import Dataset, Floats, Observations, without_copies
+from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
+from implicam.calibrators.forward_gp.position_error_fit import with_noise_told_apart
+from implicam.calibrators.protocol import Arrays, finite_column, solvable
+from implicam.dataset import Dataset, Observations, without_copies
+from implicam.dataset.unused import Rejected, Unused, blind_with_copies, copied_points, point_copy_notes
 from implicam.errors import UsageError, did_you_mean
+from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
+from implicam.rig_model.diagnostics import Diagnosis
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.level_errors import untold
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.rig import RigMap
+from implicam.rig_model.shot_errors import Shots
+from implicam.rig_model.training_data import Frame, problem_of
+from implicam.rig_model.triangulate import Labels
 from implicam.threads import blas_threads
 
 LENS_OPTIONS = (AUTO, "central", "none")

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.fit import FittedRig
-from implicam.calibrators.forward_gp.general_camera import GeneralCamera
-from implicam.calibrators.forward_gp.posterior import CameraModel
+from implicam.rig_model.camera_model import CameraModel
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.general_camera import GeneralCamera
 
 
 def kind_notes(fitted: FittedRig, names: Sequence[str]) -> list[str]:

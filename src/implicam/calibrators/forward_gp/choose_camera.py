@@ -23,12 +23,22 @@ from implicam.calibrators.forward_gp.families import (
     near_prior,
     widest_angle,
 )
-from implicam.calibrators.forward_gp.general_camera import RHO, SMALLEST_RHO, AnyCamera, GeneralCamera
-from implicam.calibrators.forward_gp.lens import TANGENT, CentralCamera, Floats, Image
-from implicam.calibrators.forward_gp.start import FAR, FEWEST, Bools, Started, levenberg_marquardt
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
-from implicam.geometry import Pose, camera_from_linear, pixel_shape_of, resect_affine, resect_any_lens, resect_robustly
+from implicam.geometry import (
+    Bools,
+    Floats,
+    Pose,
+    camera_from_linear,
+    pixel_shape_of,
+    resect_affine,
+    resect_any_lens,
+    resect_robustly,
+)
+from implicam.rig_model.camera import TANGENT, CentralCamera, Image
+from implicam.rig_model.general_camera import RHO, SMALLEST_RHO, AnyCamera, GeneralCamera
+from implicam.rig_model.initialise import FAR, Started, levenberg_marquardt
+from implicam.rig_model.training_data import FEWEST
 
 QUICK_MEDIAN = 2e-3
 """Median error of an ordinary camera, in half the longer side; more needs a look at everything else."""

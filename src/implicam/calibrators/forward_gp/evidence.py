@@ -14,15 +14,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from implicam.calibrators.forward_gp.lens import Floats, Prior
-from implicam.gp import Kernel
+from implicam.geometry import Floats
 from implicam.gp.low_rank import pivoted_cholesky
+from implicam.rig_model.camera import Prior
+from implicam.rig_model.field import Hyperparameters, field_kernel
+from implicam.rig_model.normal_equations import stable_cholesky
 
 LENGTHSCALE = np.log([1.0, 2.0])
 """Prior medians: across the image in half its longer side, and in log distance. Optics vary smoothly across the image;
 refraction and the entrance pupil vary with the distance as 1 / distance does."""
+
 LENGTHSCALE_SD = np.array([0.7, 1.0])
+
 SHORTEST = np.log([0.5, 0.1])
+
 LONGEST = np.log([30.0, 100.0])
 
 GRID = ((0.6, 1.5, 4.0), (0.15, 0.5, 2.0))
@@ -52,34 +57,6 @@ GTOL = 0.02
 
 DETERMINED = 1e-12
 """Eigenvalues below this part of the largest add nothing."""
-
-
-JITTERS = (0.0, 1e-13, 1e-11, 1e-9)
-"""Added to a unit diagonal, one after the other, where the matrix is indefinite by rounding."""
-
-
-def stable_cholesky(A: Floats) -> Floats:
-    """Of matrices (..., p, p) with unit diagonals; where rounding made one indefinite, of the nearest that is not."""
-    for jitter in JITTERS:
-        try:
-            return np.asarray(np.linalg.cholesky(A + jitter * np.eye(A.shape[-1]) if jitter else A), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            continue
-    raise np.linalg.LinAlgError("the views do not fix the camera")
-
-
-class Hyperparameters(NamedTuple):
-    """lengthscale (C, 2): across the image, in half its longer side, and in log distance, the same for cameras of one
-    kind; signal and noise sd (C,) px."""
-
-    lengthscale: Floats
-    signal: Floats
-    noise: Floats
-
-
-def field_kernel(lengthscale: Floats) -> Kernel:
-    """Of a residual field over (u, v) in half the longer side and the log distance, eq. (8); unit variance."""
-    return Kernel("squared-exponential", 1.0, lengthscale[[0, 0, 1]])
 
 
 class Spectrum(NamedTuple):

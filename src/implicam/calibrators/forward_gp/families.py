@@ -13,9 +13,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 from implicam.calibrators.forward_gp.evidence import NOISE, SIGNAL, STATED, CameraEvidence, Spectrum
-from implicam.calibrators.forward_gp.general_camera import CENTRE, KAPPA, RHO, SMALLEST_RHO, GeneralCamera
-from implicam.calibrators.forward_gp.lens import BENT, BENT_AT_EDGE, TANGENT, Floats, Image, Prior
-from implicam.calibrators.forward_gp.posterior import field_coordinates
+from implicam.geometry import Floats
+from implicam.rig_model.camera import BENT, BENT_AT_EDGE, TANGENT, Image, Prior
+from implicam.rig_model.field import field_coordinates
+from implicam.rig_model.general_camera import CENTRE, KAPPA, RHO, SMALLEST_RHO, GeneralCamera
 
 
 class Family(NamedTuple):

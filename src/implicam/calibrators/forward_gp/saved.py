@@ -8,18 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.evidence import Hyperparameters, field_kernel
 from implicam.calibrators.forward_gp.families import FAMILIES
-from implicam.calibrators.forward_gp.fit import FittedRig
-from implicam.calibrators.forward_gp.general_camera import GeneralCamera
-from implicam.calibrators.forward_gp.heavy_tails import Tails
-from implicam.calibrators.forward_gp.label_errors import LabelErrors
-from implicam.calibrators.forward_gp.lens import CentralCamera, Image, Prior, ProjectiveCamera
-from implicam.calibrators.forward_gp.posterior import CameraModel, DepthScale, Posterior, ShotErrors, Unknowns
-from implicam.calibrators.forward_gp.shots import Shots
 from implicam.calibrators.protocol import Arrays, finite_column
-from implicam.dataset import Dataset, Floats
+from implicam.dataset import Dataset
+from implicam.geometry import Floats
 from implicam.gp.low_rank import LowRank
+from implicam.rig_model.camera import CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.rig_model.camera_model import CameraModel
+from implicam.rig_model.field import DepthScale, Hyperparameters, field_kernel
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.general_camera import GeneralCamera
+from implicam.rig_model.heavy_tails import Tails
+from implicam.rig_model.position_errors import LabelErrors
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.schur import Unknowns
+from implicam.rig_model.shot_errors import ShotErrors, Shots
 
 
 def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:

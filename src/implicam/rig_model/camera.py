@@ -10,12 +10,9 @@ from dataclasses import dataclass, fields
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from implicam.cameras import BrownConrady, KannalaBrandt, Lens
-from implicam.geometry import Pose, camera_centre, rotation_from_vector
-
-Floats = NDArray[np.float64]
+from implicam.geometry import Floats, Pose, camera_centre, rotation_from_vector
 
 TANGENT = np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
 """k1 ... k4 of a perspective lens: tan(t) = t + t^3/3 + 2 t^5/15 + ..."""

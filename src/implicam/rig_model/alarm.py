@@ -30,10 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtrc, chdtri
 
-from implicam.dataset import Camera, Floats
+from implicam.dataset import Camera
+from implicam.geometry import Bools, Floats
 from implicam.row_order import late_or_early, moved_up
-
-Bools = NDArray[np.bool_]
 
 FEWEST_POINTS = 10
 """Of fewer points that can be tested nothing is said."""

@@ -10,14 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.fit import FittedRig, Problem, settle, with_heavy_tails
-from implicam.calibrators.forward_gp.label_errors import Agreement, LabelErrors, estimated
-from implicam.calibrators.forward_gp.leave_one_out import OUTLIER, Bools, LeftOut, left_out_views
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.levels import untold
-from implicam.calibrators.forward_gp.posterior import Sightings, spread
-from implicam.calibrators.forward_gp.scatter import Scatter
+from implicam.calibrators.forward_gp.heavy_tail_fit import with_heavy_tails
 from implicam.dataset import Names
+from implicam.geometry import Bools, Floats
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.leave_one_out import OUTLIER, LeftOut, left_out_views
+from implicam.rig_model.level_errors import untold
+from implicam.rig_model.linearise import settle
+from implicam.rig_model.position_errors import Agreement, LabelErrors, estimated
+from implicam.rig_model.tied import Scatter
+from implicam.rig_model.training_data import Problem
 
 MOST = 400
 """Points that the errors are estimated from; more cost time and tell little more."""
@@ -110,40 +112,3 @@ def _judged(views: list[LeftOut], kept: tuple[Bools, ...], found: LabelErrors, n
         distance = np.einsum("ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
         judged.append(np.asarray(distance <= OUTLIER, dtype=np.bool_))
     return tuple(judged)
-
-
-def left_out_points(fitted: FittedRig, points: Floats, seen: tuple[Sightings, ...]) -> tuple[Floats, Floats]:
-    """Of the known points that two cameras see: the error (m, 3) against the known position of each, measured without
-    its own views, and its covariance (m, 3, 3), in which the error of the position is included; eq. (18) with all views
-    of a point together. seen: what each fitted camera saw."""
-    errors, posterior = fitted.label_errors, fitted.posterior
-    assert errors is not None
-    assert errors.size is not None
-    n, C = len(points), len(seen)
-    residual, slope = np.zeros((n, 2 * C)), np.zeros((n, 2 * C, 3))
-    noise2, half = np.ones((n, 2 * C)), np.zeros((n, 2 * C, posterior.root(0).shape[0]))
-    shift = np.zeros((n, 3))
-    if fitted.errors is not None and posterior.unknowns is not None:
-        shift = fitted.errors.scaled @ posterior.unknowns.mean
-    for c, (one, kept) in enumerate(zip(seen, fitted.kept, strict=True)):
-        used, pair = one.select(kept), slice(2 * c, 2 * c + 2)
-        model, where = posterior.models[c], (points + shift)[used.rows]
-        rows = model.rows(where)
-        residual[used.rows, pair] = used.uv - rows.mean
-        slope[used.rows, pair] = model.predict(where)[1]
-        noise2[used.rows, pair] = (model.noise * used.relative)[:, None] ** 2
-        half[used.rows, pair] = spread(rows, posterior.root(c))
-    own = slope @ (errors.root * errors.size[:, None, None])
-    views = noise2[:, :, None] * np.eye(2 * C) + own @ own.swapaxes(1, 2)
-    without = views @ np.linalg.solve(
-        views - half @ half.swapaxes(1, 2), np.concatenate([views, residual[..., None]], 2)
-    )
-    measured = without[:, :, :-1] - own @ own.swapaxes(1, 2)  # a measurement does not know of the label's error
-    weighted = np.linalg.solve(measured, slope)
-    information = slope.swapaxes(1, 2) @ weighted
-    good = (np.linalg.eigvalsh(information)[:, 0] > 1e-12 * np.trace(information, axis1=1, axis2=2)) & (
-        np.sum(slope.any(axis=2), axis=1) >= 4
-    )
-    covariance = np.linalg.inv(information[good])
-    error = np.einsum("nij,nkj,nk->ni", covariance, weighted[good], without[good, :, -1])
-    return error, covariance + errors.covariance

@@ -12,16 +12,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc, gammaln, logsumexp, ndtri
 
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import Sightings
-from implicam.calibrators.forward_gp.wrong_views import Linear
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
+from implicam.geometry import Bools, Floats
+from implicam.rig_model.camera_model import Sightings
+from implicam.rig_model.wrong_views import Ints, Linear
 
 DEGREES = (2.2, 2.6, 3.0, 3.5, 4.2, 5.0, 7.0, 10.0, 20.0)
 """Degrees of freedom tried. With two or fewer the noise has no variance, with more than 20 it is as good as normal."""

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.fit import FittedRig
-from implicam.calibrators.forward_gp.label_fit import left_out_points
-from implicam.calibrators.forward_gp.leave_one_out import left_out
-from implicam.calibrators.forward_gp.posterior import Sightings
-from implicam.calibrators.forward_gp.problem import Frame, sightings_of, stated_noise
-from implicam.calibrators.protocol import Rejected, Unused
-from implicam.dataset import Dataset, Floats
+from implicam.dataset import Dataset
+from implicam.dataset.unused import Rejected, Unused
+from implicam.geometry import Floats
+from implicam.rig_model.camera_model import Sightings
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.leave_one_out import left_out, left_out_points
+from implicam.rig_model.training_data import Frame, sightings_of, stated_noise
 
 NAMED = 5
 """Things that a note names one by one; of more it gives the number."""

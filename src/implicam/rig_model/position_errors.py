@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import chdtri, fdtri, gammainccinv
 
-from implicam.calibrators.forward_gp.lens import Floats
+from implicam.geometry import Floats
 
 USUAL = (np.log(5e-4), 1.5)
 """Prior of the sd of a known position, median and log sd, in the working frame: machined, printed or driven there."""

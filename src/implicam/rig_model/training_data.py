@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.fit import Problem
-from implicam.calibrators.forward_gp.lens import Image
-from implicam.calibrators.forward_gp.posterior import ShotErrors, Sightings
-from implicam.calibrators.forward_gp.shots import Shots
-from implicam.calibrators.forward_gp.start import FEWEST, pixel_extent
-from implicam.calibrators.protocol import require_points, require_volume
-from implicam.dataset import Dataset, Floats, Observations
+from implicam.dataset import Dataset, Observations
+from implicam.dataset.requirements import require_points, require_volume
+from implicam.geometry import FAR_OUT, Floats
+from implicam.rig_model.camera import Image
+from implicam.rig_model.camera_model import Sightings
+from implicam.rig_model.shot_errors import ShotErrors, Shots
+
+FEWEST = 8
+"""Known points that a camera must see: 16 numbers for the 14 of lens and pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,3 +127,24 @@ def _declared(data: Dataset, frame: Frame) -> ShotErrors | None:
     of_shot = np.stack([np.sqrt(np.bincount(shot, weights=sd[:, k] ** 2) / count) for k in range(3)], axis=1)
     basis = np.broadcast_to(np.eye(3), (len(data), 3, 3))
     return ShotErrors(shot.astype(np.int64), basis, of_shot, np.full(3, -1))
+
+
+def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
+    """The lowest and highest (2,) of pixels (n, 2), wild ones aside."""
+    away = np.linalg.norm(uv - np.median(uv, axis=0), axis=1)
+    inside = uv[away <= FAR_OUT * np.quantile(away, 0.75)]
+    return inside.min(axis=0), inside.max(axis=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Known points (n, 3) in the working frame; per camera what it saw (all of it), its image, and its stated noise in
+    pixels or NaN; how the points may be off; lens: "auto", "central" or "none"."""
+
+    points: Floats
+    names: tuple[str, ...]
+    sightings: tuple[Sightings, ...]
+    images: tuple[Image, ...]
+    stated: Floats
+    errors: ShotErrors | None
+    lens: str

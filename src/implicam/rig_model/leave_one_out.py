@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import Posterior, Sightings, spread
+from implicam.geometry import Bools, Floats
+from implicam.rig_model.camera_model import Sightings, spread
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.posterior import Posterior
 from implicam.threads import side_by_side
-
-Bools = NDArray[np.bool_]
 
 OUTLIER = 25.0
 """Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
@@ -148,3 +148,40 @@ def left_out_positions(
     error = np.full((n, 3), np.nan)
     error[good] = np.linalg.solve(information[good], pull[good][..., None])[..., 0]
     return error
+
+
+def left_out_points(fitted: FittedRig, points: Floats, seen: tuple[Sightings, ...]) -> tuple[Floats, Floats]:
+    """Of the known points that two cameras see: the error (m, 3) against the known position of each, measured without
+    its own views, and its covariance (m, 3, 3), in which the error of the position is included; eq. (18) with all views
+    of a point together. seen: what each fitted camera saw."""
+    errors, posterior = fitted.label_errors, fitted.posterior
+    assert errors is not None
+    assert errors.size is not None
+    n, C = len(points), len(seen)
+    residual, slope = np.zeros((n, 2 * C)), np.zeros((n, 2 * C, 3))
+    noise2, half = np.ones((n, 2 * C)), np.zeros((n, 2 * C, posterior.root(0).shape[0]))
+    shift = np.zeros((n, 3))
+    if fitted.errors is not None and posterior.unknowns is not None:
+        shift = fitted.errors.scaled @ posterior.unknowns.mean
+    for c, (one, kept) in enumerate(zip(seen, fitted.kept, strict=True)):
+        used, pair = one.select(kept), slice(2 * c, 2 * c + 2)
+        model, where = posterior.models[c], (points + shift)[used.rows]
+        rows = model.rows(where)
+        residual[used.rows, pair] = used.uv - rows.mean
+        slope[used.rows, pair] = model.predict(where)[1]
+        noise2[used.rows, pair] = (model.noise * used.relative)[:, None] ** 2
+        half[used.rows, pair] = spread(rows, posterior.root(c))
+    own = slope @ (errors.root * errors.size[:, None, None])
+    views = noise2[:, :, None] * np.eye(2 * C) + own @ own.swapaxes(1, 2)
+    without = views @ np.linalg.solve(
+        views - half @ half.swapaxes(1, 2), np.concatenate([views, residual[..., None]], 2)
+    )
+    measured = without[:, :, :-1] - own @ own.swapaxes(1, 2)  # a measurement does not know of the label's error
+    weighted = np.linalg.solve(measured, slope)
+    information = slope.swapaxes(1, 2) @ weighted
+    good = (np.linalg.eigvalsh(information)[:, 0] > 1e-12 * np.trace(information, axis1=1, axis2=2)) & (
+        np.sum(slope.any(axis=2), axis=1) >= 4
+    )
+    covariance = np.linalg.inv(information[good])
+    error = np.einsum("nij,nkj,nk->ni", covariance, weighted[good], without[good, :, -1])
+    return error, covariance + errors.covariance

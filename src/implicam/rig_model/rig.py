@@ -10,15 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.alarm import Table, alarm_of
-from implicam.calibrators.forward_gp.heavy_tails import information_loss
-from implicam.calibrators.forward_gp.locate import Labels, Located, locate
-from implicam.calibrators.forward_gp.posterior import Posterior, spread
-from implicam.calibrators.forward_gp.problem import Frame, stated_noise, view_noise
-from implicam.calibrators.forward_gp.wrong_views import AGREE
-from implicam.calibrators.protocol import same_cameras
-from implicam.dataset import Floats, Names, Observations
+from implicam.dataset import Names, Observations
+from implicam.dataset.requirements import same_cameras
+from implicam.geometry import Floats
 from implicam.measurement import Measurement
+from implicam.rig_model.alarm import Table, alarm_of
+from implicam.rig_model.camera_model import spread
+from implicam.rig_model.heavy_tails import information_loss
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.training_data import Frame, stated_noise, view_noise
+from implicam.rig_model.triangulate import Labels, Located, locate
+from implicam.rig_model.wrong_views import AGREE
 
 
 class Sensitivity(NamedTuple):

@@ -6,38 +6,30 @@ lens prior, and views that stay far off what most agree on are set aside, for th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.general_camera import AnyCamera
-from implicam.calibrators.forward_gp.lens import (
-    TANGENT,
-    CentralCamera,
-    Floats,
-    Image,
-    Prior,
-    ProjectiveCamera,
-)
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
-from implicam.geometry import FAR_OUT, resect, resect_any_lens
-
-Bools = NDArray[np.bool_]
-
-FEWEST = 8
-"""Known points that a camera must see: 16 numbers for the 14 of lens and pose."""
+from implicam.geometry import Bools, Floats, resect, resect_any_lens
+from implicam.rig_model.camera import TANGENT, CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.rig_model.camera_model import CameraModel
+from implicam.rig_model.field import empty_field
+from implicam.rig_model.general_camera import AnyCamera
+from implicam.rig_model.training_data import FEWEST, Problem, pixel_extent
+from implicam.row_order import what_is_wrong
+from implicam.threads import side_by_side
 
 FAR = 8.0
 """Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
 
+ENOUGH_VIEWS = 12
+"""Views of a camera that are too many to call too few the reason why nothing fits them."""
 
-def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
-    """The lowest and highest (2,) of pixels (n, 2), wild ones aside."""
-    away = np.linalg.norm(uv - np.median(uv, axis=0), axis=1)
-    inside = uv[away <= FAR_OUT * np.quantile(away, 0.75)]
-    return inside.min(axis=0), inside.max(axis=0)
+TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
+"""Median error of a start, in half the extent of the pixels, beyond which it is none."""
 
 
 class Started(NamedTuple):
@@ -150,3 +142,92 @@ def levenberg_marquardt(
         if best > previous * (1 - gain):
             break
     return camera
+
+
+def start_rig(
+    problem: Problem, start: Callable[[int, Floats, Floats], Started]
+) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    """Each camera that `start` can place from its number, known points (n, 3) and pixels, and why it cannot the others.
+
+    FitError where fewer than two can be placed.
+    """
+
+    def one(c: int) -> Started | FitError:
+        seen = problem.sightings[c]
+        try:
+            _check_places(problem.points[seen.rows])
+            started = start(c, problem.points[seen.rows], seen.uv)
+            check_start(started, problem.points[seen.rows], seen.uv, problem)
+            return started
+        except np.linalg.LinAlgError:
+            return FitError(f"the known points do not fix it.{_why(problem, c)}")
+        except FitError as error:
+            return type(error)(error.what + _why(problem, c), why=error.why, fix=error.fix)
+
+    started, blind = {}, []
+    for c, found in enumerate(side_by_side(one, range(len(problem.sightings)))):
+        if isinstance(found, FitError):
+            blind.append((c, found.what))
+        else:
+            started[c] = found
+    require_two_cameras(problem, started, blind)
+    return started, blind
+
+
+def require_two_cameras(problem: Problem, started: dict[int, Started], blind: list[tuple[int, str]]) -> None:
+    """FitError, which says why, where fewer than two cameras are left."""
+    if len(started) < 2:
+        raise FitError(
+            f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
+            why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
+            fix=_cure(problem, blind),
+        )
+
+
+def _why(problem: Problem, c: int) -> str:
+    """What its rows say of a camera that no model fits, as a sentence after another."""
+    seen = problem.sightings[c]
+    uv = np.full((len(problem.points), 2), np.nan)
+    uv[seen.rows] = seen.uv
+    why = what_is_wrong(problem.points, uv)
+    return f" {why[0].upper()}{why[1:]}." if why else ""
+
+
+def _check_places(points: Floats) -> None:
+    """FitError for many views of few places: to click a point again says nothing new of the camera."""
+    places = len(np.unique(points, axis=0))
+    if places < FEWEST <= len(points):
+        raise FitError(f"its {len(points)} views are of {places} different positions, and it takes {FEWEST}.")
+
+
+def _cure(problem: Problem, blind: list[tuple[int, str]]) -> str:
+    if not blind:
+        return "use two cameras or more: a position is where their lines of sight meet"
+    if sum(len(seen.rows) >= ENOUGH_VIEWS for seen in problem.sightings) >= 2:
+        return "look whether pixels and known positions belong together: order of the rows, names, axes, units"
+    return "show the cameras more known points, in the whole volume"
+
+
+def check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:
+    """FitError for a start that too few views agree on, or that leaves too much."""
+    error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.kept]
+    low, high = pixel_extent(uv)
+    half = float((high - low).max()) / 2
+    if len(error) < FEWEST:
+        raise FitError(
+            f"{len(error)} of its {len(uv)} views agree on one camera, and it takes {FEWEST}.",
+            fix="add known points, or look for wrong detections",
+        )
+    if not np.median(error) < TOLERABLE[started.camera.kind] * half:
+        raise FitError(
+            f"no camera sees the known points at these pixels: the best of all fits leaves {np.median(error):.3g} px."
+        )
+
+
+def without_field(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
+    """A camera model that is nothing but the camera; noise in pixels."""
+    field = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
+    none = np.zeros((1, 2))
+    return CameraModel(
+        started.camera, started.camera, started.prior, image, field, 0.0, noise, none, family=started.family
+    )

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import LIKELY
-from implicam.calibrators.forward_gp.shots import SMOOTH, Shots
+from implicam.geometry import Floats
+from implicam.rig_model.shot_errors import LIKELY, SMOOTH, Shots
 
 SHOT = float(np.exp(sum(LIKELY)))
 """Sd of the error of one of two or three shots, in the working frame: eq. (17) where nothing is told."""

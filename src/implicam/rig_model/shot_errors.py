@@ -10,14 +10,13 @@ includes that a label there would be off as well.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import ShotErrors
+from implicam.geometry import Floats
 
 POINTS = 6
 """A shot's position is judged by its own points: so many at least."""
@@ -41,6 +40,9 @@ plates."""
 
 REACH = 0.25
 """How far the label of a shot holds around it, as a part of the distance to the next one."""
+
+LIKELY = (np.log(3e-3), 1.0)
+"""Prior of how far a shot is off, median and log sd, in the working frame: a thousandth of the volume's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,3 +166,53 @@ def _common_normal(axes: Floats, extent: Floats) -> Floats | None:
     flat = extent[:, 2] <= FLAT * extent[:, 1]
     parallel = np.abs(normals @ normals[0]) >= 1 - PARALLEL
     return np.asarray(normals[0], dtype=np.float64) if (flat & parallel).all() else None
+
+
+@dataclass(frozen=True, eq=False)
+class ShotErrors:
+    """How known positions may be off: `displacement of point i = basis[i] @ (sd of its shot * unknowns N(0, 1))`.
+
+    shot (n,) number of the point's shot; basis (n, 3, k) in the working frame; sd (shots, k). group (k,): components
+    with the same number >= 0 have one sd that is estimated; -1 is declared and stays.
+    """
+
+    shot: NDArray[np.int64]
+    basis: Floats
+    sd: Floats
+    group: NDArray[np.int64]
+
+    @cached_property
+    def scaled(self) -> Floats:
+        """(n, 3, k) displacement of each point by one standard deviation of each component."""
+        return self.basis * self.sd[self.shot][:, None, :]
+
+    @property
+    def count(self) -> int:
+        """Number of shots."""
+        return len(self.sd)
+
+    @property
+    def estimated(self) -> bool:
+        """Whether any sd is estimated."""
+        return bool((self.group >= 0).any())
+
+    def updated(self, mean: Floats, variance: Floats) -> tuple[ShotErrors, Floats]:
+        """With more probable sds, from the posterior of the unknowns (shots, k) in sds: one step of EM, eq. (17); and
+        (shots, k) the sds for error bars.
+
+        With few shots the most probable sd is too small for error bars: as for the noise, eq. (12), they are made of
+        the mean variance.
+        """
+        second = (mean**2 + variance) * self.sd**2
+        sd, mean_sd = self.sd.copy(), self.sd.copy()
+        for number in np.unique(self.group[self.group >= 0]):
+            members = self.group == number
+            n, total = second[:, members].size, float(second[:, members].sum())
+            u = 0.5 * np.log(total / n)
+            for _ in range(30):  # Newton; the log posterior is concave in u = log sd
+                pull = total * np.exp(-2 * u)
+                u -= (n - pull + (u - LIKELY[0]) / LIKELY[1] ** 2) / (2 * pull + 1 / LIKELY[1] ** 2)
+            told = float(np.sum(1 - np.minimum(variance[:, members], 1)))  # of n, how many the data tell
+            sd[:, members] = np.exp(u)
+            mean_sd[:, members] = np.exp(u + 1 / (2 * told + 1 / LIKELY[1] ** 2))
+        return replace(self, sd=sd), mean_sd

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from implicam.calibrators.forward_gp.lens import Floats
+from implicam.geometry import Bools, Floats
 
-Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 DISAGREE = 1e-4

@@ -12,18 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import (
-    CameraModel,
-    Posterior,
-    ShotErrors,
-    Sightings,
-    Unknowns,
-    camera_normals,
-    moved,
-    solve_normal,
-    spread,
-)
+from implicam.geometry import Floats
+from implicam.rig_model.camera_model import CameraModel, Sightings, spread
+from implicam.rig_model.normal_equations import camera_normals, solve_normal
+from implicam.rig_model.posterior import Posterior, moved
+from implicam.rig_model.schur import Unknowns
+from implicam.rig_model.shot_errors import ShotErrors
 from implicam.threads import side_by_side
 
 TOGETHER = 512

@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from implicam.calibrators.forward_gp.heavy_tails import consistency, refined, taken_as_normal
-from implicam.calibrators.forward_gp.lens import Floats
-from implicam.calibrators.forward_gp.posterior import CHUNK, Posterior, Unknowns, spread
-from implicam.calibrators.forward_gp.shots import Shots
-from implicam.calibrators.forward_gp.wrong_views import DISAGREE, Linear, weighted, without_wrong_views
+from implicam.geometry import Bools, Floats
+from implicam.rig_model.camera_model import spread
+from implicam.rig_model.heavy_tails import consistency, refined, taken_as_normal
+from implicam.rig_model.normal_equations import CHUNK
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.schur import Unknowns
+from implicam.rig_model.shot_errors import Shots
+from implicam.rig_model.wrong_views import DISAGREE, Linear, weighted, without_wrong_views
 from implicam.threads import side_by_side
-
-Bools = NDArray[np.bool_]
 
 ITERATIONS = 12
 CONVERGED = 1e-3

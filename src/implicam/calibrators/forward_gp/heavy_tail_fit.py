@@ -1,0 +1,150 @@
+"""After the fit: is the pixel noise heavy-tailed, and the rig fitted with views weighted by a Student's t."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.rounds import Round, check_fitted, next_round
+from implicam.geometry import Bools, Floats
+from implicam.rig_model.camera import Image
+from implicam.rig_model.camera_model import Sightings, random_subset
+from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.heavy_tails import (
+    DEGREES,
+    MOST_VIEWS,
+    Tails,
+    degrees_of_agreement,
+    looks_heavy,
+    outlier_distance,
+    weights_of,
+    whitened,
+)
+from implicam.rig_model.leave_one_out import OUTLIER, left_out_from, next_inliers, residuals_of
+from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.training_data import Problem
+from implicam.rig_model.wrong_views import Linear
+
+REWEIGHTED = 3
+"""Rounds more where the noise has heavy tails."""
+
+
+def with_heavy_tails(problem: Problem, fitted: FittedRig) -> FittedRig:
+    """After a few rounds more with views weighted by a t, where the noise of the fit clearly is one; else the same."""
+    cameras = fitted.cameras
+    seen, images = tuple(problem.sightings[c] for c in cameras), tuple(problem.images[c] for c in cameras)
+    stated, hyper, errors = problem.stated[list(cameras)], fitted.hyperparameters, fitted.errors
+    fixed = hyper if errors is not None and not errors.estimated else None
+    state = Round(
+        hyper,
+        fitted.posterior.models,
+        fitted.posterior,
+        fitted.kept,
+        errors,
+        fitted.label_sd,
+        settled=True,
+        errors=errors,
+        fixed=fixed,
+    )
+    try:
+        for number in range(REWEIGHTED):
+            found = _tails(problem, state, seen, images)
+            if found is None:
+                break
+            tails, kept = found
+            again = state._replace(tails=tails, kept=kept)
+            state = next_round(problem, again, seen, images, stated, search=number == 0)
+        if state.tails is None:
+            return fitted
+        check_fitted(problem, state, seen)
+    except np.linalg.LinAlgError:
+        return fitted
+    assert state.hyper is not None
+    return replace(
+        fitted,
+        posterior=state.posterior,
+        kept=state.kept,
+        hyperparameters=state.hyper,
+        errors=state.errors,
+        label_sd=state.label_sd,
+        tails=state.tails,
+    )
+
+
+def _tails(
+    problem: Problem, state: Round, seen: tuple[Sightings, ...], images: tuple[Image, ...]
+) -> tuple[Tails, tuple[Bools, ...]] | None:
+    """Degrees of freedom of the noise, from how far all views are from what the others predict; the weight of each view
+    by how far it is from what all say; and the views to use. None where the noise is normal."""
+    weighted = state.weighted(seen, told=True)
+
+    def one(c: int, most: int) -> _Predicted:
+        some = random_subset(len(seen[c].rows), most)
+        return _Predicted.of(
+            state.posterior, c, problem.points, seen[c].select(some), weighted[c].select(some), state.kept[c][some]
+        )
+
+    if state.tails is None:
+        few = [one(c, MOST_VIEWS) for c in range(len(seen))]
+        areas = [(2 * image.half) ** 2 for image in images]
+        background = [2 * np.pi * f.variance / area for f, area in zip(few, areas, strict=True)]
+        if not looks_heavy(np.concatenate([f.distance for f in few]), np.concatenate(background)):
+            return None
+        try:
+            degrees = degrees_of_agreement(*_agreement(state.posterior, problem.points, few))
+        except np.linalg.LinAlgError:  # the cameras among themselves say nothing of the noise
+            return None
+    else:
+        degrees = state.tails.degrees
+    if degrees is None:
+        return None
+    every = [one(c, len(problem.points)) for c in range(len(seen))]
+    limit = outlier_distance(degrees, OUTLIER)
+    judged = tuple(next_inliers(p.distance, k, limit) for p, k in zip(every, state.kept, strict=True))
+    return Tails(degrees, tuple(weights_of(p.own, degrees) for p in every)), judged
+
+
+class _Predicted(NamedTuple):
+    """Of one camera's views: rows of the points, residual (n, 2) from what the others predict, and its scale matrix in
+    covariance (n, 2, 2); the squared distance (n,) by these; own: the expected one from what all say; variance (n,) of
+    the noise, the scale squared, px^2."""
+
+    rows: NDArray[np.int64]
+    residual: Floats
+    covariance: Floats
+    distance: Floats
+    own: Floats
+    variance: Floats
+
+    @classmethod
+    def of(
+        cls, posterior: Posterior, c: int, points: Floats, seen: Sightings, weighted: Sightings, kept: Bools
+    ) -> _Predicted:
+        at = residuals_of(posterior, c, points, weighted)
+        variance = (posterior.models[c].noise * seen.relative) ** 2
+        residual, covariance = left_out_from(at, kept)
+        covariance = covariance - (at.sd**2 - variance)[:, None, None] * np.eye(2)
+        distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
+        sound = np.isfinite(distance) & (covariance[:, 0, 0] > 0) & (np.linalg.det(covariance) > 0)
+        distance = np.where(sound, distance, np.inf)
+        expected = (np.sum(at.residual**2, axis=1) + np.trace(at.reach, axis1=1, axis2=2)) / variance
+        return cls(seen.rows, residual, covariance, distance, np.where(kept, expected, distance), variance)
+
+
+def _agreement(posterior: Posterior, points: Floats, predicted: list[_Predicted]) -> tuple[Floats, Floats, Bools]:
+    """Of points, slopes and residuals of their views in the scale of the noise, and which there are: not those that are
+    wrong even with heavy tails."""
+    limit = outlier_distance(min(DEGREES), OUTLIER)
+    n, C = len(points), len(predicted)
+    each = np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy()
+    r, D, there = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3)), np.zeros((n, C), dtype=np.bool_)
+    for c, view in enumerate(predicted):
+        good = view.distance <= limit
+        rows = view.rows[good]
+        each[rows, c] = np.linalg.inv(view.covariance[good])
+        r[rows, c], there[rows, c] = view.residual[good], True
+        D[rows, c] = posterior.models[c].predict(points[rows])[1]
+    return *whitened(Linear(r, D, each, None)), there

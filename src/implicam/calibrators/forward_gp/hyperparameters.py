@@ -1,0 +1,142 @@
+"""Lengthscales, field size and noise of all cameras from the marginal likelihood, eqs. (9) to (12)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
+from implicam.geometry import Floats
+from implicam.rig_model.camera import Image, ProjectiveCamera
+from implicam.rig_model.camera_model import CameraModel, Sightings, thin_views
+from implicam.rig_model.field import DepthScale, Hyperparameters, empty_field, field_coordinates
+from implicam.rig_model.posterior import condition
+from implicam.rig_model.training_data import Problem
+
+MOST = 300
+"""Points of one camera that the hyperparameters are found from; more cost time and tell little more."""
+
+MOST_UNCERTAIN = 50
+"""The same where every point has an error of its own: three unknowns each."""
+
+TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
+"""Part of the field's variance that its features may leave out; without a lens model the field is large."""
+
+
+def estimate_hyperparameters(
+    problem: Problem,
+    models: tuple[CameraModel, ...],
+    used: tuple[Sightings, ...],
+    images: tuple[Image, ...],
+    stated: Floats,
+    before: Hyperparameters | None,
+    moved: Floats | None,
+    search: bool,
+) -> Hyperparameters:
+    """Most probable for all cameras, from the views in use. before: a guess; moved (n, 3): how far the known points are
+    off, where that is known; search: for other lengthscales too."""
+    found = Hyperparameters(np.ones((len(models), 2)), np.ones(len(models)), np.ones(len(models)))
+    groups = []
+    for numbers in _alike(models):
+        evidence = [_evidence(problem, models[c], used[c], moved) for c in numbers]
+        half = np.array([images[c].half for c in numbers])
+        kind = models[numbers[0]].camera.kind
+        rig = RigEvidence(evidence, half, stated[numbers], kind, TOLERANCE[kind])
+        guess = None if before is None else Hyperparameters(*(values[numbers] for values in before))
+        for values, part in zip(found, rig.maximise(guess, search=search or moved is not None), strict=True):
+            values[numbers] = part
+        groups.append((numbers, rig))
+    if problem.errors is None or problem.errors.estimated:
+        return found
+    return _joint_sizes(problem, models, used, found, groups)
+
+
+def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
+    """The numbers of cameras whose fields are of one kind: what a lens model leaves, or a linear projection."""
+    none = [c for c, model in enumerate(models) if model.camera.kind == ProjectiveCamera.kind]
+    return [group for group in ([c for c in range(len(models)) if c not in none], none) if group]
+
+
+def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floats | None) -> CameraEvidence:
+    """One camera's evidence. The error of a shot of many points is known well, so the points are where it says
+    (`moved`); that of a single point is not, and is one more unknown of the camera."""
+    errors = problem.errors if problem.errors is not None and not problem.errors.estimated else None
+    seen = thin_views(seen, MOST if errors is None or errors.count <= MOST_UNCERTAIN else MOST_UNCERTAIN)
+    points = problem.points if moved is None else problem.points + moved
+    view = model.camera.view(points[seen.rows])
+    X, off, prior = view.by_parameters, model.prior.mean - model.camera.parameters, model.prior
+    if errors is not None:
+        B = view.by_point @ errors.scaled[seen.rows]  # (n, 2, k)
+        shots, number = np.unique(errors.shot[seen.rows], return_inverse=True)
+        k = B.shape[2]
+        wide = np.zeros((len(B), 2, len(shots), k))
+        wide[np.arange(len(B)), :, number] = B
+        X = np.concatenate([X, wide.reshape(len(B), 2, -1)], axis=2)
+        extra = k * len(shots)
+        off = np.concatenate([off, np.zeros(extra)])
+        precision = np.eye(len(off))
+        precision[:-extra, :-extra] = prior.precision
+        prior = prior._replace(mean=off, precision=precision)
+    return CameraEvidence(seen.uv - view.uv, X, off, prior, field_coordinates(view, model.image), seen.relative)
+
+
+def size_fields(
+    problem: Problem, models: tuple[CameraModel, ...], used: tuple[Sightings, ...], hyper: Hyperparameters
+) -> tuple[CameraModel, ...]:
+    """The cameras with fields laid out anew."""
+
+    def one(c: int) -> CameraModel:
+        model = models[c]
+        points = problem.points[used[c].rows]
+        view = model.camera.view(points[:: max(1, len(points) // 4000)])
+        depth = DepthScale.of(view)
+        tolerance = TOLERANCE[model.camera.kind]
+        field = empty_field(hyper.lengthscale[c], field_coordinates(view, model.image, depth), tolerance)
+        return replace(
+            model,
+            ruler=model.camera,
+            depth=depth,
+            field=field,
+            signal=float(hyper.signal[c]),
+            noise=float(hyper.noise[c]),
+            weights=np.zeros((len(field.inducing), 2)),
+        )
+
+    return tuple(one(c) for c in range(len(models)))
+
+
+def _joint_sizes(
+    problem: Problem,
+    models: tuple[CameraModel, ...],
+    used: tuple[Sightings, ...],
+    hyper: Hyperparameters,
+    groups: list[tuple[list[int], RigEvidence]],
+) -> Hyperparameters:
+    """Signal and noise from all cameras at once, where positions have errors of their own.
+
+    One camera cannot tell the error of a position from its own noise; together they can, for all see the same error.
+    """
+    points = np.unique(np.concatenate([seen.rows for seen in used]))
+    if len(points) > MOST:
+        points = np.random.default_rng(0).choice(points, MOST, replace=False)
+    some = tuple(seen.select(np.isin(seen.rows, points)) for seen in used)
+    laid_out = size_fields(problem, models, some, hyper)
+
+    def loss(z: Floats) -> float:
+        signal, noise = np.exp(z)
+        sized = tuple(replace(m, signal=m.signal * signal, noise=m.noise * noise) for m in laid_out)
+        evidence = condition(sized, problem.points, some, problem.errors).evidence
+        penalties = (rig.penalty(hyper.signal[c] * signal, hyper.noise[c] * noise) for c, rig in groups)
+        return float(sum(penalties)) - evidence
+
+    first = min((np.array([0.0, noise]) for noise in (0.0, 1.0, 2.0)), key=loss)
+    simplex = first + np.array([[0, 0], [0.4, 0], [0, 0.4]])
+    options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.05, "maxfev": 24}
+    z = minimize(loss, first, method="Nelder-Mead", options=options).x
+    curvature = np.empty(2)
+    for axis, h in enumerate(0.2 * np.eye(2)):
+        curvature[axis] = (loss(z + h) - 2 * loss(z) + loss(z - h)) / 0.2**2
+    signal, noise = np.exp(z + 1 / np.maximum(curvature, 1.0))  # the mean variance, eq. (12)
+    return Hyperparameters(hyper.lengthscale, hyper.signal * signal, hyper.noise * noise)

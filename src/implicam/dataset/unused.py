@@ -1,0 +1,47 @@
+"""Known points and views that a fit does not use, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from implicam.dataset import Dataset, copies_of, copy_notes
+from implicam.dataset.copies import why_no_camera
+
+
+@dataclass(frozen=True)
+class Unused:
+    """A known point that the fit could not use, and why."""
+
+    point: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A view that the fit does not use, because it contradicts the others: `residual` pixels off what they predict."""
+
+    point: str
+    camera: str
+    residual: float
+
+
+def copied_points(data: Dataset) -> tuple[Unused, ...]:
+    """The known points that are copies of others: each is used once."""
+    copies = copies_of(data)
+    return tuple(
+        Unused(str(data.points[i]), "a copy of another: the same pixels at the same position to the last bit")
+        for i in np.flatnonzero(copies.points)
+    )
+
+
+def blind_with_copies(data: Dataset, blind: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
+    """Why cameras (their number, the reason) are not calibrated, of those that are copies what they are."""
+    copies = copies_of(data)
+    return tuple((c, why_no_camera(data, c, copies) if copies.cameras[c] else why) for c, why in blind)
+
+
+def point_copy_notes(data: Dataset) -> list[str]:
+    """What is there more than once among points; a method that names its uncalibrated cameras names copied ones too."""
+    return copy_notes(data)[int(copies_of(data).cameras.sum()) :]

@@ -1,0 +1,1 @@
+"""What every method that maps positions to pixels shares."""

@@ -1,0 +1,128 @@
+"""A camera as fitted: its lens and pose, its residual field and its noise; and what such a camera saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.geometry import Bools, Floats
+from implicam.gp.low_rank import LowRank
+from implicam.rig_model.camera import Image, Prior, View
+from implicam.rig_model.field import AS_IT_IS, DepthScale, field_coordinates
+from implicam.rig_model.general_camera import AnyCamera
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """A camera, its residual field and its noise; weights (m, 2) of the field's features, zero before the fit.
+
+    The field is looked up where the `ruler` sees a point: the camera as it was when the field was laid out. It stays
+    when the camera moves, for a telephoto lens may move far along its axis with its focal length, and no pixel shows.
+    """
+
+    camera: AnyCamera
+    ruler: AnyCamera
+    prior: Prior
+    image: Image
+    field: LowRank
+    signal: float  # px
+    noise: float  # px, of a view with the camera's usual noise
+    weights: Floats
+    depth: DepthScale = AS_IT_IS
+    family: str = "ordinary"
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.camera.size + 2 * len(self.field.inducing)
+
+    def _views(self, points: Floats) -> tuple[View, View]:
+        """What the camera sees, and its ruler."""
+        view = self.camera.view(points)
+        return view, view if self.ruler is self.camera else self.ruler.view(points)
+
+    def coordinates(self, view: View) -> Floats:
+        """(n, 3) where the field is looked up."""
+        return field_coordinates(view, self.image, self.depth)
+
+    def without_weights(self) -> CameraModel:
+        """As it was before it saw anything."""
+        return replace(self, weights=np.zeros_like(self.weights))
+
+    @cached_property
+    def _coefficients(self) -> Floats:
+        return self.field.coefficients(self.signal * self.weights)
+
+    def predict(self, points: Floats) -> tuple[Floats, Floats]:
+        """Mean pixels (n, 2) and their derivative by the point (n, 2, 3); NaN where the lens has no answer."""
+        view, measured = self._views(points)
+        q = self.coordinates(measured)
+        K = self.field.kernel(q, self.field.inducing)
+        by_q = self.field.slope(q, K, self._coefficients)
+        by_point = (
+            view.by_point
+            + by_q[:, :, :2] @ (measured.by_point / self.image.half)
+            + by_q[:, :, 2, None] * (measured.distance_by_point[:, None, :] / self.depth.unit)
+        )
+        return view.uv + K @ self._coefficients, by_point
+
+    def rows(self, points: Floats) -> Rows:
+        """How the pixels of points (n, 3) depend on the camera's unknowns, about the present mean."""
+        view, measured = self._views(points)
+        K = self.field.kernel(self.coordinates(measured), self.field.inducing)
+        phi = self.field.features_from(K)
+        left = np.maximum(1 - np.sum(phi**2, axis=1), 0)
+        mean = view.uv + K @ self._coefficients
+        return Rows(mean, view.by_parameters, self.signal * phi, self.signal**2 * left, view.by_point)
+
+
+class Rows(NamedTuple):
+    """pixel = mean + J step + phi (weights - their mean) + rest + noise, for n points.
+
+    mean (n, 2); J (n, 2, p); phi (n, m), the same for u and v; rest (n,) variance the features leave, px^2; by_point
+    (n, 2, 3).
+    """
+
+    mean: Floats
+    J: Floats
+    phi: Floats
+    rest: Floats
+    by_point: Floats
+
+
+def spread(rows: Rows, root: Floats) -> Floats:
+    """(n, 2, q) whose products `spread spread^T` are the covariances of mean pixels, from a camera's root (q, P)."""
+    p, m = rows.J.shape[2], rows.phi.shape[1]
+    out = rows.J @ root[:, :p].T
+    for i in range(2):
+        out[:, i] += rows.phi @ root[:, p + i * m : p + (i + 1) * m].T
+    return np.asarray(out, dtype=np.float64)
+
+
+class Sightings(NamedTuple):
+    """What one camera saw: rows (n,) of the points, uv (n, 2), relative (n,) noise over the camera's."""
+
+    rows: NDArray[np.int64]
+    uv: Floats
+    relative: Floats
+
+    def select(self, keep: NDArray[np.bool_]) -> Sightings:
+        """Some of them."""
+        return Sightings(self.rows[keep], self.uv[keep], self.relative[keep])
+
+
+def thin_views(seen: Sightings, most: int) -> Sightings:
+    """At most so many of them, at random."""
+    return seen if len(seen.rows) <= most else seen.select(random_subset(len(seen.rows), most))
+
+
+def random_subset(n: int, most: int) -> Bools:
+    """At most so many of n, at random."""
+    keep = np.full(n, n <= most)
+    if n > most:
+        keep[np.random.default_rng(0).choice(n, most, replace=False)] = True
+    return keep

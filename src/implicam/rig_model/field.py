@@ -1,0 +1,60 @@
+"""The residual field of a camera: what no lens model contains, a Gaussian process over the image and the distance."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from implicam.geometry import Floats
+from implicam.gp import Kernel
+from implicam.gp.low_rank import LowRank
+from implicam.rig_model.camera import Image, View
+
+TYPICAL_DEPTH_SPREAD = 0.12
+"""Standard deviation of the log distance of the known points in an ordinary rig. Where the volume is thinner, depth
+counts in its own spread: what a window or water does varies over the volume, however far that is."""
+
+
+class Hyperparameters(NamedTuple):
+    """lengthscale (C, 2): across the image, in half its longer side, and in log distance, the same for cameras of one
+    kind; signal and noise sd (C,) px."""
+
+    lengthscale: Floats
+    signal: Floats
+    noise: Floats
+
+
+def field_kernel(lengthscale: Floats) -> Kernel:
+    """Of a residual field over (u, v) in half the longer side and the log distance, eq. (8); unit variance."""
+    return Kernel("squared-exponential", 1.0, lengthscale[[0, 0, 1]])
+
+
+class DepthScale(NamedTuple):
+    """How log distance becomes a coordinate of the field: its mean over the known points, and the unit it counts in."""
+
+    mean: float = 0.0
+    unit: float = 1.0
+
+    @classmethod
+    def of(cls, view: View) -> DepthScale:
+        """Of the known points that a camera sees."""
+        spread = float(np.std(view.log_distance))
+        return cls(float(np.mean(view.log_distance)), min(max(spread / TYPICAL_DEPTH_SPREAD, 1e-6), 1.0))
+
+
+AS_IT_IS = DepthScale()
+"""Log distance itself is the coordinate."""
+
+
+def field_coordinates(view: View, image: Image, depth: DepthScale | None = None) -> Floats:
+    """(n, 3) where a field is looked up: pixel about the centre in half the longer side, scaled log distance, eq. (8).
+
+    depth: as of these very points where it is not given."""
+    mean, unit = DepthScale.of(view) if depth is None else depth
+    return np.column_stack([(view.uv - image.centre) / image.half, (view.log_distance - mean) / unit])
+
+
+def empty_field(lengthscale: Floats, q: Floats, tolerance: float) -> LowRank:
+    """A field with inducing points chosen among q (n, 3)."""
+    return LowRank.of(field_kernel(lengthscale), q, tolerance)

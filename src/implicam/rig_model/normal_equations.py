@@ -1,0 +1,124 @@
+"""The normal equations of one camera, eq. (13), and their stable solution."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from implicam.geometry import Floats
+from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.threads import side_by_side
+
+JITTERS = (0.0, 1e-13, 1e-11, 1e-9)
+"""Added to a unit diagonal, one after the other, where the matrix is indefinite by rounding."""
+
+CHUNK = 4096
+"""Points at a time."""
+
+
+def stable_cholesky(A: Floats) -> Floats:
+    """Of matrices (..., p, p) with unit diagonals; where rounding made one indefinite, of the nearest that is not."""
+    for jitter in JITTERS:
+        try:
+            return np.asarray(np.linalg.cholesky(A + jitter * np.eye(A.shape[-1]) if jitter else A), dtype=np.float64)
+        except np.linalg.LinAlgError:
+            continue
+    raise np.linalg.LinAlgError("the views do not fix the camera")
+
+
+def camera_normals(
+    models: tuple[CameraModel, ...], points: Floats, sightings: tuple[Sightings, ...]
+) -> list[NormalEquations]:
+    """The normal equations of each camera, eq. (13)."""
+    return side_by_side(lambda pair: _normal(pair[0], points, pair[1]), list(zip(models, sightings, strict=True)))
+
+
+class CameraFailedError(np.linalg.LinAlgError):
+    """The views of one camera do not fix it: `number` of those being fitted."""
+
+    def __init__(self, number: int, why: str) -> None:
+        super().__init__(why)
+        self.number = number
+
+
+@contextmanager
+def naming_camera(number: int) -> Iterator[None]:
+    """Say which camera it was whose equations have no solution."""
+    try:
+        yield
+    except CameraFailedError:
+        raise
+    except np.linalg.LinAlgError as error:
+        raise CameraFailedError(number, str(error)) from error
+
+
+class NormalEquations(NamedTuple):
+    """The normal equations of one camera, eq. (13): A step = b, with the sum of squares and of the noise's logs."""
+
+    A: Floats
+    b: Floats
+    squares: float
+    logs: float
+
+
+def _normal(model: CameraModel, points: Floats, seen: Sightings) -> NormalEquations:
+    p, m, P = model.camera.size, len(model.field.inducing), model.size
+    off = model.prior.mean - model.camera.parameters
+    A, b = np.zeros((P, P)), np.zeros(P)
+    A[:p, :p] = model.prior.precision
+    A[range(p, P), range(p, P)] = 1.0
+    b[:p] = model.prior.precision @ off
+    squares, logs = float(off @ b[:p]), 0.0
+    for sd, y, J, phi, _ in whitened_rows(model, points, seen):
+        flat = J.reshape(-1, p)
+        A[:p, :p] += flat.T @ flat
+        b[:p] += flat.T @ y.ravel()
+        inner = phi.T @ phi
+        for axis in range(2):
+            block = slice(p + axis * m, p + (axis + 1) * m)
+            A[block, block] += inner
+            across = J[:, axis].T @ phi
+            A[:p, block] += across
+            A[block, :p] += across.T
+            b[block] += phi.T @ y[:, axis]
+        squares += float(np.sum(y**2))
+        logs += 4 * float(np.sum(np.log(sd)))
+    return NormalEquations(A, b, squares, logs)
+
+
+def whitened_rows(
+    model: CameraModel, points: Floats, seen: Sightings
+) -> Iterator[tuple[Floats, Floats, Floats, Floats, Floats]]:
+    """In parts: the noise (n,), and in units of it the residuals, their slopes by lens, field and point."""
+    bare = model.without_weights()
+    for part in slices(len(seen.rows)):
+        sd = model.noise * seen.relative[part]
+        rows = bare.rows(points[seen.rows[part]])
+        yield (
+            sd,
+            (seen.uv[part] - rows.mean) / sd[:, None],
+            rows.J / sd[:, None, None],
+            rows.phi / sd[:, None],
+            rows.by_point / sd[:, None, None],
+        )
+
+
+def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
+    """Root of the covariance, mean and log determinant; scaled first, since lens parameters differ by many orders of
+    magnitude."""
+    if not np.isfinite(A).all():
+        raise np.linalg.LinAlgError("a camera has turned its back on points that it saw")
+    scale = 1 / np.sqrt(np.diag(A))
+    L = stable_cholesky(A * scale[:, None] * scale)
+    root = np.ascontiguousarray(solve_triangular(L, np.diag(scale), lower=True))
+    return root, root.T @ (root @ b), float(2 * np.sum(np.log(np.diag(L) / scale)))
+
+
+def slices(n: int, size: int = CHUNK) -> Iterator[slice]:
+    """Of n rows, so many at a time."""
+    for start in range(0, n, size):
+        yield slice(start, min(start + size, n))

@@ -1,0 +1,147 @@
+"""What is known of every camera after seeing the known points: one joint normal distribution, eqs. (13) to (15), (17).
+
+The unknowns of a camera are its lens and pose (a step from where it is linearised) and the weights of its residual
+field, first of u, then of v. Where known positions are exact, cameras are independent. Where positions have an error,
+of a point or of a whole shot, all cameras see the same error: it is eliminated shot by shot, and what is left ties the
+cameras together. Work and memory grow linearly with the number of points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from implicam.geometry import Floats
+from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.normal_equations import NormalEquations, camera_normals, naming_camera, solve_normal
+from implicam.rig_model.schur import ShotSchurBlock, Unknowns, views_by_shots
+from implicam.rig_model.shot_errors import ShotErrors
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """All cameras and what is unknown of them.
+
+    Covariances are kept as *roots* W with `covariance = W^T W`: where parameters nearly make up for each other (focal
+    length and distance of a telephoto lens) the covariance itself would lose all digits of what pixels show.
+    alone: of each camera (P, P), if the known positions were where they seem now; joint: (sum P, sum P) where unknown
+    positions tie the cameras, else None. steps: how far each lens moved. evidence: log marginal likelihood, up to a
+    constant. displacement: (n, 3) of the known points, the posterior mean. ties: (q, sum P) instead of joint, where
+    single known positions are off: the roots of the cameras alone above these rows are the joint root, eq. (27).
+    """
+
+    models: tuple[CameraModel, ...]
+    alone: tuple[Floats, ...]
+    joint: Floats | None
+    steps: tuple[Floats, ...]
+    evidence: float
+    unknowns: Unknowns | None = None
+    displacement: Floats | None = None
+    ties: Floats | None = None
+
+    @property
+    def tied(self) -> bool:
+        """Whether errors of known positions tie the cameras."""
+        return self.joint is not None or self.ties is not None
+
+    def root(self, c: int) -> Floats:
+        """(., P) root of the covariance of camera c's unknowns, everything included. Where cameras are tied, the roots
+        of all have the same rows, and their products are the covariances between cameras."""
+        start, end = self.offsets[c : c + 2]
+        if self.ties is not None:
+            own = np.zeros((self.offsets[-1] + len(self.ties), end - start))
+            own[start:end], own[self.offsets[-1] :] = self.alone[c], self.ties[:, start:end]
+            return own
+        return self.alone[c] if self.joint is None else self.joint[:, start:end]
+
+    def shared_root(self, c: int) -> Floats:
+        """(q, P) the part of the root by which camera c is tied to the others."""
+        start, end = self.offsets[c : c + 2]
+        both = self.joint if self.ties is None else self.ties
+        assert both is not None
+        return both[:, start:end]
+
+    @property
+    def offsets(self) -> list[int]:
+        """Where each camera's unknowns start."""
+        ends = np.cumsum([model.size for model in self.models])
+        return [0, *map(int, ends)]
+
+
+def condition(
+    models: tuple[CameraModel, ...], points: Floats, sightings: tuple[Sightings, ...], errors: ShotErrors | None
+) -> Posterior:
+    """The posterior from known points (n, 3) and what each camera saw, eqs. (13) to (15).
+
+    The models returned have moved to the posterior mean, so that a second call linearises there.
+    """
+    normals = camera_normals(models, points, sightings)
+    if errors is None:
+        return _independent(models, normals)
+    return _tied(models, points, sightings, normals, errors)
+
+
+def _independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]) -> Posterior:
+    """Known positions are exact: every camera on its own, eq. (13)."""
+    value, means, roots = 0.0, [], []
+    for c, normal in enumerate(normals):
+        with naming_camera(c):
+            root, mean, log_determinant = solve_normal(normal.A, normal.b)
+        value += 0.5 * (float(normal.b @ mean) - log_determinant - normal.squares - normal.logs)
+        means.append(mean)
+        roots.append(root)
+    return Posterior(moved(models, means), tuple(roots), None, _steps(models, means), value)
+
+
+def _tied(
+    models: tuple[CameraModel, ...],
+    points: Floats,
+    sightings: tuple[Sightings, ...],
+    normals: list[NormalEquations],
+    errors: ShotErrors,
+) -> Posterior:
+    """All cameras see the same errors of the known positions, eqs. (14) and (15)."""
+    ends = np.cumsum([normal.b.size for normal in normals])
+    A, b = block_diag(*(normal.A for normal in normals)), np.concatenate([normal.b for normal in normals])
+    value = -sum(normal.squares + normal.logs for normal in normals)
+    parts = list(views_by_shots(sightings, errors))
+
+    def meeting(seen: tuple[Sightings, ...], part: slice) -> ShotSchurBlock:
+        return ShotSchurBlock.of(models, points, seen, errors, part)
+
+    kept = meeting(*parts[0]) if len(parts) == 1 else None  # of many, each is made twice and never kept
+    alone = []
+    for c, normal in enumerate(normals):
+        with naming_camera(c):
+            alone.append(solve_normal(normal.A, normal.b)[0])
+    for each in parts:
+        block = kept or meeting(*each)
+        squares, logs = block.eliminate(A, b)
+        value += squares - logs
+    joint, mean, log_determinant = solve_normal(A, b)
+    value += float(b @ mean) - log_determinant
+    means = np.split(mean, ends[:-1])
+    found = np.concatenate([(kept or meeting(*each)).unknowns(mean) for each in parts])
+    displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
+    unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
+    return Posterior(
+        moved(models, means), tuple(alone), joint, _steps(models, means), 0.5 * value, unknowns, displacement
+    )
+
+
+def moved(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
+    """Each camera at its posterior mean, the weights of its field too."""
+    return tuple(
+        replace(
+            model,
+            camera=model.camera.moved(mean[: model.camera.size]),
+            weights=np.ascontiguousarray(mean[model.camera.size :].reshape(2, -1).T),
+        )
+        for model, mean in zip(models, means, strict=True)
+    )
+
+
+def _steps(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[Floats, ...]:
+    return tuple(mean[: model.camera.size] for model, mean in zip(models, means, strict=True))

@@ -1,0 +1,115 @@
+"""Errors that whole shots of known positions share, eliminated from the normal equations of the cameras.
+
+A Schur complement, shot by shot: eqs. (14) and (15).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from implicam.geometry import Floats
+from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.normal_equations import slices, whitened_rows
+from implicam.rig_model.shot_errors import ShotErrors
+from implicam.threads import side_by_side
+
+
+class Unknowns(NamedTuple):
+    """Of all shots, in their sds: mean (shots * k,), covariance, and cross, of which `root^T cross` with the joint root
+    is the covariance with the cameras' (sum P, shots * k)."""
+
+    mean: Floats
+    covariance: Floats
+    cross: Floats
+
+
+def views_by_shots(
+    sightings: tuple[Sightings, ...], errors: ShotErrors
+) -> Iterator[tuple[tuple[Sightings, ...], slice]]:
+    """The sightings of some shots at a time, so that memory does not grow with their number."""
+    for part in slices(errors.count, 512):
+        inside = (errors.shot >= part.start) & (errors.shot < part.stop)
+        yield tuple(seen.select(inside[seen.rows]) for seen in sightings), part
+
+
+class ShotSchurBlock(NamedTuple):
+    """How some shots' unknowns meet each other and the cameras', eq. (14): H (S, k, k), g (S, k), G (S, k, sum P)."""
+
+    H: Floats
+    g: Floats
+    G: Floats
+
+    @classmethod
+    def of(
+        cls,
+        models: tuple[CameraModel, ...],
+        points: Floats,
+        sightings: tuple[Sightings, ...],
+        errors: ShotErrors,
+        part: slice,
+    ) -> ShotSchurBlock:
+        """From the views of these shots."""
+        S, k = part.stop - part.start, errors.basis.shape[2]
+        found = side_by_side(
+            lambda pair: _meet(pair[0], points, pair[1], errors, part), list(zip(models, sightings, strict=True))
+        )
+        H = np.eye(k) + np.sum([one.H for one in found], axis=0)
+        assert H.shape == (S, k, k)
+        return cls(H, np.sum([one.g for one in found], axis=0), np.concatenate([one.G for one in found], axis=2))
+
+    def eliminate(self, A: Floats, b: Floats) -> tuple[float, float]:
+        """Take the shots out of the cameras' normal equations, eq. (15); what they add to the evidence."""
+        L = np.linalg.cholesky(self.H)
+        half = np.linalg.solve(L, np.concatenate([self.G, self.g[..., None]], axis=2))
+        flat = half.reshape(-1, half.shape[2])
+        A -= flat[:, :-1].T @ flat[:, :-1]
+        b -= flat[:, :-1].T @ flat[:, -1]
+        logs = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
+        return float(np.sum(flat[:, -1] ** 2)), logs
+
+    def unknowns(self, mean: Floats) -> Floats:
+        """(S, k) posterior mean, from that of the cameras."""
+        found = np.linalg.solve(self.H, (self.g - self.G @ mean)[..., None])[..., 0]
+        return np.asarray(found, dtype=np.float64)
+
+    def all_unknowns(self, mean: Floats, joint: Floats) -> Unknowns:
+        """What is known of the shots' errors, after that of the cameras."""
+        S, k = self.g.shape
+        inverse = np.linalg.inv(self.H)
+        pull = (inverse @ self.G).reshape(S * k, -1)
+        cross = -joint @ pull.T
+        covariance = cross.T @ cross
+        for s in range(S):
+            covariance[s * k : (s + 1) * k, s * k : (s + 1) * k] += inverse[s]
+        return Unknowns(self.unknowns(mean).ravel(), covariance, cross)
+
+
+def _meet(model: CameraModel, points: Floats, seen: Sightings, errors: ShotErrors, part: slice) -> ShotSchurBlock:
+    S, k = part.stop - part.start, errors.basis.shape[2]
+    p, m = model.camera.size, len(model.field.inducing)
+    total = ShotSchurBlock(np.zeros((S, k, k)), np.zeros((S, k)), np.zeros((S, k, model.size)))
+    start = 0
+    for sd, y, J, phi, by_point in whitened_rows(model, points, seen):
+        rows = seen.rows[start : start + len(sd)]
+        start += len(sd)
+        B = by_point @ errors.scaled[rows]  # (n, 2, k)
+        if S == 1:  # all points in one sum: a matrix product
+            flat = B.reshape(-1, k)
+            total.H[0] += flat.T @ flat
+            total.g[0] += flat.T @ y.ravel()
+            total.G[0, :, :p] += flat.T @ J.reshape(-1, p)
+            for axis in range(2):
+                total.G[0, :, p + axis * m : p + (axis + 1) * m] += B[:, axis].T @ phi
+            continue
+        shot = errors.shot[rows] - part.start
+        Bt = B.swapaxes(1, 2)
+        np.add.at(total.H, shot, Bt @ B)
+        np.add.at(total.g, shot, np.einsum("nik,ni->nk", B, y))
+        np.add.at(total.G[:, :, :p], shot, Bt @ J)
+        for axis in range(2):
+            block = total.G[:, :, p + axis * m : p + (axis + 1) * m]
+            np.add.at(block, shot, B[:, axis, :, None] * phi[:, None, :])
+    return total
