@@ -53,6 +53,31 @@ def test_known_positions_that_are_slightly_off_are_no_doubt_where_the_fit_has_fo
     assert 0.1 < verdict.held_out.rms < 1.5 * verdict.held_out.stated
 
 
+@pytest.mark.parametrize("method", [ic.ForwardGP, ic.Explicit])
+@pytest.mark.parametrize("views_state", [True, False])
+def test_known_positions_stated_far_too_good_are_doubtful(
+    method: type[ic.ForwardGP] | type[ic.Explicit], views_state: bool
+) -> None:
+    """Off by 1 mm, stated as 0.01 mm: little more than half of the points lay in their ellipsoids, and it was usable."""
+    data = rig(50, noise_of_positions=1.0)
+    data = replace(data, known=replace(data.positions, sd=np.full((50, 3), 0.01)))
+    if not views_state:
+        data = replace(data, observations=replace(data.observations, sd=np.full_like(data.observations.uv, np.nan)))
+    verdict = ic.judge(method().fit(data))
+    assert verdict.held_out is not None
+    if verdict.held_out.inside > 0.75 and not views_state:  # then nothing states how good the views are, and all fits
+        return
+    assert verdict.word == DOUBTFUL
+    assert " ".join(verdict.reasons).count("The stated sds of the known positions seem too small") == 1
+
+
+@pytest.mark.parametrize("sd", [0.1, 1.0])
+def test_known_positions_stated_right_are_usable(sd: float) -> None:
+    data = rig(50, noise_of_positions=sd)
+    verdict = ic.judge(ic.Explicit().fit(replace(data, known=replace(data.positions, sd=np.full((50, 3), sd)))))
+    assert (verdict.word, verdict.reasons) == (USABLE, ())
+
+
 def test_explicit_is_judged_too() -> None:
     assert ic.judge(ic.Explicit().fit(rig(25, "stereo"))).word == USABLE
 
