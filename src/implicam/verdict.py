@@ -404,7 +404,7 @@ def _of_stated_sds(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _seen_and_predicted(calibration: Calibration) -> tuple[Floats, Floats]:
-    """(n, cameras, 2) each: pixels of the known points, and where the calibration has them; none where it cannot say."""
+    """(n, cameras, 2) each: pixels of the known points, and where the calibration has them; n = 0 if it cannot say."""
     predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
     data = calibration.data
     uv = np.where(copies_of(data).cameras[:, None], np.nan, data.observations.uv)
