@@ -108,6 +108,8 @@ def test_odd_cameras_measure_as_well_as_ordinary_ones(unusual: Unusual) -> None:
     found = evaluate(calibration, new, regions=False).coverage.overall
     assert found.rmse_over_limit < 1.5
     assert found.nees.value < 5
+    asked = "is an axis of the known positions negated, or are two exchanged (left-handed)?"
+    assert any(asked in note for note in calibration.notes()) == (unusual.mirror == "all")
 
 
 def test_the_kind_is_told_stored_and_found_again(tmp_path: Path) -> None:

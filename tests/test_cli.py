@@ -426,6 +426,8 @@ FAILURES = {
     "measure FILE CSV": "empty.csv is empty",
     "measure FILE nothing": "nothing does not exist",
     "report nothing": "nothing does not exist",
+    "calibrate RIG -o RIG": "rig is a folder, and a file is to be written.",
+    "measure FILE CHECK -o RIG": "rig is a folder, and a file is to be written.",
     "simulate RIG": "add --overwrite",
 }
 OF_TYPER = ["calibrat", "measure", "measure --outptu x", "calibrate RIG", "simulate x --seed -1", "evaluate RIG --cv 1",

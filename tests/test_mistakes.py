@@ -96,6 +96,14 @@ def test_a_fit_that_fails_says_why(method: type[ic.ForwardGP] | type[ic.Explicit
         method().fit(at(data, np.roll(data.xyz, 1, axis=0)))
 
 
+@pytest.mark.parametrize("method", [ic.ForwardGP, ic.Explicit])
+def test_a_fit_that_fails_says_it_once(method: type[ic.ForwardGP] | type[ic.Explicit]) -> None:
+    data = known("stereo", 30)
+    with pytest.raises(FitError) as error:
+        method().fit(with_column(data, 1, np.roll(data.observations.uv[:, 1], 1, axis=0)))
+    assert str(error.value).count("1 row late") == 1
+
+
 def test_half_in_metres_is_not_usable() -> None:
     data = known("stereo", 40)
     xyz = data.xyz.copy()

@@ -53,6 +53,22 @@ def test_known_positions_that_are_slightly_off_are_no_doubt_where_the_fit_has_fo
     assert 0.1 < verdict.held_out.rms < 1.5 * verdict.held_out.stated
 
 
+@pytest.mark.parametrize("method", [ic.ForwardGP, ic.Explicit])
+def test_known_positions_stated_far_too_good_are_doubtful(method: type[ic.ForwardGP] | type[ic.Explicit]) -> None:
+    """Off by 1 mm, stated as 0.01 mm: half of the points lay in their ellipsoids, and it was usable."""
+    data = rig(50, noise_of_positions=1.0)
+    verdict = ic.judge(method().fit(replace(data, known=replace(data.positions, sd=np.full((50, 3), 0.01)))))
+    assert verdict.word == DOUBTFUL
+    assert " ".join(verdict.reasons).count("The stated sds of the known positions seem too small") == 1
+
+
+@pytest.mark.parametrize("sd", [0.1, 1.0])
+def test_known_positions_stated_right_are_usable(sd: float) -> None:
+    data = rig(50, noise_of_positions=sd)
+    verdict = ic.judge(ic.Explicit().fit(replace(data, known=replace(data.positions, sd=np.full((50, 3), sd)))))
+    assert (verdict.word, verdict.reasons) == (USABLE, ())
+
+
 def test_explicit_is_judged_too() -> None:
     assert ic.judge(ic.Explicit().fit(rig(25, "stereo"))).word == USABLE
 
@@ -78,6 +94,15 @@ def test_rows_copied_are_doubtful_and_the_error_is_that_of_new_points(
     with pytest.raises(SystemExit):
         main(["measure", str(file), str(CASES / "rows-copied" / "new.csv"), "-o", str(tmp_path / "m.csv")])
     assert "found doubtful when it was made" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_one_camera_late_is_said_once() -> None:
+    data = rig(40)
+    uv = data.observations.uv.copy()
+    uv[:, 1] = np.roll(uv[:, 1], 1, axis=0)
+    reasons = ic.judge(ic.ForwardGP().fit(with_pixels(data, uv))).reasons
+    assert sum("1 row late" in reason for reason in reasons) == 1
+    assert not any("cam2 misses" in reason or "like another camera" in reason for reason in reasons)
 
 
 def test_a_camera_that_moved_halfway_is_named() -> None:
@@ -186,6 +211,13 @@ def test_errors_far_above_the_error_bars(off: float, word: str) -> None:
     verdict = ic.judge(_Pretends(TRUE, off))
     assert verdict.word == word
     assert bool(verdict.reasons) == (word != USABLE)
+
+
+def test_error_bars_too_small_beside_stated_sds() -> None:
+    stated = replace(TRUE, known=replace(TRUE.positions, sd=np.full((25, 3), 0.01)))
+    verdict = ic.judge(_Pretends(stated, 0.06))
+    assert verdict.word == DOUBTFUL
+    assert verdict.reasons[0].endswith("The stated sds of the known positions seem too small.")
 
 
 def test_not_usable_writes_nothing_unless_forced(

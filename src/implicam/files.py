@@ -53,6 +53,7 @@ _MAX_NPY_HEADER = 10_000
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside `path`; on leaving without error, rename it into place."""
     path = Path(path)
+    must_be_no_folder(path)
     parent = _existing_folder(path.parent)
     with failing_to_write(str(path)):
         handle, name = tempfile.mkstemp(prefix=_partial_prefix(path), dir=parent)
@@ -65,6 +66,14 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def must_be_no_folder(path: Path) -> None:
+    """ImplicamError where a file is to be written and a folder has its name."""
+    if path.is_dir():
+        raise ImplicamError(
+            f"{path} is a folder, and a file is to be written.", fix=f"name a file, {path / 'NAME'} say"
+        )
 
 
 @contextmanager

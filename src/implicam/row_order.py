@@ -24,8 +24,8 @@ SLIPPED = 3
 REVERSED = 0
 """In place of a number of rows: from the last row to the first."""
 
-FEWEST = 11
-"""Views that a linear camera, of eleven numbers, is fitted to here: two numbers each."""
+FEWEST = 10
+"""Views that a linear camera is fitted to here: 20 numbers for 11."""
 
 CLEAR = 0.2
 """What is left with the rows put right, in what is left as they are, that says that they were wrong."""

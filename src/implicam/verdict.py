@@ -58,6 +58,9 @@ depend on the place, and so on the order of a lattice. Views before and after a 
 WORST_NEES, HOPELESS_NEES = 7.0, 60.0
 """Mean NEES of held-out points, 3 is right, above which error bars are doubtful, and above which they are nothing."""
 
+USUAL_OUTSIDE = 0.15
+"""Share of the held-out points outside of their 95 % ellipsoids that is usual: 5 %, and wrong views."""
+
 TRIMMED = 0.05
 """Share of the held-out points, the worst and at least one, that have no say: a wrong view may hide among two."""
 
@@ -113,7 +116,9 @@ class Verdict:
 def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
     """Judge a calibration by its known points: a few fits without some of them, and what the data show."""
     held_out, failed = _held_out(calibration, progress)
-    findings = [*failed, *_of_held_out(held_out, calibration), *_of_data(calibration.data)]
+    sds = list(_of_stated_sds(calibration))
+    cure = _SDS if _declared(calibration.data) and not sds else _LOOK
+    findings = [*failed, *_of_held_out(held_out, calibration, cure), *sds, *_of_data(calibration.data)]
     findings += _of_cameras(calibration, {name for finding in findings for name in finding.cameras})
     reasons = tuple(finding.reason for finding in sorted(findings, key=lambda finding: not finding.grave))
     word = NOT_USABLE if any(finding.grave for finding in findings) else DOUBTFUL if findings else USABLE
@@ -233,7 +238,7 @@ def _summary(found: list[_Measured], how: str) -> HeldOut | None:
     )
 
 
-def _of_held_out(found: HeldOut | None, calibration: Calibration) -> Iterator[Finding]:
+def _of_held_out(found: HeldOut | None, calibration: Calibration, cure: str) -> Iterator[Finding]:
     if found is None:
         return
     unit = calibration.data.length_unit
@@ -246,17 +251,11 @@ def _of_held_out(found: HeldOut | None, calibration: Calibration) -> Iterator[Fi
         yield Finding(False, f"{within}: this is hardly a measurement, as the error bars say. {_LOOK}")
     elif found.nees > HOPELESS_NEES and found.inside < 0.5:
         yield Finding(True, f"{said}, where the error bars say {found.stated:.2g}: they mean nothing. {_LOOK}")
-    elif found.rms > USELESS * extent:  # honest error bars make no measurement of it
-        yield Finding(
-            False,
-            f"{said}, and all of them lie within {extent:.2g} {unit}: the cameras hardly fix a position. Look whether "
-            "they see the points from different directions, and whether two of them are one camera.",
-        )
-    elif found.nees > WORST_NEES:
+    elif found.nees > WORST_NEES or _beyond(round((1 - found.inside) * found.points), found.points, USUAL_OUTSIDE):
         yield Finding(
             False,
             f"{said}, where the error bars say {found.stated:.2g}, and {100 * found.inside:.0f} % lie in their 95 % "
-            f"ellipsoids. {_LOOK}",
+            f"ellipsoids. {cure}",
         )
     tested = found.points + round(found.contradicting * found.points / max(1 - found.contradicting, 1e-3))
     if found.contradicting > MANY_REJECTED and _beyond(round(found.contradicting * tested), tested, USUAL_WRONG):
@@ -271,6 +270,8 @@ _LOOK = (
     "Look for wrong known positions (a unit, an axis, names in another order), a camera that moved in between, or "
     "known points that fill too little of the volume; try other methods (implicam compare)."
 )
+
+_SDS = "The stated sds of the known positions seem too small."
 
 
 def _of_network(calibration: Calibration) -> Iterator[Finding]:
@@ -323,7 +324,7 @@ def _of_cameras(calibration: Calibration, explained: set[str]) -> Iterator[Findi
         own = [finding for finding in missed if name in finding.cameras]
         if name in explained or not (own or any(name in finding.cameras for finding in rejected)):
             continue
-        why = change_of(data.xyz, data.observations.uv[:, c])
+        why = change_of(data.xyz, data.observations.uv[:, c]) if data.known is not None else ""
         yield from [of_rows(name, why)] if why else own
 
 
@@ -353,13 +354,9 @@ def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
 
 def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
     """Cameras that miss their own known points, all of them or from one on."""
-    predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
     data = calibration.data
-    if predict is None or not len(data):
-        return
-    uv = np.where(copies_of(data).cameras[:, None], np.nan, data.observations.uv)
-    predicted = predict(data.xyz)
-    if predicted.shape != uv.shape:
+    uv, predicted = _seen_and_predicted(calibration)
+    if not len(uv):
         return
     moved = set()
     for c, name in enumerate(data.observations.camera_names):
@@ -368,13 +365,8 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
         if first is not None:
             moved.add(name)
             yield of_rows(name, other_camera(int(rows[first])))
-    stated = stated_noise(data.observations)
-    off = np.linalg.norm(predicted - uv, axis=2)
-    off = off / np.sqrt(1 + _seen_of_labels(calibration, predict) / np.where(np.isfinite(stated), stated, np.inf) ** 2)
-    medians = np.array(
-        [np.median(column[~np.isnan(column)]) if (~np.isnan(column)).any() else np.nan for column in off.T]
-    )
-    declared = bool((data.positions.sd > 0).any())  # then the fit explains what the positions are off by
+    medians, stated = _missed_by(calibration)
+    declared = _declared(data)
     for c, (name, median, sd) in enumerate(zip(data.observations.camera_names, medians, stated, strict=True)):
         if name in moved:
             continue
@@ -396,6 +388,47 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
             )
 
 
+def _of_stated_sds(calibration: Calibration) -> Iterator[Finding]:
+    """Known positions with stated sds that most cameras miss by more than those allow."""
+    if not _declared(calibration.data):
+        return
+    medians, stated = _missed_by(calibration)
+    ratio = medians / stated
+    judged = np.isfinite(ratio)
+    if (ratio > RESIDUAL_RATIO).sum() > 0.5 * judged.sum():
+        yield Finding(
+            False,
+            f"In the median the cameras miss the known points by {np.median(ratio[judged]):.2g} times what the stated "
+            f"sds of views and positions allow, where 1.2 is right. {_SDS}",
+        )
+
+
+def _seen_and_predicted(calibration: Calibration) -> tuple[Floats, Floats]:
+    """(n, cameras, 2) each: pixels of the known points, and where the calibration has them; n = 0 if it cannot say."""
+    predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
+    data = calibration.data
+    uv = np.where(copies_of(data).cameras[:, None], np.nan, data.observations.uv)
+    predicted = np.zeros((0, *uv.shape[1:])) if predict is None or data.known is None else predict(data.xyz)
+    return (uv, predicted) if predicted.shape == uv.shape else (uv[:0], predicted[:0])
+
+
+def _missed_by(calibration: Calibration) -> tuple[Floats, Floats]:
+    """(cameras,) each, in pixels: median error at the known points, as of positions that are right; stated noise."""
+    uv, predicted = _seen_and_predicted(calibration)
+    stated = stated_noise(calibration.data.observations)
+    if not len(uv):
+        return np.full(len(stated), np.nan), stated
+    off = np.linalg.norm(predicted - uv, axis=2)
+    off = off / np.sqrt(1 + _seen_of_labels(calibration) / np.where(np.isfinite(stated), stated, np.inf) ** 2)
+    columns = [column[~np.isnan(column)] for column in off.T]
+    return np.array([np.median(column) if len(column) else np.nan for column in columns]), stated
+
+
+def _declared(data: Dataset) -> bool:
+    """Whether somebody says how far the known positions may be off."""
+    return data.known is not None and bool((data.positions.sd > 0).any())
+
+
 def _moved_at(residual: Floats) -> int | None:
     """The row from which residuals (n, 2) are about another mean than before, in the order in which they were taken:
     where two means explain more than half of them, and chance (F, for any of the rows) would not. None where not."""
@@ -413,10 +446,11 @@ def _moved_at(residual: Floats) -> int | None:
     return int(k[best]) if explained > MOVED and by_chance < RARE else None
 
 
-def _seen_of_labels(calibration: Calibration, predict: Callable[[Floats], Floats]) -> Floats:
+def _seen_of_labels(calibration: Calibration) -> Floats:
     """(n, cameras) variance in pixels that errors of the known positions, as far as they are estimated, give a view."""
     xyz, covariance = calibration.data.xyz, known_position_covariance(calibration, calibration.data)
-    if not covariance.any():
+    predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
+    if predict is None or not covariance.any():
         return np.zeros((len(xyz), 1))
     step = np.sqrt(np.trace(covariance, axis1=1, axis2=2).max() / 3)
     slope = np.stack([(predict(xyz + d) - predict(xyz - d)) / (2 * step) for d in step * np.eye(3)], axis=-1)

@@ -11,6 +11,7 @@ import typer
 from implicam.calibrators import DEFAULT_METHOD
 from implicam.dataset import Dataset, read_dataset
 from implicam.errors import UsageError, import_extra
+from implicam.files import must_be_no_folder
 
 app = typer.Typer(
     name="implicam",
@@ -125,7 +126,8 @@ def must_be_folder(path: Path) -> None:
 
 
 def must_be_calibration(output: Path) -> None:
-    """UsageError where the name does not end as that of a calibration."""
+    """An error where the name does not end as that of a calibration, or is that of a folder."""
+    must_be_no_folder(output)
     if output.suffix.lower() != CALIBRATION_SUFFIX:
         raise UsageError(
             f"{output} is no name for a calibration.", fix=f"end it in {CALIBRATION_SUFFIX}: -o {output.stem}.implicam"

@@ -53,7 +53,7 @@ from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.dataset.folder import IMAGES
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
-from implicam.files import toml_text
+from implicam.files import must_be_no_folder, toml_text
 from implicam.images import PATTERN
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
@@ -256,6 +256,7 @@ def measure_command(
     json: Json = False,
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
+    must_be_no_folder(output)
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
@@ -329,6 +330,7 @@ def evaluate_command(
     _check_evaluate(dataset, cv, leave_out, wanted.given)
     if report is not None:
         need_plotly()
+        must_be_no_folder(report)
         must_not_replace(report, file, dataset)
     with show.progress(json) as progress:
         if dataset is not None:
@@ -415,6 +417,7 @@ def report_command(
 ) -> None:
     """Write a one-page HTML report with an interactive 3D view."""
     need_plotly()
+    must_be_no_folder(output)
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     with show.progress(json) as progress:

@@ -107,8 +107,8 @@ def _started(
         raise FitError(
             f"{listed} see{'s' * (len(names) == 1)} the known points as in a mirror.",
             why=error.why,
-            fix="an axis of the known positions points the other way (a left-handed frame), or v is counted from below"
-            ": turn the sign of one axis in points.csv, or write height - 1 - v for v"
+            fix="is an axis of the known positions negated, or are two exchanged (left-handed)? Or is v counted from "
+            "below? Turn the sign of one axis in points.csv, or write height - 1 - v for v"
             if everyone
             else "pictures flipped left to right (webcams do so) or through a mirror: write width - 1 - u for u of "
             f"{listed}, or switch the flip off",

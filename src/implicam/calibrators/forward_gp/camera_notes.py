@@ -17,7 +17,10 @@ def kind_notes(fitted: FittedRig, names: Sequence[str]) -> list[str]:
     mirrored = [isinstance(model.camera, GeneralCamera) and model.camera.mirrored for model in models]
     notes = []
     if all(mirrored):
-        notes.append("All pictures are mirrored: v is counted from below, or the world is left-handed.")
+        notes.append(
+            "All pictures are mirrored: is an axis of the known positions negated, or are two exchanged (left-handed)? "
+            "Or is v counted from below?"
+        )
     for number, (name, model) in enumerate(zip(names, models, strict=True)):
         words = _kind(model)
         if mirrored[number] and not all(mirrored):
