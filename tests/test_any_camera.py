@@ -14,7 +14,7 @@ from implicam.calibrators.forward_gp.families import FAMILIES, family_prior
 from implicam.calibrators.forward_gp.general_camera import GeneralCamera
 from implicam.calibrators.forward_gp.lens import TANGENT
 from implicam.dataset import Dataset, Observations, read_dataset
-from implicam.evaluate import cross_validate, evaluate
+from implicam.evaluation import cross_validate, evaluate
 from implicam.geometry import camera_from_linear, resect_affine, resect_robustly, rotation_from_vector
 from implicam.simulate import Unusual, build_rig, random_positions, simulate
 

@@ -29,7 +29,7 @@ from implicam.calibrators.forward_gp.problem import sightings_of, stated_noise
 from implicam.calibrators.forward_gp.scatter import Scatter, condition_scattered
 from implicam.calibrators.forward_gp.shots import Shots
 from implicam.dataset import Dataset, KnownPositions
-from implicam.evaluate import cross_validate, evaluate
+from implicam.evaluation import cross_validate, evaluate
 from implicam.simulate import Rig, Target, build_rig, moving_board, random_positions, simulate
 
 

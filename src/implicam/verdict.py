@@ -24,7 +24,7 @@ from implicam.calibrators.forward_gp.wrong_rows import slipped, what_is_wrong
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
-from implicam.evaluate import known_position_covariance
+from implicam.evaluation import known_position_covariance
 from implicam.mistakes import mistakes_in
 from implicam.progress import Progress, silent
 

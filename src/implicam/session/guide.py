@@ -494,6 +494,6 @@ def _remembered(session: Session) -> list[Step]:
 
 
 def _judged(calibration: Calibration) -> Any:
-    from implicam.evaluate import cross_validate
+    from implicam.evaluation import cross_validate
 
     return cross_validate(calibration.refit, calibration.data, min(10, len(calibration.data)))
