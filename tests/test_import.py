@@ -1,6 +1,7 @@
 """`import implicam` is cheap, shows all that is public, and no module does anything when it is imported.
 
-Each import happens in a fresh process: this one has imported everything already. How long it takes: benchmarks/import_time.py.
+Each import happens in a fresh process: this one has imported everything already. How long one takes:
+benchmarks/import_time.py.
 """
 
 from __future__ import annotations
