@@ -25,6 +25,7 @@ from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluation import known_position_covariance
+from implicam.formatting import percent
 from implicam.mistakes import mistakes_in
 from implicam.progress import Progress, silent
 
@@ -263,14 +264,14 @@ def _of_held_out(found: HeldOut | None, calibration: Calibration) -> Iterator[Fi
     elif found.nees > WORST_NEES:
         yield Finding(
             False,
-            f"{said}, where the error bars say {found.stated:.2g}, and {100 * found.inside:.0f} % lie in their 95 % "
+            f"{said}, where the error bars say {found.stated:.2g}, and {percent(found.inside)} lie in their 95 % "
             f"ellipsoids. {_LOOK}",
         )
     tested = found.points + round(found.contradicting * found.points / max(1 - found.contradicting, 1e-3))
     if found.contradicting > MANY_REJECTED and _beyond(round(found.contradicting * tested), tested, USUAL_WRONG):
         yield Finding(
             False,
-            f"The views of {100 * found.contradicting:.0f} % of the known points contradict each other in a fit that "
+            f"The views of {percent(found.contradicting)} of the known points contradict each other in a fit that "
             "has not seen them. Look whether all cameras took them at the same instants, and for wrong matches.",
         )
 
@@ -288,7 +289,7 @@ def _of_network(calibration: Calibration) -> Iterator[Finding]:
     if n >= 3 * FEWEST_JUDGED and inside < 0.5:
         yield Finding(
             False,
-            f"{100 * inside:.0f} % of the {n} coordinates of points kept for early stopping lie in their 95 % bars: "
+            f"{percent(inside)} of the {n} coordinates of points kept for early stopping lie in their 95 % bars: "
             "the spread of dropout says little of the errors. Take forward-gp, or judge with implicam evaluate --cv 5.",
         )
 

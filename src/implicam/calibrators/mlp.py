@@ -36,6 +36,7 @@ from implicam.calibrators.mlp_training import Examples, train
 from implicam.calibrators.protocol import Arrays, Rejected, Unused, finite_column, same_cameras
 from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_copies
 from implicam.errors import FitError, UsageError
+from implicam.formatting import percent
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import blas_threads
@@ -224,7 +225,7 @@ class MLPCalibration:
             )
         return (
             f"The error bars are dropout spread, not a measurement uncertainty: of the {3 * n} coordinates of {known} "
-            f"kept for early stopping, {100 * self._coverage:.0f} % lie inside their 95 % bars."
+            f"kept for early stopping, {percent(self._coverage)} lie inside their 95 % bars."
         )
 
     def residuals(self) -> dict[str, Any]:

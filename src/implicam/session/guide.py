@@ -27,6 +27,7 @@ from implicam.calibrators import Calibration, ForwardGPCalibration
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.detect import Detected, Detector, View, centred
 from implicam.errors import HardwareError, ImplicamError, UsageError
+from implicam.formatting import json_safe
 from implicam.hardware import Frame, FrameSource, Robot, Trigger, exposed
 from implicam.images import blank
 from implicam.progress import Progress, silent
@@ -384,7 +385,7 @@ class Guide:
         if data is not None and self.equipment.radius is not None:
             data = self._centred(data)
         self.loop.reset(data)
-        self.session.set(HISTORY, [_plain(step) for step in self.loop.history])
+        self.session.set(HISTORY, [json_safe(asdict(step)) for step in self.loop.history])
         self._show(
             data=data, calibration=self.loop.calibration, prospect=self.loop.prospect,
             history=tuple(self.loop.history), stop=self.loop.stop,
@@ -478,10 +479,6 @@ def _notes(state: State) -> Mapping[str, Any]:
         "target": [] if target is None else target.xyz.tolist(),
         "reasons": {look.camera: look.found.reason for look in state.looks if look.found.reason},
     }
-
-
-def _plain(step: Step) -> dict[str, float | None]:
-    return {key: value if np.isfinite(value) else None for key, value in asdict(step).items()}
 
 
 def _remembered(session: Session) -> list[Step]:
