@@ -34,6 +34,7 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports --no-logo
 
 bench: $(VENV)/.dev
+	$(BIN)/python benchmarks/import_time.py
 	$(BIN)/python benchmarks/gp_fit.py
 	$(BIN)/python benchmarks/forward_speed.py
 	$(BIN)/python benchmarks/active_speed.py

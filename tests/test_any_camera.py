@@ -12,7 +12,7 @@ import pytest
 from implicam.calibrators import ForwardGP, load_calibration
 from implicam.calibrators.forward_gp.families import FAMILIES, family_prior
 from implicam.dataset import Dataset, Observations, read_dataset
-from implicam.evaluate import cross_validate, evaluate
+from implicam.evaluation import cross_validate, evaluate
 from implicam.geometry import camera_from_linear, resect_affine, resect_robustly, rotation_from_vector
 from implicam.rig_model.camera import TANGENT
 from implicam.rig_model.general_camera import GeneralCamera

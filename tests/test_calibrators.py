@@ -23,7 +23,7 @@ from implicam.calibrators import (
 )
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import DatasetError, FitError, MissingExtraError, UsageError
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate, simulated
 from implicam.threads import cores, side_by_side
 

@@ -334,18 +334,9 @@ def test_tables_are_never_cut_and_fit_eighty_columns(
     )
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0"), (1.0, "1.00"), (123456.0, "123456"), (-2.714, "-2.71"), (0.00001234, "0.0000123"), (np.nan, "-"),
-     (1e-30, "1.00e-30"), (np.inf, "-"), (99.96, "100.0")],
-)  # fmt: skip
-def test_numbers_read_as_people_write_them(value: float, text: str) -> None:
-    assert show.number(value) == text
-
-
 def test_shares_are_whole_per_cent_with_their_interval() -> None:
-    assert show.percent(Estimate(0.912, 0.872, 0.938)) == "91 [87,94]"
-    assert show.percent(Estimate(np.nan, np.nan, np.nan)) == "-"
+    assert show.percent_interval(Estimate(0.912, 0.872, 0.938)) == "91 [87,94]"
+    assert show.percent_interval(Estimate(np.nan, np.nan, np.nan)) == "-"
 
 
 def test_a_closed_pipe_is_no_error(made: Path) -> None:

@@ -34,7 +34,7 @@ from implicam.compare import (
 from implicam.compare.splits import lattice_planes
 from implicam.dataset import Dataset, KnownPositions, Observations, write_dataset
 from implicam.errors import DatasetError, FitError, NumericalError, UsageError
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 from implicam.figures import compare_figure
 from implicam.geometry import rotation_from_vector
 from implicam.measurement import Measurement

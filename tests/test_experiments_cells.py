@@ -59,7 +59,8 @@ def algebra(seed: int) -> dict[str, Any]:
 
 def surroundings() -> dict[str, Any]:
     counts = [pool["num_threads"] for pool in threadpool_info()]
-    return {"threads": counts, "cores": threads.cores(), "pid": os.getpid()}
+    inside = threads.side_by_side(lambda _: threads.cores(), range(3))
+    return {"threads": counts, "cores": max(threads.cores(), *inside), "pid": os.getpid()}
 
 
 def unlucky(kind: str) -> dict[str, Any]:

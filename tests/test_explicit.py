@@ -21,7 +21,7 @@ from implicam.cameras import BrownConrady
 from implicam.coverage import assess
 from implicam.dataset import Dataset, KnownPositions, Observations, arrays_from_dataset
 from implicam.errors import CalibrationFileError, DatasetError, FitError, UsageError
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 from implicam.exchange import UNKNOWN, ExplicitCamera
 from implicam.exchange import Rig as ExchangeRig
 from implicam.geometry import Pose, rotation_from_vector

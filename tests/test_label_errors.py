@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from implicam.calibrators import ForwardGP, ForwardGPCalibration
 from implicam.dataset import Dataset, KnownPositions
-from implicam.evaluate import cross_validate, evaluate
+from implicam.evaluation import cross_validate, evaluate
 from implicam.rig_model.camera_model import Sightings
 from implicam.rig_model.leave_one_out import left_out_points
 from implicam.rig_model.level_errors import LEVEL, SHOT, levels, untold

@@ -14,7 +14,7 @@ import pytest
 from implicam.coverage import assess, tercile_labels
 from implicam.errors import MissingExtraError, UsageError
 from implicam.figures import error_against_sd, reliability, scene
-from implicam.figures.style import number
+from implicam.formatting import number
 from implicam.measurement import Measurement
 from implicam.report import ReportData, page, write_report
 
@@ -219,15 +219,6 @@ def test_without_plotly_the_cure_is_named(monkeypatch: pytest.MonkeyPatch):
 
 
 # ------------------------------------------------------------------------------------------------------ the figures
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.2134, "0.213"), (0.99996, "1.00"), (0, "0"), (-3.698, "-3.70"), (123.4, "123"), (98765.4, "98765"),
-     (2e-7, "2.00e-07"), (3e9, "3.00e+09"), (np.nan, "–"), (np.inf, "–")],
-)  # fmt: skip
-def test_numbers_read_well(value: float, text: str):
-    assert number(value) == text
 
 
 def test_scene_draws_each_measured_point_and_its_line():

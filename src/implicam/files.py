@@ -12,10 +12,10 @@ import io
 import math
 import os
 import re
+import secrets
 import shutil
 import struct
 import sys
-import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -56,13 +56,11 @@ def replacing(path: Path) -> Iterator[Path]:
     must_be_no_folder(path)
     parent = _existing_folder(path.parent)
     with failing_to_write(str(path)):
-        handle, name = tempfile.mkstemp(prefix=_partial_prefix(path), dir=parent)
-        os.close(handle)
-        temporary = Path(name)
+        temporary = _partial_path(path, parent)
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # less what the umask takes
         try:
             yield temporary
             _flush(temporary)
-            temporary.chmod(0o666 & ~_umask())
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
@@ -94,13 +92,13 @@ def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         )
     parent = _existing_folder(path.parent)
     with failing_to_write(str(path)):
-        temporary = Path(tempfile.mkdtemp(prefix=_partial_prefix(path), dir=parent))
+        temporary = _partial_path(path, parent)
+        temporary.mkdir()
         try:
             yield temporary
             for file in sorted(temporary.rglob("*")):
                 if file.is_file():
                     _flush(file)
-            temporary.chmod(0o777 & ~_umask())
             _swap_in(temporary, path)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -137,6 +135,12 @@ _RETIRED = ".old"
 
 def _partial_prefix(path: Path) -> str:
     return f".{path.name}.partial-"
+
+
+def _partial_path(path: Path, parent: Path) -> Path:
+    """A name that nothing has yet. `tempfile` would give what it makes rights of its own, and the umask, by which to
+    correct them, can only be read by changing it for the whole process."""
+    return parent / f"{_partial_prefix(path)}{secrets.token_hex(4)}"
 
 
 def left_behind(path: Path) -> Path | None:
@@ -176,12 +180,6 @@ def _existing_folder(parent: Path) -> Path:
 def _flush(path: Path) -> None:
     with path.open("rb") as file:
         os.fsync(file.fileno())
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
 
 
 def write_text(path: Path, text: str) -> None:

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import copy_context
+from contextvars import ContextVar, copy_context
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -20,9 +20,23 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+_MOST_CORES: ContextVar[int] = ContextVar("_MOST_CORES", default=sys.maxsize)
+
+
 def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores that the work at hand may use: those of this process, or fewer inside `at_most`."""
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(own, _MOST_CORES.get())
+
+
+@contextmanager
+def at_most(count: int) -> Iterator[None]:
+    """Let the work inside use so many cores at most; what goes on in other threads meanwhile keeps its own number."""
+    token = _MOST_CORES.set(count)
+    try:
+        yield
+    finally:
+        _MOST_CORES.reset(token)
 
 
 @contextmanager

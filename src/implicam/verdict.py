@@ -22,7 +22,8 @@ from implicam.calibrators import MLP, Calibration, InverseGP
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
-from implicam.evaluate import known_position_covariance
+from implicam.evaluation import known_position_covariance
+from implicam.formatting import percent
 from implicam.mistakes import Finding, mistakes_in, of_rows
 from implicam.progress import Progress, silent
 from implicam.rig_model.training_data import stated_noise
@@ -254,14 +255,14 @@ def _of_held_out(found: HeldOut | None, calibration: Calibration, cure: str) -> 
     elif found.nees > WORST_NEES or _beyond(round((1 - found.inside) * found.points), found.points, USUAL_OUTSIDE):
         yield Finding(
             False,
-            f"{said}, where the error bars say {found.stated:.2g}, and {100 * found.inside:.0f} % lie in their 95 % "
+            f"{said}, where the error bars say {found.stated:.2g}, and {percent(found.inside)} lie in their 95 % "
             f"ellipsoids. {cure}",
         )
     tested = found.points + round(found.contradicting * found.points / max(1 - found.contradicting, 1e-3))
     if found.contradicting > MANY_REJECTED and _beyond(round(found.contradicting * tested), tested, USUAL_WRONG):
         yield Finding(
             False,
-            f"The views of {100 * found.contradicting:.0f} % of the known points contradict each other in a fit that "
+            f"The views of {percent(found.contradicting)} of the known points contradict each other in a fit that "
             "has not seen them. Look whether all cameras took them at the same instants, and for wrong matches.",
         )
 
@@ -281,7 +282,7 @@ def _of_network(calibration: Calibration) -> Iterator[Finding]:
     if n >= 3 * FEWEST_JUDGED and inside < 0.5:
         yield Finding(
             False,
-            f"{100 * inside:.0f} % of the {n} coordinates of points kept for early stopping lie in their 95 % bars: "
+            f"{percent(inside)} of the {n} coordinates of points kept for early stopping lie in their 95 % bars: "
             "the spread of dropout says little of the errors. Take forward-gp, or judge with implicam evaluate --cv 5.",
         )
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from implicam.errors import UsageError, did_you_mean
+from implicam.formatting import percent
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Either(Rule):
 
 def _where(step: Step) -> str:
     """Nothing, or which part of the workspace this is about."""
-    return "" if step.measured > 0.995 else f" that enough cameras see ({100 * step.measured:.0f} % of the workspace)"
+    return "" if step.measured > 0.995 else f" that enough cameras see ({percent(step.measured)} of the workspace)"
 
 
 OF = {"worst": "everywhere", "usual": "in 95 % of the workspace", "mean": "on average"}
@@ -134,7 +135,7 @@ class Converged(Rule):
             return ""
         last = values[-self.over - 1 :]
         spread = (max(last) - min(last)) / last[-1]
-        return f"the last {self.over} points changed it by {100 * spread:.0f} %" if spread <= self.change else ""
+        return f"the last {self.over} points changed it by {percent(spread)}" if spread <= self.change else ""
 
 
 @dataclass(frozen=True)

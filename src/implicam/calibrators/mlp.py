@@ -38,6 +38,7 @@ from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_
 from implicam.dataset.requirements import same_cameras
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import FitError, UsageError
+from implicam.formatting import percent
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import blas_threads
@@ -226,7 +227,7 @@ class MLPCalibration:
             )
         return (
             f"The error bars are dropout spread, not a measurement uncertainty: of the {3 * n} coordinates of {known} "
-            f"kept for early stopping, {100 * self._coverage:.0f} % lie inside their 95 % bars."
+            f"kept for early stopping, {percent(self._coverage)} lie inside their 95 % bars."
         )
 
     def residuals(self) -> dict[str, Any]:

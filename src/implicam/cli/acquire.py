@@ -17,6 +17,7 @@ from implicam.dataset import Floats
 from implicam.dataset.folder import csv_text
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.files import write_text
+from implicam.formatting import decimal_number, percent
 from implicam.images import opencv
 
 RULES = "random, sobol, variance, excess, integrated, d-optimal"
@@ -96,12 +97,10 @@ def suggest_command(
     show.table(show.text_table("", ["", *cameras], seen))
     show.line(f"95 % uncertainty in 95 % of the workspace ({room.name}):")
     for words, step in (("now", found.now), (f"then, with all {len(found.targets)}", found.then)):
-        times = f"{show.number(step.excess)} times what pixel noise alone leaves"
-        show.line(f"  {words:<18} {show.number(step.usual)} {unit}, {times}")
+        times = f"{decimal_number(step.excess)} times what pixel noise alone leaves"
+        show.line(f"  {words:<18} {decimal_number(step.usual)} {unit}, {times}")
     if found.now.measured < 0.995:
-        show.note(
-            f"{100 * found.now.measured:.0f} % of the workspace is seen by enough cameras; this is about that part."
-        )
+        show.note(f"{percent(found.now.measured)} of the workspace is seen by enough cameras; this is about that part.")
     if output is not None:
         show.line(f"{output}: {len(found.targets)} targets")
 

@@ -52,8 +52,9 @@ from implicam.cli.app import (
 from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.dataset.folder import IMAGES
 from implicam.errors import DatasetError, UsageError
-from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
+from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import must_be_no_folder, toml_text
+from implicam.formatting import decimal_number
 from implicam.images import PATTERN
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
@@ -108,7 +109,7 @@ def demo_command(
         return
     show.line(
         f"{made.photographs} photographs taken; the ball found in {made.found}, "
-        f"each to {show.number(made.typical_sd, 2)} px\n"
+        f"each to {decimal_number(made.typical_sd, 2)} px\n"
     )
     show.table(show.demo_table(made))
     show.line(
@@ -233,7 +234,7 @@ def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path |
     unit = calibration.data.length_unit
     rms = residuals["leave_one_out_rms"]
     show.line(f"{output or 'no file written'}: {calibration.method} from {residuals['points_used']} points")
-    within = ", ".join(f"{axis} {show.number(value)}" for axis, value in rms.items())
+    within = ", ".join(f"{axis} {decimal_number(value)}" for axis, value in rms.items())
     how = "each left out in turn is predicted from the rest"
     if "held_out" in residuals:
         how = residuals["held_out"]
@@ -276,7 +277,7 @@ def measure_command(
         raise typer.Exit(int(bool(measured.alarm)))
     text = f"{output}: {len(measured)} rows, {count} measured"
     if count:
-        text += f", typical sd {', '.join(f'{a} {show.number(v)}' for a, v in zip('xyz', typical, strict=True))} "
+        text += f", typical sd {', '.join(f'{a} {decimal_number(v)}' for a, v in zip('xyz', typical, strict=True))} "
         text += measured.length_unit
     show.line(text)
     if judged in (DOUBTFUL, NOT_USABLE):

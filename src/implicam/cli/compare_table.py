@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 from rich.table import Table
 
-from implicam.cli.show import number, text_table
+from implicam.cli.show import text_table
 from implicam.compare import RANDOM, SHOT, Row, Trial, plane_of
+from implicam.formatting import decimal_number
 
 
 def compare_table(rows: Sequence[Row], unit: str) -> Table:
@@ -91,14 +92,14 @@ def _compare_cells(row: Row, columns: _CompareColumns, flattery: float = math.na
     mean, error = row.mean, row.standard_error
     return [
         *([str(row.known)] if columns.sizes else []),
-        *([number(100 * mean["measured"])] if columns.partial else []),
+        *([decimal_number(100 * mean["measured"])] if columns.partial else []),
         _plus_minus(mean["rmse"], error["rmse"]),
-        *([number(mean["rmse_common"])] if columns.uneven else []),
-        *([number(flattery, 2) if plane_of(row.split) else ""] if columns.planes else []),
-        *([number(mean["rmse_over_limit"])] if columns.limited else []),
+        *([decimal_number(mean["rmse_common"])] if columns.uneven else []),
+        *([decimal_number(flattery, 2) if plane_of(row.split) else ""] if columns.planes else []),
+        *([decimal_number(mean["rmse_over_limit"])] if columns.limited else []),
         _plus_minus(100 * mean["ellipsoid_95"], 100 * error["ellipsoid_95"]),
-        number(mean["nees"]),
-        number(mean["fit_seconds"], 2),
+        decimal_number(mean["nees"]),
+        decimal_number(mean["fit_seconds"], 2),
     ]
 
 
@@ -118,4 +119,4 @@ def compare_failures(trials: Sequence[Trial]) -> list[str]:
 def _plus_minus(mean: float, error: float) -> str:
     if not math.isfinite(mean):
         return "-"
-    return number(mean) + (f" ± {number(error, 1)}" if math.isfinite(error) else "")
+    return decimal_number(mean) + (f" ± {decimal_number(error, 1)}" if math.isfinite(error) else "")

@@ -13,6 +13,7 @@ from rich.table import Table
 from implicam.cli import show
 from implicam.cli.app import Json, Seed, command, must_be_folder
 from implicam.errors import UsageError
+from implicam.formatting import decimal_number
 
 
 class Experiment(StrEnum):
@@ -125,7 +126,7 @@ def _ball(table: Sequence[Mapping[str, Any]]) -> Table:
 
 def _median(rows: Sequence[Mapping[str, Any]], **wanted: Any) -> str:
     found = [row["rmse"][1] for row in rows if all(row[key] == value for key, value in wanted.items())]
-    return show.number(found[0]) if found else "-"
+    return decimal_number(found[0]) if found else "-"
 
 
 def _published(table: Sequence[Mapping[str, Any]]) -> Table:
@@ -133,8 +134,8 @@ def _published(table: Sequence[Mapping[str, Any]]) -> Table:
     from implicam.experiments.plan import FORWARD, GP, PAPER
 
     rows = [
-        [row["set"], str(row["boards"]), show.number(row["paper_gp_rmse"][0]), _mean(row, PAPER, "rmse"),
-         show.number(row["paper_gp_sd"][0]), _mean(row, PAPER, "sd"), _mean(row, GP, "rmse"),
+        [row["set"], str(row["boards"]), decimal_number(row["paper_gp_rmse"][0]), _mean(row, PAPER, "rmse"),
+         decimal_number(row["paper_gp_sd"][0]), _mean(row, PAPER, "sd"), _mean(row, GP, "rmse"),
          _mean(row, FORWARD, "rmse")]
         for row in table
     ]  # fmt: skip
@@ -144,7 +145,7 @@ def _published(table: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _mean(row: Mapping[str, Any], method: str, key: str) -> str:
-    return show.number(row[method][key][0]) if method in row else "-"
+    return decimal_number(row[method][key][0]) if method in row else "-"
 
 
 def _times(summary: Mapping[str, Any]) -> Table:

@@ -30,14 +30,13 @@ from implicam.compare import Trial
 from implicam.coverage import NEES_RIGHT, Estimate, Summary
 from implicam.demo import HELD_OUT, Demo
 from implicam.detect.folder import DetectionRun
-from implicam.evaluate import Evaluation
+from implicam.evaluation import Evaluation
+from implicam.formatting import decimal_number, json_safe, percent
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.verdict import Verdict
 
 MOST_NOTES = 6
-SMALLEST_IN_DECIMALS = 1e-8
-"""Smaller numbers would be nothing but zeros."""
 err = Console(stderr=True, highlight=False)
 
 
@@ -67,15 +66,7 @@ def progress(quiet: bool = False) -> Iterator[Progress]:
 
 def emit_json(value: Any) -> None:
     """Print JSON; numbers that do not exist are null."""
-    sys.stdout.write(json.dumps(_plain(value), indent=2, ensure_ascii=False) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    sys.stdout.write(json.dumps(json_safe(value), indent=2, ensure_ascii=False) + "\n")
 
 
 def line(text: str) -> None:
@@ -101,19 +92,7 @@ def note(text: str) -> None:
     err.print(f"[bold yellow]note:[/] {escape(text)}", soft_wrap=True)
 
 
-def number(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, never in powers of ten where people would not write them."""
-    if not math.isfinite(value):
-        return "-"
-    if value == 0:
-        return "0"
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    if abs(value) < SMALLEST_IN_DECIMALS:
-        return f"{value:.{digits - 1}e}"
-    return f"{value:.{min(decimals, 9)}f}"
-
-
-def percent(share: Estimate) -> str:
+def percent_interval(share: Estimate) -> str:
     """A share with its 95 % interval, both in whole per cent: more digits would be noise."""
     if not math.isfinite(share.value):
         return "-"
@@ -159,8 +138,8 @@ def calibration_verdict(found: Verdict, unit: str) -> None:
     if found.held_out is not None:
         h = found.held_out
         text += (
-            f"; {h.how}: {h.points} points are off by {number(h.rms)} {unit} rms, their error bars say "
-            f"{number(h.stated)}, and {100 * h.inside:.0f} % are in their 95 % ellipsoids"
+            f"; {h.how}: {h.points} points are off by {decimal_number(h.rms)} {unit} rms, their error bars say "
+            f"{decimal_number(h.stated)}, and {percent(h.inside)} are in their 95 % ellipsoids"
         )
     line(f"verdict: {text}")
     for reason in found.reasons:
@@ -208,7 +187,14 @@ def evaluation_tables(evaluation: Evaluation) -> list[Table]:
         f"Error bars in {unit}",
         ["", "stated 3D", "NEES, ideal 3", "NLL", "CRPS", "they are"],
         [
-            [row.region, number(row.stated_rms), interval(row.nees), number(row.nll), number(row.crps), row.verdict]
+            [
+                row.region,
+                decimal_number(row.stated_rms),
+                interval(row.nees),
+                decimal_number(row.nll),
+                decimal_number(row.crps),
+                row.verdict,
+            ]
             for row in rows
             if row.n
         ],
@@ -217,26 +203,31 @@ def evaluation_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def _error_cells(row: Summary, limited: bool) -> list[str]:
-    lengths = [number(value) for value in (*row.rmse_axes, row.rmse, row.median_error)]
+    lengths = [decimal_number(value) for value in (*row.rmse_axes, row.rmse, row.median_error)]
     points = f"{row.n} of {row.n + row.unmeasured}" if row.unmeasured else str(row.n)
-    return [row.region, points, *lengths, *([number(row.rmse_over_limit)] if limited else [])]
+    return [row.region, points, *lengths, *([decimal_number(row.rmse_over_limit)] if limited else [])]
 
 
 def _coverage_table(rows: Sequence[Summary]) -> Table:
     overall, *regions = rows
-    cells = [["per axis", *(percent(level.pooled) for level in overall.levels)]]
-    cells += [[f"{axis} alone", *(percent(level.axes[i]) for level in overall.levels)] for i, axis in enumerate("xyz")]
-    cells += [["ellipsoid", *(percent(level.ellipsoid) for level in overall.levels)]]
-    cells += [[f"  {row.region}", *(percent(level.ellipsoid) for level in row.levels)] for row in regions if row.n]
-    headings = [f"{100 * level.nominal:.0f} %" for level in overall.levels]
+    cells = [["per axis", *(percent_interval(level.pooled) for level in overall.levels)]]
+    cells += [
+        [f"{axis} alone", *(percent_interval(level.axes[i]) for level in overall.levels)]
+        for i, axis in enumerate("xyz")
+    ]
+    cells += [["ellipsoid", *(percent_interval(level.ellipsoid) for level in overall.levels)]]
+    cells += [
+        [f"  {row.region}", *(percent_interval(level.ellipsoid) for level in row.levels)] for row in regions if row.n
+    ]
+    headings = [percent(level.nominal) for level in overall.levels]
     return text_table("How many % of the points lie within their error bars [95 % interval]", ["", *headings], cells)
 
 
 def interval(estimate: Estimate) -> str:
     """A number with its 95 % interval."""
     if not math.isfinite(estimate.low):
-        return number(estimate.value)
-    return f"{number(estimate.value)} [{number(estimate.low)}, {number(estimate.high)}]"
+        return decimal_number(estimate.value)
+    return f"{decimal_number(estimate.value)} [{decimal_number(estimate.low)}, {decimal_number(estimate.high)}]"
 
 
 def verdict(overall: Summary) -> str:
@@ -245,10 +236,8 @@ def verdict(overall: Summary) -> str:
     if math.isfinite(overall.nees.value):
         text += f"; the mean NEES is {interval(overall.nees)}, and {NEES_RIGHT:.0f} is right"
     if math.isfinite(overall.sd_factor):
-        inside = 100 * overall.level(0.95).ellipsoid.value
-        text += (
-            f"; the 95 % ellipsoids hold {inside:.1f} %, and {number(overall.sd_factor)} times as large would hold 95 %"
-        )
+        inside, factor = percent(overall.level(0.95).ellipsoid.value, 1), decimal_number(overall.sd_factor)
+        text += f"; the 95 % ellipsoids hold {inside}, and {factor} times as large would hold 95 %"
     return text
 
 
@@ -259,7 +248,7 @@ def detection_table(run: DetectionRun) -> Table:
     for count in run.cameras:
         own = sd[:, run.data.observations.camera_names.index(count.camera)]
         own = own[np.isfinite(own[:, 0])]
-        typical = number(float(np.sqrt(np.median(np.mean(own**2, axis=1))))) if len(own) else "-"
+        typical = decimal_number(float(np.sqrt(np.median(np.mean(own**2, axis=1))))) if len(own) else "-"
         rows.append([count.camera, str(count.pictures), str(count.found), str(count.points), typical])
     return text_table("", ["camera", "pictures", "with target", "points", "typical sd, px"], rows)
 
@@ -277,6 +266,6 @@ def demo_table(demo: Demo) -> Table:
     for (cameras, known), trials in lines.items():
         cells: list[str] = []
         for t in trials:
-            cells += [number(t.rmse), number(t.rmse / t.limit), f"{100 * t.coverage_95:.1f} %"]
+            cells += [decimal_number(t.rmse), decimal_number(t.rmse / t.limit), percent(t.coverage_95, 1, none="-")]
         shown.add_row(cameras, str(known), *cells, end_section=known == demo.rows[-1].trial.known)
     return shown

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from implicam.coverage.intervals import Estimate
+from implicam.formatting import json_safe
 
 LEVELS = (0.50, 0.68, 0.90, 0.95, 0.99)
 """Nominal probabilities at which coverage is counted."""
@@ -113,7 +114,7 @@ class Coverage:
 
     def as_dict(self) -> dict[str, Any]:
         """Ready for JSON: plain numbers, lists and text; None where there is no number."""
-        plain: dict[str, Any] = _plain(asdict(self))
+        plain: dict[str, Any] = json_safe(asdict(self))
         for row, summary in zip(plain["rows"], self.rows, strict=True):
             row["verdict"] = summary.verdict
         return plain
@@ -122,11 +123,3 @@ class Coverage:
 def _ratio(a: float, b: float) -> float:
     """The quotient; infinite where it is not known, so that it proves nothing."""
     return a / b if np.isfinite(a) and b > 0 else float("inf")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

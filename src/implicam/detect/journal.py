@@ -23,6 +23,7 @@ from implicam.calibration_file import package_version
 from implicam.dataset.model import check_name
 from implicam.detect.model import Detected, Detector, View
 from implicam.errors import DatasetError, ImageError, ImplicamError, MissingExtraError
+from implicam.formatting import json_default
 from implicam.images import blank, read_picture
 from implicam.progress import Progress
 from implicam.threads import side_by_side
@@ -67,7 +68,9 @@ class Entry:
 
 def digest(detector: Detector) -> str:
     """One short text for a detector, all its options, and the version of implicam, which may find something else."""
-    text = json.dumps([package_version(), type(detector).__name__, detector.options()], sort_keys=True, default=_plain)
+    text = json.dumps(
+        [package_version(), type(detector).__name__, detector.options()], sort_keys=True, default=json_default
+    )
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -96,7 +99,7 @@ class Journal:
 
     def add(self, key: Key, entry: Entry) -> Entry:
         """Write a line; the entry as it will be read again. TypeError or ValueError for what JSON cannot hold."""
-        content = json.dumps({**key._asdict(), **entry.as_dict()}, default=_plain).encode()
+        content = json.dumps({**key._asdict(), **entry.as_dict()}, default=json_default).encode()
         line = content[:-1] + _CHECK + str(zlib.crc32(content)).encode() + b"}\n"
         read = _entry(line)
         if read is None:
@@ -145,15 +148,6 @@ def _entry(line: bytes) -> tuple[Key, Entry] | None:
         return key, entry
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
         return None
-
-
-def _plain(value: Any) -> Any:
-    """NumPy's numbers and arrays, tuples' kin and files as JSON knows them."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"a value of type {type(value).__name__} has no form in JSON")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from implicam.experiments import published
-from implicam.experiments.markdown import number, percent, quartiles, span, spread, table
+from implicam.experiments.markdown import number, quartiles, span, spread, table
 from implicam.experiments.plan import EXPLICIT, FORWARD, GP, METHODS, NETWORK, PAPER, SHOWN, slug
 from implicam.experiments.source import BALL, BOARD_CHECK, BUDGETS, CHECK, RANDOM
+from implicam.formatting import percent
 
 Summary = Mapping[str, Any]
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from implicam.dataset import Floats
-from implicam.figures.style import number
+from implicam.formatting import number
 
 HOLDS, FAILS, OPEN = "holds", "does not hold", "not decided"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from implicam.figures.style import number as plain
+from implicam import formatting
 
 
 def table(head: Sequence[str], body: Iterable[Sequence[str]], *, left: int = 1) -> str:
@@ -15,10 +15,8 @@ def table(head: Sequence[str], body: Iterable[Sequence[str]], *, left: int = 1) 
 
 
 def number(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
-    """So many significant digits; a dash where there is none."""
-    if value is None:
-        return "–"
-    return ("+" if sign and value > 0 else "") + ("−" if value < 0 else "") + plain(abs(value), digits)
+    """As in `formatting.number`, with the minus of print."""
+    return formatting.number(value, digits, sign=sign, minus="−")
 
 
 def quartiles(values: Sequence[float | None]) -> str:
@@ -38,8 +36,3 @@ def span(values: Sequence[float | None]) -> str:
 def spread(values: Sequence[float | None] | None) -> str:
     """Mean / standard deviation, or nothing."""
     return "" if not values else f"{number(values[0])} / {number(values[1], 2)}"
-
-
-def percent(value: float | None) -> str:
-    """A share in whole per cent."""
-    return "–" if value is None else f"{100 * value:.0f} %"

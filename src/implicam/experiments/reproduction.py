@@ -23,6 +23,7 @@ from implicam.experiments.plan import Plan
 from implicam.experiments.source import Source
 from implicam.experiments.stored import Values
 from implicam.files import write_text
+from implicam.formatting import json_safe
 from implicam.progress import Progress, silent
 
 EXPERIMENTS = (ball.NAME, active.NAME, board.NAME)
@@ -89,7 +90,7 @@ def reproduce(
     figures = dict(draw(rows, values, folder / "figures"))
     summary = {
         "source": {**source.options, "sets": {name: list(cameras) for name, cameras in source.sets.items()}},
-        "plan": _plain(plan),
+        "plan": asdict(plan),
         "parts": {name: _part(cells[name], seconds) for name in EXPERIMENTS if cells.get(name)},
         "cells": {"all": len(everything), "already": results.already, "failed": len(results.failures)},
         "failures": {name: " ".join(text.split()) for name, text in results.failures.items()},
@@ -98,8 +99,8 @@ def reproduce(
         "verdicts": [asdict(verdict) for verdict in verdicts(rows)],
         "figures": figures,
     }
-    write_text(folder / "summary.json", json.dumps(_without_nan(summary), indent=1) + "\n")
-    write_text(folder / "reproduce.md", markdown(_without_nan(summary)))
+    write_text(folder / "summary.json", json.dumps(json_safe(summary, 6), indent=1) + "\n")
+    write_text(folder / "reproduce.md", markdown(json_safe(summary, 6)))
     progress("tables and figures", 1, 1)
     notes = [*results.notes, *(f"{source.folder} has no data for {name}; it is left out" for name in absent)]
     files = {"account": folder / "reproduce.md", "figures": folder / "figures", "summary": folder / "summary.json"}
@@ -158,18 +159,3 @@ def _csv(rows: Sequence[Row]) -> str:
     writer.writeheader()
     writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
     return buffer.getvalue()
-
-
-def _plain(plan: Plan) -> dict[str, Any]:
-    return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(plan).items()}
-
-
-def _without_nan(value: Any) -> Any:
-    """JSON has no NaN; and six digits are enough to read."""
-    if isinstance(value, Mapping):
-        return {str(key): _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if value - value == 0 else None
-    return value

@@ -22,12 +22,12 @@ from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import NamedTuple, Protocol
 
-from implicam import threads
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.experiments.stored import encode
+from implicam.threads import at_most
 
 CONNECT_SECONDS = 10
 LOOK_SECONDS = 5  # waiting for results, look so often whether any can come
@@ -86,22 +86,16 @@ def _one_thread() -> Iterator[None]:
     """BLAS and OpenMP on one thread, whatever is loaded now, and no thread pools of our own."""
     from threadpoolctl import threadpool_limits
 
-    cores, torch = threads.cores, sys.modules.get("torch")
+    torch = sys.modules.get("torch")
     torch_threads = torch.get_num_threads() if torch else 0
-    threads.cores = _one
     if torch:
         torch.set_num_threads(1)
     try:
-        with threadpool_limits(limits=1):
+        with threadpool_limits(limits=1), at_most(1):
             yield
     finally:
-        threads.cores = cores
         if torch:
             torch.set_num_threads(torch_threads)
-
-
-def _one() -> int:
-    return 1
 
 
 class Workers(Protocol):
@@ -195,10 +189,13 @@ class LocalProcesses:
 
     def __init__(self, jobs: int) -> None:
         self._loky = import_extra("joblib.externals.loky", "paper", "computing cells side by side")
-        # loky replaces a process whose memory has grown, loses nothing by it, and says so as if something were wrong.
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
         self.at_once = jobs
         self._pool = self._new_pool()
+        # loky replaces a process whose memory has grown, loses nothing by it, and says so as if something were wrong.
+        # It does so in a thread of its own, so that the filter has to stand as long as the processes do.
+        self._warnings = ExitStack()
+        self._warnings.enter_context(warnings.catch_warnings())
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
 
     def _new_pool(self) -> Executor:
         pool: Executor = self._loky.ProcessPoolExecutor(self.at_once, env=_ONE_THREAD)
@@ -208,7 +205,7 @@ class LocalProcesses:
         """Start `attempt(task)`, in a new pool where the old one is broken."""
         with suppress(self.death):
             return self._pool.submit(attempt, task)
-        self.close()
+        self._end_pool()
         self._pool = self._new_pool()
         return self._pool.submit(attempt, task)
 
@@ -217,6 +214,10 @@ class LocalProcesses:
 
     def close(self) -> None:
         """End the processes, whatever they do."""
+        self._end_pool()
+        self._warnings.close()
+
+    def _end_pool(self) -> None:
         self._pool.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
 
 

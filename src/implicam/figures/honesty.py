@@ -9,7 +9,8 @@ import numpy as np
 
 from implicam.coverage import Coverage, Estimate
 from implicam.dataset import Floats, Names
-from implicam.figures.style import BLUE, CLEAR, GREY, VERMILLION, axis, graph_objects, layout, number, plain
+from implicam.figures.style import BLUE, CLEAR, GREY, VERMILLION, axis, graph_objects, layout, plain
+from implicam.formatting import number
 
 TOOLBAR_PX = 36
 """Height of plotly's toolbar, which otherwise lies on the legend and on the names of the lines."""

@@ -23,7 +23,8 @@ from implicam.figures.panels3d import (
     title_of,
     to_fit,
 )
-from implicam.figures.style import BLACK, BLUE, CLEAR, GREEN, GREY, ORANGE, SKY, graph_objects, layout, number, plain
+from implicam.figures.style import BLACK, BLUE, CLEAR, GREEN, GREY, ORANGE, SKY, graph_objects, layout, plain
+from implicam.formatting import number
 
 # Nothing may be loaded from anywhere; Plotly compiles some of its own code, hence eval.
 POLICY = (

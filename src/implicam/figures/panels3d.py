@@ -22,7 +22,8 @@ import numpy as np
 from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.figures.printed import PURPOSE, blank
-from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, number
+from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY
+from implicam.formatting import number
 
 Panel = Mapping[str, Any]
 

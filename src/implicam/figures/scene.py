@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from implicam.dataset import Floats, Names
-from implicam.figures.style import CLEAR, GREY, SKY, VERMILLION, graph_objects, layout, number, plain
+from implicam.figures.style import CLEAR, GREY, SKY, VERMILLION, graph_objects, layout, plain
+from implicam.formatting import number
 
 _FACTORS = (1, 10, 100, 1000, 10_000)
 # A line is seen from about a fiftieth of the scene; then neighbours do not yet tangle.

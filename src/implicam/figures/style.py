@@ -1,9 +1,8 @@
-"""What the figures share: colours, number format, layout."""
+"""What the figures share: colours, layout."""
 
 from __future__ import annotations
 
 import html
-import math
 from types import ModuleType
 from typing import Any
 
@@ -24,18 +23,6 @@ CLEAR = "rgba(0,0,0,0)"
 def graph_objects() -> ModuleType:
     """Plotly's, or a MissingExtraError that says how to get it."""
     return import_extra("plotly.graph_objects", "report", "an interactive figure")
-
-
-def number(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, without an exponent where it is readable; "–" where there is none."""
-    if not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
-    if not -4 <= exponent <= 6:
-        return f"{value:.{digits - 1}e}"
-    return f"{value:.{max(0, digits - 1 - exponent)}f}"
 
 
 def plain(text: object) -> str:

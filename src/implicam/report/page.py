@@ -13,8 +13,8 @@ from implicam import figures
 from implicam.coverage import Summary
 from implicam.errors import import_extra
 from implicam.figures.interactive3d import POLICY
-from implicam.figures.style import number
 from implicam.files import write_text
+from implicam.formatting import number
 from implicam.report import words
 from implicam.report.data import ReportData
 from implicam.report.look import SCRIPT, STYLE

@@ -8,7 +8,7 @@ import numpy as np
 
 from implicam.coverage import Estimate, Summary
 from implicam.dataset import Floats
-from implicam.figures.style import number
+from implicam.formatting import number, percent
 from implicam.report.data import ReportData
 
 VERDICTS = {
@@ -24,7 +24,7 @@ def per_cent(share: Estimate) -> str:
     """`94.1 % (91.2–96.3)`, the interval in brackets."""
     if not math.isfinite(share.value):
         return "–"
-    return f"{100 * share.value:.1f} % ({100 * share.low:.1f}–{100 * share.high:.1f})"
+    return f"{percent(share.value, 1)} ({100 * share.low:.1f}–{100 * share.high:.1f})"
 
 
 def interval(value: Estimate) -> str:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtrc, chdtri
 
 from implicam.dataset import Camera
+from implicam.formatting import percent
 from implicam.geometry import Bools, Floats
 from implicam.row_order import late_or_early, moved_up
 
@@ -128,9 +129,7 @@ def alarm_of(table: Table) -> str:
         usual = max(USUAL_WRONG, float(np.mean([_inexplicable(int(k)) for k in views[tested]])))
         moved = _contradicted(table, views)
         if moved or (alone > MANY * n and _surprising(alone, n, usual)):
-            return _said(
-                f"{100 * share:.0f} % of {n} points contradict the calibration", DISAGREE, table, tested, moved
-            )
+            return _said(f"{percent(share)} of {n} points contradict the calibration", DISAGREE, table, tested, moved)
     near = tested & ~explained & (table.p >= WRONG)
     uneven = _uneven(table.p[near], views[near]) if table.checked else None
     if uneven is None:
@@ -206,7 +205,7 @@ def _cause(table: Table, tested: Bools, moved: Sequence[str]) -> str:
             testable = rows[_views(uv[rows]) >= 2]
             agree = table.agree(uv[testable])
             if len(testable) and agree.mean() >= least:
-                return words.format(share=f"{100 * agree.mean():.0f} % of those tried agree")
+                return words.format(share=f"{percent(agree.mean())} of those tried agree")
     if moved and len(moved) < len(table.cameras) - 1:
         return f"most views of {' and '.join(moved)} contradict the other cameras. Has it been moved or refocused?"
     return (

@@ -33,6 +33,7 @@ from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Names, Obs
 from implicam.dataset.folder import POINTS, VIEWS
 from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.files import toml_text
+from implicam.formatting import json_default
 
 DATABASE = "session.db"
 VERSION = 1
@@ -237,7 +238,7 @@ def now() -> str:
 def json_text(value: Any, what: str) -> str:
     """A value as JSON; UsageError for what has no form in it."""
     try:
-        text = json.dumps(value, default=_plain, ensure_ascii=False)
+        text = json.dumps(value, default=json_default, ensure_ascii=False)
         text.encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise UsageError(
@@ -246,14 +247,6 @@ def json_text(value: Any, what: str) -> str:
             fix="use text, numbers, true or false, None, and lists and tables of these",
         ) from None
     return text
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"a value of type {type(value).__name__} has no form in JSON")
 
 
 def read_cameras(database: Database) -> tuple[Camera, ...]:

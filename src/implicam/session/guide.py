@@ -27,6 +27,7 @@ from implicam.calibrators import Calibration, ForwardGPCalibration
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.detect import Detected, Detector, View, centred
 from implicam.errors import HardwareError, ImplicamError, UsageError
+from implicam.formatting import json_safe
 from implicam.hardware import Frame, FrameSource, Robot, Trigger, exposed
 from implicam.images import blank
 from implicam.progress import Progress, silent
@@ -384,7 +385,7 @@ class Guide:
         if data is not None and self.equipment.radius is not None:
             data = self._centred(data)
         self.loop.reset(data)
-        self.session.set(HISTORY, [_plain(step) for step in self.loop.history])
+        self.session.set(HISTORY, [json_safe(asdict(step)) for step in self.loop.history])
         self._show(
             data=data, calibration=self.loop.calibration, prospect=self.loop.prospect,
             history=tuple(self.loop.history), stop=self.loop.stop,
@@ -480,10 +481,6 @@ def _notes(state: State) -> Mapping[str, Any]:
     }
 
 
-def _plain(step: Step) -> dict[str, float | None]:
-    return {key: value if np.isfinite(value) else None for key, value in asdict(step).items()}
-
-
 def _remembered(session: Session) -> list[Step]:
     """The curve as far as it was when the session was left; the last point is computed again."""
     kept = 0 if session.data is None else len(session.data) - 1
@@ -494,6 +491,6 @@ def _remembered(session: Session) -> list[Step]:
 
 
 def _judged(calibration: Calibration) -> Any:
-    from implicam.evaluate import cross_validate
+    from implicam.evaluation import cross_validate
 
     return cross_validate(calibration.refit, calibration.data, min(10, len(calibration.data)))

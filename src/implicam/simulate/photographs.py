@@ -17,7 +17,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from implicam.dataset import Dataset, Floats
 from implicam.errors import UsageError
-from implicam.images import Grey, opencv, write_picture
+from implicam.images import Grey, one_thread_each, opencv, write_picture
 from implicam.progress import Progress, silent
 from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.clutter import background
@@ -144,9 +144,8 @@ class Studio:
         """Write all pictures to folder/<camera>/<shot>.png; how many."""
         jobs = self.jobs
         done = 0
-        for c in range(len(self.rig.cameras)):
-            (folder / self.rig.cameras[c].name).mkdir(parents=True, exist_ok=True)
-            _ = self._looks[c]
+        for camera in self.rig.cameras:
+            (folder / camera.name).mkdir(parents=True, exist_ok=True)
 
         def work(job: tuple[int, int]) -> None:
             nonlocal done
@@ -157,7 +156,9 @@ class Studio:
             progress("taking photographs", done, len(jobs))
 
         progress("taking photographs", 0, len(jobs))
-        side_by_side(work, jobs)
+        with one_thread_each():
+            _ = self._looks  # once, before many ask for them at the same time
+            side_by_side(work, jobs)
         return len(jobs)
 
     def description(self) -> dict[str, Any]:
@@ -337,7 +338,6 @@ class _Look:
 
     def __init__(self, camera: SimulatedCamera, optics: Optics, rng: np.random.Generator) -> None:
         cv2 = opencv()
-        cv2.setNumThreads(1)
         self.camera = camera
         self.directions = lines_of_sight(camera)
         self.sharp = np.pad(background(camera.width, camera.height, rng, clutter=optics.clutter), PAD, mode="edge")

@@ -10,7 +10,8 @@ import numpy as np
 
 from implicam.active import Step
 from implicam.dataset import Floats
-from implicam.figures.style import BLUE, GREEN, ORANGE, VERMILLION, number
+from implicam.figures.style import BLUE, GREEN, ORANGE, VERMILLION
+from implicam.formatting import number
 from implicam.session.guide import State
 
 BUSY = ("starting", "moving", "fitting")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from implicam.experiments.evidence import Case, Row, Rows, Test, column, share_of_drop, stages, where
+from implicam.formatting import percent
 
 EARLY, AROUND = 20, 10
 """Points added that are almost none of 100; steps that are looked at there and at the end."""
@@ -54,8 +55,8 @@ def _one_value(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     early = float(np.median([ranges[added] for added in range(EARLY, EARLY + AROUND)]))
     late = float(np.median([ranges[added] for added in range(last - AROUND + 1, last + 1)]))
     words = (
-        f"starts differ by {100 * ranges[0]:.0f} % of the drop at first, {100 * early:.1f} % after {EARLY} points, "
-        f"{100 * late:.1f} % at the end (one value: {100 * CONVERGED:g} %)"
+        f"starts differ by {percent(ranges[0])} of the drop at first, {percent(early, 1)} after {EARLY} points, "
+        f"{percent(late, 1)} at the end (one value: {100 * CONVERGED:g} %)"
     )
     over = [1 / max(share, 1e-9) for share in (early, late)]
     return [Case(value, value, value, words, 1 / CONVERGED) for value in over]
