@@ -233,17 +233,41 @@ def test_constants_have_the_values_of_the_method(constant: Constant) -> None:
     np.testing.assert_allclose(in_code, in_text, rtol=1e-12)
 
 
+WORDS = ["two", "three", "four", "five", "six", "seven", "eight", "nine", "ten"]
+FRACTIONS = {"half": 0.5, "quarter": 0.25, "tenth": 0.1, "twice": 2.0}
+
+
+def numbers_in(text: str) -> set[float]:
+    """The numbers of a text, in digits, as powers of ten, in words; percentages as parts too. No equation numbers."""
+    text = re.sub(r"\\tag\{\w+\}|\(\d+\)", "", text)
+    text = re.sub(r"([\d.]+) \\cdot 10\^\{?(-?\d+)\}?", r"\1e\2", text)
+    text = re.sub(r"\b10\^\{(-?\d+)\}", r"1e\1", text)
+    found = {float(number) for number in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e-?\d+)?", text)}
+    found |= {float(a) / float(b) for a, b in re.findall(r"(\d+)/(\d+)", text)}
+    found |= {float(number) / 100 for number in re.findall(r"([\d.]+)\$? \\?%", text)}
+    found |= {number for number, word in enumerate(WORDS, start=2) if re.search(rf"\b{word}\b", text, re.I)}
+    return found | {number for word, number in FRACTIONS.items() if re.search(rf"\b{word}\b", text, re.I)}
+
+
+def test_the_text_of_the_method_quotes_the_constants() -> None:
+    """Somewhere: where, a reader has to see."""
+    quoted = numbers_in(METHOD.read_text().split(CONSTANTS)[0]) | {np.inf}
+    for constant in constants():
+        values = np.atleast_1d(eval(constant.value, {"inf": np.inf}))
+        assert set(values.tolist()) <= quoted, constant
+
+
 @pytest.mark.parametrize(
     ("text", "wrong"),
     [
-        ("`fit.fit_rig`, `_tails`, `evidence.NOISE`", set()),
-        ("`fit.fit_no_rig`, `_no_tails`", {"fit.fit_no_rig", "_no_tails"}),
-        ("`posterior._tied`, `_Meeting.eliminate`, `all_unknowns`, `nothing`", {"nothing"}),
-        ("`posterior.CameraModel.signal`, `predict`; `spread`", set()),
+        ("`errors.FitError`, `did_you_mean`, `gp.Kernel`", set()),
+        ("`errors.NoSuchError`, `_nothing`", {"errors.NoSuchError", "_nothing"}),
+        ("`measurement.Measurement.xyz`, `write_csv`; `MEASURED_COLUMNS`, `nothing`", {"nothing"}),
+        ("`errors.FitError`, `Measurement.xyz`, `xyz`", {"Measurement.xyz", "xyz"}),
         ("`calibration.rejected`, `measured.xyz`, `nowhere.xyz`", {"nowhere.xyz"}),
         ('`InverseGP(preset="plain")`, `compare(data, {1: Mine()})`', {"Mine"}),
         ("`--json`, `cells/`, `points.csv`, `x,y,z`, `K (S + place)^-1 K^T`, `make check`, `import implicam`", set()),
-        ("```\nfit.fit_no_rig\n```", set()),
+        ("```\n`errors.NoSuchError`\n```", set()),
     ],
 )
 def test_what_is_taken_for_a_name(text: str, wrong: set[str]) -> None:
