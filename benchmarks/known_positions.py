@@ -20,7 +20,7 @@ from implicam.calibrators import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.forward_gp.fit import fit_rig
 from implicam.dataset import KnownPositions, read_dataset
 from implicam.errors import FitError
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 from implicam.progress import silent
 from implicam.rig_model.training_data import Frame, problem_of
 from implicam.simulate import build_rig, moving_board, random_positions, simulate

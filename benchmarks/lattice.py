@@ -11,7 +11,7 @@ import numpy as np
 
 from implicam.calibrators import InverseGP
 from implicam.calibrators.inverse_gp import EXTENT
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 from implicam.simulate import ball_grid, build_rig, random_positions, simulate
 
 BOUNDS = (0.05, 2.0, 3.0, EXTENT, 5.0, 8.0)

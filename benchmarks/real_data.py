@@ -18,7 +18,7 @@ import numpy as np
 from implicam.calibrators import ForwardGP, InverseGP
 from implicam.dataset import KnownPositions, read_dataset
 from implicam.errors import FitError
-from implicam.evaluate import cross_validate, evaluate
+from implicam.evaluation import cross_validate, evaluate
 from implicam.files import write_text
 
 

@@ -14,7 +14,7 @@ from implicam import demo
 from implicam.calibrators import Calibration, ForwardGP, InverseGP
 from implicam.dataset import Dataset, KnownPositions, Observations, join
 from implicam.errors import DatasetError, FitError, UsageError
-from implicam.evaluate import cross_validate, evaluate, leave_out_shots
+from implicam.evaluation import cross_validate, evaluate, leave_out_shots
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.simulate import Rig, build_rig, moving_board, random_positions, simulate
@@ -182,7 +182,7 @@ def test_regions_by_depth_and_by_number_of_views() -> None:
 def test_the_near_region_is_the_one_near_the_cameras() -> None:
     others = sets()[1]
     evaluation = evaluate(fitted(), others)
-    from implicam.evaluate import _regions
+    from implicam.evaluation import _regions
 
     labels = _regions(evaluation.data)["depth"]
     distance = np.mean([np.linalg.norm(c.camera_from_world.apply(others.truth.xyz), axis=1) for c in rig().cameras], 0)

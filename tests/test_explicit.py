@@ -21,7 +21,7 @@ from implicam.cameras import BrownConrady
 from implicam.coverage import assess
 from implicam.dataset import Dataset, KnownPositions, Observations, arrays_from_dataset
 from implicam.errors import CalibrationFileError, DatasetError, FitError, UsageError
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 from implicam.exchange import UNKNOWN, ExplicitCamera
 from implicam.exchange import Rig as ExchangeRig
 from implicam.geometry import Pose, rotation_from_vector
@@ -120,7 +120,7 @@ def test_a_camera_that_cannot_be_joined_is_left_out_with_the_reason() -> None:
     hidden = replace(data, observations=replace(data.observations, uv=uv, sd=np.full(uv.shape, np.nan), extra={}))
     found = calibrate_network(boards_of(hidden), "auto")
     names = rig_names(rig)
-    reasons = {names[c]: why for c, why in found.blind}
+    reasons = {names[c]: why for c, why in found.uncalibrated}
     assert "no board at the same time" in reasons["cam5"]
     assert "2 of the 3 boards" in reasons["cam4"]
     assert len(found.cameras) == 2

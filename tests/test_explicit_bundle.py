@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from implicam.calibrators.explicit.adjust import Bundle, _Normal, Placed, Views, adjust
+from implicam.calibrators.explicit.adjust import Bundle, Placed, Views, _Normal, adjust
 from implicam.calibrators.explicit.boards import BoardView, boards_of
 from implicam.calibrators.explicit.lenses import as_brown_conrady
 from implicam.calibrators.explicit.zhang import calibrate_camera, planar_poses

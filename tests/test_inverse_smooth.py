@@ -12,7 +12,7 @@ from implicam.calibrators import InverseGP, InverseGPCalibration, load_calibrati
 from implicam.calibrators.inverse_maps import SmoothMap, is_principal
 from implicam.calibrators.pixel_cloud import FAR, PixelCloud
 from implicam.dataset import Dataset, read_dataset
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 from implicam.gp import Kernel, Kriging, LengthscalePrior, Smoothness, most_probable
 from implicam.gp.kriging import RestrictedPosterior
 from implicam.simulate import build_rig, random_positions, simulate

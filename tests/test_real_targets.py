@@ -11,7 +11,7 @@ import pytest
 
 from implicam.calibrators import ForwardGP
 from implicam.dataset import Dataset, read_dataset
-from implicam.evaluate import evaluate
+from implicam.evaluation import evaluate
 
 REAL = Path(__file__).parent / "data" / "real"
 

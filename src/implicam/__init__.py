@@ -37,7 +37,7 @@ from implicam.errors import (
     NumericalError,
     UsageError,
 )
-from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
+from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.measurement import Measurement
 from implicam.simulate import simulated
 from implicam.verdict import Verdict, judge

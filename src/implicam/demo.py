@@ -18,7 +18,7 @@ from implicam.compare import Trial, trial_of
 from implicam.dataset import Dataset, folder_files, write_dataset
 from implicam.detect import Ball, DetectionRun, centred, detect_folder
 from implicam.errors import UsageError, import_extra
-from implicam.evaluate import Evaluation, evaluate
+from implicam.evaluation import Evaluation, evaluate
 from implicam.files import toml_text
 from implicam.images import opencv
 from implicam.progress import Progress, silent

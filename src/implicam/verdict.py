@@ -22,7 +22,7 @@ from implicam.calibrators import MLP, Calibration, InverseGP
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
-from implicam.evaluate import known_position_covariance
+from implicam.evaluation import known_position_covariance
 from implicam.mistakes import mistakes_in
 from implicam.progress import Progress, silent
 from implicam.rig_model.training_data import stated_noise

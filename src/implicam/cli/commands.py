@@ -52,7 +52,7 @@ from implicam.cli.app import (
 from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.dataset.folder import IMAGES
 from implicam.errors import DatasetError, UsageError
-from implicam.evaluate import Evaluation, cross_validate, evaluate, leave_out_shots
+from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import toml_text
 from implicam.images import PATTERN
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge

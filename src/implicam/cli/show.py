@@ -30,7 +30,7 @@ from implicam.compare import Trial
 from implicam.coverage import NEES_RIGHT, Estimate, Summary
 from implicam.demo import HELD_OUT, Demo
 from implicam.detect.folder import DetectionRun
-from implicam.evaluate import Evaluation
+from implicam.evaluation import Evaluation
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.verdict import Verdict

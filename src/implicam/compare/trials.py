@@ -14,7 +14,7 @@ from implicam.calibrators import Calibration, Calibrator
 from implicam.compare.splits import RANDOM, Split
 from implicam.dataset import Dataset
 from implicam.errors import DatasetError, FitError, ImplicamError, NumericalError, UsageError
-from implicam.evaluate import Evaluation, evaluate
+from implicam.evaluation import Evaluation, evaluate
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from implicam.coverage import Coverage
 from implicam.dataset import Floats
 from implicam.errors import UsageError
-from implicam.evaluate import Evaluation
+from implicam.evaluation import Evaluation
 from implicam.measurement import Measurement
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from implicam.active import Step
 from implicam.dataset import Floats
 from implicam.figures.style import BLUE, GREEN, ORANGE, VERMILLION, number
-from implicam.session.guide import State
+from implicam.session.controller import State
 
 BUSY = ("starting", "moving", "fitting")
 IDLE = "#5b6270"
