@@ -32,7 +32,7 @@ STAGES = {
     "kinds": (fit, "_started"),
     "sizes": (rounds, "estimate_hyperparameters"),
     "posterior": (rounds, "condition_with_new_fields"),
-    "wrong views": (fit, "judged_all"),
+    "wrong views": (fit, "update_inliers"),
     "tails": (position_error_fit, "with_heavy_tails"),
     "projections": (fit, "_with_projections"),
     "known positions": (calibration, "with_noise_told_apart"),

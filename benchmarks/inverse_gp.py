@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from implicam.calibrators import named
+from implicam.calibrators import calibrator_from_name
 from implicam.coverage import assess
 from implicam.dataset import read_dataset
 from implicam.files import write_text
@@ -56,7 +56,7 @@ HEAD = (
 def outcome(method, known, others, truth, limit):
     """Errors, covariances, limits; and the seconds of the fit."""
     started = time.perf_counter()
-    calibration = named(method).fit(known)
+    calibration = calibrator_from_name(method).fit(known)
     seconds = time.perf_counter() - started
     m = calibration.measure(others.observations)
     return (m.xyz - truth, m.cov, limit), seconds

@@ -31,13 +31,13 @@ from implicam.active import (
     Workspace,
     acquisition,
     choose,
-    outlook_of,
+    design_model_of,
     path_length,
     suggest,
     workspace_from,
 )
-from implicam.active.acquisition import IntegratedVariance
-from implicam.active.outlook import K95, ForwardOutlook, InverseOutlook
+from implicam.active.acquisitions import IntegratedVariance
+from implicam.active.design_model import K95, ForwardDesignModel, InverseDesignModel
 from implicam.calibrators import ForwardGP, InverseGP
 from implicam.calibrators.inverse_maps import SmoothMap
 from implicam.dataset import Camera, Dataset, join
@@ -68,16 +68,16 @@ def renamed(data: Dataset, letter: str = "q") -> Dataset:
     return replace(data, observations=replace(data.observations, points=names))
 
 
-def forward(known: Dataset, room: Workspace, candidates: int = 40, judged: int = 30) -> ForwardOutlook:
-    found = outlook_of(ForwardGP().fit(known), room.candidates(candidates, 1), room.judged(judged))
-    assert isinstance(found, ForwardOutlook)
+def forward(known: Dataset, room: Workspace, candidates: int = 40, judged: int = 30) -> ForwardDesignModel:
+    found = design_model_of(ForwardGP().fit(known), room.candidates(candidates, 1), room.judged(judged))
+    assert isinstance(found, ForwardDesignModel)
     return found
 
 
-def inverse(known: Dataset, room: Workspace) -> InverseOutlook:
+def inverse(known: Dataset, room: Workspace) -> InverseDesignModel:
     pilot = ForwardGP().fit(known)
-    found = outlook_of(InverseGP().fit(known), room.candidates(40, 1), room.judged(30), pilot)
-    assert isinstance(found, InverseOutlook)
+    found = design_model_of(InverseGP().fit(known), room.candidates(40, 1), room.judged(30), pilot)
+    assert isinstance(found, InverseDesignModel)
     return found
 
 
@@ -174,31 +174,31 @@ def test_a_forward_outlook_states_what_measuring_states(rig: Rig, known: Dataset
     """The predicted covariance is that of a measurement there, for pixels without noise."""
     calibration = ForwardGP().fit(known)
     judged = room.judged(40)
-    outlook = outlook_of(calibration, judged[:0], judged)
+    design = design_model_of(calibration, judged[:0], judged)
     uv = calibration.predict(judged)
     template = simulate(rig, random_positions(rig, 40, np.random.default_rng(0)), seed=0).observations
-    seen = outlook.judged.seen
+    seen = design.judged.seen
     uv = np.where(seen[..., None], uv, np.nan)
     cov = calibration.measure(replace(template, uv=uv, sd=np.full_like(uv, np.nan), extra={})).cov
     both = np.isfinite(cov[:, 0, 0])
     assert both.sum() > 30
-    assert (both == outlook.now.measured).all()
-    assert np.allclose(outlook.now.total[both], cov[both], rtol=2e-3)
+    assert (both == design.now.measured).all()
+    assert np.allclose(design.now.total[both], cov[both], rtol=2e-3)
 
 
 def test_the_floor_is_what_perfect_cameras_would_leave(known: Dataset, room: Workspace) -> None:
-    outlook = forward(known, room)
-    bare = replace(outlook, parts=tuple(p._replace(half=0 * p.half, rest=0 * p.rest) for p in outlook.parts))
-    ok = outlook.now.measured
-    assert np.allclose(bare.now.total[ok], outlook.now.floor[ok])
-    assert (outlook.now.excess[ok] > 1).all()
+    design = forward(known, room)
+    bare = replace(design, parts=tuple(p._replace(half=0 * p.half, rest=0 * p.rest) for p in design.parts))
+    ok = design.now.measured
+    assert np.allclose(bare.now.total[ok], design.now.floor[ok])
+    assert (design.now.excess[ok] > 1).all()
 
 
 def test_an_inverse_outlook_states_what_measuring_states(rig: Rig, known: Dataset) -> None:
     new = simulate(rig, random_positions(rig, 30, np.random.default_rng(5)), seed=5)
     calibration = InverseGP().fit(known)
-    outlook = outlook_of(calibration, Places.recorded(new).select(np.arange(0)), Places.recorded(new))
-    assert np.allclose(outlook.now.total, calibration.measure(new.observations).cov)
+    design = design_model_of(calibration, Places.recorded(new).select(np.arange(0)), Places.recorded(new))
+    assert np.allclose(design.now.total, calibration.measure(new.observations).cov)
 
 
 def test_one_more_point_of_an_inverse_outlook_is_a_gp_with_one_more_point(rig: Rig, known: Dataset) -> None:
@@ -206,7 +206,7 @@ def test_one_more_point_of_an_inverse_outlook_is_a_gp_with_one_more_point(rig: R
     new = simulate(rig, random_positions(rig, 30, np.random.default_rng(5)), seed=5)
     calibration = InverseGP(preset="plain").fit(known)
     places = Places.recorded(new)
-    after = outlook_of(calibration, places, places).after(4)
+    after = design_model_of(calibration, places, places).after(4)
     grown = replace(calibration, data=join(known, renamed(new).select([4])))
     # what is left is the difference of two numbers as large as the signal's variance
     signal = max(gp.kernel.signal_variance for gp in calibration.processes) * calibration.positions.scale.max() ** 2
@@ -218,8 +218,8 @@ def test_one_more_point_of_a_smooth_outlook_is_kriging_with_one_more_point(rig: 
     new = simulate(rig, random_positions(rig, 30, np.random.default_rng(5)), seed=5)
     calibration = InverseGP().fit(known)
     places = Places.recorded(new)
-    after = outlook_of(calibration, places, places).after(4)
-    assert isinstance(after, InverseOutlook)
+    after = design_model_of(calibration, places, places).after(4)
+    assert isinstance(after, InverseDesignModel)
     assert isinstance(calibration.map, SmoothMap)
     X = calibration.pixels.apply(new.observations.uv.reshape(len(new), -1))
     axes = calibration.map.axes  # the mean of both: its axes move with the data
@@ -239,13 +239,13 @@ def test_one_more_point_of_a_forward_outlook_is_a_posterior_with_one_more_point(
 ) -> None:
     """Against linear algebra on the full covariance of all unknowns, Kalman's update."""
     data = simulate(rig, random_positions(rig, 24, np.random.default_rng(1)), seed=1, robot_noise=robot_noise)
-    outlook = forward(data, room, 12, 9)
-    assert len(outlook.parts) == (1 if robot_noise else 2)
-    after = outlook.after(3)
-    for part, then in zip(outlook.parts, after.parts, strict=True):
+    design = forward(data, room, 12, 9)
+    assert len(design.parts) == (1 if robot_noise else 2)
+    after = design.after(3)
+    for part, then in zip(design.parts, after.parts, strict=True):
         q = part.half.shape[2]
         h = part.half[3]
-        noise = np.diag(part.noise[3] + part.rest[3]) + part.slope[3] @ outlook.place @ part.slope[3].T
+        noise = np.diag(part.noise[3] + part.rest[3]) + part.slope[3] @ design.place @ part.slope[3].T
         updated = np.eye(q) - h.T @ np.linalg.inv(h @ h.T + noise) @ h
         wanted = part.half @ updated @ part.half.swapaxes(1, 2)
         assert np.allclose(then.half @ then.half.swapaxes(1, 2), wanted, rtol=1e-7, atol=1e-12 * np.abs(wanted).max())
@@ -253,14 +253,14 @@ def test_one_more_point_of_a_forward_outlook_is_a_posterior_with_one_more_point(
 
 @pytest.mark.parametrize("kind", [forward, inverse])
 def test_the_gain_is_the_reduction_that_follows(kind: object, known: Dataset, room: Workspace) -> None:
-    """Against computing the whole outlook after each candidate; exact for inverse-gp, to first order for forward-gp."""
-    outlook = kind(known, room)  # type: ignore[operator]
-    weights = np.where(outlook.now.measured, RNG.random(len(outlook.judged)), np.nan)
-    trace = np.trace(outlook.now.total, axis1=1, axis2=2)
-    gain = outlook.gain(weights)
+    """Against computing the whole design after each candidate; exact for inverse-gp, to first order for forward-gp."""
+    design = kind(known, room)  # type: ignore[operator]
+    weights = np.where(design.now.measured, RNG.random(len(design.judged)), np.nan)
+    trace = np.trace(design.now.total, axis1=1, axis2=2)
+    gain = design.gain(weights)
     brute = np.zeros(len(gain))
-    for i in np.flatnonzero(outlook.useful):
-        then = np.trace(outlook.after(int(i)).now.total, axis1=1, axis2=2)
+    for i in np.flatnonzero(design.useful):
+        then = np.trace(design.after(int(i)).now.total, axis1=1, axis2=2)
         brute[i] = np.nansum(weights * (trace - then))
     if kind is inverse:
         assert np.allclose(gain, brute, rtol=1e-6)
@@ -271,12 +271,12 @@ def test_the_gain_is_the_reduction_that_follows(kind: object, known: Dataset, ro
 
 @pytest.mark.parametrize("kind", [forward, inverse])
 def test_information_is_the_log_of_the_determinants(kind: object, known: Dataset, room: Workspace) -> None:
-    outlook = kind(known, room)  # type: ignore[operator]
-    found = outlook.information()
-    assert (found[outlook.useful] > 0).all()
-    assert (found[~outlook.useful] == 0).all()
+    design = kind(known, room)  # type: ignore[operator]
+    found = design.information()
+    assert (found[design.useful] > 0).all()
+    assert (found[~design.useful] == 0).all()
     i = int(np.argmax(found))
-    later = outlook.after(i).information()
+    later = design.after(i).information()
     assert later[i] < found[i]  # a place tells less the second time
     assert (later <= found + 1e-9).all()
 
@@ -306,26 +306,26 @@ def test_what_no_camera_sees_is_not_proposed(rig: Rig, known: Dataset) -> None:
 @pytest.mark.parametrize("name", ACQUISITIONS)
 @pytest.mark.parametrize("kind", [forward, inverse])
 def test_every_acquisition(name: str, kind: object, known: Dataset, room: Workspace) -> None:
-    outlook, rule = kind(known, room), acquisition(name)  # type: ignore[operator]
-    before = [part.copy() for part in (outlook.candidates.xyz, outlook.now.total)]
-    scores = rule.scores(outlook, np.random.default_rng(1))
-    assert scores.shape == (len(outlook.candidates),)
-    assert np.isfinite(scores[outlook.there.measured]).all()
+    design, rule = kind(known, room), acquisition(name)  # type: ignore[operator]
+    before = [part.copy() for part in (design.candidates.xyz, design.now.total)]
+    scores = rule.scores(design, np.random.default_rng(1))
+    assert scores.shape == (len(design.candidates),)
+    assert np.isfinite(scores[design.there.measured]).all()
     assert (scores[np.isfinite(scores)] >= 0).all()
-    assert np.array_equal(scores, rule.scores(outlook, np.random.default_rng(1)), equal_nan=True)
-    for now, then in zip(before, (outlook.candidates.xyz, outlook.now.total), strict=True):
+    assert np.array_equal(scores, rule.scores(design, np.random.default_rng(1)), equal_nan=True)
+    for now, then in zip(before, (design.candidates.xyz, design.now.total), strict=True):
         assert np.array_equal(now, then, equal_nan=True)
-    chosen = choose(outlook, rule, np.random.default_rng(1), count=5)
+    chosen = choose(design, rule, np.random.default_rng(1), count=5)
     assert len(set(chosen.index)) == 5
-    assert outlook.useful[chosen.index].all()
+    assert design.useful[chosen.index].all()
     assert hash(rule) == hash(acquisition(name))
 
 
 def test_a_batch_is_one_after_the_other(known: Dataset, room: Workspace) -> None:
     """Each as if those before it were known: not five times the same corner."""
-    outlook, rule = forward(known, room, 200), IntegratedVariance()
-    chosen = choose(outlook, rule, np.random.default_rng(0), count=4)
-    step = outlook
+    design, rule = forward(known, room, 200), IntegratedVariance()
+    chosen = choose(design, rule, np.random.default_rng(0), count=4)
+    step = design
     for i in chosen.index:
         score = rule.scores(step, np.random.default_rng(0))
         assert score[i] == np.nanmax(score)
@@ -334,12 +334,12 @@ def test_a_batch_is_one_after_the_other(known: Dataset, room: Workspace) -> None
 
 
 def test_a_robot_does_not_zigzag(known: Dataset, room: Workspace) -> None:
-    outlook, rule = forward(known, room, 300), IntegratedVariance()
+    design, rule = forward(known, room, 300), IntegratedVariance()
     here = room.vertices[0]
-    free = choose(outlook, rule, np.random.default_rng(0), count=8)
-    ordered = choose(outlook, rule, np.random.default_rng(0), count=8, here=here)
-    near = choose(outlook, rule, np.random.default_rng(0), count=8, here=here, reach=0.05 * room.size)
-    length = [path_length(outlook.candidates.xyz[c.index], here) for c in (free, ordered, near)]
+    free = choose(design, rule, np.random.default_rng(0), count=8)
+    ordered = choose(design, rule, np.random.default_rng(0), count=8, here=here)
+    near = choose(design, rule, np.random.default_rng(0), count=8, here=here, reach=0.05 * room.size)
+    length = [path_length(design.candidates.xyz[c.index], here) for c in (free, ordered, near)]
     assert sorted(free.index) == sorted(ordered.index)
     assert length[1] < length[0]
     assert length[2] < length[1]
@@ -348,10 +348,10 @@ def test_a_robot_does_not_zigzag(known: Dataset, room: Workspace) -> None:
 def test_the_short_path_is_as_short_as_any(known: Dataset, room: Workspace) -> None:
     from itertools import permutations
 
-    outlook = forward(known, room, 60)
+    design = forward(known, room, 60)
     here = room.centre
-    found = choose(outlook, acquisition("random"), np.random.default_rng(2), count=6, here=here)
-    xyz = outlook.candidates.xyz[found.index]
+    found = choose(design, acquisition("random"), np.random.default_rng(2), count=6, here=here)
+    xyz = design.candidates.xyz[found.index]
     best = min(path_length(xyz[list(order)], here) for order in permutations(range(6)))
     assert path_length(xyz, here) <= 1.1 * best
 
@@ -493,7 +493,7 @@ def test_a_grown_fit_is_a_fit(rig: Rig, room: Workspace) -> None:
     new = simulate(rig, random_positions(rig, 50, np.random.default_rng(9)), seed=9)
     grown = ForwardGP().fit(data.select(np.arange(20)))
     for n in (22, 26, 36, 60):
-        grown = grown.grown(data.select(np.arange(n)))
+        grown = grown.refit_from(data.select(np.arange(n)))
     fresh = ForwardGP().fit(data).measure(new.observations)
     assert np.nanmax(np.abs(grown.measure(new.observations).xyz - fresh.xyz) / fresh.sd) < 0.3
 
@@ -512,10 +512,10 @@ def test_inverse_gp_does_not_take_its_ignorance_for_noise(rig: Rig, room: Worksp
     """With few points the processes call everything noise; the floor is what pixel noise leaves in space."""
     data = simulate(rig, random_positions(rig, 14, np.random.default_rng(2)), seed=2)
     inverse, forward = (Loop(method, room, data=data) for method in (InverseGP(), ForwardGP()))
-    assert inverse.prospect is not None
-    assert forward.prospect is not None
-    both = inverse.prospect.measured & forward.prospect.measured
-    floors = [np.trace(one.prospect.floor[both], axis1=1, axis2=2) for one in (inverse, forward)]  # type: ignore[union-attr]
+    assert inverse.predicted is not None
+    assert forward.predicted is not None
+    both = inverse.predicted.measured & forward.predicted.measured
+    floors = [np.trace(one.predicted.floor[both], axis1=1, axis2=2) for one in (inverse, forward)]  # type: ignore[union-attr]
     assert np.allclose(*floors, rtol=1e-9)
     assert inverse.history[-1].excess > 3
 
@@ -544,7 +544,7 @@ def test_a_camera_without_a_size_is_aimed_beyond_what_it_saw(rig: Rig, known: Da
     untold = tuple(Camera(camera.name) for camera in known.cameras)
     data = replace(known, observations=replace(known.observations, cameras=untold))
     seen = known.observations.uv[known.observations.seen[:, 0], 0]
-    found = outlook_of(ForwardGP().fit(data), room.candidates(300, 0), room.judged(50))
+    found = design_model_of(ForwardGP().fit(data), room.candidates(300, 0), room.judged(50))
     uv = found.candidates.uv[found.candidates.seen[:, 0], 0]
     assert (uv.min(axis=0) < seen.min(axis=0)).any()
     assert (uv.max(axis=0) - uv.min(axis=0) <= 1.5 * np.ptp(seen, axis=0) + 1e-9).all()
@@ -568,14 +568,16 @@ def test_a_grown_inverse_fit_is_never_less_probable(rig: Rig) -> None:
     """From no guess a search can end in a poor optimum; with the last result beside it, it cannot."""
     data = simulate(rig, random_positions(rig, 60, np.random.default_rng(8)), seed=8)
     few = InverseGP().fit(data.select(np.arange(40)))
-    values = [f.smoothness.value for f in (InverseGP().fit(data), few.grown(data), few.grown(data, anew=True))]  # type: ignore[union-attr]
+    values = [
+        f.smoothness.value for f in (InverseGP().fit(data), few.refit_from(data), few.refit_from(data, anew=True))
+    ]  # type: ignore[union-attr]
     assert values[2] <= min(values[:2]) + 1e-6
     few = InverseGP(preset="plain").fit(data.select(np.arange(40)))
-    fresh, grown, both = InverseGP(preset="plain").fit(data), few.grown(data), few.grown(data, anew=True)
+    fresh, grown, both = InverseGP(preset="plain").fit(data), few.refit_from(data), few.refit_from(data, anew=True)
     for k in range(3):
         a, b, c = (fit.processes[k].log_marginal_likelihood() for fit in (fresh, grown, both))
         assert c >= max(a, b) - 1e-6
-    assert np.array_equal(few.grown(data).measure(data.observations).xyz, grown.measure(data.observations).xyz)
+    assert np.array_equal(few.refit_from(data).measure(data.observations).xyz, grown.measure(data.observations).xyz)
 
 
 # the paper's pool

@@ -130,7 +130,7 @@ def test_the_kind_is_told_stored_and_found_again(tmp_path: Path) -> None:
 def test_a_fit_that_grows_keeps_the_kind() -> None:
     known, new = odd_rig(Unusual(tilt=8.0), points=60)
     first = ForwardGP().fit(known.select(np.arange(50)))
-    second = first.grown(known)
+    second = first.refit_from(known)
     kinds = [[model.family for model in one.posterior.models] for one in (first, second)]
     assert kinds[0] == kinds[1]
     assert evaluate(second, new, regions=False).coverage.overall.nees.value < 5
@@ -180,8 +180,8 @@ def test_a_linear_camera_comes_apart_and_together_again(sign: float) -> None:
     u, v, w = (np.column_stack([points, np.ones(30)]) @ P.T).T
     uv = np.column_stack([u / w, v / w])
     uv[3] += 50.0
-    found, kept = resect_robustly(points, uv)
-    assert not kept[3]
+    found, inliers = resect_robustly(points, uv)
+    assert not inliers[3]
     parts = camera_from_linear(found)
     assert parts is not None
     focal, shape, centre, mirrored, pose = parts
@@ -189,7 +189,7 @@ def test_a_linear_camera_comes_apart_and_together_again(sign: float) -> None:
     np.testing.assert_allclose(centre, [300.0, 200.0], atol=1e-6)
     assert focal == pytest.approx(np.sqrt(800 * 900))
     camera = GeneralCamera(focal, shape, np.zeros(2), centre, TANGENT, mirrored, pose)
-    np.testing.assert_allclose(camera.pixel(points)[kept], uv[kept], atol=1e-4)
+    np.testing.assert_allclose(camera.pixel(points)[inliers], uv[inliers], atol=1e-4)
 
 
 def test_a_parallel_projection_is_found_in_spite_of_wrong_views() -> None:

@@ -18,8 +18,8 @@ from implicam.calibrators import (
     InverseGP,
     InverseGPCalibration,
     calibrator,
+    calibrator_from_name,
     load_calibration,
-    named,
 )
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import DatasetError, FitError, MissingExtraError, UsageError
@@ -408,15 +408,15 @@ def test_a_name_is_a_method_with_one_option(
 ) -> None:
     if name in NEEDED:
         pytest.importorskip(NEEDED[name][0])
-    assert named(name) == calibrator(name.partition(":")[0], **options)
+    assert calibrator_from_name(name) == calibrator(name.partition(":")[0], **options)
     for wrong in (f"no-{name}", f"{name}-no"):
         with pytest.raises(UsageError):
-            named(wrong)
+            calibrator_from_name(wrong)
     if name in NEEDED:  # told when it is named, not in the middle of a sweep
         library, extra = NEEDED[name]
         monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(MissingExtraError, match=f"{name} needs the library '{library}'") as caught:
-            named(name)
+            calibrator_from_name(name)
         assert f"implicam[{extra}]" in caught.value.fix
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from implicam.calibrators import METHODS, NEEDED, Calibration, ForwardGP, InverseGP, named
+from implicam.calibrators import METHODS, NEEDED, Calibration, ForwardGP, InverseGP, calibrator_from_name
 from implicam.cli import main
 from implicam.cli.compare import _available_methods
 from implicam.cli.compare_table import compare_failures, compare_table
@@ -468,9 +468,9 @@ def test_a_random_split_flatters_what_learns_planes_and_the_planes_show_it() -> 
     splits = random_splits(known, [100], seeds=2)
     splits += [split for split in plane_splits(known, [100]) if split.kind == "plane y"]
     rows = {(row.method, row.split): row for row in summarise(compare_on(splits, methods))}
-    flattery = {name: rows[name, "plane y"].mean["rmse"] / rows[name, "random"].mean["rmse"] for name in methods}
-    assert flattery["unbounded"] > 20  # 75 in a trial, and 102 with another rig
-    assert flattery["forward-gp"] < 1.5
+    lattice_bias = {name: rows[name, "plane y"].mean["rmse"] / rows[name, "random"].mean["rmse"] for name in methods}
+    assert lattice_bias["unbounded"] > 20  # 75 in a trial, and 102 with another rig
+    assert lattice_bias["forward-gp"] < 1.5
     assert rows["unbounded", "plane y"].mean["ellipsoid_95"] < 0.5
 
 
@@ -749,7 +749,7 @@ def test_all_methods_are_those_that_are_there(
     assert {"forward-gp", "forward-gp:none", "inverse-gp", "other"} <= set(names)
     assert set(METHODS) - set(NEEDED) <= set(names)
     for name in names:
-        assert named(name).method == name.partition(":")[0]
-    assert named("inverse-gp:matern-5/2").kernel == "matern-5/2"
-    assert named("forward-gp:none").lens == "none"
-    assert named("explicit:kannala-brandt").lens == "kannala-brandt"
+        assert calibrator_from_name(name).method == name.partition(":")[0]
+    assert calibrator_from_name("inverse-gp:matern-5/2").kernel == "matern-5/2"
+    assert calibrator_from_name("forward-gp:none").lens == "none"
+    assert calibrator_from_name("explicit:kannala-brandt").lens == "kannala-brandt"

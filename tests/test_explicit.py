@@ -120,7 +120,7 @@ def test_a_camera_that_cannot_be_joined_is_left_out_with_the_reason() -> None:
     hidden = replace(data, observations=replace(data.observations, uv=uv, sd=np.full(uv.shape, np.nan), extra={}))
     found = calibrate_network(boards_of(hidden), "auto")
     names = rig_names(rig)
-    reasons = {names[c]: why for c, why in found.blind}
+    reasons = {names[c]: why for c, why in found.uncalibrated}
     assert "no board at the same time" in reasons["cam5"]
     assert "2 of the 3 boards" in reasons["cam4"]
     assert len(found.cameras) == 2

@@ -22,7 +22,7 @@ from implicam.geometry import Pose, look_at
 from implicam.gp.low_rank import LowRank
 from implicam.measurement import Measurement
 from implicam.rig_model.camera import TANGENT, CentralCamera, Image, Prior, ProjectiveCamera
-from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.field import empty_field
 from implicam.rig_model.general_camera import AnyCamera
 from implicam.rig_model.initialise import start_camera
@@ -225,7 +225,7 @@ def test_a_camera_is_found_from_nothing(fov: float, seed: int) -> None:
     points, offset, scale = working(world)
     started = start_camera(points[:60], uv[:60], IMAGE, "central")
     assert isinstance(started.camera, CentralCamera)
-    assert started.kept.all()
+    assert started.inliers.all()
     assert np.abs(started.camera.pixel(points[60:]) - uv[60:]).max() < 0.05  # px; the prior holds it that far
     centre = started.camera.pose.centre * scale + offset
     assert np.linalg.norm(centre - camera.pose.centre) < 1e-3 * scale
@@ -247,8 +247,8 @@ def test_a_fifth_of_wrong_detections_does_not_lead_it_astray(fov: float, seed: i
         while np.linalg.norm(noisy[i] - uv[i]) < 30:
             noisy[i] = rng.uniform(0, [1280, 800])
     started = start_camera(points, noisy, IMAGE, "central")
-    assert not started.kept[wrong].any()
-    assert started.kept[~wrong].sum() >= 31
+    assert not started.inliers[wrong].any()
+    assert started.inliers[~wrong].sum() >= 31
     assert np.sqrt(np.mean((started.camera.pixel(points) - uv) ** 2)) < 0.4
     assert isinstance(started.camera, CentralCamera)
     assert np.linalg.norm(started.camera.pose.centre * scale + offset - camera.pose.centre) < 0.05 * scale
@@ -266,9 +266,9 @@ def test_a_projective_camera_is_found_exactly(seed: int) -> None:
     np.testing.assert_allclose((centre * scale + offset - 100 * shift) @ turn, POSE.centre, atol=1e-6)
     wrong = uv.copy()
     wrong[4] += 80
-    kept = start_camera(moved, wrong, IMAGE, "none").kept
-    assert not kept[4]
-    assert kept.sum() >= 28
+    inliers = start_camera(moved, wrong, IMAGE, "none").inliers
+    assert not inliers[4]
+    assert inliers.sum() >= 28
 
 
 @pytest.mark.parametrize("lens", ["central", "none"])
@@ -377,11 +377,11 @@ def test_with_little_data_the_stated_noise_decides() -> None:
 
 def two_cameras(
     *, field_points: int = 50, signal: float = 0.5, noise: float = 0.2, proper: bool = True
-) -> tuple[tuple[CameraModel, ...], np.ndarray, tuple[Sightings, ...]]:
+) -> tuple[tuple[CameraModel, ...], np.ndarray, tuple[CameraViews, ...]]:
     """Two cameras and 50 points, of which each sees most, with a smooth error and noise; models before the fit."""
     rng = np.random.default_rng(3)
     points = rng.uniform(-1.2, 1.2, (50, 3))
-    models, sightings = [], []
+    models, camera_views = [], []
     for number, centre in enumerate([(-2.5, 0.3, -3.5), (2.2, -0.4, -3.2)]):
         lens = KannalaBrandt(900.0, 901.0, 642.0, 396.0, *(0.5 * TANGENT).tolist())
         real = CentralCamera(lens, look_at(centre, (0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0)))
@@ -398,7 +398,7 @@ def two_cameras(
         none = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
         model = CameraModel(
             camera=camera,
-            ruler=camera,
+            field_camera=camera,
             prior=prior,
             image=IMAGE,
             field=none,
@@ -410,8 +410,8 @@ def two_cameras(
         field = empty_field(LENGTHSCALE, q, 1e-7)
         weights = np.zeros((len(field.inducing), 2))
         models.append(replace(model, field=field, weights=weights))
-        sightings.append(Sightings(rows, uv, rng.uniform(0.7, 1.5, len(rows))))
-    return tuple(models), points, tuple(sightings)
+        camera_views.append(CameraViews(rows, uv, rng.uniform(0.7, 1.5, len(rows))))
+    return tuple(models), points, tuple(camera_views)
 
 
 def design(model: CameraModel, points: np.ndarray) -> np.ndarray:
@@ -439,11 +439,11 @@ def regression(
 
 
 def dense_problem(
-    models: tuple[CameraModel, ...], points: np.ndarray, sightings: tuple[Sightings, ...]
+    models: tuple[CameraModel, ...], points: np.ndarray, camera_views: tuple[CameraViews, ...]
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Designs of each camera, y, sd, and the prior of all cameras' unknowns."""
     designs, y, sd, mean, precision = [], [], [], [], []
-    for model, seen in zip(models, sightings, strict=True):
+    for model, seen in zip(models, camera_views, strict=True):
         designs.append(design(model, points[seen.rows]).reshape(2 * len(seen.rows), -1))
         y.append((seen.uv - model.camera.pixel(points[seen.rows])).ravel())
         sd.append(np.repeat(model.noise * seen.relative, 2))
@@ -478,11 +478,11 @@ def unknowns_of(posterior: Posterior) -> np.ndarray:
 
 
 def test_exact_positions_give_each_camera_its_own_linear_regression() -> None:
-    models, points, sightings = two_cameras()
-    posterior = condition(models, points, sightings, None)
+    models, points, camera_views = two_cameras()
+    posterior = condition(models, points, camera_views, None)
     assert posterior.joint is None
     for c in range(2):
-        designs, y, sd, mean, precision = dense_problem(models[c : c + 1], points, sightings[c : c + 1])
+        designs, y, sd, mean, precision = dense_problem(models[c : c + 1], points, camera_views[c : c + 1])
         expected, covariance, _ = regression(designs[0], y, sd, mean, precision)
         found = np.concatenate([posterior.steps[c], posterior.models[c].weights.T.ravel()])
         np.testing.assert_allclose(
@@ -497,10 +497,10 @@ def test_exact_positions_give_each_camera_its_own_linear_regression() -> None:
 def test_the_evidence_of_a_posterior_is_the_density_of_what_was_seen() -> None:
     found, expected = [], []
     for signal, noise in ((0.5, 0.2), (0.1, 0.4), (2.0, 0.3)):
-        models, points, sightings = two_cameras()
+        models, points, camera_views = two_cameras()
         models = tuple(replace(m, signal=signal, noise=noise) for m in models)
-        designs, y, sd, mean, precision = dense_problem(models, points, sightings)
-        found.append(condition(models, points, sightings, None).evidence)
+        designs, y, sd, mean, precision = dense_problem(models, points, camera_views)
+        found.append(condition(models, points, camera_views, None).evidence)
         expected.append(regression(block_diag(*designs), y, sd, mean, precision)[2])
     assert np.ptp(expected) > 10
     np.testing.assert_allclose(np.diff(found), np.diff(expected), rtol=1e-5)
@@ -508,9 +508,9 @@ def test_the_evidence_of_a_posterior_is_the_density_of_what_was_seen() -> None:
 
 def test_the_prediction_is_universal_kriging() -> None:
     """With the full kernel matrix and no features: eq. 4 of the design."""
-    models, points, sightings = two_cameras()
-    model, seen = models[0], sightings[0]
-    posterior = condition(models, points, sightings, None)
+    models, points, camera_views = two_cameras()
+    model, seen = models[0], camera_views[0]
+    posterior = condition(models, points, camera_views, None)
     at = np.random.default_rng(9).uniform(-1, 1, (20, 3))
 
     def seen_at(where: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -552,16 +552,16 @@ def declared(points: np.ndarray, shots: int, k: int = 3) -> ShotErrors:
 def dense_with_shots(
     models: tuple[CameraModel, ...],
     points: np.ndarray,
-    sightings: tuple[Sightings, ...],
+    camera_views: tuple[CameraViews, ...],
     errors: ShotErrors,
     *,
     density: bool = True,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """All cameras and all shots as one linear regression."""
-    designs, y, sd, mean, precision = dense_problem(models, points, sightings)
+    designs, y, sd, mean, precision = dense_problem(models, points, camera_views)
     shots, k = errors.sd.shape
     by_shot = []
-    for model, seen in zip(models, sightings, strict=True):
+    for model, seen in zip(models, camera_views, strict=True):
         D = model.camera.view(points[seen.rows]).by_point
         wide = np.zeros((len(D), 2, shots, k))
         for i, row in enumerate(seen.rows):
@@ -579,12 +579,12 @@ def dense_with_shots(
     ("shots", "k", "estimated"), [(50, 3, False), (12, 3, False), (5, 6, False), (1, 4, True), (7, 3, True)]
 )
 def test_positions_that_may_be_off_tie_the_cameras(shots: int, k: int, estimated: bool) -> None:
-    models, points, sightings = two_cameras()
+    models, points, camera_views = two_cameras()
     errors = declared(points, shots, k)
     if estimated:
         errors = replace(errors, group=np.zeros(k, dtype=np.int64))
-    mean, covariance, _ = dense_with_shots(models, points, sightings, errors)
-    posterior = condition(models, points, sightings, errors)
+    mean, covariance, _ = dense_with_shots(models, points, camera_views, errors)
+    posterior = condition(models, points, camera_views, errors)
     total = posterior.offsets[-1]
     assert posterior.joint is not None
     sd = np.sqrt(np.diag(covariance))
@@ -598,7 +598,7 @@ def test_positions_that_may_be_off_tie_the_cameras(shots: int, k: int, estimated
     assert posterior.displacement is not None
     np.testing.assert_allclose(posterior.displacement, displacement, atol=1e-6 * np.abs(displacement).max())
     for c in range(2):
-        designs, y, noise, off, precision = dense_problem(models[c : c + 1], points, sightings[c : c + 1])
+        designs, y, noise, off, precision = dense_problem(models[c : c + 1], points, camera_views[c : c + 1])
         assert_close_covariance(
             posterior.alone[c].T @ posterior.alone[c], regression(designs[0], y, noise, off, precision)[1]
         )
@@ -616,18 +616,18 @@ def test_positions_that_may_be_off_tie_the_cameras(shots: int, k: int, estimated
 @pytest.mark.parametrize("shots", [0, 4])
 def test_single_positions_that_are_off_tie_the_cameras(shots: int) -> None:
     """Of themselves, and with shots that are off besides: one dense linear regression."""
-    models, points, sightings = two_cameras()
+    models, points, camera_views = two_cameras()
     rng = np.random.default_rng(5)
     n = len(points)
     scatter = Scatter(rng.normal(size=(3, 3)) * 2e-3, rng.uniform(0.5, 3, n))
     own = ShotErrors(np.arange(n), scatter.root * scatter.size[:, None, None], np.ones((n, 3)), np.full(3, -1))
     errors = replace(declared(points, 1, shots), group=np.zeros(shots, dtype=np.int64)) if shots else None
-    designs, y, sd, mean, precision = dense_problem(models, points, sightings)
+    designs, y, sd, mean, precision = dense_problem(models, points, camera_views)
     X = [block_diag(*designs)]
     for each in (own, *([errors] * (shots > 0))):
         k = each.basis.shape[2]
         wide = []
-        for model, seen in zip(models, sightings, strict=True):
+        for model, seen in zip(models, camera_views, strict=True):
             D = model.camera.view(points[seen.rows]).by_point @ each.scaled[seen.rows]
             block = np.zeros((len(D), 2, each.count, k))
             block[np.arange(len(D)), :, each.shot[seen.rows]] = D
@@ -638,7 +638,7 @@ def test_single_positions_that_are_off_tie_the_cameras(shots: int) -> None:
     found, covariance, density = regression(
         design_matrix, y, sd, np.concatenate([mean, np.zeros(extra)]), block_diag(precision, np.eye(extra))
     )
-    posterior = condition_scattered(models, points, sightings, errors, scatter)
+    posterior = condition_scattered(models, points, camera_views, errors, scatter)
     sds = np.sqrt(np.diag(covariance))[:total]
     assert posterior.joint is None
     assert posterior.ties is not None
@@ -659,8 +659,8 @@ def test_single_positions_that_are_off_tie_the_cameras(shots: int) -> None:
         np.testing.assert_allclose(cross, covariance[:total, total + 3 * n :] / sds[:, None], atol=1e-4)
     assert posterior.displacement is not None
     np.testing.assert_allclose(posterior.displacement, moved_by, atol=1e-5 * np.abs(moved_by).max())
-    exact = condition(models, points, sightings, None)
-    expected = density - regression(*_stacked(dense_problem(models, points, sightings)))[2]
+    exact = condition(models, points, camera_views, None)
+    expected = density - regression(*_stacked(dense_problem(models, points, camera_views)))[2]
     assert abs(expected) > 5
     assert posterior.evidence - exact.evidence == pytest.approx(expected, abs=1e-2)
 
@@ -676,7 +676,7 @@ def test_more_shots_and_points_than_fit_in_one_piece_of_work() -> None:
         for model in models:
             rows = np.flatnonzero(rng.random(n) < 0.98)
             uv = model.camera.pixel(points[rows]) + 0.3 * rng.normal(size=(len(rows), 2))
-            seen.append(Sightings(rows, uv, rng.uniform(0.7, 1.5, len(rows))))
+            seen.append(CameraViews(rows, uv, rng.uniform(0.7, 1.5, len(rows))))
         if shots:
             errors = replace(declared(points, shots), shot=np.arange(n) % shots)
             posterior = condition(models, points, tuple(seen), errors)
@@ -693,15 +693,15 @@ def test_more_shots_and_points_than_fit_in_one_piece_of_work() -> None:
 
 
 def test_the_evidence_of_tied_cameras_is_the_density_of_what_was_seen() -> None:
-    models, points, sightings = two_cameras()
+    models, points, camera_views = two_cameras()
     errors = declared(points, 12)
     found, expected = [], []
     for factor in (0.1, 1.0, 10.0):
         scaled = replace(errors, sd=factor * errors.sd)
-        found.append(condition(models, points, sightings, scaled).evidence)
-        expected.append(dense_with_shots(models, points, sightings, scaled)[2])
-    found.append(condition(models, points, sightings, None).evidence)
-    expected.append(regression(*_stacked(dense_problem(models, points, sightings)))[2])
+        found.append(condition(models, points, camera_views, scaled).evidence)
+        expected.append(dense_with_shots(models, points, camera_views, scaled)[2])
+    found.append(condition(models, points, camera_views, None).evidence)
+    expected.append(regression(*_stacked(dense_problem(models, points, camera_views)))[2])
     assert np.ptp(expected) > 5
     np.testing.assert_allclose(np.diff(found), np.diff(expected), rtol=1e-4, atol=1e-3)
 
@@ -714,8 +714,8 @@ def _stacked(
 
 
 def test_rows_and_predictions_agree_with_each_other_and_with_differences() -> None:
-    models, points, sightings = two_cameras()
-    model = condition(models, points, sightings, None).models[0]
+    models, points, camera_views = two_cameras()
+    model = condition(models, points, camera_views, None).models[0]
     at = points[:20] * 0.9
     mean, slope = model.predict(at)
     np.testing.assert_allclose(model.rows(at).mean, mean, atol=1e-9)
@@ -731,23 +731,23 @@ def test_rows_and_predictions_agree_with_each_other_and_with_differences() -> No
 # fit: one view left out
 
 
-def converged(models: tuple[CameraModel, ...], points: np.ndarray, sightings: tuple[Sightings, ...]) -> Posterior:
+def converged(models: tuple[CameraModel, ...], points: np.ndarray, camera_views: tuple[CameraViews, ...]) -> Posterior:
     for _ in range(6):
-        posterior = condition(models, points, sightings, None)
+        posterior = condition(models, points, camera_views, None)
         models = posterior.models
     return posterior
 
 
 def test_leaving_a_view_out_in_closed_form_is_leaving_it_out() -> None:
-    models, points, sightings = two_cameras(proper=False)
-    posterior = converged(models, points, sightings)
-    seen, kept = sightings[0], np.ones(len(sightings[0].rows), dtype=np.bool_)
-    residual, spread = left_out(posterior, 0, points, seen, kept)
-    distance = squared_distances(posterior, 0, points, seen, kept)
+    models, points, camera_views = two_cameras(proper=False)
+    posterior = converged(models, points, camera_views)
+    seen, inliers = camera_views[0], np.ones(len(camera_views[0].rows), dtype=np.bool_)
+    residual, spread = left_out(posterior, 0, points, seen, inliers)
+    distance = squared_distances(posterior, 0, points, seen, inliers)
     for i in (0, 7, 20, 43):
-        without = kept.copy()
+        without = inliers.copy()
         without[i] = False
-        again = condition(posterior.models, points, (seen.select(without), sightings[1]), None)
+        again = condition(posterior.models, points, (seen.select(without), camera_views[1]), None)
         step, weights = again.steps[0], again.models[0].weights
         where = points[seen.rows[[i]]]
         before = replace(posterior.models[0], weights=np.zeros_like(weights))
@@ -1008,7 +1008,7 @@ def test_the_position_is_the_most_probable_one(kind: str) -> None:
             pixels = np.concatenate([model.predict(x[None])[0][0] for model in posterior.models])
             return np.asarray(root @ (data.observations.uv[i].ravel() - pixels))
 
-        best = least_squares(residuals, frame.inward(truth(data)[i]), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        best = least_squares(residuals, frame.to_working(truth(data)[i]), xtol=1e-14, ftol=1e-14, gtol=1e-14)
         sd = np.sqrt(np.diag(found.cov[i]))
         assert np.abs((best.x - found.xyz[i]) / sd).max() < 2e-3
         J = numeric(lambda d: residuals(best.x + d), np.full(3, 1e-5))  # noqa: B023

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 from implicam.calibrators import ForwardGP, ForwardGPCalibration
 from implicam.dataset import Dataset, KnownPositions
 from implicam.evaluation import cross_validate, evaluate
-from implicam.rig_model.camera_model import Sightings
+from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.leave_one_out import left_out_points
 from implicam.rig_model.level_errors import LEVEL, SHOT, levels, untold
 from implicam.rig_model.position_errors import (
@@ -29,7 +29,7 @@ from implicam.rig_model.position_errors import (
 )
 from implicam.rig_model.shot_errors import Shots
 from implicam.rig_model.tied import Scatter, condition_scattered
-from implicam.rig_model.training_data import sightings_of, stated_noise
+from implicam.rig_model.training_data import camera_views_of, stated_noise
 from implicam.simulate import Rig, Target, build_rig, moving_board, random_positions, simulate
 
 
@@ -318,18 +318,18 @@ def test_known_positions_left_out_in_closed_form_are_left_out() -> None:
     """Whole points, of the cameras as they are conditioned: against conditioning without them."""
     calibration = dots()
     fitted, frame, data = calibration.fitted, calibration.frame, calibration.data
-    errors, points = fitted.label_errors, frame.inward(data.xyz)
+    errors, points = fitted.label_errors, frame.to_working(data.xyz)
     assert errors is not None
     assert errors.size is not None
-    all_seen = sightings_of(data.observations, stated_noise(data.observations))
+    all_seen = camera_views_of(data.observations, stated_noise(data.observations))
     seen = tuple(all_seen[c] for c in fitted.cameras)
     found, spread = left_out_points(fitted, points, seen)
     assert len(found) == len(points)
-    used = tuple(one.select(k) for one, k in zip(seen, fitted.kept, strict=True))
+    used = tuple(one.select(k) for one, k in zip(seen, fitted.inliers, strict=True))
     scatter = Scatter(errors.root, errors.size)
     for row in (3, 17):
 
-        def without(one: Sightings, row: int = row) -> Sightings:
+        def without(one: CameraViews, row: int = row) -> CameraViews:
             return one.select(one.rows != row)
 
         # conditioning takes the prior of a model, which a posterior keeps
@@ -409,7 +409,7 @@ def test_plates_follow_each_other_along_their_normal() -> None:
 
 def test_a_calibration_that_grows_finds_them_again() -> None:
     before, data = dots(), moved(known(), DOTS, 5)
-    grown = before.grown(data)
+    grown = before.refit_from(data)
     errors, again = before.fitted.label_errors, grown.fitted.label_errors
     assert errors is not None
     assert again is not None
@@ -423,7 +423,7 @@ def test_what_cameras_see_is_sensitive_to_what_ties_them() -> None:
     (found,) = calibration.map.sensitivities(known().xyz[:3])
     posterior = calibration.posterior
     joint = np.concatenate([posterior.root(c) for c in range(len(posterior.models))], axis=1)
-    x = calibration.frame.inward(known().xyz[:3])
+    x = calibration.frame.to_working(known().xyz[:3])
     designs = []
     for model in posterior.models:
         rows = model.rows(x)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from implicam.calibrators import InverseGP, InverseGPCalibration, named
+from implicam.calibrators import InverseGP, InverseGPCalibration, calibrator_from_name
 from implicam.calibrators.explicit.boards import boards_of
 from implicam.cli import main
 from implicam.dataset import Dataset, write_dataset
@@ -467,7 +467,7 @@ def test_the_tables_say_what_the_rows_say() -> None:
     assert tables.tenfold(rows)[0]["best"]["known"] == 87
     rows = rows[:-3]
     rows += [{**row, "judged": BALL, "rmse": row["rmse"] / 4} for row in rows]
-    assert {(r["method"], r["random"] / r["lattice"]) for r in tables.flattery(rows)} == {(FORWARD, 4.0), (GP, 4.0)}
+    assert {(r["method"], r["random"] / r["lattice"]) for r in tables.lattice_bias(rows)} == {(FORWARD, 4.0), (GP, 4.0)}
 
 
 def test_markdown_numbers() -> None:
@@ -609,4 +609,4 @@ def test_the_page_of_the_docs_is_what_its_numbers_make() -> None:
 def test_every_method_has_a_name_that_makes_it() -> None:
     pytest.importorskip("gpytorch")
     for name in METHODS:
-        assert named(name).method == name.partition(":")[0]
+        assert calibrator_from_name(name).method == name.partition(":")[0]

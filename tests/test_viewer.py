@@ -29,8 +29,8 @@ from implicam.detect import Detected
 from implicam.errors import HardwareError, UsageError
 from implicam.geometry import rotation_from_vector
 from implicam.hardware import Frame
-from implicam.session.guide import State
-from implicam.session.looks import Look
+from implicam.session.controller import State
+from implicam.session.detections import Look
 from implicam.simulate import Target as Shown
 from implicam.simulate import build_rig, simulate
 from implicam.viewer import words
@@ -357,13 +357,13 @@ class Slow:
 
 @pytest.fixture
 def work() -> Iterator[tuple[Slow, Worker, list[Any]]]:
-    guide = Slow()
+    controller = Slow()
     complaints: list[Any] = []
-    worker = Worker(guide, complaints.append)  # type: ignore[arg-type]
+    worker = Worker(controller, complaints.append)  # type: ignore[arg-type]
     worker.start()
-    until(lambda: guide.done == ["start"])
-    yield guide, worker, complaints
-    guide.gate.set()
+    until(lambda: controller.done == ["start"])
+    yield controller, worker, complaints
+    controller.gate.set()
     worker.close()
     assert not worker._thread.is_alive()
 
@@ -381,30 +381,30 @@ def asked(worker: Worker, action: Any) -> None:
 
 
 def test_a_button_pressed_twice_counts_once(work: Any) -> None:
-    guide, worker, _ = work
-    asked(worker, guide.slow)
-    assert not worker.ask(guide.slow)
-    assert not worker.ask(guide.fail)
-    guide.gate.set()
-    asked(worker, guide.slow)
-    until(lambda: guide.done == ["start", "slow", "slow"])
+    controller, worker, _ = work
+    asked(worker, controller.slow)
+    assert not worker.ask(controller.slow)
+    assert not worker.ask(controller.fail)
+    controller.gate.set()
+    asked(worker, controller.slow)
+    until(lambda: controller.done == ["start", "slow", "slow"])
 
 
 def test_what_cannot_be_done_is_said_and_work_goes_on(work: Any) -> None:
-    guide, worker, complaints = work
-    asked(worker, guide.fail)
+    controller, worker, complaints = work
+    asked(worker, controller.fail)
     until(lambda: [str(error) for error in complaints] == ["not now"])
-    guide.gate.set()
-    asked(worker, guide.slow)
-    until(lambda: "slow" in guide.done)
+    controller.gate.set()
+    asked(worker, controller.slow)
+    until(lambda: "slow" in controller.done)
 
 
 def test_by_itself_until_a_rule_says_stop(work: Any) -> None:
-    guide, _, _ = work
-    guide.state = aiming(look("left"), auto=True)
-    until(lambda: not guide.state.auto)
-    assert guide.done == ["start", "step", "step", "step"]
-    assert guide.state.stop == "enough"
+    controller, _, _ = work
+    controller.state = aiming(look("left"), auto=True)
+    until(lambda: not controller.state.auto)
+    assert controller.done == ["start", "step", "step", "step"]
+    assert controller.state.stop == "enough"
 
 
 # -------------------------------------------------------------------------------------------------------- viser

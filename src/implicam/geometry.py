@@ -145,21 +145,21 @@ def resect_robustly(xyz: Floats, uv: Floats, *, subsets: bool = True) -> tuple[F
     Of random subsets of seven points the one with the least median error (always the same subsets), then three times
     what agrees with it. Without `subsets` it starts from all points: ten times faster, for few wrong views.
     """
-    kept = _of_best_subset(xyz, uv) if subsets else np.ones(len(xyz), dtype=np.bool_)
+    inliers = _of_best_subset(xyz, uv) if subsets else np.ones(len(xyz), dtype=np.bool_)
     for _ in range(3):
-        p = resect(xyz[kept], uv[kept])
+        p = resect(xyz[inliers], uv[inliers])
         error = _linear_error(p, xyz, uv)
-        inside = error <= 4 * np.median(error[kept])
-        if inside.sum() < FEWEST + 1 or (inside == kept).all():
+        inside = error <= 4 * np.median(error[inliers])
+        if inside.sum() < FEWEST + 1 or (inside == inliers).all():
             break
-        kept = inside
-    return p, np.asarray(kept, dtype=np.bool_)
+        inliers = inside
+    return p, np.asarray(inliers, dtype=np.bool_)
 
 
 def _of_best_subset(xyz: Floats, uv: Floats) -> Bools:
     """(n,) the seven tenths of the views that agree best with the subset that leaves the least median error."""
     rng = np.random.default_rng(0)
-    best, kept = np.inf, np.ones(len(xyz), dtype=np.bool_)
+    best, inliers = np.inf, np.ones(len(xyz), dtype=np.bool_)
     starts = [np.arange(len(xyz))]
     if len(xyz) >= 2 * FEWEST:
         starts += [rng.choice(len(xyz), FEWEST + 1, replace=False) for _ in range(SUBSETS_OF_LINEAR)]
@@ -169,10 +169,13 @@ def _of_best_subset(xyz: Floats, uv: Floats) -> Bools:
         except FitError:
             continue
         if np.median(error) < best:
-            best, kept = float(np.median(error)), error <= np.sort(error)[int(0.7 * len(error))]  # some may be infinite
+            best, inliers = (
+                float(np.median(error)),
+                error <= np.sort(error)[int(0.7 * len(error))],
+            )  # some may be infinite
     if not np.isfinite(best):
         raise _undetermined()
-    return np.asarray(kept, dtype=np.bool_)
+    return np.asarray(inliers, dtype=np.bool_)
 
 
 def _linear_error(p: Floats, xyz: Floats, uv: Floats) -> Floats:
@@ -226,16 +229,16 @@ def resect_affine(xyz: Floats, uv: Floats) -> tuple[Floats, Floats, Bools]:
     FitError for points that fix none.
     """
     _check_spread(xyz)
-    kept = np.ones(len(xyz), dtype=np.bool_)
+    inliers = np.ones(len(xyz), dtype=np.bool_)
     for _ in range(6):
-        found = np.linalg.lstsq(_homogeneous(xyz[kept]), uv[kept], rcond=None)[0]
+        found = np.linalg.lstsq(_homogeneous(xyz[inliers]), uv[inliers], rcond=None)[0]
         error = np.linalg.norm(_homogeneous(xyz) @ found - uv, axis=1)
         inside = error <= 3 * np.median(error)
-        if inside.sum() < FEWEST or (inside == kept).all() or _extents(xyz[inside])[2] < FLAT:
+        if inside.sum() < FEWEST or (inside == inliers).all() or _extents(xyz[inside])[2] < FLAT:
             break
-        kept = inside
+        inliers = inside
     A, b = np.asarray(found[:3].T, dtype=np.float64), np.asarray(found[3], dtype=np.float64)
-    return A, b, np.asarray(kept, dtype=np.bool_)
+    return A, b, np.asarray(inliers, dtype=np.bool_)
 
 
 def camera_centre(p: Floats) -> Floats:
@@ -291,7 +294,7 @@ class Resection(NamedTuple):
     focal: float
     pinhole: bool
     rms: float
-    kept: Bools
+    inliers: Bools
     doubtful: bool
 
 
@@ -320,10 +323,10 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, su
             again = _trimmed(points, offset, start)
             if np.median(again[1]) < np.median(errors):
                 found, errors, keep = again
-    kept = np.zeros(len(xyz), dtype=np.bool_)
-    kept[rows[keep]] = True
+    inliers = np.zeros(len(xyz), dtype=np.bool_)
+    inliers[rows[keep]] = True
     rms = float(np.sqrt(np.mean(errors[keep] ** 2)))
-    return Resection(found.camera_from_world, found.focal, found.pinhole, rms, kept, doubtful)
+    return Resection(found.camera_from_world, found.focal, found.pinhole, rms, inliers, doubtful)
 
 
 def resect_any_pixels(

@@ -10,12 +10,12 @@
 ('all 12 points of the budget are measured', 12)
 """
 
-from implicam.active.acquisition import ACQUISITIONS, Acquisition, acquisition, choose, path_length
+from implicam.active.acquisitions import ACQUISITIONS, Acquisition, acquisition, choose, path_length
+from implicam.active.design_model import DesignModel, Places, PredictedCovariance, design_model_of
 from implicam.active.loop import Answer, Loop, Oracle, Target, step_of
 from implicam.active.oracles import RecordedOracle, SimulatedOracle
-from implicam.active.outlook import Outlook, Places, Prospect, outlook_of
 from implicam.active.stopping import AtLeast, Below, Budget, Converged, Never, Rule, Step, Time, Within
-from implicam.active.suggest import Suggestion, suggest
+from implicam.active.suggestion import Suggestion, suggest
 from implicam.active.workspace import Workspace, workspace_from
 
 __all__ = [
@@ -26,12 +26,12 @@ __all__ = [
     "Below",
     "Budget",
     "Converged",
+    "DesignModel",
     "Loop",
     "Never",
     "Oracle",
-    "Outlook",
     "Places",
-    "Prospect",
+    "PredictedCovariance",
     "RecordedOracle",
     "Rule",
     "SimulatedOracle",
@@ -43,7 +43,7 @@ __all__ = [
     "Workspace",
     "acquisition",
     "choose",
-    "outlook_of",
+    "design_model_of",
     "path_length",
     "step_of",
     "suggest",

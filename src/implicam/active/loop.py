@@ -17,8 +17,14 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from implicam.active.acquisition import DEFAULT, Acquisition, Choice, acquisition, choose
-from implicam.active.outlook import ForwardOutlook, InverseOutlook, Places, Prospect, outlook_of
+from implicam.active.acquisitions import DEFAULT, Acquisition, Choice, acquisition, choose
+from implicam.active.design_model import (
+    ForwardDesignModel,
+    InverseDesignModel,
+    Places,
+    PredictedCovariance,
+    design_model_of,
+)
 from implicam.active.stopping import Never, Rule, Step
 from implicam.active.workspace import Workspace
 from implicam.calibrators import (
@@ -115,7 +121,7 @@ class Loop:
         self.history: list[Step] = []
         self.calibration: Calibration | None = None
         self.problem: ImplicamError | None = None
-        self.prospect: Prospect | None = None
+        self.predicted: PredictedCovariance | None = None
         self.judged_at: Floats = self.workspace.judged(self.judged, self.seed)
         self._began = time.monotonic()
         self._refused: list[tuple[Floats, str]] = []
@@ -150,13 +156,13 @@ class Loop:
         rng = np.random.default_rng([self.seed, self._asked, 3])
         try:
             with blas_threads(1):  # thousands of small matrices: two threads would wait for each other
-                outlook = self._outlook()
-                chosen = choose(outlook, self.acquisition, rng, count=number, here=here, reach=self.reach)
+                design = self._outlook()
+                chosen = choose(design, self.acquisition, rng, count=number, here=here, reach=self.reach)
         except FitError as error:  # the forward model of inverse-gp: more points will help
             self.problem = error
             return self._to_begin(number, here)
         assert self.data is not None
-        targets = targets_of(outlook.candidates, chosen, self.data)
+        targets = targets_of(design.candidates, chosen, self.data)
         if self.pool is None:
             return targets
         return [replace(target, name=self._name(target.xyz, k)) for k, target in enumerate(targets)]
@@ -181,7 +187,7 @@ class Loop:
             self.history = [step for step in self.history if data is not None and step.points < len(data)]
         self.data = data
         before, self.calibration = self.calibration, None
-        self.prospect = self.problem = None
+        self.predicted = self.problem = None
         if data is not None and len(data) >= self.start:
             try:
                 self.calibration = self._fitted(before, data, progress)
@@ -212,7 +218,7 @@ class Loop:
         if anew:
             self._from_no_guess = len(data)
         if isinstance(before, ForwardGPCalibration | InverseGPCalibration) and len(before.data) < len(data):
-            return before.grown(data, progress, anew=anew)
+            return before.refit_from(data, progress, anew=anew)
         return self.calibrator.fit(data, progress)
 
     def _to_begin(self, number: int, here: Floats | None) -> list[Target]:
@@ -244,7 +250,7 @@ class Loop:
             return str(self.pool.points[int(np.argmin(np.linalg.norm(self.pool.xyz - xyz, axis=1)))])
         return next(islice(free_names(self.data), k, None))
 
-    def _outlook(self) -> ForwardOutlook | InverseOutlook:
+    def _outlook(self) -> ForwardDesignModel | InverseDesignModel:
         assert self.calibration is not None
         candidates: Floats | Places
         if self.pool is not None:
@@ -255,7 +261,7 @@ class Loop:
             if self.acquisition.name == "sobol":
                 candidates = self.workspace.candidates(self.candidates, self.seed)[self.points :]
             candidates = self._not_refused(candidates)
-        return outlook_of(self.calibration, candidates, self._judged(), self._forward())
+        return design_model_of(self.calibration, candidates, self._judged(), self._forward())
 
     def _unused(self) -> list[int]:
         assert self.pool is not None
@@ -296,24 +302,24 @@ class Loop:
         return self.judged_at if self._forward() is None else self._judged_by_pilot
 
     def _step(self) -> Step:
-        """What is known now, and the prospect at the judged places."""
+        """What is known now, and the predicted at the judged places."""
         passed = time.monotonic() - self._began
         if self.calibration is None:
             return Step(self.points, seconds=passed)
         try:
             with blas_threads(1):
-                prospect = outlook_of(self.calibration, self.judged_at[:0], self._judged(), self._forward()).now
+                predicted = design_model_of(self.calibration, self.judged_at[:0], self._judged(), self._forward()).now
         except FitError as error:
             self.problem = error
             return Step(self.points, seconds=passed)
-        self.prospect = prospect
-        return step_of(prospect, self.points, passed)
+        self.predicted = predicted
+        return step_of(predicted, self.points, passed)
 
 
-def step_of(prospect: Prospect, points: int, seconds: float = 0.0) -> Step:
-    """The numbers of a prospect over the places where it is measured."""
-    u95, excess = prospect.u95[prospect.measured], prospect.excess[prospect.measured]
-    share = float(prospect.measured.mean()) if len(prospect.measured) else 0.0
+def step_of(predicted: PredictedCovariance, points: int, seconds: float = 0.0) -> Step:
+    """The numbers of a predicted over the places where it is measured."""
+    u95, excess = predicted.u95[predicted.measured], predicted.excess[predicted.measured]
+    share = float(predicted.measured.mean()) if len(predicted.measured) else 0.0
     if not len(u95):
         return Step(points, seconds=seconds)
     return Step(

@@ -52,7 +52,7 @@ def calibrator(method: str, **options: Any) -> Calibrator:
     return made
 
 
-def named(name: str) -> Calibrator:
+def calibrator_from_name(name: str) -> Calibrator:
     """The calibrator of a name, `method` or `method:variant`, as tables and sweeps name them.
 
     The variant is `paper` or `plain` (inverse-gp: its preset) or `no-dropout` (mlp); any other is a kernel of

@@ -280,7 +280,7 @@ class InverseGPCalibration:
         """The same method with the same options on other data."""
         return self.calibrator.fit(data, progress)
 
-    def grown(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> InverseGPCalibration:
+    def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> InverseGPCalibration:
         """As `refit`, starting from what is known, for some points more; with `anew` from no guess as well, and the
         more probable of both counts. The paper's preset always starts from its defaults."""
         if self.calibrator.preset == "paper":

@@ -55,7 +55,7 @@ def suggest_command(
     """Where to put the next known points, and what each camera will see."""
     from implicam.active import acquisition as rule_named
     from implicam.active import suggest, workspace_from
-    from implicam.active.acquisition import DEFAULT
+    from implicam.active.acquisitions import DEFAULT
 
     if output is not None:
         must_not_replace(output, calibration)
@@ -251,7 +251,7 @@ def acquire_command(
 
     Without cameras it shows the simulated rig. Every accepted point is on disk; run it again to go on.
     """
-    from implicam.session.setup import Setup, changed, open_guide
+    from implicam.session.setup import Setup, changed, open_session
 
     given = {
         "rig": rig, "rig_cameras": rig_cameras, "cameras": _cameras(camera), "robot": robot, "trigger": trigger,
@@ -270,19 +270,21 @@ def acquire_command(
     opencv()  # what is missing is said before anything is begun
     if not unattended:
         import_extra("viser", "viewer", "the page of implicam acquire")
-    with open_guide(folder, None if setup == before else setup, say=show.say) as guide:
+    with open_session(folder, None if setup == before else setup, say=show.say) as controller:
         if not unattended:
             from implicam.viewer import serve
 
-            serve(guide, host=host, port=port, token=token, open_browser=browser, say=show.say)
+            serve(controller, host=host, port=port, token=token, open_browser=browser, say=show.say)
         else:
             with show.progress(json) as progress:
-                guide.run(progress)
-            if guide.state.problem is not None:
-                raise guide.state.problem
-            if guide.state.phase != "done":
-                raise ImplicamError("nothing was calibrated.", why=guide.state.message, fix="run it again to go on")
-        _tell(guide, json)
+                controller.run(progress)
+            if controller.state.problem is not None:
+                raise controller.state.problem
+            if controller.state.phase != "done":
+                raise ImplicamError(
+                    "nothing was calibrated.", why=controller.state.message, fix="run it again to go on"
+                )
+        _tell(controller, json)
 
 
 def _stored(folder: Path) -> Any:
@@ -306,17 +308,17 @@ def _cameras(words: list[str] | None) -> tuple[tuple[str, str], ...] | None:
     return tuple((name, what) for name, _, what in pairs)
 
 
-def _tell(guide: Any, json: bool) -> None:
-    from implicam.session.guide import CALIBRATION
+def _tell(controller: Any, json: bool) -> None:
+    from implicam.session.controller import CALIBRATION
 
-    state, folder = guide.state, guide.session.folder
+    state, folder = controller.state, controller.session.folder
     step = state.history[-1] if state.history else None
     saved = folder / CALIBRATION
     if json:
         show.emit_json({
             "session": str(folder), "points": step.points if step else 0, "stopped": state.stop,
-            "length_unit": guide.session.length_unit, "worst": step and step.worst, "usual": step and step.usual,
-            "excess": step and step.excess, "skipped": len(guide.session.skipped),
+            "length_unit": controller.session.length_unit, "worst": step and step.worst, "usual": step and step.usual,
+            "excess": step and step.excess, "skipped": len(controller.session.skipped),
             "calibration": str(saved) if saved.exists() else None,
             "report": None if state.report is None else str(state.report),
         })  # fmt: skip

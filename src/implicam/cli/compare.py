@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from implicam.calibrators import METHODS, MLP, NEEDED, ForwardGP, InverseGP, named
+from implicam.calibrators import METHODS, MLP, NEEDED, ForwardGP, InverseGP, calibrator_from_name
 from implicam.cli import show
 from implicam.cli.app import Cameras, Json, LeaveOut, Unit, Without, check_figure, command, must_be_shot, read
 from implicam.cli.compare_table import compare_failures, compare_table
@@ -54,7 +54,7 @@ def compare_command(
     check_data = None if check is None else read(check, unit, cameras, without)
     splits = _splits(data, train, seeds, check_data, leave_out, lattice)
     names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
-    chosen = {name: named(name) for name in names}
+    chosen = {name: calibrator_from_name(name) for name in names}
     with show.progress(json) as progress:
         trials = compare_on(splits, chosen, progress)
     if output is not None:

@@ -88,14 +88,14 @@ def _compare_title(rows: Sequence[Row], columns: _CompareColumns) -> str:
     return f"{known}Means{error} over {over};\nbars are 95 % ellipsoids{also}"
 
 
-def _compare_cells(row: Row, columns: _CompareColumns, flattery: float = math.nan) -> list[str]:
+def _compare_cells(row: Row, columns: _CompareColumns, lattice_bias: float = math.nan) -> list[str]:
     mean, error = row.mean, row.standard_error
     return [
         *([str(row.known)] if columns.sizes else []),
         *([decimal_number(100 * mean["measured"])] if columns.partial else []),
         _plus_minus(mean["rmse"], error["rmse"]),
         *([decimal_number(mean["rmse_common"])] if columns.uneven else []),
-        *([decimal_number(flattery, 2) if plane_of(row.split) else ""] if columns.planes else []),
+        *([decimal_number(lattice_bias, 2) if plane_of(row.split) else ""] if columns.planes else []),
         *([decimal_number(mean["rmse_over_limit"])] if columns.limited else []),
         _plus_minus(100 * mean["ellipsoid_95"], 100 * error["ellipsoid_95"]),
         decimal_number(mean["nees"]),

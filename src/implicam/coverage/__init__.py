@@ -1,6 +1,6 @@
 """Does the covariance tell the truth? Errors against the stated covariance: rmse, coverage, NEES, NLL, CRPS."""
 
-from implicam.coverage.assess import assess, tercile_labels
+from implicam.coverage.assessment import assess, tercile_labels
 from implicam.coverage.intervals import Estimate
 from implicam.coverage.model import LEVELS, NEES_RIGHT, Coverage, Level, Summary
 

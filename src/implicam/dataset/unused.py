@@ -36,10 +36,10 @@ def copied_points(data: Dataset) -> tuple[Unused, ...]:
     )
 
 
-def blind_with_copies(data: Dataset, blind: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
+def uncalibrated_with_copies(data: Dataset, uncalibrated: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
     """Why cameras (their number, the reason) are not calibrated, of those that are copies what they are."""
     copies = copies_of(data)
-    return tuple((c, why_no_camera(data, c, copies) if copies.cameras[c] else why) for c, why in blind)
+    return tuple((c, why_no_camera(data, c, copies) if copies.cameras[c] else why) for c, why in uncalibrated)
 
 
 def point_copy_notes(data: Dataset) -> list[str]:

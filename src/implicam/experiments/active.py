@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators import Calibration, InverseGPCalibration, named
+from implicam.calibrators import Calibration, InverseGPCalibration, calibrator_from_name
 from implicam.compare import fit_each
 from implicam.dataset import Dataset, Floats
 from implicam.errors import ImplicamError
@@ -77,7 +77,7 @@ def grow(
     for added in range(additions + 1):
         new = added % lot == 0 or added == additions
         if new:
-            fits = [fit for fit, _ in fit_each(named(method), [data.select(mask) for mask in chosen])]
+            fits = [fit for fit, _ in fit_each(calibrator_from_name(method), [data.select(mask) for mask in chosen])]
         for i, (repeat, mask) in enumerate(zip(repeats, chosen, strict=True)):
             fit = _now(fits[i], data, mask, new)
             where = {"set": cameras, "method": method, "repeat": repeat, "added": added, "known": int(mask.sum())}

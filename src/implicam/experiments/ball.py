@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from implicam.calibrators import Calibration, Explicit, named
+from implicam.calibrators import Calibration, Explicit, calibrator_from_name
 from implicam.calibrators.explicit import rig_of
 from implicam.compare import Split, fit_each, judge
 from implicam.dataset import Dataset
@@ -92,7 +92,9 @@ def learn(source: Mapping[str, Any], trained: str, cameras: str, method: str, kn
     splits = [Split(trained, *data.split(known, seed=run), run) for run in range(runs)]
     check = of.data(CHECK, cameras) if CHECK in of.parts else None
     rows = list[Values]()
-    for split, (fit, seconds) in zip(splits, fit_each(named(method), [one.train for one in splits]), strict=True):
+    for split, (fit, seconds) in zip(
+        splits, fit_each(calibrator_from_name(method), [one.train for one in splits]), strict=True
+    ):
         to_judge = {} if trained == RANDOM else {trained: split.held_out}
         to_judge |= {} if check is None else {CHECK: check}
         for judged, held_out in to_judge.items():
@@ -159,7 +161,7 @@ def errors(measured: Measurement, data: Dataset) -> Values:
 def example(source: Mapping[str, Any], cameras: str, method: str, known: int) -> Values:
     """One run to be drawn: positions and their stated standard deviations, in mm."""
     train, held_out = Source(**source).data(BALL, cameras).split(known, seed=0)
-    return drawn(named(method).fit(train), train, held_out)
+    return drawn(calibrator_from_name(method).fit(train), train, held_out)
 
 
 def drawn(fit: Calibration, train: Dataset, held_out: Dataset) -> Values:

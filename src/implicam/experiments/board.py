@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators import named
+from implicam.calibrators import calibrator_from_name
 from implicam.compare import Split, judge
 from implicam.dataset import Dataset
 from implicam.errors import DatasetError
@@ -70,7 +70,7 @@ def learn(source: Mapping[str, Any], cameras: str, boards: int, method: str) -> 
     names = shots(data)
     taken = np.isin(data.shots, training(names, boards))
     train, held_out = data.select(taken), data.select(~taken)
-    fit = named(method).fit(train)
+    fit = calibrator_from_name(method).fit(train)
     panel = drawn(fit, train, held_out)
     where = {"set": cameras, "method": method, "boards": boards, "known": len(train), "trained": BOARD}
     scale = millimetres(train)

@@ -33,7 +33,7 @@ def ball(summary: Summary, figures: str) -> str:
             "fits, judged at random positions in the same volume:",
             _errors(rows, BALL, CHECK),
         ),
-        _flattery(summary.get("flattery", ())),
+        _lattice_bias(summary.get("flattery", ())),
         _under("Trained on random positions, and judged at random ones:", _errors(rows, RANDOM, CHECK)),
         _tenfold(summary.get("tenfold", ())),
         shown("ball-error-random"),
@@ -135,7 +135,7 @@ def _interval(times: Sequence[float | None]) -> str:
     return f"× {number(value)} [{number(low)}, {number(high)}]"
 
 
-def _flattery(given: Sequence[Mapping[str, Any]]) -> str:
+def _lattice_bias(given: Sequence[Mapping[str, Any]]) -> str:
     """Whom the lattice favours, with the most points."""
     if not given:
         return ""

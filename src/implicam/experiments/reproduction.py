@@ -129,7 +129,11 @@ def _tables(rows: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if rows.get(ball.NAME):
         mine = rows[ball.NAME]
-        found |= {"ball": tables.ball_table(mine), "tenfold": tables.tenfold(mine), "flattery": tables.flattery(mine)}
+        found |= {
+            "ball": tables.ball_table(mine),
+            "tenfold": tables.tenfold(mine),
+            "flattery": tables.lattice_bias(mine),
+        }
     if rows.get(active.NAME):
         found["active"] = tables.active_table(rows[active.NAME])
     if rows.get(board.NAME):

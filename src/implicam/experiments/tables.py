@@ -95,7 +95,7 @@ def tenfold(rows: Sequence[Row]) -> Table:
     return table
 
 
-def flattery(rows: Sequence[Row]) -> Table:
+def lattice_bias(rows: Sequence[Row]) -> Table:
     """What a lattice hides: rms error over the limit, at held-out positions of the lattice and at random ones.
 
     Only where the data have a Cramer-Rao limit: positions differ in how exactly anybody can measure them.

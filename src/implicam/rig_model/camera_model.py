@@ -25,7 +25,7 @@ class CameraModel:
     """
 
     camera: AnyCamera
-    ruler: AnyCamera
+    field_camera: AnyCamera
     prior: Prior
     image: Image
     field: LowRank
@@ -41,9 +41,9 @@ class CameraModel:
         return self.camera.size + 2 * len(self.field.inducing)
 
     def _views(self, points: Floats) -> tuple[View, View]:
-        """What the camera sees, and its ruler."""
+        """What the camera sees, and its field camera."""
         view = self.camera.view(points)
-        return view, view if self.ruler is self.camera else self.ruler.view(points)
+        return view, view if self.field_camera is self.camera else self.field_camera.view(points)
 
     def coordinates(self, view: View) -> Floats:
         """(n, 3) where the field is looked up."""
@@ -94,7 +94,7 @@ class Rows(NamedTuple):
     by_point: Floats
 
 
-def spread(rows: Rows, root: Floats) -> Floats:
+def apply_covariance_root(rows: Rows, root: Floats) -> Floats:
     """(n, 2, q) whose products `spread spread^T` are the covariances of mean pixels, from a camera's root (q, P)."""
     p, m = rows.J.shape[2], rows.phi.shape[1]
     out = rows.J @ root[:, :p].T
@@ -103,19 +103,19 @@ def spread(rows: Rows, root: Floats) -> Floats:
     return np.asarray(out, dtype=np.float64)
 
 
-class Sightings(NamedTuple):
+class CameraViews(NamedTuple):
     """What one camera saw: rows (n,) of the points, uv (n, 2), relative (n,) noise over the camera's."""
 
     rows: NDArray[np.int64]
     uv: Floats
     relative: Floats
 
-    def select(self, keep: NDArray[np.bool_]) -> Sightings:
+    def select(self, keep: NDArray[np.bool_]) -> CameraViews:
         """Some of them."""
-        return Sightings(self.rows[keep], self.uv[keep], self.relative[keep])
+        return CameraViews(self.rows[keep], self.uv[keep], self.relative[keep])
 
 
-def thin_views(seen: Sightings, most: int) -> Sightings:
+def thin_views(seen: CameraViews, most: int) -> CameraViews:
     """At most so many of them, at random."""
     return seen if len(seen.rows) <= most else seen.select(random_subset(len(seen.rows), most))
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from implicam.dataset import Dataset
 from implicam.dataset.unused import Rejected, Unused
 from implicam.geometry import Floats
-from implicam.rig_model.camera_model import Sightings
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.camera_model import CameraViews
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.leave_one_out import left_out, left_out_points
-from implicam.rig_model.training_data import Frame, sightings_of, stated_noise
+from implicam.rig_model.training_data import Frame, camera_views_of, stated_noise
 
 NAMED = 5
 """Things that a note names one by one; of more it gives the number."""
@@ -27,19 +27,19 @@ class Diagnosis:
 
     data: Dataset
     frame: Frame
-    fitted: FittedRig
+    fitted: FitResult
 
     @cached_property
     def rejected(self) -> tuple[Rejected, ...]:
         """The views not used because they contradict the others, the farthest first."""
         names, found = self.data.observations.camera_names, []
         for number, c in enumerate(self.fitted.cameras):
-            kept = self.fitted.kept[number]
-            if kept.all():
+            inliers = self.fitted.inliers[number]
+            if inliers.all():
                 continue
-            seen = self._sightings[c]
-            residual, _ = left_out(self.fitted.posterior, number, self._points, seen, kept)
-            for row in np.flatnonzero(~kept):
+            seen = self._camera_views[c]
+            residual, _ = left_out(self.fitted.posterior, number, self._points, seen, inliers)
+            for row in np.flatnonzero(~inliers):
                 point = str(self.data.points[seen.rows[row]])
                 found.append(Rejected(point, names[c], float(np.linalg.norm(residual[row]))))
         return tuple(sorted(found, key=lambda view: -np.nan_to_num(view.residual, nan=np.inf)))
@@ -64,22 +64,22 @@ class Diagnosis:
         n = len(self.data)
         posterior = self.fitted.posterior
         if self.fitted.label_errors is not None:
-            all_seen = tuple(self._sightings[c] for c in self.fitted.cameras)
+            all_seen = tuple(self._camera_views[c] for c in self.fitted.cameras)
             error, cov = left_out_points(self.fitted, self._points, all_seen)
             return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
         H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
         views = np.zeros(n)
         for number, c in enumerate(self.fitted.cameras):
-            seen, kept = self._sightings[c], self.fitted.kept[number]
-            residual, spread = left_out(posterior, number, self._points, seen, kept)
-            rows = seen.rows[kept]
+            seen, inliers = self._camera_views[c], self.fitted.inliers[number]
+            residual, spread = left_out(posterior, number, self._points, seen, inliers)
+            rows = seen.rows[inliers]
             where = self._points[rows]
             if posterior.displacement is not None:
                 where = where + posterior.displacement[rows]
             _, D = posterior.models[number].predict(where)
-            WD = np.linalg.inv(spread[kept]) @ D
+            WD = np.linalg.inv(spread[inliers]) @ D
             H[rows] += D.swapaxes(1, 2) @ WD
-            g[rows] += np.einsum("nij,ni->nj", WD, residual[kept])
+            g[rows] += np.einsum("nij,ni->nj", WD, residual[inliers])
             views[rows] += 1
         H[~np.isfinite(H).all(axis=(1, 2))] = 0.0
         size = np.linalg.eigvalsh(H)
@@ -105,8 +105,10 @@ class Diagnosis:
     def notes(self) -> list[str]:
         """Cameras that could not be calibrated, and views that contradict the others."""
         names = self.data.observations.camera_names
-        blind = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in self.fitted.blind]
-        return [*blind, *self._rejected_notes(), *self._tail_notes()]
+        uncalibrated = [
+            f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in self.fitted.uncalibrated
+        ]
+        return [*uncalibrated, *self._rejected_notes(), *self._tail_notes()]
 
     def _tail_notes(self) -> list[str]:
         if self.fitted.tails is None:
@@ -132,7 +134,7 @@ class Diagnosis:
     def _rejected_notes(self) -> list[str]:
         if not self.rejected:
             return []
-        n, total = len(self.rejected), int(sum(len(kept) for kept in self.fitted.kept))
+        n, total = len(self.rejected), int(sum(len(inliers) for inliers in self.fitted.inliers))
         named = ", ".join(
             f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in self.rejected[:NAMED]
         )
@@ -147,16 +149,16 @@ class Diagnosis:
 
     @cached_property
     def _points(self) -> Floats:
-        return self.frame.inward(self.data.xyz)
+        return self.frame.to_working(self.data.xyz)
 
     @cached_property
-    def _sightings(self) -> tuple[Sightings, ...]:
-        found = list(sightings_of(self.data.observations, stated_noise(self.data.observations)))
+    def _camera_views(self) -> tuple[CameraViews, ...]:
+        found = list(camera_views_of(self.data.observations, stated_noise(self.data.observations)))
         if self.fitted.tails is not None:
             calibrated = self.fitted.cameras
             weighted = self.fitted.tails.weighted(tuple(found[c] for c in calibrated), told=True)
-            for c, sightings in zip(calibrated, weighted, strict=True):
-                found[c] = sightings
+            for c, camera_views in zip(calibrated, weighted, strict=True):
+                found[c] = camera_views
         return tuple(found)
 
     @cached_property
@@ -164,5 +166,5 @@ class Diagnosis:
         """(n, calibrated cameras) the views used."""
         used = np.zeros((len(self.data), len(self.fitted.cameras)), dtype=np.bool_)
         for number, c in enumerate(self.fitted.cameras):
-            used[self._sightings[c].rows, number] = self.fitted.kept[number]
+            used[self._camera_views[c].rows, number] = self.fitted.inliers[number]
         return used

@@ -13,17 +13,17 @@ from implicam.rig_model.shot_errors import ShotErrors
 
 
 @dataclass(frozen=True, eq=False)
-class FittedRig:
-    """cameras: numbers of those that could be fitted, in order, as posterior.models. blind: (number, why) of others.
-    kept: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are; label_sd
-    (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. label_errors: how
-    single known positions are off besides, if they are; untold_sd (6,): how planes may be off that are too few to tell.
-    ordinary_px: per fitted camera, see `Started`."""
+class FitResult:
+    """cameras: numbers of those that could be fitted, in order, as posterior.models. uncalibrated: (number, why) of the
+    others. inliers: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are;
+    label_sd (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. label_errors:
+    how single known positions are off besides, if they are; untold_sd (6,): how planes may be off that are too few to
+    tell. ordinary_px: per fitted camera, see `Started`."""
 
     posterior: Posterior
     cameras: tuple[int, ...]
-    blind: tuple[tuple[int, str], ...]
-    kept: tuple[Bools, ...]
+    uncalibrated: tuple[tuple[int, str], ...]
+    inliers: tuple[Bools, ...]
     hyperparameters: Hyperparameters
     errors: ShotErrors | None
     label_sd: Floats | None

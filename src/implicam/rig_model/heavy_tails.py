@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc, gammaln, logsumexp, ndtri
 
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.camera_model import Sightings
+from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.wrong_views import Ints, Linear
 
 DEGREES = (2.2, 2.6, 3.0, 3.5, 4.2, 5.0, 7.0, 10.0, 20.0)
@@ -80,7 +80,7 @@ class Tails(NamedTuple):
     degrees: float
     weights: tuple[Floats, ...]
 
-    def weighted(self, seen: tuple[Sightings, ...], *, told: bool) -> tuple[Sightings, ...]:
+    def weighted(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
         """The sightings, noisier where they count less; told: by the loss of information too."""
         loss = self.loss if told else 1.0
         return tuple(

@@ -38,7 +38,7 @@ class Started(NamedTuple):
 
     camera: AnyCamera
     prior: Prior
-    kept: Bools
+    inliers: Bools
     family: str = "ordinary"
     ordinary_px: float = float("nan")
 
@@ -54,49 +54,51 @@ def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> Started
     camera = CentralCamera(
         KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist()), found.camera_from_world
     )
-    return _with_prior(camera, points, uv, image, found.kept)
+    return _with_prior(camera, points, uv, image, found.inliers)
 
 
 def start_again(camera: AnyCamera, points: Floats, uv: Floats, image: Image, lens: str) -> Started:
     """The same from a camera that fitted most of these points a moment ago; from no guess where it does not."""
     error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    kept = error <= max(FAR * float(np.nanmedian(error)), 1e-4 * image.half)
-    if not isinstance(camera, CentralCamera) or kept.sum() < max(FEWEST, len(points) / 2):
+    inliers = error <= max(FAR * float(np.nanmedian(error)), 1e-4 * image.half)
+    if not isinstance(camera, CentralCamera) or inliers.sum() < max(FEWEST, len(points) / 2):
         return start_camera(points, uv, image, lens)
-    return _with_prior(camera, points, uv, image, kept)
+    return _with_prior(camera, points, uv, image, inliers)
 
 
-def _with_prior(camera: CentralCamera, points: Floats, uv: Floats, image: Image, kept: Bools) -> Started:
-    there = camera.pose.apply(points[kept])
+def _with_prior(camera: CentralCamera, points: Floats, uv: Floats, image: Image, inliers: Bools) -> Started:
+    there = camera.pose.apply(points[inliers])
     widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
-    return _refined(camera, camera.prior(image, widest), points, uv, image, kept)
+    return _refined(camera, camera.prior(image, widest), points, uv, image, inliers)
 
 
 def _start_projective(points: Floats, uv: Floats, image: Image) -> Started:
-    kept = resect_any_lens(points, uv, middle=image.centre).kept  # any lens at all tells the wrong views from the right
+    inliers = resect_any_lens(
+        points, uv, middle=image.centre
+    ).inliers  # any lens at all tells the wrong views from the right
     for _ in range(5):
-        camera = ProjectiveCamera(resect(points[kept], uv[kept]))
+        camera = ProjectiveCamera(resect(points[inliers], uv[inliers]))
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         inside = ~(error > FAR * np.nanmedian(error))
-        if inside.sum() < FEWEST or (inside == kept).all():
+        if inside.sum() < FEWEST or (inside == inliers).all():
             break
-        kept = inside
+        inliers = inside
     front = ~np.isnan(camera.pixel(points)[:, 0])  # no linear projection sees what is behind it
-    return Started(camera, camera.prior(image, 1.0), kept & front, "none")
+    return Started(camera, camera.prior(image, 1.0), inliers & front, "none")
 
 
-def _refined(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, kept: Bools) -> Started:
+def _refined(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, inliers: Bools) -> Started:
     """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong."""
     sd = 1e-3 * image.half
     for _ in range(4):
-        camera = levenberg_marquardt(camera, prior, points[kept], uv[kept], sd)
+        camera = levenberg_marquardt(camera, prior, points[inliers], uv[inliers], sd)
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        sd = max(float(np.median(error[kept])), 1e-5 * image.half)
-        inside = error <= max(FAR * float(np.median(error[kept])), 1e-4 * image.half)
-        if inside.sum() < FEWEST or (inside == kept).all():
+        sd = max(float(np.median(error[inliers])), 1e-5 * image.half)
+        inside = error <= max(FAR * float(np.median(error[inliers])), 1e-4 * image.half)
+        if inside.sum() < FEWEST or (inside == inliers).all():
             break
-        kept = inside
-    return Started(camera, prior, kept)
+        inliers = inside
+    return Started(camera, prior, inliers)
 
 
 def levenberg_marquardt(
@@ -153,7 +155,7 @@ def start_rig(
     """
 
     def one(c: int) -> Started | FitError:
-        seen = problem.sightings[c]
+        seen = problem.camera_views[c]
         try:
             _check_places(problem.points[seen.rows])
             started = start(c, problem.points[seen.rows], seen.uv)
@@ -164,29 +166,29 @@ def start_rig(
         except FitError as error:
             return type(error)(error.what + _why(problem, c), why=error.why, fix=error.fix)
 
-    started, blind = {}, []
-    for c, found in enumerate(side_by_side(one, range(len(problem.sightings)))):
+    started, uncalibrated = {}, []
+    for c, found in enumerate(side_by_side(one, range(len(problem.camera_views)))):
         if isinstance(found, FitError):
-            blind.append((c, found.what))
+            uncalibrated.append((c, found.what))
         else:
             started[c] = found
-    require_two_cameras(problem, started, blind)
-    return started, blind
+    require_two_cameras(problem, started, uncalibrated)
+    return started, uncalibrated
 
 
-def require_two_cameras(problem: Problem, started: dict[int, Started], blind: list[tuple[int, str]]) -> None:
+def require_two_cameras(problem: Problem, started: dict[int, Started], uncalibrated: list[tuple[int, str]]) -> None:
     """FitError, which says why, where fewer than two cameras are left."""
     if len(started) < 2:
         raise FitError(
             f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
-            why="; ".join(f"{problem.names[c]}: {why}" for c, why in blind) or "there is one camera",
-            fix=_cure(problem, blind),
+            why="; ".join(f"{problem.names[c]}: {why}" for c, why in uncalibrated) or "there is one camera",
+            fix=_cure(problem, uncalibrated),
         )
 
 
 def _why(problem: Problem, c: int) -> str:
     """What its rows say of a camera that no model fits, as a sentence after another."""
-    seen = problem.sightings[c]
+    seen = problem.camera_views[c]
     uv = np.full((len(problem.points), 2), np.nan)
     uv[seen.rows] = seen.uv
     why = what_is_wrong(problem.points, uv)
@@ -200,17 +202,17 @@ def _check_places(points: Floats) -> None:
         raise FitError(f"its {len(points)} views are of {places} different positions, and it takes {FEWEST}.")
 
 
-def _cure(problem: Problem, blind: list[tuple[int, str]]) -> str:
-    if not blind:
+def _cure(problem: Problem, uncalibrated: list[tuple[int, str]]) -> str:
+    if not uncalibrated:
         return "use two cameras or more: a position is where their lines of sight meet"
-    if sum(len(seen.rows) >= ENOUGH_VIEWS for seen in problem.sightings) >= 2:
+    if sum(len(seen.rows) >= ENOUGH_VIEWS for seen in problem.camera_views) >= 2:
         return "look whether pixels and known positions belong together: order of the rows, names, axes, units"
     return "show the cameras more known points, in the whole volume"
 
 
 def check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:
     """FitError for a start that too few views agree on, or that leaves too much."""
-    error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.kept]
+    error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.inliers]
     low, high = pixel_extent(uv)
     half = float((high - low).max()) / 2
     if len(error) < FEWEST:
@@ -224,7 +226,7 @@ def check_start(started: Started, points: Floats, uv: Floats, problem: Problem) 
         )
 
 
-def without_field(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
+def lens_only_model(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
     """A camera model that is nothing but the camera; noise in pixels."""
     field = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
     none = np.zeros((1, 2))

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.camera_model import Sightings, spread
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.camera_model import CameraViews, apply_covariance_root
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.posterior import Posterior
 from implicam.threads import side_by_side
 
@@ -24,23 +24,23 @@ MAX_LEVERAGE = 3.0
 and not how it is off itself."""
 
 
-def squared_distances(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> Floats:
+def squared_distances(posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools) -> Floats:
     """(n,) how far each view is from what the others predict: closed form for the views used, eq. (18)."""
-    residual, covariance = left_out(posterior, c, points, seen, kept)
+    residual, covariance = left_out(posterior, c, points, seen, inliers)
     inverse = np.linalg.inv(covariance)
     distance = np.einsum("ni,nij,nj->n", residual, inverse, residual)
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf), dtype=np.float64)
 
 
-def left_out(posterior: Posterior, c: int, points: Floats, seen: Sightings, kept: Bools) -> tuple[Floats, Floats]:
+def left_out(posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools) -> tuple[Floats, Floats]:
     """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px.
 
     A lens is extrapolated behind the camera, to pixels that may be anything, with a spread to match. A view that is
     off by more than the picture is none of that point, whatever the spread: its covariance is that of the noise.
     """
     at = residuals_of(posterior, c, points, seen)
-    residual, covariance = left_out_from(at, kept)
-    elsewhere = ~kept & ~(np.linalg.norm(at.residual, axis=1) <= 2 * posterior.models[c].image.half)
+    residual, covariance = left_out_from(at, inliers)
+    elsewhere = ~inliers & ~(np.linalg.norm(at.residual, axis=1) <= 2 * posterior.models[c].image.half)
     return residual, np.where(elsewhere[:, None, None], (at.sd**2)[:, None, None] * np.eye(2), covariance)
 
 
@@ -54,43 +54,43 @@ class Residuals(NamedTuple):
     sd: Floats
 
 
-def residuals_of(posterior: Posterior, c: int, points: Floats, seen: Sightings) -> Residuals:
+def residuals_of(posterior: Posterior, c: int, points: Floats, seen: CameraViews) -> Residuals:
     """Of all views of camera c."""
     model = posterior.models[c]
     where = points[seen.rows]
     if posterior.displacement is not None:
         where = where + posterior.displacement[seen.rows]
     rows = model.rows(where)
-    half = spread(rows, posterior.alone[c])
+    half = apply_covariance_root(rows, posterior.alone[c])
     return Residuals(seen.uv - rows.mean, half @ half.swapaxes(1, 2), rows.rest, model.noise * seen.relative)
 
 
-def left_out_from(at: Residuals, kept: Bools) -> tuple[Floats, Floats]:
-    """As `left_out`; kept: the views that the posterior is from."""
+def left_out_from(at: Residuals, inliers: Bools) -> tuple[Floats, Floats]:
+    """As `left_out`; inliers: the views that the posterior is from."""
     smooth = at.reach / (at.sd**2)[:, None, None]
-    left = np.where(kept[:, None, None] & np.isfinite(smooth), np.eye(2) - smooth, np.eye(2))
+    left = np.where(inliers[:, None, None] & np.isfinite(smooth), np.eye(2) - smooth, np.eye(2))
     values, vectors = np.linalg.eigh(left)  # rounding can make a view that decides alone more than decisive
     inside = vectors / np.maximum(values, LEAST_LEFT)[:, None, :] @ vectors.swapaxes(1, 2)
     residual = np.einsum("nij,nj->ni", inside, at.residual)
-    extra = np.where(kept[:, None, None], 0, at.reach)
+    extra = np.where(inliers[:, None, None], 0, at.reach)
     return residual, inside * (at.sd**2)[:, None, None] + extra + at.rest[:, None, None] * np.eye(2)
 
 
-def judged_all(
-    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
+def update_inliers(
+    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
 ) -> tuple[Bools, ...]:
     """Per camera, the views to use next: not those that contradict the others."""
 
     def one(c: int) -> Bools:
-        return next_inliers(squared_distances(posterior, c, points, seen[c], kept[c]), kept[c])
+        return next_inliers(squared_distances(posterior, c, points, seen[c], inliers[c]), inliers[c])
 
     return tuple(side_by_side(one, range(len(seen))))
 
 
-def next_inliers(distance: Floats, kept: Bools, limit: float = OUTLIER) -> Bools:
+def next_inliers(distance: Floats, inliers: Bools, limit: float = OUTLIER) -> Bools:
     """The views to use next: the far ones go, the worst tenth at a time, those that agree come back."""
-    worst = np.quantile(distance[kept], 0.9) if kept.any() else 0.0
-    return np.asarray(np.where(kept, distance <= max(limit, worst), distance <= limit), dtype=np.bool_)
+    worst = np.quantile(distance[inliers], 0.9) if inliers.any() else 0.0
+    return np.asarray(np.where(inliers, distance <= max(limit, worst), distance <= limit), dtype=np.bool_)
 
 
 class LeftOut(NamedTuple):
@@ -115,12 +115,12 @@ class LeftOut(NamedTuple):
 
 
 def left_out_views(
-    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
+    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
 ) -> list[LeftOut]:
     """Per camera."""
     found = []
     where = points if posterior.displacement is None else points + posterior.displacement
-    for c, (one, k) in enumerate(zip(seen, kept, strict=True)):
+    for c, (one, k) in enumerate(zip(seen, inliers, strict=True)):
         residual, covariance = left_out(posterior, c, points, one, k)
         slope = posterior.models[c].predict(where[one.rows])[1]
         noise2 = (posterior.models[c].noise * one.relative) ** 2
@@ -132,13 +132,13 @@ def left_out_views(
 
 
 def left_out_positions(
-    posterior: Posterior, points: Floats, seen: tuple[Sightings, ...], kept: tuple[Bools, ...]
+    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
 ) -> Floats:
     """(n, 3) how far each known point is measured off its position by views predicted without it; NaN where fewer than
     two cameras see it."""
     n = len(points)
     information, pull, views = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
-    for view, k in zip(left_out_views(posterior, points, seen, kept), kept, strict=True):
+    for view, k in zip(left_out_views(posterior, points, seen, inliers), inliers, strict=True):
         rows = view.rows[k]  # a camera sees a point once
         information[rows] += view.information[k]
         pull[rows] += view.pull[k]
@@ -150,7 +150,7 @@ def left_out_positions(
     return error
 
 
-def left_out_points(fitted: FittedRig, points: Floats, seen: tuple[Sightings, ...]) -> tuple[Floats, Floats]:
+def left_out_points(fitted: FitResult, points: Floats, seen: tuple[CameraViews, ...]) -> tuple[Floats, Floats]:
     """Of the known points that two cameras see: the error (m, 3) against the known position of each, measured without
     its own views, and its covariance (m, 3, 3), in which the error of the position is included; eq. (18) with all views
     of a point together. seen: what each fitted camera saw."""
@@ -163,14 +163,14 @@ def left_out_points(fitted: FittedRig, points: Floats, seen: tuple[Sightings, ..
     shift = np.zeros((n, 3))
     if fitted.errors is not None and posterior.unknowns is not None:
         shift = fitted.errors.scaled @ posterior.unknowns.mean
-    for c, (one, kept) in enumerate(zip(seen, fitted.kept, strict=True)):
-        used, pair = one.select(kept), slice(2 * c, 2 * c + 2)
+    for c, (one, inliers) in enumerate(zip(seen, fitted.inliers, strict=True)):
+        used, pair = one.select(inliers), slice(2 * c, 2 * c + 2)
         model, where = posterior.models[c], (points + shift)[used.rows]
         rows = model.rows(where)
         residual[used.rows, pair] = used.uv - rows.mean
         slope[used.rows, pair] = model.predict(where)[1]
         noise2[used.rows, pair] = (model.noise * used.relative)[:, None] ** 2
-        half[used.rows, pair] = spread(rows, posterior.root(c))
+        half[used.rows, pair] = apply_covariance_root(rows, posterior.root(c))
     own = slope @ (errors.root * errors.size[:, None, None])
     views = noise2[:, :, None] * np.eye(2 * C) + own @ own.swapaxes(1, 2)
     without = views @ np.linalg.solve(

@@ -9,7 +9,7 @@ import numpy as np
 
 from implicam.geometry import Floats
 from implicam.rig_model.camera import Prior
-from implicam.rig_model.camera_model import CameraModel, Sightings, thin_views
+from implicam.rig_model.camera_model import CameraModel, CameraViews, thin_views
 from implicam.rig_model.general_camera import AnyCamera
 from implicam.rig_model.normal_equations import CameraFailedError
 from implicam.rig_model.posterior import Posterior, condition
@@ -27,16 +27,16 @@ MISFIT_TOLERANCE = 1e-3
 """By how much a step may worsen minus twice the log posterior: rounding and what is left out of the views."""
 
 
-def settle(
+def iterate_linearisation(
     models: tuple[CameraModel, ...],
     points: Floats,
-    used: tuple[Sightings, ...],
+    used: tuple[CameraViews, ...],
     errors: ShotErrors | None,
     scatter: Scatter | None = None,
 ) -> Posterior:
     """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
     if errors is None and scatter is None and len(models) > 1:
-        return _settled_alone(models, points, used)
+        return _linearise_alone(models, points, used)
     misfits: list[_Misfit] = []
     for _ in range(MAX_SETTLING_STEPS):
         if scatter is None:
@@ -58,12 +58,12 @@ def settle(
     return replace(posterior, models=models)
 
 
-def _settled_alone(models: tuple[CameraModel, ...], points: Floats, used: tuple[Sightings, ...]) -> Posterior:
+def _linearise_alone(models: tuple[CameraModel, ...], points: Floats, used: tuple[CameraViews, ...]) -> Posterior:
     """The same where known positions are exact: no camera takes part in the steps that another still needs."""
 
     def one(c: int) -> Posterior:
         try:
-            return settle((models[c],), points, (used[c],), None)
+            return iterate_linearisation((models[c],), points, (used[c],), None)
         except CameraFailedError as error:
             raise CameraFailedError(c, str(error)) from error
 
@@ -92,7 +92,7 @@ class _Misfit(NamedTuple):
     factor: Floats
 
     @classmethod
-    def of(cls, model: CameraModel, points: Floats, seen: Sightings) -> _Misfit:
+    def of(cls, model: CameraModel, points: Floats, seen: CameraViews) -> _Misfit:
         """Of the camera's present field."""
         seen = thin_views(seen, MAX_MISFIT_VIEWS)
         where = points[seen.rows]

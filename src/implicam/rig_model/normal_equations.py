@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from implicam.geometry import Floats
-from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.threads import side_by_side
 
 JITTERS = (0.0, 1e-13, 1e-11, 1e-9)
@@ -31,10 +31,10 @@ def stable_cholesky(A: Floats) -> Floats:
 
 
 def camera_normals(
-    models: tuple[CameraModel, ...], points: Floats, sightings: tuple[Sightings, ...]
+    models: tuple[CameraModel, ...], points: Floats, camera_views: tuple[CameraViews, ...]
 ) -> list[NormalEquations]:
     """The normal equations of each camera, eq. (13)."""
-    return side_by_side(lambda pair: _normal(pair[0], points, pair[1]), list(zip(models, sightings, strict=True)))
+    return side_by_side(lambda pair: _normal(pair[0], points, pair[1]), list(zip(models, camera_views, strict=True)))
 
 
 class CameraFailedError(np.linalg.LinAlgError):
@@ -65,7 +65,7 @@ class NormalEquations(NamedTuple):
     logs: float
 
 
-def _normal(model: CameraModel, points: Floats, seen: Sightings) -> NormalEquations:
+def _normal(model: CameraModel, points: Floats, seen: CameraViews) -> NormalEquations:
     p, m, P = model.camera.size, len(model.field.inducing), model.size
     off = model.prior.mean - model.camera.parameters
     A, b = np.zeros((P, P)), np.zeros(P)
@@ -91,7 +91,7 @@ def _normal(model: CameraModel, points: Floats, seen: Sightings) -> NormalEquati
 
 
 def whitened_rows(
-    model: CameraModel, points: Floats, seen: Sightings
+    model: CameraModel, points: Floats, seen: CameraViews
 ) -> Iterator[tuple[Floats, Floats, Floats, Floats, Floats]]:
     """In parts: the noise (n,), and in units of it the residuals, their slopes by lens, field and point."""
     bare = model.without_weights()

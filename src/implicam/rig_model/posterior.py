@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from implicam.geometry import Floats
-from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.normal_equations import NormalEquations, camera_normals, naming_camera, solve_normal
 from implicam.rig_model.schur import ShotSchurBlock, Unknowns, views_by_shots
 from implicam.rig_model.shot_errors import ShotErrors
@@ -71,16 +71,16 @@ class Posterior:
 
 
 def condition(
-    models: tuple[CameraModel, ...], points: Floats, sightings: tuple[Sightings, ...], errors: ShotErrors | None
+    models: tuple[CameraModel, ...], points: Floats, camera_views: tuple[CameraViews, ...], errors: ShotErrors | None
 ) -> Posterior:
     """The posterior from known points (n, 3) and what each camera saw, eqs. (13) to (15).
 
     The models returned have moved to the posterior mean, so that a second call linearises there.
     """
-    normals = camera_normals(models, points, sightings)
+    normals = camera_normals(models, points, camera_views)
     if errors is None:
         return _independent(models, normals)
-    return _tied(models, points, sightings, normals, errors)
+    return _tied(models, points, camera_views, normals, errors)
 
 
 def _independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]) -> Posterior:
@@ -98,7 +98,7 @@ def _independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]
 def _tied(
     models: tuple[CameraModel, ...],
     points: Floats,
-    sightings: tuple[Sightings, ...],
+    camera_views: tuple[CameraViews, ...],
     normals: list[NormalEquations],
     errors: ShotErrors,
 ) -> Posterior:
@@ -106,9 +106,9 @@ def _tied(
     ends = np.cumsum([normal.b.size for normal in normals])
     A, b = block_diag(*(normal.A for normal in normals)), np.concatenate([normal.b for normal in normals])
     value = -sum(normal.squares + normal.logs for normal in normals)
-    parts = list(views_by_shots(sightings, errors))
+    parts = list(views_by_shots(camera_views, errors))
 
-    def meeting(seen: tuple[Sightings, ...], part: slice) -> ShotSchurBlock:
+    def meeting(seen: tuple[CameraViews, ...], part: slice) -> ShotSchurBlock:
         return ShotSchurBlock.of(models, points, seen, errors, part)
 
     kept = meeting(*parts[0]) if len(parts) == 1 else None  # of many, each is made twice and never kept

@@ -15,7 +15,7 @@ from implicam.dataset.requirements import same_cameras
 from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.rig_model.alarm import Table, alarm_of
-from implicam.rig_model.camera_model import spread
+from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
@@ -39,7 +39,7 @@ class Sensitivity(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RigMap:
+class FittedRig:
     """trained: what the cameras saw when they were fitted, all cameras; cameras: numbers of those that could be, in
     the order of posterior.models; posterior: in the working frame; labels: how known positions are off, if they are.
     misfit_adds: residuals that are larger than the views state come from the lens models, and not from the views.
@@ -69,7 +69,7 @@ class RigMap:
         seen = np.asarray(np.isfinite(uv).all(axis=2))
         measured = Measurement(
             observations.points,
-            self.frame.outward(found.xyz),
+            self.frame.to_world(found.xyz),
             found.cov * self.frame.scale**2,
             seen.sum(axis=1) - found.left_out.sum(axis=1),
             found.p,
@@ -108,7 +108,7 @@ class RigMap:
 
     def predict(self, xyz: Floats) -> Floats:
         """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
-        points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
         uv = np.full((len(points), len(self.trained.cameras), 2), np.nan)
         there = np.isfinite(points).all(axis=1)
         where = points[there]
@@ -121,12 +121,12 @@ class RigMap:
     def sensitivities(self, xyz: Floats) -> list[Sensitivity]:
         """For positions (n, 3): one for each camera; a single one of all cameras where errors of the known positions
         tie them together. NaN where a lens has no answer."""
-        points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
         parts = []
         for number, (c, model) in enumerate(zip(self.cameras, self.posterior.models, strict=True)):
             rows = model.rows(points)
             slope = model.predict(points)[1] / self.frame.scale
-            half = spread(rows, self.posterior.root(number))
+            half = apply_covariance_root(rows, self.posterior.root(number))
             noise = np.full((len(points), 2), model.noise**2 * information_loss(self.degrees))
             parts.append(Sensitivity((c,), slope, half, rows.rest[:, None].repeat(2, axis=1), noise))
         if not self.posterior.tied:
@@ -137,7 +137,7 @@ class RigMap:
     def slopes(self, xyz: Floats) -> Iterator[tuple[Floats, float, int]]:
         """For positions (n, 3), per calibrated camera: the derivative of its pixels (n, 2, 3) per length unit, its
         noise in pixels, and its number in the dataset."""
-        points = self.frame.inward(np.asarray(xyz, dtype=np.float64))
+        points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
         loss = float(np.sqrt(information_loss(self.degrees)))
         for c, model in zip(self.cameras, self.posterior.models, strict=True):
             yield model.predict(points)[1] / self.frame.scale, model.noise * loss, c
@@ -147,7 +147,7 @@ class RigMap:
         nowhere = np.zeros((1, 2))
         cameras = (model.camera for model in self.posterior.models)
         return {
-            name: self.frame.outward(camera.lines(nowhere)[0])
+            name: self.frame.to_world(camera.lines(nowhere)[0])
             for name, camera in zip(self.camera_names, cameras, strict=True)
         }
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.geometry import Floats
-from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.normal_equations import slices, whitened_rows
 from implicam.rig_model.shot_errors import ShotErrors
 from implicam.threads import side_by_side
@@ -27,12 +27,12 @@ class Unknowns(NamedTuple):
 
 
 def views_by_shots(
-    sightings: tuple[Sightings, ...], errors: ShotErrors
-) -> Iterator[tuple[tuple[Sightings, ...], slice]]:
+    camera_views: tuple[CameraViews, ...], errors: ShotErrors
+) -> Iterator[tuple[tuple[CameraViews, ...], slice]]:
     """The sightings of some shots at a time, so that memory does not grow with their number."""
     for part in slices(errors.count, 512):
         inside = (errors.shot >= part.start) & (errors.shot < part.stop)
-        yield tuple(seen.select(inside[seen.rows]) for seen in sightings), part
+        yield tuple(seen.select(inside[seen.rows]) for seen in camera_views), part
 
 
 class ShotSchurBlock(NamedTuple):
@@ -47,14 +47,14 @@ class ShotSchurBlock(NamedTuple):
         cls,
         models: tuple[CameraModel, ...],
         points: Floats,
-        sightings: tuple[Sightings, ...],
+        camera_views: tuple[CameraViews, ...],
         errors: ShotErrors,
         part: slice,
     ) -> ShotSchurBlock:
         """From the views of these shots."""
         S, k = part.stop - part.start, errors.basis.shape[2]
         found = side_by_side(
-            lambda pair: _meet(pair[0], points, pair[1], errors, part), list(zip(models, sightings, strict=True))
+            lambda pair: _meet(pair[0], points, pair[1], errors, part), list(zip(models, camera_views, strict=True))
         )
         H = np.eye(k) + np.sum([one.H for one in found], axis=0)
         assert H.shape == (S, k, k)
@@ -87,7 +87,7 @@ class ShotSchurBlock(NamedTuple):
         return Unknowns(self.unknowns(mean).ravel(), covariance, cross)
 
 
-def _meet(model: CameraModel, points: Floats, seen: Sightings, errors: ShotErrors, part: slice) -> ShotSchurBlock:
+def _meet(model: CameraModel, points: Floats, seen: CameraViews, errors: ShotErrors, part: slice) -> ShotSchurBlock:
     S, k = part.stop - part.start, errors.basis.shape[2]
     p, m = model.camera.size, len(model.field.inducing)
     total = ShotSchurBlock(np.zeros((S, k, k)), np.zeros((S, k)), np.zeros((S, k, model.size)))

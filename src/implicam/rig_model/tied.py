@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from implicam.geometry import Floats
-from implicam.rig_model.camera_model import CameraModel, Sightings, spread
+from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
 from implicam.rig_model.normal_equations import camera_normals, solve_normal
 from implicam.rig_model.posterior import Posterior, moved
 from implicam.rig_model.schur import Unknowns
@@ -41,15 +41,15 @@ class Scatter:
 def condition_scattered(
     models: tuple[CameraModel, ...],
     points: Floats,
-    sightings: tuple[Sightings, ...],
+    camera_views: tuple[CameraViews, ...],
     errors: ShotErrors | None,
     scatter: Scatter,
 ) -> Posterior:
     """As `posterior.condition`, where each known point has an error of its own. errors: those of shots besides, all
     as one "shot"; or None."""
-    normals = camera_normals(models, points, sightings)
+    normals = camera_normals(models, points, camera_views)
     alone = [solve_normal(normal.A, normal.b) for normal in normals]
-    rig = _Rig(models, points, sightings, errors, scatter, tuple(root for root, _, _ in alone))
+    rig = _Rig(models, points, camera_views, errors, scatter, tuple(root for root, _, _ in alone))
     b = np.concatenate([root @ normal.b for root, normal in zip(rig.alone, normals, strict=True)])
     value = -sum(normal.squares + normal.logs + log for normal, (_, _, log) in zip(normals, alone, strict=True))
     k, P = rig.shot_unknowns, len(b)
@@ -116,7 +116,7 @@ class _Rig:
 
     models: tuple[CameraModel, ...]
     points: Floats
-    sightings: tuple[Sightings, ...]
+    camera_views: tuple[CameraViews, ...]
     errors: ShotErrors | None
     scatter: Scatter
     alone: tuple[Floats, ...]
@@ -143,7 +143,7 @@ class _Rig:
         own = self.scatter.root * self.scatter.size[part, None, None]
 
         def fill(c: int) -> None:
-            seen = self.sightings[c]
+            seen = self.camera_views[c]
             seen = seen.select((seen.rows >= part.start) & (seen.rows < part.stop))
             model = self.models[c].without_weights()
             rows = model.rows(self.points[seen.rows])
@@ -152,7 +152,7 @@ class _Rig:
             by_point = rows.by_point / noise
             if self.errors is not None:
                 views[at, pair, :k] = by_point @ self.errors.scaled[seen.rows]
-            views[at, pair, starts[c] : starts[c + 1]] = spread(rows, self.alone[c]) / noise
+            views[at, pair, starts[c] : starts[c + 1]] = apply_covariance_root(rows, self.alone[c]) / noise
             views[at, pair, -1] = (seen.uv - rows.mean) / noise[..., 0]
             slopes[at, pair] = by_point @ own[at]
 

@@ -10,7 +10,7 @@ from implicam.dataset import Dataset, Observations
 from implicam.dataset.requirements import require_points, require_volume
 from implicam.geometry import FAR_OUT, Floats
 from implicam.rig_model.camera import Image
-from implicam.rig_model.camera_model import Sightings
+from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.shot_errors import ShotErrors, Shots
 
 FEWEST = 8
@@ -51,31 +51,31 @@ class Frame:
         """(4,) offset and scale."""
         return np.append(self.offset, self.scale)
 
-    def inward(self, xyz: Floats) -> Floats:
+    def to_working(self, xyz: Floats) -> Floats:
         """World to working frame."""
         return (xyz - self.offset) / self.scale
 
-    def outward(self, points: Floats) -> Floats:
+    def to_world(self, points: Floats) -> Floats:
         """Working frame to world."""
         return points * self.scale + self.offset
 
 
 def problem_of(lens: str, data: Dataset, frame: Frame, *, shots_off: bool = True) -> Problem:
     """The problem of known points, in the working frame; shots_off: estimate how shots are off as a whole."""
-    observations, points = data.observations, frame.inward(data.xyz)
+    observations, points = data.observations, frame.to_working(data.xyz)
     stated = stated_noise(observations)
     images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
     shots = _shots(data, points) if shots_off else None
     errors = shots.errors(points) if shots is not None else _declared(data, frame)
-    sightings = sightings_of(observations, stated)
-    return Problem(points, observations.camera_names, sightings, images, stated, errors, lens)
+    camera_views = camera_views_of(observations, stated)
+    return Problem(points, observations.camera_names, camera_views, images, stated, errors, lens)
 
 
-def sightings_of(observations: Observations, stated: Floats) -> tuple[Sightings, ...]:
+def camera_views_of(observations: Observations, stated: Floats) -> tuple[CameraViews, ...]:
     """What each camera saw, all of it."""
     relative = relative_noise(observations, stated)
     seen = (np.flatnonzero(there) for there in observations.seen.T)
-    return tuple(Sightings(rows, observations.uv[rows, c], relative[rows, c]) for c, rows in enumerate(seen))
+    return tuple(CameraViews(rows, observations.uv[rows, c], relative[rows, c]) for c, rows in enumerate(seen))
 
 
 def image_of(observations: Observations, c: int) -> Image:
@@ -143,7 +143,7 @@ class Problem:
 
     points: Floats
     names: tuple[str, ...]
-    sightings: tuple[Sightings, ...]
+    camera_views: tuple[CameraViews, ...]
     images: tuple[Image, ...]
     stated: Floats
     errors: ShotErrors | None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.camera_model import spread
+from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import consistency, refined, taken_as_normal
 from implicam.rig_model.normal_equations import CHUNK
 from implicam.rig_model.posterior import Posterior
@@ -264,13 +264,13 @@ class _Weights:
         self.joint: Floats | None = None
         self.halves: list[Floats] = []  # of ties: each camera's own
         if posterior.joint is None:
-            self.halves = [spread(rows[c], posterior.alone[c]) for c in range(C)]
+            self.halves = [apply_covariance_root(rows[c], posterior.alone[c]) for c in range(C)]
             own = [own[c] + _square(self.halves[c]) for c in range(C)]
         if not posterior.tied:
             for c in range(C):
                 self.each[:, c] = _inverted(np.where(seen[:, c, None, None], own[c], np.eye(2)))
             return
-        self.half = np.concatenate([spread(rows[c], posterior.shared_root(c)) for c in range(C)], axis=1)
+        self.half = np.concatenate([apply_covariance_root(rows[c], posterior.shared_root(c)) for c in range(C)], axis=1)
         S = _square(self.half).reshape(len(x), C, 2, C, 2)  # half is (n, 2C, sum P), of ties (n, 2C, q)
         for c in range(C):
             S[:, c, :, c] += own[c]

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition, workspace_from
-from implicam.active.acquisition import DEFAULT
-from implicam.calibrators import DEFAULT_METHOD, METHODS, named
+from implicam.active.acquisitions import DEFAULT
+from implicam.calibrators import DEFAULT_METHOD, METHODS, calibrator_from_name
 from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import FrameSource, Robot, Trigger, camera_from, exposed, robot_from, simulated_rig, trigger_from
 from implicam.rig_model.training_data import FEWEST
+from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
-from implicam.session.guide import Equipment, Guide
 from implicam.session.journal import Session
 from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
 
@@ -122,8 +122,10 @@ class Setup:
         return build_rig(self.rig, seed=self.seed, unit=self.unit, cameras=self.rig_cameras)  # type: ignore[arg-type]
 
 
-def open_guide(folder: Path, setup: Setup | None, *, auto: bool = False, say: Callable[[str], None] = print) -> Guide:
-    """The guide of a new session, or of the one in the folder: with its own setup where `setup` is None.
+def open_session(
+    folder: Path, setup: Setup | None, *, auto: bool = False, say: Callable[[str], None] = print
+) -> SessionController:
+    """The controller of a new session, or of the one in the folder: with its own setup where `setup` is None.
 
     Opens no camera and no robot yet but to learn the size of the pictures. UsageError where the folder is in use, or
     holds something else.
@@ -132,12 +134,12 @@ def open_guide(folder: Path, setup: Setup | None, *, auto: bool = False, say: Ca
         session = Session.open(folder)
         try:
             now = _continued(session, setup)
-            guide = _made(session, now, _hardware(now, say), auto)
+            controller = _made(session, now, _hardware(now, say), auto)
             kept = session.settings
             for key, value in now.as_settings().items():  # once it is known that it works
                 if key not in kept or kept[key] != value:
                     session.set(key, value)
-            return guide
+            return controller
         except BaseException:
             session.close()
             raise
@@ -173,7 +175,7 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
 Hardware = tuple[list[FrameSource], Robot, Workspace]
 
 
-def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Guide:
+def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> SessionController:
     eyes, robot, room = hardware
     trigger = None if setup.trigger is None else trigger_from(setup.trigger)
     radius = setup.radius
@@ -182,14 +184,14 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Gui
     timeout = 10.0 if trigger is not None or all(source.live for source in eyes) else PATIENCE
     equipment = Equipment(eyes, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run)
     loop = Loop(
-        named(setup.method),
+        calibrator_from_name(setup.method),
         room,
         acquisition(setup.acquisition),
         setup.rule,
         reach=np.inf if setup.reach is None else setup.reach,
         seed=setup.seed,
     )
-    return Guide(session, equipment, loop, auto=auto)
+    return SessionController(session, equipment, loop, auto=auto)
 
 
 def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:

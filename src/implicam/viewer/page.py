@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from implicam.errors import ImplicamError, UsageError, import_extra
-from implicam.session.guide import CALIBRATION, REPORT, Guide, State
+from implicam.session.controller import CALIBRATION, REPORT, SessionController, State
 from implicam.viewer import words
 from implicam.viewer.front import Front
 from implicam.viewer.legend import EXCESS, EXCESS_SCALE, U95, across, chart, curve, legend
@@ -50,17 +50,17 @@ QUIET = 0.1
 class Page:
     """The viser server of one guide. `closed` is set when the person closes the session."""
 
-    def __init__(self, guide: Guide) -> None:
-        self._guide, self.closed = guide, threading.Event()
-        self._unit, self._moves = guide.session.length_unit, guide.equipment.robot.moves
+    def __init__(self, controller: SessionController) -> None:
+        self._controller, self.closed = controller, threading.Event()
+        self._unit, self._moves = controller.session.length_unit, controller.equipment.robot.moves
         self.server, self.origin = _inner_server()
         self._window = (900, 620)  # pixels of the page: width and height of the pictures
         self._left = LEFT
-        self._worker = Worker(guide, self._complain)
+        self._worker = Worker(controller, self._complain)
         self._running = self._stale = True
-        self._names = [source.name for source in guide.equipment.cameras]
+        self._names = [source.name for source in controller.equipment.cameras]
         self._build()
-        self._scene = Scene(self.server, guide.loop)
+        self._scene = Scene(self.server, controller.loop)
         self.server.on_client_connect(self._welcome)
         self._threads = [
             threading.Thread(target=work, name=f"implicam-{work.__name__}", daemon=True)
@@ -91,7 +91,7 @@ class Page:
     # building
 
     def _build(self) -> None:
-        gui, equipment = self.server.gui, self._guide.equipment
+        gui, equipment = self.server.gui, self._controller.equipment
         by_itself = equipment.robot.alone and not equipment.dry_run
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="large")
         gui.set_panel_label("implicam")
@@ -112,7 +112,10 @@ class Page:
         self._auto = gui.add_checkbox("automatic", False, visible=by_itself, order=20)
         self._auto.on_update(lambda event: self._set_auto(event))
         self._chart = gui.add_uplot(
-            curve((), self._guide.loop.rule), **chart(self._unit, self._guide.loop.rule), aspect=1.75, order=30
+            curve((), self._controller.loop.rule),
+            **chart(self._unit, self._controller.loop.rule),
+            aspect=1.75,
+            order=30,
         )
         self._shown = gui.add_dropdown("colour", (U95, EXCESS), order=40)
         self._shown.on_update(lambda _: self._recolour())
@@ -140,9 +143,9 @@ class Page:
         @command.on_trigger
         def _(event: Any) -> None:
             wish = word
-            if word == "go" and self._guide.state.phase == "shown":
+            if word == "go" and self._controller.state.phase == "shown":
                 wish = "accept"
-            if words.allowed(self._guide.state, self._moves)[wish]:
+            if words.allowed(self._controller.state, self._moves)[wish]:
                 self._press(wish, event.client)
 
     # what people do
@@ -153,24 +156,25 @@ class Page:
     def _press(self, word: str, client: viser.ClientHandle | None) -> None:
         if word == "stop":
             try:
-                self._guide.stop_robot()
+                self._controller.stop_robot()
             except ImplicamError as error:
                 self._complain(error)
         elif word == "skip":
             self._ask_why(client)
-        elif word == "finish" and self._guide.state.phase == "done":
+        elif word == "finish" and self._controller.state.phase == "done":
             self.closed.set()
         else:
             self._worker.ask(self._action(word))
 
     def _action(self, word: str) -> Callable[[], Any]:
-        guide = self._guide
-        if word == "go" and guide.state.phase in ("trouble", "done"):
-            return guide.retry
+        controller = self._controller
+        if word == "go" and controller.state.phase in ("trouble", "done"):
+            return controller.retry
         if word == "go" and not self._moves:
-            return functools.partial(guide.arrived, np.array(self._place.value, dtype=np.float64))
+            return functools.partial(controller.arrived, np.array(self._place.value, dtype=np.float64))
         return {
-            "go": guide.go, "accept": guide.accept, "redo": guide.redo, "undo": guide.undo, "finish": guide.finish,
+            "go": controller.go, "accept": controller.accept, "redo": controller.redo, "undo": controller.undo,
+            "finish": controller.finish,
         }[word]  # fmt: skip
 
     def _ask_why(self, client: viser.ClientHandle | None) -> None:
@@ -184,12 +188,12 @@ class Page:
 
     def _skip(self, modal: Any, reason: str, _event: Any) -> None:
         modal.close()
-        self._worker.ask(functools.partial(self._guide.skip, reason))
+        self._worker.ask(functools.partial(self._controller.skip, reason))
 
     def _set_auto(self, event: Any) -> None:
         if event.client is not None:  # else it was this page itself
             try:
-                self._guide.set_auto(bool(self._auto.value))
+                self._controller.set_auto(bool(self._auto.value))
             except UsageError as error:
                 self._complain(error)
 
@@ -227,21 +231,21 @@ class Page:
         while self._running:
             begun = time.monotonic()
             if self.server.get_clients():
-                self._guide.live()
+                self._controller.live()
             time.sleep(max(QUIET, 0.3 * (time.monotonic() - begun)))
 
     def _render(self) -> None:
         version = -1
         while self._running:
-            state = self._guide.wait(version, 0.25)
+            state = self._controller.wait(version, 0.25)
             if state.version != version or self._stale:
                 version, self._stale = state.version, False
                 self._draw(state)
 
     def _draw(self, state: State) -> None:
         state = current(state)
-        measured = self._guide.measured_live if state.phase == "aim" else np.full(3, np.nan)
-        skipped = self._guide.session.skipped
+        measured = self._controller.measured_live if state.phase == "aim" else np.full(3, np.nan)
+        skipped = self._controller.session.skipped
         self._banner.content = words.banner(state, measured, self._unit, self._moves)
         self._numbers.content = words.numbers(state.history, self._unit, len(skipped))
         self._draw_buttons(state)
@@ -278,7 +282,7 @@ class Page:
 
     def _aspects(self, state: State) -> list[float]:
         shapes = {look.camera: look.frame.picture.shape for look in state.looks if look.frame is not None}
-        sizes = [(camera.width, camera.height) for camera in self._guide.session.cameras]
+        sizes = [(camera.width, camera.height) for camera in self._controller.session.cameras]
         return [
             shapes[name][1] / shapes[name][0] if name in shapes else width / height if width and height else 4 / 3
             for name, (width, height) in zip(self._names, sizes, strict=True)
@@ -287,7 +291,7 @@ class Page:
     def _draw_curve(self, state: State) -> None:
         if state.history is not getattr(self, "_curved", None):
             self._curved = state.history
-            self._chart.data = curve(state.history, self._guide.loop.rule)
+            self._chart.data = curve(state.history, self._controller.loop.rule)
             scales = across(state.history[-1].points if state.history else 0)
             _set(self._chart, "scales", scales)
 
@@ -342,7 +346,7 @@ def _handshake(port: int, origin: str) -> int:
 
 
 def serve(
-    guide: Guide,
+    controller: SessionController,
     *,
     host: str = "127.0.0.1",
     port: int = 8090,
@@ -355,8 +359,8 @@ def serve(
     host: what to listen on; another than this machine asks for a token, made up where none is given. port: 0 for any.
     ImplicamError where it cannot listen.
     """
-    page = Page(guide)
-    folder = guide.session.folder
+    page = Page(controller)
+    folder = controller.session.folder
     files = {"/report.html": folder / REPORT, "/calibration.implicam": folder / CALIBRATION}
     front = Front(host=host, port=port, behind=("127.0.0.1", page.port), token=token, files=files, origin=page.origin)
     try:

@@ -20,8 +20,8 @@ from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.figures.style import GREEN, ORANGE, SKY, VERMILLION
 from implicam.images import Grey, eight_bit, opencv
-from implicam.session.guide import State
-from implicam.session.looks import Look
+from implicam.session.controller import State
+from implicam.session.detections import Look
 
 Canvas = NDArray[np.uint8]
 Colour = tuple[int, int, int]

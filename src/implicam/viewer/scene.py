@@ -9,7 +9,7 @@ import numpy as np
 from implicam.active import Loop
 from implicam.dataset import Floats
 from implicam.images import eight_bit, opencv
-from implicam.session.guide import State
+from implicam.session.controller import State
 from implicam.viewer.legend import EXCESS, EXCESS_SCALE, U95, line
 from implicam.viewer.pictures import BALL, GREY, TARGET, WHITE
 from implicam.viewer.space import Eye, Placing, Scale, edges, eyes, upwards, vantage
@@ -47,7 +47,7 @@ class Scene:
             if self._changed("known", state.data, len(skipped)):
                 self._points("known", NOTHING if state.data is None else state.data.xyz, WHITE, "circle")
                 self._points("skipped", skipped, GREY, "diamond")
-            if self._changed("prospect", state.prospect, self.shown):
+            if self._changed("predicted", state.predicted, self.shown):
                 self._cloud(state)
             if self._changed("target", state.target):
                 self._target(state)
@@ -146,16 +146,16 @@ class Scene:
             self._scene.remove_by_name(f"/{name}")
 
     def _cloud(self, state: State) -> None:
-        if state.prospect is None:
+        if state.predicted is None:
             self._scene.remove_by_name("/uncertainty")
             return
-        u95 = state.prospect.u95
+        u95 = state.predicted.u95
         if self.scale is None and np.isfinite(u95).any():
             stop = line(self._loop.rule)
             self.scale = Scale.around(stop.value / 3 if stop is not None else 0.5 * float(np.nanmedian(u95)))
         if self.scale is None:
             return
-        colours = EXCESS_SCALE.colours(state.prospect.excess) if self.shown == EXCESS else self.scale.colours(u95)
+        colours = EXCESS_SCALE.colours(state.predicted.excess) if self.shown == EXCESS else self.scale.colours(u95)
         self._scene.add_point_cloud(
             "/uncertainty", self._placing.place(self._loop.judged_at), colours, point_size=0.028, point_shape="circle",
             point_shading="flat",

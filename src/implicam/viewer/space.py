@@ -82,8 +82,8 @@ def eyes(calibration: Calibration | None) -> list[Eye]:
         height = camera.height or float(np.ceil(seen[:, 1].max())) + 1
         pixels = np.array([[0.5, 0.5], [0.4, 0.5], [0.6, 0.5], [0.5, 0.4], [0.5, 0.6], [0.5, 0.0], [0.5, 1.0]])
         centre, rays = rig.posterior.models[number].camera.lines(pixels * (width, height) - 0.5)
-        ahead = calibration.data.xyz.mean(axis=0) - rig.frame.outward(centre)
-        eye = _eye(name, rig.frame.outward(centre), rays, ahead, width / height)
+        ahead = calibration.data.xyz.mean(axis=0) - rig.frame.to_world(centre)
+        eye = _eye(name, rig.frame.to_world(centre), rays, ahead, width / height)
         if eye is not None:
             found.append(eye)
     return found

@@ -12,7 +12,7 @@ from implicam.active import Step
 from implicam.dataset import Floats
 from implicam.figures.style import BLUE, GREEN, ORANGE, VERMILLION
 from implicam.formatting import number
-from implicam.session.guide import State
+from implicam.session.controller import State
 
 BUSY = ("starting", "moving", "fitting")
 IDLE = "#5b6270"

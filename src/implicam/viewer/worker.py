@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from implicam.errors import ImplicamError
-from implicam.session.guide import Guide
+from implicam.session.controller import SessionController
 
 Action = Callable[[], Any]
 
@@ -19,15 +19,15 @@ PAUSE = 0.15
 class Worker:
     """complain: what tells a person that something could not be done."""
 
-    def __init__(self, guide: Guide, complain: Callable[[ImplicamError], None]) -> None:
-        self._guide, self._complain = guide, complain
+    def __init__(self, controller: SessionController, complain: Callable[[ImplicamError], None]) -> None:
+        self._controller, self._complain = controller, complain
         self._jobs: queue.Queue[Action | None] = queue.Queue()
         self._lock, self._taken = threading.Lock(), True
         self._thread = threading.Thread(target=self._run, name="implicam-worker", daemon=True)
 
     def start(self) -> None:
         """Begin, with connecting."""
-        self._jobs.put(self._guide.start)
+        self._jobs.put(self._controller.start)
         self._thread.start()
 
     def ask(self, action: Action) -> bool:
@@ -48,7 +48,7 @@ class Worker:
             try:
                 job = self._jobs.get(timeout=PAUSE)
             except queue.Empty:
-                if not self._guide.state.auto or not self._take():
+                if not self._controller.state.auto or not self._take():
                     continue
                 job = self._by_itself
             if job is None:
@@ -72,10 +72,10 @@ class Worker:
 
     def _by_itself(self) -> None:
         """The next step of an automatic session; it ends when a rule says so, or where no place is left."""
-        state = self._guide.state
+        state = self._controller.state
         if not state.auto:  # somebody has just switched it off
             return
         if state.phase == "shown" or (state.phase == "aim" and state.target is not None and not state.stop):
-            self._guide.step()
+            self._controller.step()
         elif state.phase == "aim":
-            self._guide.set_auto(False)
+            self._controller.set_auto(False)

@@ -32,7 +32,7 @@ from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
-from implicam.rig_model.rig import RigMap
+from implicam.rig_model.rig import FittedRig
 from implicam.threads import blas_threads
 
 
@@ -109,10 +109,10 @@ class ExplicitCalibration:
     method: ClassVar[str] = "explicit"
 
     @cached_property
-    def map(self) -> RigMap:
+    def map(self) -> FittedRig:
         """The cameras, and how they measure."""
         fitted = self.fitted
-        return RigMap(
+        return FittedRig(
             fitted.trained, self.data.length_unit, fitted.frame, fitted.cameras, fitted.posterior, misfit_adds=True
         )
 

@@ -16,7 +16,7 @@ from implicam.exchange import UNKNOWN, ExplicitCamera, Rig
 from implicam.geometry import Floats, Pose
 from implicam.rig_model.camera import CentralCamera, Image, Prior
 from implicam.rig_model.general_camera import GeneralCamera
-from implicam.rig_model.initialise import Started, levenberg_marquardt, without_field
+from implicam.rig_model.initialise import Started, lens_only_model, levenberg_marquardt
 from implicam.rig_model.training_data import Frame
 
 DRAWN = 2000
@@ -32,10 +32,10 @@ def rig_of(calibration: Any) -> tuple[Rig, list[str]]:
             why="it learns the map from pixels to positions as a whole",
             fix="calibrate the same data with --method explicit",
         )
-    rig_map, notes, cameras = calibration.map, [], []
-    for number, c in enumerate(rig_map.cameras):
-        described = rig_map.trained.cameras[c]
-        camera = rig_map.posterior.models[number].camera
+    fitted_rig, notes, cameras = calibration.map, [], []
+    for number, c in enumerate(fitted_rig.cameras):
+        described = fitted_rig.trained.cameras[c]
+        camera = fitted_rig.posterior.models[number].camera
         if isinstance(camera, GeneralCamera) and not camera.mirrored:
             camera = camera.as_central()
         if not isinstance(camera, CentralCamera):
@@ -50,10 +50,10 @@ def rig_of(calibration: Any) -> tuple[Rig, list[str]]:
             notes += [f"{described.name}: {note}"] if note else []
         cameras.append(
             ExplicitCamera(
-                described.name, described.width, described.height, camera.lens, _world(camera, rig_map.frame)
+                described.name, described.width, described.height, camera.lens, _world(camera, fitted_rig.frame)
             )
         )
-    return Rig(tuple(cameras), rig_map.length_unit), notes
+    return Rig(tuple(cameras), fitted_rig.length_unit), notes
 
 
 def _world(camera: CentralCamera, frame: Frame) -> Pose:
@@ -64,7 +64,7 @@ def _world(camera: CentralCamera, frame: Frame) -> Pose:
 
 def _nearest(calibration: ForwardGPCalibration, number: int, camera: CentralCamera) -> tuple[CentralCamera, str]:
     """The lens and place that come nearest to what forward-gp predicts in the workspace, and the cost in pixels."""
-    points = calibration.frame.inward(calibration.data.xyz)
+    points = calibration.frame.to_working(calibration.data.xyz)
     low, high = points.min(axis=0), points.max(axis=0)
     drawn = np.random.default_rng(0).uniform(low, high, size=(DRAWN, 3))
     model = calibration.posterior.models[number]
@@ -101,7 +101,7 @@ def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
     known = KnownPositions(np.zeros(0, dtype=np.str_), np.zeros((0, 3)), np.zeros((0, 3)))
     frame = _frame(rig)
     models = tuple(
-        without_field(Started(*_working(camera, frame), np.zeros(0, dtype=np.bool_)), _image(camera), noise)
+        lens_only_model(Started(*_working(camera, frame), np.zeros(0, dtype=np.bool_)), _image(camera), noise)
         for camera in rig.cameras
     )
     fitted = Fitted(

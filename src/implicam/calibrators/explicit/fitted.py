@@ -14,17 +14,17 @@ from implicam.calibrators.explicit.network import Network, calibrate_network
 from implicam.calibrators.explicit.pixels import told
 from implicam.dataset import Dataset, KnownPositions, Observations, without_copies
 from implicam.dataset.requirements import same_cameras
-from implicam.dataset.unused import Rejected, Unused, blind_with_copies, copied_points, point_copy_notes
+from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
 from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.progress import Progress
 from implicam.rig_model.camera import CentralCamera
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.diagnostics import NAMED, Diagnosis
-from implicam.rig_model.fit_result import FittedRig
-from implicam.rig_model.initialise import Started, without_field
+from implicam.rig_model.fit_result import FitResult
+from implicam.rig_model.initialise import Started, lens_only_model
 from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.rig import RigMap
+from implicam.rig_model.rig import FittedRig
 from implicam.rig_model.training_data import Frame, problem_of, stated_noise
 
 METHOD = "explicit"
@@ -54,7 +54,7 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
     used = without_copies(data)
     frame = Frame.of(used, METHOD)
     fitted, choices = fit_points(problem_of("central", used, frame, shots_off=False), family, progress)
-    fitted = replace(fitted, blind=blind_with_copies(data, fitted.blind))
+    fitted = replace(fitted, uncalibrated=uncalibrated_with_copies(data, fitted.uncalibrated))
     diagnosis = Diagnosis(used, frame, fitted)
     return Fitted(
         data.observations,
@@ -74,7 +74,7 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
     )
 
 
-def _pixel_notes(data: Dataset, fitted: FittedRig, choices: Mapping[int, Choice]) -> list[str]:
+def _pixel_notes(data: Dataset, fitted: FitResult, choices: Mapping[int, Choice]) -> list[str]:
     notes = []
     for c, model in zip(fitted.cameras, fitted.posterior.models, strict=True):
         assert isinstance(model.camera, CentralCamera)
@@ -87,9 +87,9 @@ def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple
     network = calibrate_network(boards_of(data), family, progress)
     placed = _placed(data, network)
     posterior = network_posterior(network, network.bundle.cameras, network.root)
-    measured = RigMap(data.observations, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True).measure(
-        placed.observations
-    )
+    measured = FittedRig(
+        data.observations, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True
+    ).measure(placed.observations)
     first = data.observations.camera_names[network.cameras[0]]
     fitted = Fitted(
         data.observations,
@@ -143,8 +143,8 @@ def network_posterior(network: Network, cameras: Sequence[CentralCamera], root: 
     """Cameras of a network, wherever they have been moved to, with the root of their covariance."""
     none = [np.ones(camera.size, dtype=np.bool_) for camera in cameras]  # only a fit asks which views started it
     models = tuple(
-        without_field(Started(camera, prior, kept), image, float(noise))
-        for camera, prior, kept, image, noise in zip(
+        lens_only_model(Started(camera, prior, inliers), image, float(noise))
+        for camera, prior, inliers, image, noise in zip(
             cameras, network.bundle.priors, none, network.images, network.bundle.noise, strict=True
         )
     )
@@ -171,7 +171,7 @@ def wrong_corners(network: Network, boards: Dataset) -> tuple[Rejected, ...]:
 def network_notes(network: Network, trained: Observations, boards: Dataset) -> list[str]:
     """What is to be said of the boards: cameras that contradict each other, wrong corners, lenses hardly fixed."""
     names = trained.camera_names
-    notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in network.blind]
+    notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in network.uncalibrated]
     moved = np.sqrt(6) * network.bundle.slack  # along three axes, in either picture
     notes += [
         f"{names[one.pair[0]]} and {names[one.pair[1]]} contradict each other on the {one.boards} boards that both saw"

@@ -33,7 +33,7 @@ from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.diagnostics import Diagnosis
-from implicam.rig_model.rig import RigMap
+from implicam.rig_model.rig import FittedRig
 from implicam.rig_model.training_data import Frame, problem_of
 from implicam.rig_model.triangulate import locate
 
@@ -60,7 +60,7 @@ def fit_to_boards(data: Dataset, groups: Groups, boards: Dataset, how: str, prog
     trained = by_cameras_of(data, boards)
     frame = _frame(data.positions.xyz)
     names = trained.camera_names
-    blind = list(groups.blind)
+    uncalibrated = list(groups.uncalibrated)
     parts: list[Part] = []
     several = [network for network in groups.networks if len(network.cameras) > 1]
     lone = [network for network in groups.networks if len(network.cameras) == 1]
@@ -70,27 +70,29 @@ def fit_to_boards(data: Dataset, groups: Groups, boards: Dataset, how: str, prog
             parts.append(_aligned(data, trained, network, boards, how, frame))
         except FitError as error:
             failure = error
-            blind += [(c, error.what) for c in network.cameras]
+            uncalibrated += [(c, error.what) for c in network.cameras]
     if lone and how != MATCHING[0]:
-        blind += [(n.cameras[0], "it saw no board at the same time as the others, and icp places none") for n in lone]
+        uncalibrated += [
+            (n.cameras[0], "it saw no board at the same time as the others, and icp places none") for n in lone
+        ]
     elif lone:
         part, left = _placed(data, trained, lone, boards, frame, progress)
         parts += [part] if part.cameras else []
-        blind += left
+        uncalibrated += left
     if sum(len(part.cameras) for part in parts) < 2:
         if failure is not None and not lone:
             raise failure
-        raise _too_few(parts, names, blind)
-    told = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in sorted(blind)]
+        raise _too_few(parts, names, uncalibrated)
+    told = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in sorted(uncalibrated)]
     fitted = _together(parts, trained, frame, [*copies_told, *_without_boards(data, trained), *told])
     return replace(fitted, unused=(*fitted.unused, *copied))
 
 
-def _too_few(parts: Sequence[Part], names: tuple[str, ...], blind: Sequence[tuple[int, str]]) -> FitError:
+def _too_few(parts: Sequence[Part], names: tuple[str, ...], uncalibrated: Sequence[tuple[int, str]]) -> FitError:
     count = sum(len(part.cameras) for part in parts)
     return FitError(
         f"{count} of {len(names)} cameras can be calibrated together; a position takes two.",
-        why="; ".join(f"{names[c]}: {why}" for c, why in sorted(blind)),
+        why="; ".join(f"{names[c]}: {why}" for c, why in sorted(uncalibrated)),
         fix="show every camera the board in ten places or more, and in half of them to two cameras at once, or four "
         "known points or more",
     )
@@ -125,7 +127,7 @@ def _aligned(data: Dataset, trained: Observations, network: Network, boards: Dat
     """A group of cameras that boards join, by the known points that it measures."""
     known, bundle = data.positions, network.bundle
     posterior = network_posterior(network, bundle.cameras, network.root)
-    in_rig = RigMap(trained, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True)
+    in_rig = FittedRig(trained, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True)
     uv, noise = in_rig.views(data.observations)
     found = locate(posterior, uv, noise)
     uv[found.left_out] = np.nan
@@ -161,12 +163,12 @@ def _placed(
     mine = data.with_cameras(trained.camera_names)
     problem = problem_of("central", mine, frame, shots_off=False)
     fitted = place(problem, {network.cameras[0]: network for network in networks}, progress)
-    blind = list(fitted.blind)
+    uncalibrated = list(fitted.uncalibrated)
     by_camera = {network.cameras[0]: network for network in networks}
     if not fitted.cameras:
         none = np.zeros((0, 3))
-        return Part((), (), np.zeros((0, 0)), (), none, none, (), (), ()), blind
-    diagnosis = Diagnosis(mine, frame, replace(fitted, blind=()))
+        return Part((), (), np.zeros((0, 0)), (), none, none, (), (), ()), uncalibrated
+    diagnosis = Diagnosis(mine, frame, replace(fitted, uncalibrated=()))
     posterior, names = fitted.posterior, trained.camera_names
     root = posterior.joint if posterior.joint is not None else np.asarray(block_diag(*posterior.alone))
     used = [by_camera[c] for c in fitted.cameras]
@@ -186,7 +188,7 @@ def _placed(
             diagnosis.unused,
             (told, *diagnosis.notes(), *notes),
         ),
-        blind,
+        uncalibrated,
     )
 
 
@@ -209,7 +211,7 @@ def _not_used(data: Dataset, reasons: Names, alignment: Alignment) -> tuple[Unus
     )
 
 
-def _moved_notes(in_rig: RigMap, left_out: Bools, used: Bools) -> list[str]:
+def _moved_notes(in_rig: FittedRig, left_out: Bools, used: Bools) -> list[str]:
     """Cameras whose views of the known points are mostly left out: they may have moved since the boards."""
     notes = []
     for c, name in enumerate(in_rig.camera_names):

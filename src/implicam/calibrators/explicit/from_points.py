@@ -18,12 +18,12 @@ from implicam.calibrators.explicit.start import MirroredError, start_with_lens
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
-from implicam.rig_model.camera_model import CameraModel, Sightings, spread
+from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
 from implicam.rig_model.field import Hyperparameters
-from implicam.rig_model.fit_result import FittedRig
-from implicam.rig_model.initialise import Started, levenberg_marquardt, start_rig, without_field
-from implicam.rig_model.leave_one_out import judged_all
-from implicam.rig_model.linearise import settle
+from implicam.rig_model.fit_result import FitResult
+from implicam.rig_model.initialise import Started, lens_only_model, levenberg_marquardt, start_rig
+from implicam.rig_model.leave_one_out import update_inliers
+from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.posterior import Posterior, condition
 from implicam.rig_model.training_data import FEWEST, Problem
 
@@ -36,7 +36,7 @@ AS_IF = 2.0
 """The stated noise counts like so many residuals; so does the noise of all cameras together where none is stated."""
 
 
-def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[FittedRig, dict[int, Choice]]:
+def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[FitResult, dict[int, Choice]]:
     """Fit every camera that can be fitted; and the lens model that each got, by its number."""
     progress("fitting", 0, 3)
     choices: dict[int, Choice] = {}
@@ -45,42 +45,42 @@ def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[Fitte
         started, choices[c] = start_with_lens(points, uv, problem.images[c], family)
         return started
 
-    started, blind = _started(problem, start)
-    fitted = refined(problem, started, blind, progress)
+    started, uncalibrated = _started(problem, start)
+    fitted = refined(problem, started, uncalibrated, progress)
     return fitted, {c: choices[c] for c in fitted.cameras}
 
 
 def refined(
-    problem: Problem, started: Mapping[int, Started], blind: Sequence[tuple[int, str]], progress: Progress
-) -> FittedRig:
+    problem: Problem, started: Mapping[int, Started], uncalibrated: Sequence[tuple[int, str]], progress: Progress
+) -> FitResult:
     """Cameras from where they start, with the noise that the residuals show and without the views that contradict."""
     cameras = tuple(started)
     progress("fitting", 1, 3)
-    seen = tuple(problem.sightings[c] for c in cameras)
-    kept = tuple(started[c].kept for c in cameras)
+    seen = tuple(problem.camera_views[c] for c in cameras)
+    inliers = tuple(started[c].inliers for c in cameras)
     stated = problem.stated[list(cameras)]
-    models = tuple(without_field(started[c], problem.images[c]) for c in cameras)
-    first = _first_noise(problem, models, seen, kept)
+    models = tuple(lens_only_model(started[c], problem.images[c]) for c in cameras)
+    first = _first_noise(problem, models, seen, inliers)
     models = with_noise(models, first)
     for number in range(ROUNDS):
         used = tuple(
             s.select(k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1))
-            for s, k, m in zip(seen, kept, models, strict=True)
+            for s, k, m in zip(seen, inliers, models, strict=True)
         )
         posterior = _settled(models, problem, used, first)
         noise = _noise(problem, posterior, used, stated)
         close = np.allclose(noise, [m.noise for m in models], rtol=0.01)
         models = with_noise(posterior.models, noise)
-        judged = judged_all(replace(posterior, models=models), problem.points, seen, kept)
-        if close and all((a == b).all() for a, b in zip(judged, kept, strict=True)):
+        judged = update_inliers(replace(posterior, models=models), problem.points, seen, inliers)
+        if close and all((a == b).all() for a, b in zip(judged, inliers, strict=True)):
             break
         if number < ROUNDS - 1:
-            kept = judged
+            inliers = judged
         progress("fitting", 2, 3)
-    posterior = _settled(models, problem, tuple(s.select(k) for s, k in zip(seen, kept, strict=True)), first)
+    posterior = _settled(models, problem, tuple(s.select(k) for s, k in zip(seen, inliers, strict=True)), first)
     progress("fitting", 3, 3)
     hyper = Hyperparameters(np.ones(2), np.zeros(len(cameras)), noise)
-    return FittedRig(posterior, cameras, tuple(blind), kept, hyper, problem.errors, None)
+    return FitResult(posterior, cameras, tuple(uncalibrated), inliers, hyper, problem.errors, None)
 
 
 def _started(
@@ -103,7 +103,7 @@ def _started(
             raise
         names = [problem.names[c] for c in sorted(mirrored)]
         listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-        everyone = len(names) == sum(len(seen.rows) >= FEWEST for seen in problem.sightings)
+        everyone = len(names) == sum(len(seen.rows) >= FEWEST for seen in problem.camera_views)
         raise FitError(
             f"{listed} see{'s' * (len(names) == 1)} the known points as in a mirror.",
             why=error.why,
@@ -116,13 +116,13 @@ def _started(
 
 
 def _settled(
-    models: tuple[CameraModel, ...], problem: Problem, used: tuple[Sightings, ...], first: Floats
+    models: tuple[CameraModel, ...], problem: Problem, used: tuple[CameraViews, ...], first: Floats
 ) -> Posterior:
-    """As fit.settle; a camera that Gauss-Newton would lead astray, as a lens can that bends much, is taken there by
-    damped steps, and stays. first (C,): the noise at the start, pixels."""
-    posterior = settle(models, problem.points, used, problem.errors)
+    """As linearise.iterate_linearisation; a camera that Gauss-Newton would lead astray, as a lens can that bends much,
+    is taken there by damped steps, and stays. first (C,): the noise at the start, pixels."""
+    posterior = iterate_linearisation(models, problem.points, used, problem.errors)
 
-    def left(model: CameraModel, seen: Sightings) -> float:
+    def left(model: CameraModel, seen: CameraViews) -> float:
         off = np.sum((seen.uv - model.camera.pixel(problem.points[seen.rows])) ** 2)
         return float(off) if np.isfinite(off) else np.inf
 
@@ -137,10 +137,10 @@ def _settled(
         camera = model.camera
         if lost:
             camera = levenberg_marquardt(camera, model.prior, problem.points[seen.rows], seen.uv, model.noise)
-        damped.append(replace(model, camera=camera, ruler=camera))
+        damped.append(replace(model, camera=camera, field_camera=camera))
     posterior = condition(tuple(damped), problem.points, used, problem.errors)
     ends = (
-        replace(after, camera=before.camera, ruler=before.camera) if lost else after
+        replace(after, camera=before.camera, field_camera=before.camera) if lost else after
         for before, after, lost in zip(damped, posterior.models, astray, strict=True)
     )
     return replace(posterior, models=tuple(ends))
@@ -152,17 +152,17 @@ def with_noise(models: Sequence[CameraModel], noise: Floats) -> tuple[CameraMode
 
 
 def _first_noise(
-    problem: Problem, models: Sequence[CameraModel], seen: Sequence[Sightings], kept: Sequence[Bools]
+    problem: Problem, models: Sequence[CameraModel], seen: Sequence[CameraViews], inliers: Sequence[Bools]
 ) -> Floats:
     """(C,) from the residuals of the start, never nothing."""
     noise = []
-    for m, s, k in zip(models, seen, kept, strict=True):
+    for m, s, k in zip(models, seen, inliers, strict=True):
         error = (s.uv - m.camera.pixel(problem.points[s.rows]))[k] / s.relative[k, None]
         noise.append(max(float(np.sqrt(np.nanmean(error**2))), 1e-5 * m.image.half))
     return np.array(noise)
 
 
-def _noise(problem: Problem, posterior: Posterior, used: tuple[Sightings, ...], stated: Floats) -> Floats:
+def _noise(problem: Problem, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats) -> Floats:
     """(C,) the noise of each camera in pixels: the residuals' sum of squares over the degrees of freedom left."""
     if problem.errors is not None:
         return _noise_beside_errors(problem, posterior, used, stated)
@@ -171,7 +171,7 @@ def _noise(problem: Problem, posterior: Posterior, used: tuple[Sightings, ...], 
         model = posterior.models[c]
         rows = model.rows(problem.points[seen.rows])
         squares[c] = np.sum(((seen.uv - rows.mean) / seen.relative[:, None]) ** 2)
-        reach = spread(rows, posterior.alone[c]) / (model.noise * seen.relative)[:, None, None]
+        reach = apply_covariance_root(rows, posterior.alone[c]) / (model.noise * seen.relative)[:, None, None]
         freedom[c] = max(2 * len(seen.rows) - float(np.sum(reach**2)), 0.0)
     told = np.isfinite(stated)
     together = float(np.sum(squares) / max(np.sum(freedom), 1e-3))
@@ -180,14 +180,18 @@ def _noise(problem: Problem, posterior: Posterior, used: tuple[Sightings, ...], 
     return np.asarray(np.maximum(np.sqrt((squares + AS_IF * believed) / (freedom + AS_IF)), floor), dtype=np.float64)
 
 
-def _noise_beside_errors(problem: Problem, posterior: Posterior, used: tuple[Sightings, ...], stated: Floats) -> Floats:
+def _noise_beside_errors(
+    problem: Problem, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats
+) -> Floats:
     """(C,) where known positions have errors of their own: one factor for all cameras, the most probable one."""
     now = np.array([model.noise for model in posterior.models])
     base = np.where(np.isfinite(stated), stated, now)
 
     def loss(log_factor: float) -> float:
         models = with_noise(posterior.models, base * np.exp(log_factor))
-        return -settle(models, problem.points, used, problem.errors).evidence + 0.5 * AS_IF * log_factor**2
+        return (
+            -iterate_linearisation(models, problem.points, used, problem.errors).evidence + 0.5 * AS_IF * log_factor**2
+        )
 
     found = minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded", options={"xatol": 0.02})
     return np.asarray(base * np.exp(found.x), dtype=np.float64)

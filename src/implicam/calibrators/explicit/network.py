@@ -51,7 +51,7 @@ class Network:
     calibrated; shots: (n,) of each row of the dataset; doubts: pairs of cameras that fit alone and not together."""
 
     cameras: tuple[int, ...]
-    blind: tuple[tuple[int, str], ...]
+    uncalibrated: tuple[tuple[int, str], ...]
     choices: Mapping[int, Choice]
     bundle: Bundle
     root: Floats
@@ -68,31 +68,31 @@ class Groups:
     without a lens."""
 
     networks: tuple[Network, ...]
-    blind: tuple[tuple[int, str], ...]
+    uncalibrated: tuple[tuple[int, str], ...]
 
 
 def calibrate_groups(boards: Boards, family: str, progress: Progress = silent) -> Groups:
     """Every camera that saw enough boards, in the groups that shared boards join; a group may be one camera."""
-    singles, choices, blind = _singles(boards, family, progress)
+    singles, choices, uncalibrated = _singles(boards, family, progress)
     networks = [_network(boards, singles, choices, poses, progress) for poses in _joined(boards, singles)]
-    return Groups(tuple(networks), tuple(sorted(blind)))
+    return Groups(tuple(networks), tuple(sorted(uncalibrated)))
 
 
 def calibrate_network(boards: Boards, family: str, progress: Progress = silent) -> Network:
     """The largest group of cameras that shared boards join. FitError where it is fewer than two cameras."""
-    singles, choices, blind = _singles(boards, family, progress)
+    singles, choices, uncalibrated = _singles(boards, family, progress)
     groups = _joined(boards, singles)
     poses = groups[0] if groups and len(groups[0]) > 1 else {}
     why = "it saw no board at the same time as the others" if len(singles) > 1 else "there is no other camera to join"
-    blind += [(c, why) for c in singles if c not in poses]
+    uncalibrated += [(c, why) for c in singles if c not in poses]
     if len(poses) < 2:
         raise FitError(
             f"{len(poses)} of {len(boards.cameras)} cameras can be calibrated together; a position takes two.",
-            why="; ".join(f"{boards.names[c]}: {why}" for c, why in blind),
+            why="; ".join(f"{boards.names[c]}: {why}" for c, why in uncalibrated),
             fix="show every camera the board in ten places or more, and in half of them to two cameras at once; or "
             "give known points that join them: implicam calibrate POINTS --boards BOARDS",
         )
-    return _network(boards, singles, choices, poses, progress, blind)
+    return _network(boards, singles, choices, poses, progress, uncalibrated)
 
 
 def _network(
@@ -101,7 +101,7 @@ def _network(
     choices: Mapping[int, Choice],
     poses: Mapping[int, Pose],
     progress: Progress,
-    blind: Sequence[tuple[int, str]] = (),
+    uncalibrated: Sequence[tuple[int, str]] = (),
 ) -> Network:
     """Cameras, joined at first_from_camera, adjusted together.
 
@@ -127,7 +127,7 @@ def _network(
         found = loosened(found, progress)
     return Network(
         cameras,
-        tuple(sorted(blind)),
+        tuple(sorted(uncalibrated)),
         {c: choices[c] for c in cameras},
         found.bundle,
         found.root,
@@ -142,7 +142,7 @@ def _network(
 def _singles(
     boards: Boards, family: str, progress: Progress
 ) -> tuple[dict[int, OneCamera], dict[int, Choice], list[tuple[int, str]]]:
-    usable, blind = usable_cameras(boards)
+    usable, uncalibrated = usable_cameras(boards)
     done = 0
 
     def one(c: int) -> tuple[OneCamera, Choice] | FitError:
@@ -160,10 +160,10 @@ def _singles(
     singles, choices = {}, {}
     for c, found in zip(usable, side_by_side(one, usable), strict=True):
         if isinstance(found, FitError):
-            blind.append((c, found.what))
+            uncalibrated.append((c, found.what))
         else:
             singles[c], choices[c] = found
-    return singles, choices, blind
+    return singles, choices, uncalibrated
 
 
 def _joined(boards: Boards, singles: Mapping[int, OneCamera]) -> list[dict[int, Pose]]:

@@ -18,7 +18,7 @@ from implicam.geometry import Bools, Floats, Pose, poses_from_rays
 from implicam.progress import Progress
 from implicam.rig_model.camera import CentralCamera, Prior
 from implicam.rig_model.field import Hyperparameters
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.initialise import FAR, Started, levenberg_marquardt
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.training_data import Problem
@@ -42,25 +42,25 @@ SUBSETS = 30
 """Random sets of five points; with a third of the views wrong, four of them are clean."""
 
 
-def place(problem: Problem, networks: Mapping[int, Network], progress: Progress) -> FittedRig:
+def place(problem: Problem, networks: Mapping[int, Network], progress: Progress) -> FitResult:
     """The cameras of networks of one camera, by number, placed by the problem's known points; there may be none."""
     stated = problem.stated.copy()
     started: dict[int, Started] = {}
-    blind: list[tuple[int, str]] = []
+    uncalibrated: list[tuple[int, str]] = []
     images = list(problem.images)
     for c, network in networks.items():
-        seen, images[c] = problem.sightings[c], network.images[0]
+        seen, images[c] = problem.camera_views[c], network.images[0]
         if not np.isfinite(stated[c]):
             stated[c] = network.bundle.noise[0]  # until the residuals of the known points say more
         try:
             started[c] = _placed(network, problem.points[seen.rows], seen.uv)
         except FitError as error:
-            blind.append((c, error.what))
+            uncalibrated.append((c, error.what))
     problem = replace(problem, stated=stated, images=tuple(images))
     if not started:
         none = Hyperparameters(np.ones(2), np.zeros(0), np.zeros(0))
-        return FittedRig(Posterior((), (), None, (), 0.0), (), tuple(blind), (), none, None, None)
-    return refined(problem, started, blind, progress)
+        return FitResult(Posterior((), (), None, (), 0.0), (), tuple(uncalibrated), (), none, None, None)
+    return refined(problem, started, uncalibrated, progress)
 
 
 def _placed(network: Network, points: Floats, uv: Floats) -> Started:
@@ -75,22 +75,22 @@ def _placed(network: Network, points: Floats, uv: Floats) -> Started:
         _check_mirror(known, prior, points, uv, rays, valid, sd, left)
     if not found:
         raise FitError("from no place does its lens see the known points at these pixels.")
-    (camera, kept), *others = found
+    (camera, inliers), *others = found
     error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    if not np.median(error) < TOLERABLE * half or kept.sum() < FEWEST:
+    if not np.median(error) < TOLERABLE * half or inliers.sum() < FEWEST:
         raise FitError(
             f"with the lens from its boards, the known points are left {np.median(error):.3g} px off: they are not "
             "where they are said to be, or its pictures are of another size or another zoom."
         )
-    usual = max(sd, float(np.sqrt(np.mean(error[kept] ** 2) / 2)))
+    usual = max(sd, float(np.sqrt(np.mean(error[inliers] ** 2) / 2)))
     for other, _ in others:
-        more = np.sum((other.pixel(points[kept]) - uv[kept]) ** 2) - np.sum(error[kept] ** 2)
+        more = np.sum((other.pixel(points[inliers]) - uv[inliers]) ** 2) - np.sum(error[inliers] ** 2)
         apart = np.linalg.norm(other.pose.centre - camera.pose.centre) / np.linalg.norm(camera.pose.translation)
         if more < AS_GOOD * usual**2 and apart > 0.02:
             raise FitError(
-                f"its {int(kept.sum())} known points place it in two ways: show it more, spread out in depth."
+                f"its {int(inliers.sum())} known points place it in two ways: show it more, spread out in depth."
             )
-    return Started(camera, prior, kept)
+    return Started(camera, prior, inliers)
 
 
 def _check_mirror(
@@ -161,19 +161,19 @@ def _median(camera: CentralCamera, points: Floats, uv: Floats) -> float:
 
 
 def _refined(
-    camera: CentralCamera, prior: Prior, points: Floats, uv: Floats, kept: Bools, sd: float
+    camera: CentralCamera, prior: Prior, points: Floats, uv: Floats, inliers: Bools, sd: float
 ) -> tuple[CentralCamera, Bools]:
     """Levenberg-Marquardt on the views kept, and again without those far off the others."""
     for _ in range(4):
-        usual = max(sd, _median(camera, points[kept], uv[kept]))
+        usual = max(sd, _median(camera, points[inliers], uv[inliers]))
         if not np.isfinite(usual):
             break
-        fitted = levenberg_marquardt(camera, prior, points[kept], uv[kept], usual)
+        fitted = levenberg_marquardt(camera, prior, points[inliers], uv[inliers], usual)
         assert isinstance(fitted, CentralCamera)
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        inside = np.asarray(error <= FAR * max(float(np.median(error[kept])), sd))
-        if inside.sum() < FEWEST or (inside == kept).all():
+        inside = np.asarray(error <= FAR * max(float(np.median(error[inliers])), sd))
+        if inside.sum() < FEWEST or (inside == inliers).all():
             break
-        kept = inside
-    return camera, kept
+        inliers = inside
+    return camera, inliers

@@ -16,7 +16,7 @@ from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.unused import Rejected, Unused
 from implicam.rig_model.camera import CentralCamera, Image, Prior
 from implicam.rig_model.camera_model import CameraModel
-from implicam.rig_model.initialise import Started, without_field
+from implicam.rig_model.initialise import Started, lens_only_model
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.training_data import Frame
 
@@ -118,4 +118,4 @@ def _model(arrays: Arrays, number: int, sizes: NDArray[np.float64], lens: str) -
         raise ValueError("noise and image size must be positive")
     prior = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))  # only a fit needs it
     started = Started(camera, prior, np.zeros(0, dtype=np.bool_))
-    return without_field(started, Image(np.array(centre), half), noise)
+    return lens_only_model(started, Image(np.array(centre), half), noise)

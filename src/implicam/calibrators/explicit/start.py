@@ -56,8 +56,8 @@ class _Candidate(NamedTuple):
     pixels: Pixels
 
     @property
-    def kept(self) -> Bools:
-        return self.started.kept
+    def inliers(self) -> Bools:
+        return self.started.inliers
 
 
 def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tuple[Started, Choice]:
@@ -71,7 +71,7 @@ def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tu
     bent = tried[0]
 
     def perspective() -> _Candidate:
-        starts = [one._replace(camera=as_brown_conrady(one.camera, points[one.kept])) for one in tried]
+        starts = [one._replace(camera=as_brown_conrady(one.camera, points[one.inliers])) for one in tried]
         return _with_pixels(starts, points, uv, image)[0]
 
     candidates = {"kannala-brandt": lambda: bent, "brown-conrady": perspective}
@@ -85,7 +85,7 @@ def _resected(points: Floats, uv: Floats, image: Image) -> _Candidate:
     k = TANGENT if found.pinhole else np.zeros(4)
     lens = KannalaBrandt(found.focal, found.focal * aspect, *image.centre.tolist(), *k.tolist())
     pixels = square(CENTRE) if aspect == 1 else kinds(square(CENTRE))[1]
-    return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.kept, points, uv, image, 1e-3)
+    return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.inliers, points, uv, image, 1e-3)
 
 
 def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image: Image) -> list[_Candidate]:
@@ -94,7 +94,7 @@ def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image
     usual, *between, widest = kinds(square(SHIFTED * CENTRE))
 
     def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
-        return _refined(start.camera, pixels, start.kept, points, uv, image)
+        return _refined(start.camera, pixels, start.inliers, points, uv, image)
 
     found = [fitted(usual, starts[0]), fitted(widest, starts[0])]
     simple, free = _evidence(found, points, uv, image)
@@ -115,7 +115,7 @@ def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image
 def _refined(
     camera: CentralCamera,
     pixels: Pixels,
-    kept: Bools,
+    inliers: Bools,
     points: Floats,
     uv: Floats,
     image: Image,
@@ -123,27 +123,27 @@ def _refined(
 ) -> _Candidate:
     """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong; first: the noise
     to begin with in half the longer side, where the start is rough."""
-    sd = _sd(camera, points[kept], uv[kept], image) if first is None else first * image.half
+    sd = _sd(camera, points[inliers], uv[inliers], image) if first is None else first * image.half
     for _ in range(4):
-        widest = float(angles(camera, points[kept]).max())
+        widest = float(angles(camera, points[inliers]).max())
         prior = prior_of(camera, image, widest, pixels)
-        fitted = levenberg_marquardt(camera, prior, points[kept], uv[kept], sd)
+        fitted = levenberg_marquardt(camera, prior, points[inliers], uv[inliers], sd)
         assert isinstance(fitted, CentralCamera)
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        sd = max(float(np.median(error[kept])), 1e-5 * image.half)
-        inside = np.asarray(error <= max(FAR * float(np.median(error[kept])), 1e-4 * image.half))
-        if inside.sum() < FEWEST or (inside == kept).all():
+        sd = max(float(np.median(error[inliers])), 1e-5 * image.half)
+        inside = np.asarray(error <= max(FAR * float(np.median(error[inliers])), 1e-4 * image.half))
+        if inside.sum() < FEWEST or (inside == inliers).all():
             break
-        kept = inside
-    return _Candidate(Started(camera, prior, kept), camera, pixels)
+        inliers = inside
+    return _Candidate(Started(camera, prior, inliers), camera, pixels)
 
 
 def _evidence(found: list[_Candidate], points: Floats, uv: Floats, image: Image) -> list[float]:
     """Log marginal likelihood of each, by Laplace's method at its best noise, on the views that all of them keep."""
-    common = np.logical_and.reduce([one.kept for one in found])
+    common = np.logical_and.reduce([one.inliers for one in found])
     if common.sum() < FEWEST:
-        common = found[-1].kept
+        common = found[-1].inliers
     return [_log_evidence(one, points[common], uv[common], image) for one in found]
 
 
@@ -205,7 +205,7 @@ def _held_out(started: Started, points: Floats, uv: Floats, image: Image) -> Flo
     """(n,) squared errors of views in `FOLDS` random folds, each predicted from the others; far ones count little, and
     views that the camera could not keep are NaN."""
     squares = np.full(len(points), np.nan)
-    points, uv = points[started.kept], uv[started.kept]
+    points, uv = points[started.inliers], uv[started.inliers]
     assert isinstance(started.camera, CentralCamera)
     sd = _sd(started.camera, points, uv, image)
     fold = np.random.default_rng(0).permutation(np.arange(len(points)) % FOLDS)
@@ -214,5 +214,5 @@ def _held_out(started: Started, points: Floats, uv: Floats, image: Image) -> Flo
         others = fold != k
         camera = levenberg_marquardt(started.camera, started.prior, points[others], uv[others], sd)
         errors[~others] = np.linalg.norm(camera.pixel(points[~others]) - uv[~others], axis=1)
-    squares[started.kept] = clipped(errors) ** 2
+    squares[started.inliers] = clipped(errors) ** 2
     return squares

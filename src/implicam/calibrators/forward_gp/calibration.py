@@ -22,17 +22,17 @@ from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import with_noise_told_apart
 from implicam.calibrators.protocol import Arrays, finite_column, solvable
 from implicam.dataset import Dataset, Observations, without_copies
-from implicam.dataset.unused import Rejected, Unused, blind_with_copies, copied_points, point_copy_notes
+from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.rig_model.diagnostics import Diagnosis
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.level_errors import untold
 from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.rig import RigMap
+from implicam.rig_model.rig import FittedRig
 from implicam.rig_model.shot_errors import Shots
 from implicam.rig_model.training_data import Frame, problem_of
 from implicam.rig_model.triangulate import Labels
@@ -73,8 +73,8 @@ class ForwardGP:
         return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
 
 
-def _copies_named(data: Dataset, fitted: FittedRig) -> FittedRig:
-    return replace(fitted, blind=blind_with_copies(data, fitted.blind))
+def _copies_named(data: Dataset, fitted: FitResult) -> FitResult:
+    return replace(fitted, uncalibrated=uncalibrated_with_copies(data, fitted.uncalibrated))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class ForwardGPCalibration:
     calibrator: ForwardGP
     data: Dataset
     frame: Frame
-    fitted: FittedRig
+    fitted: FitResult
 
     method: ClassVar[str] = "forward-gp"
 
@@ -99,10 +99,10 @@ class ForwardGPCalibration:
         return self.fitted.posterior
 
     @cached_property
-    def map(self) -> RigMap:
+    def map(self) -> FittedRig:
         """The cameras, and how they measure."""
         tails = self.fitted.tails
-        return RigMap(
+        return FittedRig(
             self.used.observations,
             self.data.length_unit,
             self.frame,
@@ -132,7 +132,7 @@ class ForwardGPCalibration:
     @cached_property
     def _labels(self) -> Labels | None:
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
-        points = self.frame.inward(self.used.xyz)
+        points = self.frame.to_working(self.used.xyz)
         if errors is None or unknowns is None or self.fitted.label_sd is None:
             untold_sd = self.fitted.untold_sd
             planes = None if untold_sd is None else untold(points, self.used.shots)
@@ -160,7 +160,7 @@ class ForwardGPCalibration:
         """The same method with the same options on other data."""
         return self.calibrator.fit(data, progress)
 
-    def grown(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> ForwardGPCalibration:
+    def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> ForwardGPCalibration:
         """As `refit`, starting from what is known: for a few points more, in half of the time.
 
         What is found is the nearest optimum and not the best of many, so begin `anew` where the points have grown much.
@@ -229,7 +229,7 @@ class ForwardGPCalibration:
         if self.fitted.label_errors is not None:
             out += self.fitted.label_errors.covariance
         if self._labels is not None:
-            out += self._labels.own(self.frame.inward(xyz))
+            out += self._labels.own(self.frame.to_working(xyz))
         return out * self.frame.scale**2
 
     def residuals(self) -> dict[str, Any]:
@@ -251,5 +251,5 @@ class ForwardGPCalibration:
         calibrator = ForwardGP(str(table["lens"]), int(table["seed"]))
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = without_copies(data)
-        fitted = saved.restored(used, working.inward(used.xyz), table, arrays)
+        fitted = saved.restored(used, working.to_working(used.xyz), table, arrays)
         return cls(calibrator, data, working, fitted)

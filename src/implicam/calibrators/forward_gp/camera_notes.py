@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from implicam.rig_model.camera_model import CameraModel
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.general_camera import GeneralCamera
 
 
-def kind_notes(fitted: FittedRig, names: Sequence[str]) -> list[str]:
+def kind_notes(fitted: FitResult, names: Sequence[str]) -> list[str]:
     """names: of the fitted cameras."""
     models = fitted.posterior.models
     mirrored = [isinstance(model.camera, GeneralCamera) and model.camera.mirrored for model in models]

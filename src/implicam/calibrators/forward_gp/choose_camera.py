@@ -95,7 +95,7 @@ class Candidate(NamedTuple):
 
     camera: GeneralCamera
     family: str
-    kept: Bools
+    inliers: Bools
     evidence: float
 
     @property
@@ -108,7 +108,7 @@ class Start(NamedTuple):
     """A rough camera and the views (n,) that it explains; doubtful: too many others are far off."""
 
     camera: GeneralCamera
-    kept: Bools
+    inliers: Bools
     doubtful: bool = False
 
 
@@ -126,10 +126,10 @@ class Scene(NamedTuple):
         away = np.linalg.norm(camera.pixel(self.points) - self.uv, axis=1)
         return np.asarray(np.where(np.isnan(away), np.inf, away), dtype=np.float64)
 
-    def near(self, error: Floats, kept: Bools) -> Bools:
+    def near(self, error: Floats, inliers: Bools) -> Bools:
         """The views that a camera explains, judged by the median of those kept; of few views, which a camera of
         seventeen numbers may nearly go through, by the noise."""
-        limit = max(FAR * float(np.median(error[kept])), MIN_TOLERATED_NOISES * self.noise)
+        limit = max(FAR * float(np.median(error[inliers])), MIN_TOLERATED_NOISES * self.noise)
         return np.asarray(error <= limit, dtype=np.bool_)
 
     @property
@@ -176,23 +176,23 @@ def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate |
     if not isinstance(camera, GeneralCamera) or family not in FAMILIES:
         return None
     error = whole.error(camera)
-    kept = whole.near(error, np.isfinite(error))
-    if kept.sum() < max(FEWEST, len(error) / 2):
+    inliers = whole.near(error, np.isfinite(error))
+    if inliers.sum() < max(FEWEST, len(error) / 2):
         return None
-    found, kept = _refined(camera, family, whole, kept, FINAL_STEPS, rounds=4)
-    return Candidate(found, family, kept, 0.0)
+    found, inliers = _refined(camera, family, whole, inliers, FINAL_STEPS, rounds=4)
+    return Candidate(found, family, inliers, 0.0)
 
 
 def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> Started:
     """What the fit starts from; some: all candidates of the camera."""
-    prior = family_prior(one.camera, one.family, whole.image, _widest(one.camera, whole.points[one.kept]))
-    left = float(np.median(whole.error(one.camera)[one.kept]))
+    prior = family_prior(one.camera, one.family, whole.image, _widest(one.camera, whole.points[one.inliers]))
+    left = float(np.median(whole.error(one.camera)[one.inliers]))
     if one.family == "free" and left > WANDERING_NOISES * whole.noise:
         prior = near_prior(one.camera, prior, whole.image)
-    kept = one.kept & np.isfinite(whole.error(one.camera))
+    inliers = one.inliers & np.isfinite(whole.error(one.camera))
     ordinary = [float(np.median(whole.error(other.camera))) for other in some if other.kind == ("ordinary", False)]
     left = ordinary[0] if ordinary and one.kind != ("ordinary", False) else float("nan")
-    return Started(one.camera, prior, kept, one.family, left)
+    return Started(one.camera, prior, inliers, one.family, left)
 
 
 def _weight(one: Candidate, others: list[tuple[str, bool]]) -> float:
@@ -212,11 +212,17 @@ def _widest(camera: GeneralCamera, points: Floats) -> float:
 
 
 def _refined(
-    camera: GeneralCamera, family: str, scene: Scene, kept: Bools, steps: int, rounds: int = 1, gain: float = FINE_GAIN
+    camera: GeneralCamera,
+    family: str,
+    scene: Scene,
+    inliers: Bools,
+    steps: int,
+    rounds: int = 1,
+    gain: float = FINE_GAIN,
 ) -> tuple[GeneralCamera, Bools]:
     """The camera of that kind that explains the views kept, and those that it then explains."""
     for _ in range(rounds):
-        rows = np.flatnonzero(kept)
+        rows = np.flatnonzero(inliers)
         if len(rows) > MAX_START_VIEWS:
             rows = rows[np.random.default_rng(0).choice(len(rows), MAX_START_VIEWS, replace=False)]
         points, uv = scene.points[rows], scene.uv[rows]
@@ -227,11 +233,11 @@ def _refined(
         found = levenberg_marquardt(camera, prior, points, uv, sd, steps, gain)
         assert isinstance(found, GeneralCamera)
         camera = found
-        inside = scene.near(scene.error(camera), kept)
-        if inside.sum() < FEWEST or (inside == kept).all():
+        inside = scene.near(scene.error(camera), inliers)
+        if inside.sum() < FEWEST or (inside == inliers).all():
             break
-        kept = inside
-    return camera, kept
+        inliers = inside
+    return camera, inliers
 
 
 def _from_ladder(scene: Scene, *, mirrored: bool, subsets: bool = True) -> Start | None:
@@ -255,35 +261,35 @@ def _ladder(scene: Scene, *, mirrored: bool, subsets: bool) -> Start | None:
     camera = GeneralCamera.from_central(central, mirrored_about=about)
     if camera.rho < SMALLEST_RHO:
         return None
-    kept = found.kept
-    if len(kept) > kept.sum() and len(scene.points) > 120:  # the ladder looked at some of many
+    inliers = found.inliers
+    if len(inliers) > inliers.sum() and len(scene.points) > 120:  # the ladder looked at some of many
         error = scene.error(camera)
-        kept = scene.near(error, found.kept)
-    return Start(camera, kept if kept.sum() >= FEWEST else found.kept, found.doubtful)
+        inliers = scene.near(error, found.inliers)
+    return Start(camera, inliers if inliers.sum() >= FEWEST else found.inliers, found.doubtful)
 
 
 def _quick(scene: Scene, ladder: Start) -> Candidate | None:
     """The ordinary camera, if nothing freer is clearly better."""
-    camera, kept = _refined(ladder.camera, "ordinary", scene, ladder.kept, FINAL_STEPS * 5, rounds=4)
+    camera, inliers = _refined(ladder.camera, "ordinary", scene, ladder.inliers, FINAL_STEPS * 5, rounds=4)
     error = scene.error(camera)
-    median = float(np.median(error[kept]))
-    if kept.sum() < FEWEST or not median < QUICK_MEDIAN * scene.image.half or camera.rho < 4 * SMALLEST_RHO:
+    median = float(np.median(error[inliers]))
+    if inliers.sum() < FEWEST or not median < QUICK_MEDIAN * scene.image.half or camera.rho < 4 * SMALLEST_RHO:
         return None
-    views = _common_views(scene, kept)
+    views = _common_views(scene, inliers)
     tight, free_from_here = _evidences(camera, ("ordinary", "free"), views)
     if tight > free_from_here + QUICK_NATS and median < QUICK_NOISES * scene.noise:
-        free, free_kept = _refined(camera, "free", scene, kept, 1, gain=ROUGH_GAIN)
-        left = np.sum(scene.error(free)[kept] ** 2) / np.sum(error[kept] ** 2)
-        if left > QUICK_LEFT and free_kept.sum() <= kept.sum():
-            return Candidate(camera, "ordinary", kept, tight)
-    free, free_kept = _refined(camera, "free", scene, kept, PROBE_STEPS, gain=ROUGH_GAIN)
+        free, free_kept = _refined(camera, "free", scene, inliers, 1, gain=ROUGH_GAIN)
+        left = np.sum(scene.error(free)[inliers] ** 2) / np.sum(error[inliers] ** 2)
+        if left > QUICK_LEFT and free_kept.sum() <= inliers.sum():
+            return Candidate(camera, "ordinary", inliers, tight)
+    free, free_kept = _refined(camera, "free", scene, inliers, PROBE_STEPS, gain=ROUGH_GAIN)
     free_error = scene.error(free)
     # what seventeen free numbers gain over eleven by chance is no reason; of few views the evidence must do
-    by_chance = np.sqrt(max(2 * kept.sum() - 17, 0) / (2 * kept.sum() - 11))
-    better = kept.sum() >= FEW_VIEWS and np.median(free_error[kept]) < QUICK_GAIN * by_chance * median
-    if better or free_kept.sum() > kept.sum() or tight < _evidences(free, ("free",), views)[0] - QUICK_NATS:
+    by_chance = np.sqrt(max(2 * inliers.sum() - 17, 0) / (2 * inliers.sum() - 11))
+    better = inliers.sum() >= FEW_VIEWS and np.median(free_error[inliers]) < QUICK_GAIN * by_chance * median
+    if better or free_kept.sum() > inliers.sum() or tight < _evidences(free, ("free",), views)[0] - QUICK_NATS:
         return None
-    return Candidate(camera, "ordinary", kept, tight)
+    return Candidate(camera, "ordinary", inliers, tight)
 
 
 def _thorough(scene: Scene, ladder: Start | None, linear: Start | None) -> list[Candidate]:
@@ -292,12 +298,14 @@ def _thorough(scene: Scene, ladder: Start | None, linear: Start | None) -> list[
     if not starts:
         raise FitError("no camera sees the known points at these pixels.", fix="look for wrong detections")
     best: dict[bool, list[tuple[float, GeneralCamera, Bools]]] = {False: [], True: []}
-    for camera, kept, _ in starts:
-        found, explained = _refined(camera, "free", scene, kept, SHORT_STEPS, gain=ROUGH_GAIN)
+    for camera, inliers, _ in starts:
+        found, explained = _refined(camera, "free", scene, inliers, SHORT_STEPS, gain=ROUGH_GAIN)
         best[camera.mirrored].append((_score(scene, found), found, explained))
     for sign, some in best.items():
         some.sort(key=lambda one: one[0])
-        again = [_refined(camera, "free", scene, kept, LONG_STEPS, rounds=2) for _, camera, kept in some[:BEST_STARTS]]
+        again = [
+            _refined(camera, "free", scene, inliers, LONG_STEPS, rounds=2) for _, camera, inliers in some[:BEST_STARTS]
+        ]
         best[sign] = sorted(((_score(scene, c), c, k) for c, k in again), key=lambda one: one[0])
     leading = {sign: some[0][0] if some else np.inf for sign, some in best.items()}
     signs = [sign for sign in best if best[sign] and not leading[sign] * CLEARLY_WRONG > leading[not sign]]
@@ -317,8 +325,8 @@ def _kinds(
     sign: bool,
 ) -> Iterator[Candidate]:
     """Each kind, from the best free camera and from the ladder of what that one explains."""
-    _, free, kept = best
-    right = Scene(scene.points[kept], scene.uv[kept], scene.relative[kept], scene.image, scene.stated)
+    _, free, inliers = best
+    right = Scene(scene.points[inliers], scene.uv[inliers], scene.relative[inliers], scene.image, scene.stated)
     ladder = _from_ladder(right, mirrored=sign, subsets=False)
     others = [] if ladder is None else [ladder.camera]
     for family, kind in FAMILIES.items():
@@ -327,7 +335,7 @@ def _kinds(
         some = []
         near = [one for one in others if family == "ordinary" or _score(scene, one) < FAR_BEHIND * best[0]]
         for camera in (free.with_shape(shape, tilt), *near):
-            found, explained = _refined(camera, family, scene, kept, FINAL_STEPS, rounds=2)
+            found, explained = _refined(camera, family, scene, inliers, FINAL_STEPS, rounds=2)
             plausible = np.median(scene.error(found)[explained]) < MAX_MEDIAN * scene.image.half
             evidence = _evidences(found, (family,), views)[0] if plausible else -np.inf
             some.append(Candidate(found, family, explained, evidence))
@@ -341,8 +349,8 @@ def _score(scene: Scene, camera: GeneralCamera) -> float:
     return scene.noise * float(np.exp(0.5 * np.mean(np.log1p((error / scene.noise) ** 2))))
 
 
-def _common_views(scene: Scene, kept: Bools) -> Views:
-    rows = np.flatnonzero(kept)
+def _common_views(scene: Scene, inliers: Bools) -> Views:
+    rows = np.flatnonzero(inliers)
     if len(rows) > MAX_CHOICE_VIEWS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MAX_CHOICE_VIEWS, replace=False))
     return Views(scene.points[rows], scene.uv[rows], scene.relative[rows], scene.image, scene.stated)
@@ -356,17 +364,17 @@ def _evidences(camera: GeneralCamera, families: Sequence[str], views: Views) -> 
 
 def _from_dlt(scene: Scene) -> Start | None:
     try:
-        P, kept = resect_robustly(scene.points, scene.uv)
+        P, inliers = resect_robustly(scene.points, scene.uv)
     except FitError:
         return None
     camera = _from_linear(P)
-    return None if camera is None else Start(camera, kept)
+    return None if camera is None else Start(camera, inliers)
 
 
 def _starts(scene: Scene, ladder: Start | None, linear: Start | None) -> Iterator[Start]:
     if ladder is not None:
         yield ladder
-        if not ladder.kept.all() and len(scene.points) < FEW_VIEWS:  # too few to say by themselves which are wrong
+        if not ladder.inliers.all() and len(scene.points) < FEW_VIEWS:  # too few to say by themselves which are wrong
             yield Start(ladder.camera, np.ones(len(scene.points), dtype=np.bool_))
     mirrored = _from_ladder(scene, mirrored=True, subsets=linear is None or not linear.camera.mirrored)
     if mirrored is not None:
@@ -375,7 +383,7 @@ def _starts(scene: Scene, ladder: Start | None, linear: Start | None) -> Iterato
         yield linear
         farther = np.zeros(linear.camera.size)
         farther[RHO] = -0.7 * linear.camera.rho
-        yield Start(linear.camera.moved(farther), linear.kept)  # its perspective is what noise disturbs first
+        yield Start(linear.camera.moved(farther), linear.inliers)  # its perspective is what noise disturbs first
     yield from _from_affine(scene)
 
 
@@ -393,7 +401,7 @@ def _from_linear(P: Floats) -> GeneralCamera | None:
 def _from_affine(scene: Scene) -> Iterator[Start]:
     """Far cameras: a parallel projection and a guess of the distance, both signs."""
     try:
-        A, b, kept = resect_affine(scene.points, scene.uv)
+        A, b, inliers = resect_affine(scene.points, scene.uv)
     except FitError:
         return
     parts = pixel_shape_of(A)
@@ -414,4 +422,4 @@ def _from_affine(scene: Scene) -> Iterator[Start]:
             pose = Pose(rotation, translation)
             centre = scene.image.centre
             camera = GeneralCamera(scale / rho, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose)
-            yield Start(camera, kept)
+            yield Start(camera, inliers)

@@ -107,11 +107,13 @@ class CameraEvidence:
 
     def objective(self, spectrum: Spectrum, signal: float, noise: float) -> tuple[float, float, float]:
         """Minus the log marginal likelihood, eq. (11), and its derivatives by log signal and log noise."""
-        value, by_signal, by_noise = _Together.of([self], [spectrum]).objective(np.array([signal]), np.array([noise]))
+        value, by_signal, by_noise = BatchedEvidence.of([self], [spectrum]).objective(
+            np.array([signal]), np.array([noise])
+        )
         return float(value[0]), float(by_signal[0]), float(by_noise[0])
 
 
-class _Together(NamedTuple):
+class BatchedEvidence(NamedTuple):
     """Several cameras with as many parameters each, in stacks (C, ...): small matrices are fast only together.
 
     A camera with fewer eigenvalues than others is filled up with zeros, that is, with noise and no field.
@@ -128,7 +130,8 @@ class _Together(NamedTuple):
     precision: Floats
 
     @classmethod
-    def of(cls, cameras: list[CameraEvidence], spectra: list[Spectrum]) -> _Together:
+    def of(cls, cameras: list[CameraEvidence], spectra: list[Spectrum]) -> BatchedEvidence:
+        """Of several cameras, padded with zeros to the largest."""
         m, p = max(len(s.e) for s in spectra), cameras[0].X.shape[2]
         e, y, X = np.zeros((len(spectra), m)), np.zeros((len(spectra), m, 2)), np.zeros((len(spectra), m, 2, p))
         for c, s in enumerate(spectra):
@@ -298,7 +301,7 @@ class RigEvidence:
         for c, camera in enumerate(self.cameras):
             alike.setdefault(camera.X.shape[2], []).append(c)
         groups = [
-            (group, _Together.of([self.cameras[c] for c in group], [spectra[c] for c in group]))
+            (group, BatchedEvidence.of([self.cameras[c] for c in group], [spectra[c] for c in group]))
             for group in alike.values()
         ]
 

@@ -28,16 +28,16 @@ from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.progress import Progress, silent
 from implicam.rig_model.camera_model import CameraModel
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.initialise import (
     Started,
+    lens_only_model,
     require_two_cameras,
     start_again,
     start_camera,
     start_rig,
-    without_field,
 )
-from implicam.rig_model.leave_one_out import judged_all
+from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.normal_equations import CameraFailedError
 from implicam.rig_model.training_data import Problem
 from implicam.threads import side_by_side
@@ -52,28 +52,28 @@ SEARCHED, FEW_CHANGED = 2, 0.01
 which, when they change later, tell nothing new of how smooth a field is."""
 
 
-def fit_rig(problem: Problem, progress: Progress, before: FittedRig | None = None) -> FittedRig:
+def fit_rig(problem: Problem, progress: Progress, before: FitResult | None = None) -> FitResult:
     """Fit every camera that can be fitted. before: a fit in the same working frame to most of these points, from a
     moment ago: its cameras and hyperparameters are the guess. Where known positions have declared errors, which make
     hyperparameters costly, they are kept."""
     progress("fitting", 0, 3)
-    started, blind = _started(problem, before)
-    fitted = _fit_without_failures(problem, progress, before, started, blind)
+    started, uncalibrated = _started(problem, before)
+    fitted = _fit_without_failures(problem, progress, before, started, uncalibrated)
     return _with_projections(problem, fitted, started) if problem.lens == AUTO else fitted
 
 
 def _fit_without_failures(
     problem: Problem,
     progress: Progress,
-    before: FittedRig | None,
+    before: FitResult | None,
     started: dict[int, Started],
-    blind: list[tuple[int, str]],
-) -> FittedRig:
+    uncalibrated: list[tuple[int, str]],
+) -> FitResult:
     """One bad camera never takes the rig down: it goes on without a lens model, or is left out. Changes `started` and
-    `blind`."""
+    `uncalibrated`."""
     while True:
         try:
-            return _fit_started(problem, progress, before, started, blind)
+            return _fit_started(problem, progress, before, started, uncalibrated)
         except CameraFailedError as error:
             failed = list(started)[error.number]
             again = None
@@ -82,12 +82,12 @@ def _fit_without_failures(
             if again is not None:
                 started[failed] = again._replace(ordinary_px=started[failed].ordinary_px)
                 continue
-            blind.append((failed, f"no camera model fits its views: {error}."))
+            uncalibrated.append((failed, f"no camera model fits its views: {error}."))
             del started[failed]
-            require_two_cameras(problem, started, blind)
+            require_two_cameras(problem, started, uncalibrated)
 
 
-def _with_projections(problem: Problem, fitted: FittedRig, started: dict[int, Started]) -> FittedRig:
+def _with_projections(problem: Problem, fitted: FitResult, started: dict[int, Started]) -> FitResult:
     """The rig with those cameras as linear projections that clearly predict left-out views better so."""
     tried = {}
     for number, c in enumerate(fitted.cameras):
@@ -99,9 +99,9 @@ def _with_projections(problem: Problem, fitted: FittedRig, started: dict[int, St
                 tried[c] = found._replace(ordinary_px=started[c].ordinary_px)
     if not tried:
         return fitted
-    blind = list(fitted.blind)
+    uncalibrated = list(fitted.uncalibrated)
     try:
-        other = _fit_started(problem, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, blind)
+        other = _fit_started(problem, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, uncalibrated)
     except np.linalg.LinAlgError:
         return fitted
     if measures_better(problem, other, fitted):
@@ -113,12 +113,12 @@ def _with_projections(problem: Problem, fitted: FittedRig, started: dict[int, St
         return other if better else fitted
     mixed = {c: tried[c] if c in better else started[c] for c in fitted.cameras}
     try:
-        return _fit_started(problem, silent, None, mixed, blind)
+        return _fit_started(problem, silent, None, mixed, uncalibrated)
     except np.linalg.LinAlgError:
         return fitted
 
 
-def _started(problem: Problem, before: FittedRig | None) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+def _started(problem: Problem, before: FitResult | None) -> tuple[dict[int, Started], list[tuple[int, str]]]:
     guess = {} if before is None else dict(zip(before.cameras, before.posterior.models, strict=True))
     if problem.lens == AUTO:
         return choose_cameras(problem, guess)
@@ -137,7 +137,7 @@ def choose_cameras(
     """The kind of each camera, and where it starts; guess: cameras that fitted most of the points a moment ago."""
 
     def scene(c: int) -> Scene:
-        seen = problem.sightings[c]
+        seen = problem.camera_views[c]
         return Scene(problem.points[seen.rows], seen.uv, seen.relative, problem.images[c], float(problem.stated[c]))
 
     def look(c: int) -> list[Candidate] | FitError:
@@ -149,7 +149,7 @@ def choose_cameras(
         except np.linalg.LinAlgError as error:
             return FitError(f"its equations have no solution: {error}.")
 
-    found = side_by_side(look, range(len(problem.sightings)))
+    found = side_by_side(look, range(len(problem.camera_views)))
     seeing = [c for c, some in enumerate(found) if not isinstance(some, FitError)]
     chosen = dict(zip(seeing, choose([some for some in found if not isinstance(some, FitError)]), strict=True))
 
@@ -165,43 +165,43 @@ def choose_cameras(
 def _fit_started(
     problem: Problem,
     progress: Progress,
-    before: FittedRig | None,
+    before: FitResult | None,
     started: dict[int, Started],
-    blind: list[tuple[int, str]],
-) -> FittedRig:
+    uncalibrated: list[tuple[int, str]],
+) -> FitResult:
     cameras = tuple(started)
-    seen = tuple(problem.sightings[c] for c in cameras)
+    seen = tuple(problem.camera_views[c] for c in cameras)
     images = tuple(problem.images[c] for c in cameras)
-    kept = tuple(started[c].kept for c in cameras)
-    models = tuple(without_field(started[c], image) for c, image in zip(cameras, images, strict=True))
+    inliers = tuple(started[c].inliers for c in cameras)
+    models = tuple(lens_only_model(started[c], image) for c, image in zip(cameras, images, strict=True))
     progress("fitting", 1, 3)
     stated = problem.stated[list(cameras)]
     rounds = ROUNDS_WITH_SHOTS if problem.errors is not None and problem.errors.estimated else ROUNDS
     hyper = before.hyperparameters if before is not None and before.cameras == cameras else None
     tied = problem.errors is not None and not problem.errors.estimated
-    state = Round(hyper, models, None, kept, problem.errors, None, settled=False, fixed=hyper if tied else None)
+    state = Round(hyper, models, None, inliers, problem.errors, None, settled=False, fixed=hyper if tied else None)
     changed = 1.0  # part of the views
     for number in range(rounds):
         search = number < SEARCHED or changed > FEW_CHANGED
         state = next_round(problem, state, seen, images, stated, search=search)
-        judged = state.kept
+        judged = state.inliers
         if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
-            judged = judged_all(state.posterior, problem.points, seen, state.kept)
-        changed = float(np.mean(np.concatenate(judged) != np.concatenate(state.kept)))
+            judged = update_inliers(state.posterior, problem.points, seen, state.inliers)
+        changed = float(np.mean(np.concatenate(judged) != np.concatenate(state.inliers)))
         if state.settled and not changed:
             break
         progress("fitting", 2, 3)
         if number < rounds - 1:  # the last round's views stay those of its posterior
-            state = state._replace(kept=judged)
+            state = state._replace(inliers=judged)
     progress("fitting", 3, 3)
     assert state.hyper is not None
     check_fitted(problem, state, seen)
     ordinary_px = tuple(one.ordinary_px for one in started.values())
-    return FittedRig(
+    return FitResult(
         state.posterior,
         cameras,
-        tuple(blind),
-        state.kept,
+        tuple(uncalibrated),
+        state.inliers,
         state.hyper,
         state.errors,
         state.label_sd,

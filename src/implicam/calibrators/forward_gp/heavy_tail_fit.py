@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from implicam.calibrators.forward_gp.rounds import Round, check_fitted, next_round
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera import Image
-from implicam.rig_model.camera_model import Sightings, random_subset
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.camera_model import CameraViews, random_subset
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.heavy_tails import (
     DEGREES,
     MOST_VIEWS,
@@ -32,17 +32,17 @@ REWEIGHTED = 3
 """Rounds more where the noise has heavy tails."""
 
 
-def with_heavy_tails(problem: Problem, fitted: FittedRig) -> FittedRig:
+def with_heavy_tails(problem: Problem, fitted: FitResult) -> FitResult:
     """After a few rounds more with views weighted by a t, where the noise of the fit clearly is one; else the same."""
     cameras = fitted.cameras
-    seen, images = tuple(problem.sightings[c] for c in cameras), tuple(problem.images[c] for c in cameras)
+    seen, images = tuple(problem.camera_views[c] for c in cameras), tuple(problem.images[c] for c in cameras)
     stated, hyper, errors = problem.stated[list(cameras)], fitted.hyperparameters, fitted.errors
     fixed = hyper if errors is not None and not errors.estimated else None
     state = Round(
         hyper,
         fitted.posterior.models,
         fitted.posterior,
-        fitted.kept,
+        fitted.inliers,
         errors,
         fitted.label_sd,
         settled=True,
@@ -54,8 +54,8 @@ def with_heavy_tails(problem: Problem, fitted: FittedRig) -> FittedRig:
             found = _tails(problem, state, seen, images)
             if found is None:
                 break
-            tails, kept = found
-            again = state._replace(tails=tails, kept=kept)
+            tails, inliers = found
+            again = state._replace(tails=tails, inliers=inliers)
             state = next_round(problem, again, seen, images, stated, search=number == 0)
         if state.tails is None:
             return fitted
@@ -66,7 +66,7 @@ def with_heavy_tails(problem: Problem, fitted: FittedRig) -> FittedRig:
     return replace(
         fitted,
         posterior=state.posterior,
-        kept=state.kept,
+        inliers=state.inliers,
         hyperparameters=state.hyper,
         errors=state.errors,
         label_sd=state.label_sd,
@@ -75,7 +75,7 @@ def with_heavy_tails(problem: Problem, fitted: FittedRig) -> FittedRig:
 
 
 def _tails(
-    problem: Problem, state: Round, seen: tuple[Sightings, ...], images: tuple[Image, ...]
+    problem: Problem, state: Round, seen: tuple[CameraViews, ...], images: tuple[Image, ...]
 ) -> tuple[Tails, tuple[Bools, ...]] | None:
     """Degrees of freedom of the noise, from how far all views are from what the others predict; the weight of each view
     by how far it is from what all say; and the views to use. None where the noise is normal."""
@@ -84,7 +84,7 @@ def _tails(
     def one(c: int, most: int) -> _Predicted:
         some = random_subset(len(seen[c].rows), most)
         return _Predicted.of(
-            state.posterior, c, problem.points, seen[c].select(some), weighted[c].select(some), state.kept[c][some]
+            state.posterior, c, problem.points, seen[c].select(some), weighted[c].select(some), state.inliers[c][some]
         )
 
     if state.tails is None:
@@ -103,7 +103,7 @@ def _tails(
         return None
     every = [one(c, len(problem.points)) for c in range(len(seen))]
     limit = outlier_distance(degrees, OUTLIER)
-    judged = tuple(next_inliers(p.distance, k, limit) for p, k in zip(every, state.kept, strict=True))
+    judged = tuple(next_inliers(p.distance, k, limit) for p, k in zip(every, state.inliers, strict=True))
     return Tails(degrees, tuple(weights_of(p.own, degrees) for p in every)), judged
 
 
@@ -121,17 +121,17 @@ class _Predicted(NamedTuple):
 
     @classmethod
     def of(
-        cls, posterior: Posterior, c: int, points: Floats, seen: Sightings, weighted: Sightings, kept: Bools
+        cls, posterior: Posterior, c: int, points: Floats, seen: CameraViews, weighted: CameraViews, inliers: Bools
     ) -> _Predicted:
         at = residuals_of(posterior, c, points, weighted)
         variance = (posterior.models[c].noise * seen.relative) ** 2
-        residual, covariance = left_out_from(at, kept)
+        residual, covariance = left_out_from(at, inliers)
         covariance = covariance - (at.sd**2 - variance)[:, None, None] * np.eye(2)
         distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
         sound = np.isfinite(distance) & (covariance[:, 0, 0] > 0) & (np.linalg.det(covariance) > 0)
         distance = np.where(sound, distance, np.inf)
         expected = (np.sum(at.residual**2, axis=1) + np.trace(at.reach, axis1=1, axis2=2)) / variance
-        return cls(seen.rows, residual, covariance, distance, np.where(kept, expected, distance), variance)
+        return cls(seen.rows, residual, covariance, distance, np.where(inliers, expected, distance), variance)
 
 
 def _agreement(posterior: Posterior, points: Floats, predicted: list[_Predicted]) -> tuple[Floats, Floats, Bools]:

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
 from implicam.geometry import Floats
 from implicam.rig_model.camera import Image, ProjectiveCamera
-from implicam.rig_model.camera_model import CameraModel, Sightings, thin_views
+from implicam.rig_model.camera_model import CameraModel, CameraViews, thin_views
 from implicam.rig_model.field import DepthScale, Hyperparameters, empty_field, field_coordinates
 from implicam.rig_model.posterior import condition
 from implicam.rig_model.training_data import Problem
@@ -28,7 +28,7 @@ TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 def estimate_hyperparameters(
     problem: Problem,
     models: tuple[CameraModel, ...],
-    used: tuple[Sightings, ...],
+    used: tuple[CameraViews, ...],
     images: tuple[Image, ...],
     stated: Floats,
     before: Hyperparameters | None,
@@ -59,7 +59,7 @@ def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
     return [group for group in ([c for c in range(len(models)) if c not in none], none) if group]
 
 
-def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floats | None) -> CameraEvidence:
+def _evidence(problem: Problem, model: CameraModel, seen: CameraViews, moved: Floats | None) -> CameraEvidence:
     """One camera's evidence. The error of a shot of many points is known well, so the points are where it says
     (`moved`); that of a single point is not, and is one more unknown of the camera."""
     errors = problem.errors if problem.errors is not None and not problem.errors.estimated else None
@@ -83,7 +83,7 @@ def _evidence(problem: Problem, model: CameraModel, seen: Sightings, moved: Floa
 
 
 def size_fields(
-    problem: Problem, models: tuple[CameraModel, ...], used: tuple[Sightings, ...], hyper: Hyperparameters
+    problem: Problem, models: tuple[CameraModel, ...], used: tuple[CameraViews, ...], hyper: Hyperparameters
 ) -> tuple[CameraModel, ...]:
     """The cameras with fields laid out anew."""
 
@@ -96,7 +96,7 @@ def size_fields(
         field = empty_field(hyper.lengthscale[c], field_coordinates(view, model.image, depth), tolerance)
         return replace(
             model,
-            ruler=model.camera,
+            field_camera=model.camera,
             depth=depth,
             field=field,
             signal=float(hyper.signal[c]),
@@ -110,7 +110,7 @@ def size_fields(
 def _joint_sizes(
     problem: Problem,
     models: tuple[CameraModel, ...],
-    used: tuple[Sightings, ...],
+    used: tuple[CameraViews, ...],
     hyper: Hyperparameters,
     groups: list[tuple[list[int], RigEvidence]],
 ) -> Hyperparameters:

@@ -6,7 +6,7 @@ import numpy as np
 
 from implicam.errors import FitError
 from implicam.geometry import Floats
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.initialise import Started, check_start, start_camera
 from implicam.rig_model.leave_one_out import OUTLIER, left_out, left_out_positions
 from implicam.rig_model.training_data import Problem
@@ -26,7 +26,7 @@ MAX_SQUARES = 20.0
 
 def start_without_lens(problem: Problem, c: int) -> Started | None:
     """Camera c as a linear projection with a field; None where it saw too little for one."""
-    seen = problem.sightings[c]
+    seen = problem.camera_views[c]
     if len(seen.rows) < FEWEST_WITHOUT_LENS:
         return None
     try:
@@ -37,20 +37,20 @@ def start_without_lens(problem: Problem, c: int) -> Started | None:
     return found
 
 
-def predicts_better(problem: Problem, one: FittedRig, other: FittedRig, number: int) -> bool:
+def predicts_better(problem: Problem, one: FitResult, other: FitResult, number: int) -> bool:
     """Whether a camera's left-out views are clearly more probable in one fit than in another."""
     gain = _left_out_log_densities(problem, one, number) - _left_out_log_densities(problem, other, number)
     clearly = 2 * float(np.std(gain)) * np.sqrt(len(gain))
     return bool(np.sum(gain) > max(clearly, CLEAR_NATS))
 
 
-def measures_better(problem: Problem, one: FittedRig, other: FittedRig) -> bool:
+def measures_better(problem: Problem, one: FitResult, other: FitResult) -> bool:
     """Whether known points, measured without themselves, are clearly nearer to their positions in one fit than in
     another. A view of a steep camera says little of depth, so its density is not all that counts."""
     squares = []
     for fitted in (one, other):
-        seen = tuple(problem.sightings[c] for c in fitted.cameras)
-        error = left_out_positions(fitted.posterior, problem.points, seen, fitted.kept)
+        seen = tuple(problem.camera_views[c] for c in fitted.cameras)
+        error = left_out_positions(fitted.posterior, problem.points, seen, fitted.inliers)
         squares.append(np.sum(error**2, axis=1))
     one_squares, other_squares = np.array(squares)[:, np.isfinite(squares).all(axis=0)]
     if len(one_squares) < FEWEST_WITHOUT_LENS:
@@ -60,10 +60,10 @@ def measures_better(problem: Problem, one: FittedRig, other: FittedRig) -> bool:
     return bool(np.sum(gain) > 2 * float(np.std(gain)) * np.sqrt(len(gain)))
 
 
-def _left_out_log_densities(problem: Problem, fitted: FittedRig, number: int) -> Floats:
+def _left_out_log_densities(problem: Problem, fitted: FitResult, number: int) -> Floats:
     """(n,) of each view of a camera, predicted from all others; a wrong view costs what a view just rejected does."""
-    seen, kept = problem.sightings[fitted.cameras[number]], fitted.kept[number]
-    residual, covariance = left_out(fitted.posterior, number, problem.points, seen, kept)
+    seen, inliers = problem.camera_views[fitted.cameras[number]], fitted.inliers[number]
+    residual, covariance = left_out(fitted.posterior, number, problem.points, seen, inliers)
     distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
     distance = np.where(np.isfinite(distance), distance, OUTLIER)
     return np.asarray(-0.5 * np.minimum(distance, OUTLIER) - 0.5 * np.linalg.slogdet(covariance)[1], dtype=np.float64)

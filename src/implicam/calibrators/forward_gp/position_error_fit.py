@@ -13,10 +13,10 @@ import numpy as np
 from implicam.calibrators.forward_gp.heavy_tail_fit import with_heavy_tails
 from implicam.dataset import Names
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.leave_one_out import OUTLIER, LeftOut, left_out_views
 from implicam.rig_model.level_errors import untold
-from implicam.rig_model.linearise import settle
+from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.position_errors import Agreement, LabelErrors, estimated
 from implicam.rig_model.tied import Scatter
 from implicam.rig_model.training_data import Problem
@@ -25,7 +25,7 @@ MOST = 400
 """Points that the errors are estimated from; more cost time and tell little more."""
 
 
-def with_noise_told_apart(problem: Problem, fitted: FittedRig, shots: Names) -> FittedRig:
+def with_noise_told_apart(problem: Problem, fitted: FitResult, shots: Names) -> FitResult:
     """The rig where what the fit took for normal pixel noise is something else: errors of known positions if all
     cameras agree on them, else heavy tails; else the same. shots: (n,) of the points.
 
@@ -45,34 +45,34 @@ def with_noise_told_apart(problem: Problem, fitted: FittedRig, shots: Names) -> 
     return fitted if heavy.tails is None else _with_scatter(problem, heavy)
 
 
-def _with_scatter(problem: Problem, fitted: FittedRig) -> FittedRig:
-    seen = tuple(problem.sightings[c] for c in fitted.cameras)
+def _with_scatter(problem: Problem, fitted: FitResult) -> FitResult:
+    seen = tuple(problem.camera_views[c] for c in fitted.cameras)
     if fitted.tails is not None:
         seen = fitted.tails.weighted(seen, told=True)
-    views = left_out_views(fitted.posterior, problem.points, seen, fitted.kept)
-    kept, n = fitted.kept, len(problem.points)
-    found = _estimated(views, kept, n)
+    views = left_out_views(fitted.posterior, problem.points, seen, fitted.inliers)
+    inliers, n = fitted.inliers, len(problem.points)
+    found = _estimated(views, inliers, n)
     if found is None:
         return fitted
-    kept = _judged(views, kept, found[0], n)
-    if any((a != b).any() for a, b in zip(kept, fitted.kept, strict=True)):
-        found = _estimated(views, kept, n) or found
+    inliers = _judged(views, inliers, found[0], n)
+    if any((a != b).any() for a, b in zip(inliers, fitted.inliers, strict=True)):
+        found = _estimated(views, inliers, n) or found
     errors, size = found
     errors = replace(errors, size=size)
     models = tuple(replace(model, noise=model.noise * errors.noise) for model in fitted.posterior.models)
-    used = tuple(one.select(k) for one, k in zip(seen, kept, strict=True))
+    used = tuple(one.select(k) for one, k in zip(seen, inliers, strict=True))
     try:
-        posterior = settle(models, problem.points, used, fitted.errors, Scatter(errors.root, size))
+        posterior = iterate_linearisation(models, problem.points, used, fitted.errors, Scatter(errors.root, size))
     except np.linalg.LinAlgError:  # then the cameras stay as they were, with more noise than there is
         return fitted
-    return replace(fitted, posterior=posterior, kept=kept, label_errors=errors)
+    return replace(fitted, posterior=posterior, inliers=inliers, label_errors=errors)
 
 
-def _sums(views: list[LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
+def _sums(views: list[LeftOut], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
     """Of all points, and which of them may be used: seen twice, and not of high leverage."""
     total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
     high = np.zeros(n, dtype=np.bool_)
-    for view, k in zip(views, kept, strict=True):
+    for view, k in zip(views, inliers, strict=True):
         rows = view.rows[k]  # a camera sees a point once
         information, pull = view.information, view.pull
         total.information[rows] += information[k]
@@ -83,9 +83,9 @@ def _sums(views: list[LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[Agreem
     return total, (total.coordinates >= 4) & ~high
 
 
-def _estimated(views: list[LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[LabelErrors, Floats] | None:
+def _estimated(views: list[LeftOut], inliers: tuple[Bools, ...], n: int) -> tuple[LabelErrors, Floats] | None:
     """The errors, and (n,) how much larger than usual each point's own scale is."""
-    agreement, good = _sums(views, kept, n)
+    agreement, good = _sums(views, inliers, n)
     rows = np.flatnonzero(good).astype(np.int64)
     some = rows if len(rows) <= MOST else np.random.default_rng(0).choice(rows, MOST, replace=False)
     errors = estimated(agreement.select(some))
@@ -96,13 +96,13 @@ def _estimated(views: list[LeftOut], kept: tuple[Bools, ...], n: int) -> tuple[L
     return errors, size
 
 
-def _judged(views: list[LeftOut], kept: tuple[Bools, ...], found: LabelErrors, n: int) -> tuple[Bools, ...]:
+def _judged(views: list[LeftOut], inliers: tuple[Bools, ...], found: LabelErrors, n: int) -> tuple[Bools, ...]:
     """The views to use: those that agree with what the others say of where their point is."""
-    total, _ = _sums(views, kept, n)
+    total, _ = _sums(views, inliers, n)
     noise2 = found.noise**2
     prior = np.linalg.inv(found.covariance)
     judged = []
-    for view, k in zip(views, kept, strict=True):
+    for view, k in zip(views, inliers, strict=True):
         information, pull = view.information, view.pull
         others = (total.information[view.rows] - np.where(k[:, None, None], information, 0)) / noise2 + prior
         drawn = (total.pull[view.rows] - np.where(k[:, None], pull, 0)) / noise2

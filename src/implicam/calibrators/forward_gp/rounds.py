@@ -9,10 +9,10 @@ import numpy as np
 from implicam.calibrators.forward_gp.hyperparameters import estimate_hyperparameters, size_fields
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera import Image
-from implicam.rig_model.camera_model import CameraModel, Sightings
+from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.field import Hyperparameters
 from implicam.rig_model.heavy_tails import Tails
-from implicam.rig_model.linearise import settle
+from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.normal_equations import CameraFailedError
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.shot_errors import ShotErrors
@@ -25,14 +25,14 @@ SETTLED = 0.1
 """Relative change of the shots' errors between two rounds below which they are found."""
 
 
-def check_fitted(problem: Problem, state: Round, seen: tuple[Sightings, ...]) -> None:
+def check_fitted(problem: Problem, state: Round, seen: tuple[CameraViews, ...]) -> None:
     """A camera that ends far off its own known points is no camera, whatever its covariance says."""
     points = problem.points
     if state.posterior.displacement is not None:
         points = points + state.posterior.displacement
-    for number, (model, views, kept) in enumerate(zip(state.posterior.models, seen, state.kept, strict=True)):
-        rows = views.rows[kept]
-        error = np.linalg.norm(model.predict(points[rows])[0] - views.uv[kept], axis=1) / views.relative[kept]
+    for number, (model, views, inliers) in enumerate(zip(state.posterior.models, seen, state.inliers, strict=True)):
+        rows = views.rows[inliers]
+        error = np.linalg.norm(model.predict(points[rows])[0] - views.uv[inliers], axis=1) / views.relative[inliers]
         if len(rows) < FEWEST or not np.median(error) < FAR_OFF * model.noise:
             off = float(np.median(error)) if len(rows) else np.nan
             raise CameraFailedError(number, f"it ends {off:.3g} px off its own known points")
@@ -45,7 +45,7 @@ class Round(NamedTuple):
     hyper: Hyperparameters | None
     models: tuple[CameraModel, ...]
     found: Posterior | None
-    kept: tuple[Bools, ...]
+    inliers: tuple[Bools, ...]
     next_errors: ShotErrors | None
     label_sd: Floats | None
     settled: bool
@@ -53,7 +53,7 @@ class Round(NamedTuple):
     fixed: Hyperparameters | None = None
     tails: Tails | None = None
 
-    def weighted(self, seen: tuple[Sightings, ...], *, told: bool) -> tuple[Sightings, ...]:
+    def weighted(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
         """The sightings with their weights as noise; told: as much as they tell, for what is known of the cameras."""
         return seen if self.tails is None else self.tails.weighted(seen, told=told)
 
@@ -67,42 +67,44 @@ class Round(NamedTuple):
 def next_round(
     problem: Problem,
     last: Round,
-    seen: tuple[Sightings, ...],
+    seen: tuple[CameraViews, ...],
     images: tuple[Image, ...],
     stated: Floats,
     *,
     search: bool,
 ) -> Round:
     """Sizes, posterior, and how far the shots are off. search: for other lengthscales too."""
-    kept = tuple(
+    inliers = tuple(
         k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
-        for k, m, s in zip(last.kept, last.models, seen, strict=True)
+        for k, m, s in zip(last.inliers, last.models, seen, strict=True)
     )
-    for number, k in enumerate(kept):
+    for number, k in enumerate(inliers):
         if k.sum() < FEWEST:
             raise CameraFailedError(number, f"{k.sum()} of its {len(k)} views agree with the others")
-    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=False), kept, strict=True))
+    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=False), inliers, strict=True))
     moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
     hyper = last.fixed or estimate_hyperparameters(
         problem, last.models, used, images, stated, last.hyper, moved, search
     )
     errors = last.next_errors
-    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=True), kept, strict=True))
+    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=True), inliers, strict=True))
     posterior = condition_with_new_fields(problem, last.models, used, hyper, errors)
     following, label_sd, settled = errors, None, True
     if errors is not None and posterior.unknowns is not None:
         mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
         following, label_sd = errors.updated(mean.reshape(errors.sd.shape), variance.reshape(errors.sd.shape))
         settled = bool(np.allclose(following.sd, errors.sd, rtol=SETTLED))
-    return Round(hyper, posterior.models, posterior, kept, following, label_sd, settled, errors, last.fixed, last.tails)
+    return Round(
+        hyper, posterior.models, posterior, inliers, following, label_sd, settled, errors, last.fixed, last.tails
+    )
 
 
 def condition_with_new_fields(
     problem: Problem,
     models: tuple[CameraModel, ...],
-    used: tuple[Sightings, ...],
+    used: tuple[CameraViews, ...],
     hyper: Hyperparameters,
     errors: ShotErrors | None,
 ) -> Posterior:
     """The posterior with fields laid out anew."""
-    return settle(size_fields(problem, models, used, hyper), problem.points, used, errors)
+    return iterate_linearisation(size_fields(problem, models, used, hyper), problem.points, used, errors)

@@ -16,7 +16,7 @@ from implicam.gp.low_rank import LowRank
 from implicam.rig_model.camera import CentralCamera, Image, Prior, ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.field import DepthScale, Hyperparameters, field_kernel
-from implicam.rig_model.fit_result import FittedRig
+from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.general_camera import GeneralCamera
 from implicam.rig_model.heavy_tails import Tails
 from implicam.rig_model.position_errors import LabelErrors
@@ -25,12 +25,12 @@ from implicam.rig_model.schur import Unknowns
 from implicam.rig_model.shot_errors import ShotErrors, Shots
 
 
-def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def state(fitted: FitResult, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """A readable table, and arrays: per camera lens, field, weights, root of the covariance, in the working frame."""
     posterior = fitted.posterior
     table = {
         "calibrated": [names[c] for c in fitted.cameras],
-        "not_calibrated": {names[c]: why for c, why in fitted.blind},
+        "not_calibrated": {names[c]: why for c, why in fitted.uncalibrated},
         "cameras": [_described(fitted, number, names[c]) for number, c in enumerate(fitted.cameras)],
     }
     arrays: dict[str, NDArray[Any]] = {
@@ -40,10 +40,10 @@ def state(fitted: FittedRig, names: Sequence[str]) -> tuple[dict[str, Any], dict
     for number, model in enumerate(posterior.models):
         arrays |= {
             f"{number}/camera": model.camera.as_array(),
-            f"{number}/ruler": model.ruler.as_array(),
+            f"{number}/ruler": model.field_camera.as_array(),
             f"{number}/inducing": model.field.inducing,
             f"{number}/weights": model.weights,
-            f"{number}/kept": fitted.kept[number],
+            f"{number}/kept": fitted.inliers[number],
             f"{number}/root": posterior.alone[number],
         }
     if fitted.tails is not None:
@@ -74,7 +74,7 @@ CAMERAS: dict[str, type[CentralCamera] | type[GeneralCamera] | type[ProjectiveCa
 """Name in a file -> camera model."""
 
 
-def _described(fitted: FittedRig, number: int, name: str) -> dict[str, Any]:
+def _described(fitted: FitResult, number: int, name: str) -> dict[str, Any]:
     """The readable entry of one camera: its model, its lens by name, its kind, whether it is mirrored, and what an
     ordinary camera would have left."""
     model = fitted.posterior.models[number]
@@ -85,22 +85,22 @@ def _described(fitted: FittedRig, number: int, name: str) -> dict[str, Any]:
     return table | ({"ordinary_would_leave_px": left} if np.isfinite(left) else {})
 
 
-def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays) -> FittedRig:
+def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays) -> FitResult:
     """The inverse of `state`; points: (n, 3) the known positions in the working frame.
 
     KeyError, ValueError or TypeError for anything that does not fit.
     """
     names = data.observations.camera_names
     cameras = tuple(names.index(str(name)) for name in table["calibrated"])
-    blind = tuple((names.index(str(name)), str(why)) for name, why in table["not_calibrated"].items())
-    if sorted([*cameras, *(c for c, _ in blind)]) != list(range(len(names))) or len(cameras) < 2:
+    uncalibrated = tuple((names.index(str(name)), str(why)) for name, why in table["not_calibrated"].items())
+    if sorted([*cameras, *(c for c, _ in uncalibrated)]) != list(range(len(names))) or len(cameras) < 2:
         raise ValueError("the cameras calibrated and not calibrated are not those of the data")
     lengthscales = finite_column(arrays, "lengthscale", (len(cameras), 2), positive=True)
     sizes = finite_column(arrays, "sizes", (len(cameras), 7))
     described = list(table["cameras"])
     if [str(one["name"]) for one in described] != [names[c] for c in cameras]:
         raise ValueError("the cameras described are not those calibrated")
-    models, alone, kept = [], [], []
+    models, alone, inliers = [], [], []
     for number, c in enumerate(cameras):
         model, covariance = _model(described[number], arrays, number, sizes[number], lengthscales[number])
         models.append(model)
@@ -108,7 +108,7 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
         used = arrays[f"{number}/kept"]
         if used.dtype != np.bool_ or used.shape != (int(data.observations.seen[:, c].sum()),):
             raise ValueError(f"{number}/kept must say of each view whether it is used")
-        kept.append(used)
+        inliers.append(used)
     posterior = _posterior(data, arrays, tuple(models), tuple(alone))
     errors, label_sd = _shot_errors(data, points, arrays, posterior)
     hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
@@ -116,13 +116,23 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
     label_errors, untold_sd = _label_errors(data, arrays, posterior), None
     if "untold_sd" in arrays:
         untold_sd = finite_column(arrays, "untold_sd", (6,), positive=True)
-    tails = _tails(arrays, kept)
-    return FittedRig(
-        posterior, cameras, blind, tuple(kept), hyper, errors, label_sd, tails, label_errors, untold_sd, ordinary
+    tails = _tails(arrays, inliers)
+    return FitResult(
+        posterior,
+        cameras,
+        uncalibrated,
+        tuple(inliers),
+        hyper,
+        errors,
+        label_sd,
+        tails,
+        label_errors,
+        untold_sd,
+        ordinary,
     )
 
 
-def _tails(arrays: Arrays, kept: Sequence[NDArray[np.bool_]]) -> Tails | None:
+def _tails(arrays: Arrays, inliers: Sequence[NDArray[np.bool_]]) -> Tails | None:
     """None where the noise is normal, as in files from before there were tails."""
     if "tails" not in arrays:
         return None
@@ -130,7 +140,8 @@ def _tails(arrays: Arrays, kept: Sequence[NDArray[np.bool_]]) -> Tails | None:
     if degrees <= 2:
         raise ValueError("noise with two degrees of freedom or fewer has no variance")
     weights = (
-        finite_column(arrays, f"{number}/tail_weights", used.shape, positive=True) for number, used in enumerate(kept)
+        finite_column(arrays, f"{number}/tail_weights", used.shape, positive=True)
+        for number, used in enumerate(inliers)
     )
     return Tails(degrees, tuple(weights))
 
@@ -176,7 +187,7 @@ def _model(
     if family not in (*FAMILIES, "none"):
         raise ValueError(f"{family!r} is no kind of camera")
     numbers = {"central": (20,), "general": (24,), "none": (12,)}[kind.kind]
-    camera, ruler = (
+    camera, field_camera = (
         kind.from_array(finite_column(arrays, f"{number}/{what}", numbers)) for what in ("camera", "ruler")
     )
     m = len(arrays[f"{number}/inducing"])
@@ -191,7 +202,7 @@ def _model(
     field = LowRank(field_kernel(lengthscale), inducing)
     image = Image(np.array(centre), half)
     model = CameraModel(
-        camera, ruler, none, image, field, signal, noise, weights, DepthScale(depth, unit), family=family
+        camera, field_camera, none, image, field, signal, noise, weights, DepthScale(depth, unit), family=family
     )
     return model, alone
 

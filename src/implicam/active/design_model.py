@@ -3,7 +3,7 @@
 A calibration is linear in what it does not know, near what it does: so the covariance after one more point depends on
 where the point is, not on what the cameras will see. Both kinds of methods answer the same questions:
 
-- forward (forward-gp, explicit): pixels depend on the unknowns of the cameras, `RigMap.sensitivities`;
+- forward (forward-gp, explicit): pixels depend on the unknowns of the cameras, `FittedRig.sensitivities`;
 - inverse (inverse-gp): each coordinate is a Gaussian process of the pixels, and the pixels of a place are predicted by
   a forward model that was fitted to the same points, or known because the place was recorded.
 """
@@ -24,7 +24,7 @@ from implicam.calibrators.inverse_maps import Part
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
 from implicam.gp.linalg import solve_lower
-from implicam.rig_model.rig import RigMap, Sensitivity
+from implicam.rig_model.rig import FittedRig, Sensitivity
 
 Bools = NDArray[np.bool_]
 
@@ -81,7 +81,7 @@ def on_image(observations: Observations, uv: Floats) -> Bools:
 
 
 @dataclass(frozen=True, eq=False)
-class Prospect:
+class PredictedCovariance:
     """What measuring at n places would be worth: total (n, 3, 3) the covariance of a position measured there; floor
     (n, 3, 3) what pixel noise alone would leave, however well the cameras are known. NaN where nothing is measured.
     make_floor: called when somebody asks for it, for it can cost as much as all the rest."""
@@ -118,7 +118,7 @@ class Prospect:
         return largest
 
 
-class Outlook(Protocol):
+class DesignModel(Protocol):
     """A calibration, the candidates for the next known point, and the places at which it is judged."""
 
     @property
@@ -130,11 +130,11 @@ class Outlook(Protocol):
         """Where the calibration has to be good."""
 
     @property
-    def now(self) -> Prospect:
+    def now(self) -> PredictedCovariance:
         """What measuring at the judged places is worth."""
 
     @property
-    def there(self) -> Prospect:
+    def there(self) -> PredictedCovariance:
         """What measuring at the candidates is worth."""
 
     @property
@@ -149,11 +149,11 @@ class Outlook(Protocol):
         """(m,) what a known point at each candidate would tell of the unknowns, in nats."""
 
     def after(self, i: int) -> Self:
-        """The outlook when candidate number i is a known point too."""
+        """The design when candidate number i is a known point too."""
 
 
 @dataclass(frozen=True, eq=False)
-class ForwardOutlook:
+class ForwardDesignModel:
     """Of a method that predicts pixels. parts: the sensitivities at candidates and judged places, in this order; what
     is not seen is zero, with unit noise. place: (3, 3) covariance of a known position."""
 
@@ -163,7 +163,7 @@ class ForwardOutlook:
     place: Floats
 
     @classmethod
-    def of(cls, rig: RigMap, candidates: Places, judged: Places) -> ForwardOutlook:
+    def of(cls, rig: FittedRig, candidates: Places, judged: Places) -> ForwardDesignModel:
         """What the rig's cameras would see."""
         xyz = np.concatenate([candidates.xyz, judged.xyz])
         seen = np.concatenate([candidates.seen, judged.seen])
@@ -176,7 +176,7 @@ class ForwardOutlook:
         return np.asarray(self.candidates.seen.any(axis=1))
 
     @cached_property
-    def _prospect(self) -> Prospect:
+    def _predicted(self) -> PredictedCovariance:
         seen = np.concatenate([self.candidates.seen, self.judged.seen]).sum(axis=1) >= 2
         n = len(seen)
         now, ever = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
@@ -186,7 +186,7 @@ class ForwardOutlook:
             ever += Dt @ (part.slope / part.noise[..., None])
         total, floor = np.full((n, 3, 3), np.nan), np.full((n, 3, 3), np.nan)
         total[seen], floor[seen] = np.linalg.inv(now[seen]), np.linalg.inv(ever[seen])
-        return Prospect(total, lambda: floor)
+        return PredictedCovariance(total, lambda: floor)
 
     @cached_property
     def _covariances(self) -> tuple[Floats, ...]:
@@ -194,22 +194,22 @@ class ForwardOutlook:
         return tuple(_covariance(part) for part in self.parts)
 
     @property
-    def now(self) -> Prospect:
+    def now(self) -> PredictedCovariance:
         """At the judged places."""
         m = len(self.candidates)
-        return Prospect(self._prospect.total[m:], lambda: self._prospect.floor[m:])
+        return PredictedCovariance(self._predicted.total[m:], lambda: self._predicted.floor[m:])
 
     @property
-    def there(self) -> Prospect:
+    def there(self) -> PredictedCovariance:
         """At the candidates."""
         m = len(self.candidates)
-        return Prospect(self._prospect.total[:m], lambda: self._prospect.floor[:m])
+        return PredictedCovariance(self._predicted.total[:m], lambda: self._predicted.floor[:m])
 
     def gain(self, weights: Floats) -> Floats:
         """(m,) the expected reduction: a position is off by `A (error of the pixels)`, A = T D^T S^-1, and one more
         point takes `K (S + place)^-1 K^T` off their covariance (Cohn's criterion, for a Gaussian linear model)."""
         m = len(self.candidates)
-        total = self._prospect.total[m:]
+        total = self._predicted.total[m:]
         good = np.isfinite(total[:, 0, 0]) & np.isfinite(weights)
         root = np.sqrt(weights[good])[:, None, None]
         found = np.zeros(m)
@@ -236,7 +236,7 @@ class ForwardOutlook:
         D = part.slope[: len(self.candidates)]
         return np.asarray(D @ self.place @ D.swapaxes(1, 2), dtype=np.float64)
 
-    def after(self, i: int) -> ForwardOutlook:
+    def after(self, i: int) -> ForwardDesignModel:
         """Candidate i known too: `half <- half (I - V diag(1 - 1/sqrt(1 + s^2)) V^T)`, s and V of its whitened half."""
         parts = []
         for part in self.parts:
@@ -247,7 +247,7 @@ class ForwardOutlook:
         return replace(self, parts=tuple(parts))
 
 
-def floor_of(rig: RigMap, xyz: Floats, seen: Bools) -> Floats:
+def floor_of(rig: FittedRig, xyz: Floats, seen: Bools) -> Floats:
     """(n, 3, 3) what pixel noise alone would leave at positions (n, 3) with the views seen (n, cameras); NaN for fewer
     than two."""
     information = np.zeros((len(xyz), 3, 3))
@@ -286,7 +286,7 @@ def _diagonal(variances: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class InverseOutlook:
+class InverseDesignModel:
     """Of Gaussian processes from pixels to positions, over candidates and judged places, in this order.
 
     X: (places, d) what the processes take. Per process known: V (n, places), and drift: W (p, places), with
@@ -303,12 +303,12 @@ class InverseOutlook:
     drift: tuple[Floats, ...]
     beside: Floats
     widened: Floats
-    forward: RigMap | None = None
+    forward: FittedRig | None = None
 
     @classmethod
     def of(
-        cls, calibration: InverseGPCalibration, candidates: Places, judged: Places, forward: RigMap | None
-    ) -> InverseOutlook:
+        cls, calibration: InverseGPCalibration, candidates: Places, judged: Places, forward: FittedRig | None
+    ) -> InverseDesignModel:
         """The three processes of a calibration at the predicted pixels; only places that every camera sees count.
 
         forward: knows what pixel noise leaves at each place. Without it that is what the processes take for noise, and
@@ -357,7 +357,7 @@ class InverseOutlook:
         scale = self.calibration.positions.scale
         return np.stack([part.share * np.outer(scale, scale) for part in self._parts])
 
-    def _prospect(self, part: slice, places: Places) -> Prospect:
+    def _predicted(self, part: slice, places: Places) -> PredictedCovariance:
         scale = self.calibration.positions.scale
         total = np.einsum("nk,kij->nij", self._variances[part] + self._noise, self._shares)
         total += self.beside[part] * np.outer(scale, scale)
@@ -370,17 +370,17 @@ class InverseOutlook:
             noise = np.einsum("k,kij->ij", self._noise, self._shares)
             return np.broadcast_to(noise, total.shape)
 
-        return Prospect(total, floor)
+        return PredictedCovariance(total, floor)
 
     @property
-    def now(self) -> Prospect:
+    def now(self) -> PredictedCovariance:
         """At the judged places."""
-        return self._prospect(slice(len(self.candidates), None), self.judged)
+        return self._predicted(slice(len(self.candidates), None), self.judged)
 
     @property
-    def there(self) -> Prospect:
+    def there(self) -> PredictedCovariance:
         """At the candidates."""
-        return self._prospect(slice(len(self.candidates)), self.candidates)
+        return self._predicted(slice(len(self.candidates)), self.candidates)
 
     def gain(self, weights: Floats) -> Floats:
         """(m,) the expected reduction, in closed form: covariance squared over the variance of a new output."""
@@ -401,7 +401,7 @@ class InverseOutlook:
         found = 0.5 * np.log1p(self._variances[:m] / self._noise) @ outputs
         return np.where(self.useful, found, 0.0)
 
-    def after(self, i: int) -> InverseOutlook:
+    def after(self, i: int) -> InverseDesignModel:
         """Candidate i known too: V gets one more row."""
         rows = []
         for k, V in enumerate(self.known):
@@ -417,13 +417,13 @@ def _inputs(calibration: InverseGPCalibration, candidates: Places, judged: Place
     return np.where(np.isfinite(X), X, 0.0)
 
 
-def outlook_of(
+def design_model_of(
     calibration: Calibration, candidates: Floats | Places, judged: Floats | Places, pilot: Calibration | None = None
-) -> ForwardOutlook | InverseOutlook:
-    """The outlook of a calibration at positions (m, 3) and (g, 3), or at places whose pixels are known.
+) -> ForwardDesignModel | InverseDesignModel:
+    """The design of a calibration at positions (m, 3) and (g, 3), or at places whose pixels are known.
 
     pilot: a forward calibration of the same rig that predicts pixels; the calibration itself where it is one.
-    UsageError for a method without an outlook.
+    UsageError for a method without an design.
     """
     forward = calibration if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration) else pilot
 
@@ -438,11 +438,11 @@ def outlook_of(
         return Places.predicted(forward, where)
 
     if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration):
-        made = ForwardOutlook.of(calibration.map, places(candidates), places(judged))
+        made = ForwardDesignModel.of(calibration.map, places(candidates), places(judged))
         return replace(made, place=_place(calibration.data))
     if isinstance(calibration, InverseGPCalibration):
         rig = forward.map if isinstance(forward, ForwardGPCalibration | ExplicitCalibration) else None
-        return InverseOutlook.of(calibration, places(candidates), places(judged), rig)
+        return InverseDesignModel.of(calibration, places(candidates), places(judged), rig)
     raise UsageError(
         f"{calibration.method} cannot say where to measure next.",
         why="its error bars do not say what one more known point would change",

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from implicam.active import Loop, Prospect, Step, Target
+from implicam.active import Loop, PredictedCovariance, Step, Target
 from implicam.calibrators import Calibration, ForwardGPCalibration
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.detect import Detected, Detector, View, centred
@@ -31,8 +31,8 @@ from implicam.formatting import json_safe
 from implicam.hardware import Frame, FrameSource, Robot, Trigger, exposed
 from implicam.images import blank
 from implicam.progress import Progress, silent
+from implicam.session.detections import Look, reject_implausible
 from implicam.session.journal import Session
-from implicam.session.looks import Look, believed
 
 CALIBRATION, REPORT = "calibration.implicam", "report.html"
 
@@ -78,7 +78,7 @@ class State:
     looks: tuple[Look, ...] = ()
     history: tuple[Step, ...] = ()
     stop: str = ""
-    prospect: Prospect | None = None
+    predicted: PredictedCovariance | None = None
     calibration: Calibration | None = None
     data: Dataset | None = None
     problem: ImplicamError | None = None
@@ -92,7 +92,7 @@ class State:
         return [look.camera for look in self.looks if len(look.found)]
 
 
-class Guide:
+class SessionController:
     """One session, its equipment, and the loop that says where to measure next. A context manager: it opens the
     equipment, and closes it and the session."""
 
@@ -116,7 +116,7 @@ class Guide:
             loop.refuse(skipped.xyz, skipped.reason)
         self._pool = ThreadPoolExecutor(max(1, len(names)))
 
-    def __enter__(self) -> Guide:
+    def __enter__(self) -> SessionController:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -387,7 +387,7 @@ class Guide:
         self.loop.reset(data)
         self.session.set(HISTORY, [json_safe(asdict(step)) for step in self.loop.history])
         self._show(
-            data=data, calibration=self.loop.calibration, prospect=self.loop.prospect,
+            data=data, calibration=self.loop.calibration, predicted=self.loop.predicted,
             history=tuple(self.loop.history), stop=self.loop.stop,
         )  # fmt: skip
 
@@ -433,7 +433,9 @@ class Guide:
     def _shown(self, where: Floats) -> None:
         with self._eyes:
             frames = self._frames(self.equipment.trigger)
-        looks = believed(self._looks(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration)
+        looks = reject_implausible(
+            self._looks(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration
+        )
         count = sum(len(look.found) > 0 for look in looks)
         words = f"found in {count} of {len(looks)} cameras"
         if not count:

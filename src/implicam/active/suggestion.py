@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from implicam.active.acquisition import DEFAULT, Acquisition, acquisition, choose
+from implicam.active.acquisitions import DEFAULT, Acquisition, acquisition, choose
+from implicam.active.design_model import design_model_of
 from implicam.active.loop import Target, step_of, targets_of
-from implicam.active.outlook import outlook_of
 from implicam.active.stopping import Step
 from implicam.active.workspace import Workspace
 from implicam.calibrators import Calibration, ForwardGP, InverseGPCalibration
@@ -42,15 +42,15 @@ def suggest(
     `choose`. UsageError for a method that cannot say, and for a workspace that the cameras do not see."""
     pilot = ForwardGP().fit(calibration.data) if isinstance(calibration, InverseGPCalibration) else None
     places = workspace.candidates(candidates, seed)
-    outlook = outlook_of(calibration, places, workspace.judged(judged, seed), pilot)
-    if not outlook.now.measured.any():
+    design = design_model_of(calibration, places, workspace.judged(judged, seed), pilot)
+    if not design.now.measured.any():
         raise UsageError(
             "nowhere in the workspace can a position be measured.",
             why="no place of it is seen by enough of the calibrated cameras",
             fix="give another workspace (--workspace), one that the cameras look at",
         )
     rng = np.random.default_rng([seed, 3])
-    chosen = choose(outlook, rule or acquisition(DEFAULT), rng, count=count, here=here, reach=reach)
+    chosen = choose(design, rule or acquisition(DEFAULT), rng, count=count, here=here, reach=reach)
     known = len(calibration.data)
     then = step_of(chosen.after.now, known + len(chosen.index))
-    return Suggestion(targets_of(outlook.candidates, chosen, calibration.data), step_of(outlook.now, known), then)
+    return Suggestion(targets_of(design.candidates, chosen, calibration.data), step_of(design.now, known), then)

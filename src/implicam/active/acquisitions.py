@@ -11,17 +11,17 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from implicam.active.outlook import Outlook
+from implicam.active.design_model import DesignModel
 from implicam.dataset import Floats
 from implicam.errors import UsageError, did_you_mean
 
 
 class Acquisition(Protocol):
-    """A rule, without any state: the same outlook and random numbers give the same scores."""
+    """A rule, without any state: the same design and random numbers give the same scores."""
 
     name: ClassVar[str]
 
-    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+    def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """(m,) how much is to be expected of a known point at each candidate, never negative; NaN for nothing."""
 
 
@@ -31,9 +31,9 @@ class Random:
 
     name: ClassVar[str] = "random"
 
-    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+    def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """Random numbers."""
-        return rng.random(len(outlook.candidates))
+        return rng.random(len(design.candidates))
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Sobol:
 
     name: ClassVar[str] = "sobol"
 
-    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+    def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """The first one first."""
-        return np.arange(len(outlook.candidates), 0, -1, dtype=np.float64)
+        return np.arange(len(design.candidates), 0, -1, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class MaximumVariance:
 
     name: ClassVar[str] = "variance"
 
-    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+    def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """In the length unit."""
-        total = outlook.there.total
+        total = design.there.total
         return np.asarray(np.sqrt(np.diagonal(total, axis1=1, axis2=2)).mean(axis=1), dtype=np.float64)
 
 
@@ -65,9 +65,9 @@ class RelativeExcess:
 
     name: ClassVar[str] = "excess"
 
-    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+    def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """The ratio, minus one."""
-        return np.asarray(np.maximum(outlook.there.excess**2 - 1, 0), dtype=np.float64)
+        return np.asarray(np.maximum(design.there.excess**2 - 1, 0), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,14 @@ class IntegratedVariance:
 
     name: ClassVar[str] = "integrated"
 
-    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+    def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """The reduction of the weighted mean over the judged places."""
-        now = outlook.now
+        now = design.now
         floor = np.trace(now.floor, axis1=1, axis2=2) if self.relative else 1.0
         excess = np.trace(now.total, axis1=1, axis2=2) / floor
         worst = np.nanmax(excess, initial=0.0) or 1.0
         weights = (excess / worst) ** (self.power - 1) / floor / max(1, int(now.measured.sum()))
-        return np.asarray(outlook.gain(weights), dtype=np.float64)
+        return np.asarray(design.gain(weights), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class DOptimal:
 
     name: ClassVar[str] = "d-optimal"
 
-    def scores(self, outlook: Outlook, rng: np.random.Generator) -> Floats:
+    def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """Half the log of the determinant's ratio."""
-        return outlook.information()
+        return design.information()
 
 
 ACQUISITIONS: dict[str, Acquisition] = {
@@ -130,17 +130,17 @@ class Choice:
 
     index: list[int]
     scores: list[float]
-    _before_last: tuple[Outlook, int]
+    _before_last: tuple[DesignModel, int]
 
     @property
-    def after(self) -> Outlook:
-        """The outlook when all of them are known points."""
-        outlook, last = self._before_last
-        return outlook.after(last)
+    def after(self) -> DesignModel:
+        """The design when all of them are known points."""
+        design, last = self._before_last
+        return design.after(last)
 
 
 def choose(
-    outlook: Outlook,
+    design: DesignModel,
     rule: Acquisition,
     rng: np.random.Generator,
     *,
@@ -159,26 +159,26 @@ def choose(
     place = here
     for _ in range(count):
         if chosen:
-            outlook = outlook.after(chosen[-1])
-        score = np.where(outlook.useful, rule.scores(outlook, rng), np.nan)
+            design = design.after(chosen[-1])
+        score = np.where(design.useful, rule.scores(design, rng), np.nan)
         score[chosen] = np.nan
         if not np.isfinite(score).any():
             break
         worth = score
         if place is not None and np.isfinite(reach):
-            worth = score / (1 + np.linalg.norm(outlook.candidates.xyz - place, axis=1) / reach)
+            worth = score / (1 + np.linalg.norm(design.candidates.xyz - place, axis=1) / reach)
         best = int(np.nanargmax(worth))
         chosen.append(best)
         scores.append(float(score[best]))
-        place = outlook.candidates.xyz[best] if place is not None else None
+        place = design.candidates.xyz[best] if place is not None else None
     if not chosen:
         raise UsageError(
             "no candidate can be used for calibration.",
             why="the cameras would see none of them",
             fix="give another workspace (--workspace), one that the cameras look at",
         )
-    order = _path(outlook.candidates.xyz[chosen], here)
-    return Choice([chosen[k] for k in order], [scores[k] for k in order], (outlook, chosen[-1]))
+    order = _path(design.candidates.xyz[chosen], here)
+    return Choice([chosen[k] for k in order], [scores[k] for k in order], (design, chosen[-1]))
 
 
 def _path(xyz: Floats, here: Floats | None) -> list[int]:

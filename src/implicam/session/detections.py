@@ -34,7 +34,7 @@ class Look:
         return self.found.uv[0] if len(self.found) else np.full(2, np.nan)
 
 
-def believed(
+def reject_implausible(
     looks: tuple[Look, ...], where: Floats, where_sd: Floats, calibration: Calibration | None
 ) -> tuple[Look, ...]:
     """The looks without detections far from where a ball at `where` (3,), known to where_sd, must be: another thing.
@@ -50,17 +50,17 @@ def believed(
         variance = np.einsum("nij,nij->ni", part.half, part.half)[0] + part.rest[0] + part.noise[0]
         variance += (part.slope[0] ** 2) @ where_sd**2
         sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))
-    believed = []
+    plausible = []
     for look, there, spread in zip(looks, uv, sd, strict=True):
         far = max(AT_LEAST, FAR * spread) if np.isfinite(spread) else np.inf
         near = _nearest(look.found, there)
         if near is None or np.linalg.norm(near.uv[0] - there) <= far or not np.isfinite(there).all():
-            believed.append(replace(look, found=look.found if near is None else near))
+            plausible.append(replace(look, found=look.found if near is None else near))
             continue
         away = float(np.linalg.norm(near.uv[0] - there))
         reason = f"what was found is {away:.0f} px from where the ball must be: left out"
-        believed.append(replace(look, found=Detected(reason=reason)))
-    return tuple(believed)
+        plausible.append(replace(look, found=Detected(reason=reason)))
+    return tuple(plausible)
 
 
 def _nearest(found: Detected, there: Floats) -> Detected | None:
