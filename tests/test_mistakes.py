@@ -11,6 +11,7 @@ import implicam as ic
 from implicam.dataset import Dataset, Floats
 from implicam.errors import FitError
 from implicam.mistakes import mistakes_in
+from implicam.row_order import moved_up
 from implicam.simulate import ball_grid, build_rig, random_positions, simulate
 from implicam.verdict import _of_data
 
@@ -110,3 +111,11 @@ def test_half_in_metres_is_not_usable() -> None:
     xyz[:20] /= 1000
     (said, *_) = [one for one in _of_data(at(data, xyz)) if one.grave]
     assert "in another unit" in said.reason
+
+
+@pytest.mark.parametrize("rows", [-3, -1, 0, 2, 5])
+def test_rows_are_moved_up_whatever_their_number(rows: int) -> None:
+    for n in range(4):
+        values = np.arange(2.0 * n).reshape(n, 2)
+        expected = [values[i + rows] if 0 <= i + rows < n else np.full(2, np.nan) for i in range(n)]
+        assert np.array_equal(moved_up(values, rows), np.array(expected).reshape(n, 2), equal_nan=True)

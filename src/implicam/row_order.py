@@ -67,6 +67,8 @@ def late_or_early(rows: int) -> str:
 def moved_up(values: Floats, rows: int) -> Floats:
     """Each row (n, ...) with the values of the one `rows` after it; NaN where there is none."""
     out = np.full_like(values, np.nan)
+    if abs(rows) >= len(values):
+        return out
     if rows >= 0:
         out[: len(values) - rows] = values[rows:]
     else:
