@@ -71,7 +71,7 @@ $(VENV)/bin/python:
 
 $(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
 	@echo "Setting up (once) ..."
-	@$(PIP) --editable ".[report,images,viewer]"
+	@$(PIP) --editable ".[app]"
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
