@@ -29,13 +29,13 @@ from implicam.verdict import judge
 from odd_rigs import draw
 
 STAGES = {
-    "kinds": (fit, "_started"),
+    "kinds": (fit, "_start_cameras"),
     "sizes": (rounds, "estimate_hyperparameters"),
     "posterior": (rounds, "condition_with_new_fields"),
     "wrong views": (fit, "update_inliers"),
-    "tails": (position_error_fit, "with_heavy_tails"),
-    "projections": (fit, "_with_projections"),
-    "known positions": (calibration, "with_noise_told_apart"),
+    "tails": (position_error_fit, "refit_with_heavy_tails"),
+    "projections": (fit, "_try_linear_projections"),
+    "known positions": (calibration, "separate_position_errors"),
 }
 """The parts of a fit, each with all that it calls."""
 

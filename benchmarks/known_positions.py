@@ -22,7 +22,7 @@ from implicam.dataset import KnownPositions, read_dataset
 from implicam.errors import FitError
 from implicam.evaluation import evaluate
 from implicam.progress import silent
-from implicam.rig_model.training_data import Frame, problem_of
+from implicam.rig_model.training_data import Frame, training_data_of
 from implicam.simulate import build_rig, moving_board, random_positions, simulate
 
 REAL = {
@@ -45,7 +45,7 @@ RIGS = {
 def exact(lens, data):
     """As `ForwardGP.fit`, the known positions taken as they are."""
     frame = Frame.of(data, "forward-gp")
-    return ForwardGPCalibration(ForwardGP(lens), data, frame, fit_rig(problem_of(lens, data, frame), silent))
+    return ForwardGPCalibration(ForwardGP(lens), data, frame, fit_rig(training_data_of(lens, data, frame), silent))
 
 
 def after(lens, data):
@@ -69,7 +69,7 @@ def splits(data, size, seeds):
 
 def off(calibration):
     """How far single positions seem to be off, in x, y, z."""
-    errors = calibration.fitted.label_errors
+    errors = calibration.fitted.position_errors
     if errors is None:
         return "exact"
     sd = np.sqrt(np.diagonal(errors.covariance)) * calibration.frame.scale
@@ -149,7 +149,7 @@ def dot_rows(rigs):
                             scale = 1 / rig.units_per_mm
                             row = (e.level(0.95).ellipsoid.value, e.nees.value, e.rmse * scale)
                             cells[fit, what].append(row)
-                    errors = calibration.fitted.label_errors
+                    errors = calibration.fitted.position_errors
                     scale = calibration.frame.scale / rig.units_per_mm
                     found.append(0.0 if errors is None else np.sqrt(np.trace(errors.covariance) / 3) * scale)
             (t0, t1), (l0, l1) = ([np.mean(cells[fit, what], axis=0) for fit in (exact, after)] for what in (0, 1))

@@ -8,7 +8,7 @@ import numpy as np
 
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.triangulate import _Seen
-from implicam.rig_model.wrong_views import AGREE, CLEARLY, DISAGREE
+from implicam.rig_model.wrong_views import AGREE_P_VALUE, CLEARLY_BETTER_RATIO, DISAGREE_P_VALUE
 
 
 def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most: int = 2) -> tuple[np.ndarray, ...]:
@@ -18,7 +18,7 @@ def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most:
     xyz, _, p = points.solved(np.arange(len(uv)), seen)
     left_out = np.zeros_like(seen)
     for count in range(1, most + 1):
-        rows = np.flatnonzero((seen.sum(axis=1) >= 2 * count + 1) & ~(p >= DISAGREE))
+        rows = np.flatnonzero((seen.sum(axis=1) >= 2 * count + 1) & ~(p >= DISAGREE_P_VALUE))
         groups = list(combinations(range(seen.shape[1]), count))
         if not len(rows):
             continue
@@ -31,7 +31,9 @@ def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most:
             ps[:, k] = np.where(there & np.isfinite(found), found, 0.0)
             tried.append(x)
         best, ordered = np.argmax(ps, axis=1), np.sort(ps, axis=1)
-        for i in np.flatnonzero((ordered[:, -1] > AGREE) & (ordered[:, -1] > CLEARLY * ordered[:, -2])):
+        for i in np.flatnonzero(
+            (ordered[:, -1] > AGREE_P_VALUE) & (ordered[:, -1] > CLEARLY_BETTER_RATIO * ordered[:, -2])
+        ):
             xyz[rows[i]], p[rows[i]] = tried[best[i]][i], ps[i, best[i]]
             left_out[rows[i], groups[best[i]]] = True
     return xyz, p, left_out

@@ -14,7 +14,7 @@ from implicam.calibrators.forward_gp.families import FAMILIES, family_prior
 from implicam.dataset import Dataset, Observations, read_dataset
 from implicam.evaluation import cross_validate, evaluate
 from implicam.geometry import camera_from_linear, resect_affine, resect_robustly, rotation_from_vector
-from implicam.rig_model.camera import TANGENT
+from implicam.rig_model.camera import PERSPECTIVE_K
 from implicam.rig_model.general_camera import GeneralCamera
 from implicam.simulate import Unusual, build_rig, random_positions, simulate
 
@@ -188,7 +188,7 @@ def test_a_linear_camera_comes_apart_and_together_again(sign: float) -> None:
     assert mirrored == (sign < 0)
     np.testing.assert_allclose(centre, [300.0, 200.0], atol=1e-6)
     assert focal == pytest.approx(np.sqrt(800 * 900))
-    camera = GeneralCamera(focal, shape, np.zeros(2), centre, TANGENT, mirrored, pose)
+    camera = GeneralCamera(focal, shape, np.zeros(2), centre, PERSPECTIVE_K, mirrored, pose)
     np.testing.assert_allclose(camera.pixel(points)[inliers], uv[inliers], atol=1e-4)
 
 

@@ -21,14 +21,14 @@ from implicam.errors import FitError, UsageError
 from implicam.geometry import Pose, look_at
 from implicam.gp.low_rank import LowRank
 from implicam.measurement import Measurement
-from implicam.rig_model.camera import TANGENT, CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, Image, Prior, ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.field import empty_field
 from implicam.rig_model.general_camera import AnyCamera
 from implicam.rig_model.initialise import start_camera
-from implicam.rig_model.leave_one_out import left_out, squared_distances
+from implicam.rig_model.leave_one_out import left_out_residuals, squared_distances
 from implicam.rig_model.posterior import Posterior, condition
-from implicam.rig_model.shot_errors import LIKELY, SMOOTH, ShotErrors, Shots
+from implicam.rig_model.shot_errors import SHOT_SD_PRIOR, WORLD_POLYNOMIAL_TERMS, ShotErrors, Shots
 from implicam.rig_model.tied import Scatter, condition_scattered
 from implicam.rig_model.triangulate import locate
 from implicam.simulate import Rig, Target, build_rig, moving_board, random_positions, simulate
@@ -46,7 +46,7 @@ def rotation(seed: int) -> np.ndarray:
 
 POSE = Pose(rotation(0), np.array([0.1, -0.2, 0.3]))
 CAMERAS: dict[str, tuple[AnyCamera, float]] = {
-    "telephoto": (CentralCamera(KannalaBrandt(9000.0, 9010.0, 645.0, 390.0, *TANGENT), POSE), 4.0),
+    "telephoto": (CentralCamera(KannalaBrandt(9000.0, 9010.0, 645.0, 390.0, *PERSPECTIVE_K), POSE), 4.0),
     "normal": (CentralCamera(KannalaBrandt(900.0, 903.0, 630.0, 405.0, 0.25, 0.1, 0.04, 0.01), POSE), 35.0),
     "fisheye": (CentralCamera(KannalaBrandt(330.0, 329.0, 642.0, 402.0, -0.02, 0.004, -1e-3, 1e-4), POSE), 105.0),
     "perspective": (
@@ -187,7 +187,7 @@ def test_the_lens_prior_holds_square_pixels_and_both_kinds_of_lenses() -> None:
         return float(off @ prior.precision @ off)
 
     for widest in (0.3, 0.6, 1.0):
-        assert square(KannalaBrandt(900.0, 900.0, *IMAGE.centre.tolist(), *TANGENT.tolist()), widest) < 2
+        assert square(KannalaBrandt(900.0, 900.0, *IMAGE.centre.tolist(), *PERSPECTIVE_K.tolist()), widest) < 2
         assert square(KannalaBrandt(900.0, 900.0, *IMAGE.centre.tolist()), widest) < 2
     assert square(KannalaBrandt(900.0, 909.0, *IMAGE.centre.tolist()), 0.5) > 20  # 1 % off square
     assert square(KannalaBrandt(900.0, 900.0, 750.0, 400.0), 0.5) > 10  # 110 px off the centre
@@ -202,7 +202,7 @@ def made(fov: float, n: int, seed: int) -> tuple[CentralCamera, np.ndarray, np.n
     """A camera with a full field of view in degrees over an image 1280 wide, points in front of it, and its pixels."""
     rng = np.random.default_rng(seed)
     widest = np.radians(fov / 2)
-    k = 0.5 * TANGENT if fov < 100 else np.array([-0.02, 0.004, -5e-4, 1e-5])
+    k = 0.5 * PERSPECTIVE_K if fov < 100 else np.array([-0.02, 0.004, -5e-4, 1e-5])
     focal = 600 / float(widest * np.polyval([*k[::-1], 1.0], widest**2))
     scale, offset = 10 ** rng.uniform(-1, 3), rng.uniform(-5, 5, 3)
     centre = scale * (offset + rng.normal(size=3))
@@ -383,7 +383,7 @@ def two_cameras(
     points = rng.uniform(-1.2, 1.2, (50, 3))
     models, camera_views = [], []
     for number, centre in enumerate([(-2.5, 0.3, -3.5), (2.2, -0.4, -3.2)]):
-        lens = KannalaBrandt(900.0, 901.0, 642.0, 396.0, *(0.5 * TANGENT).tolist())
+        lens = KannalaBrandt(900.0, 901.0, 642.0, 396.0, *(0.5 * PERSPECTIVE_K).tolist())
         real = CentralCamera(lens, look_at(centre, (0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0)))
         rows = np.sort(rng.choice(50, 44, replace=False))
         uv = real.pixel(points[rows])
@@ -707,9 +707,9 @@ def test_the_evidence_of_tied_cameras_is_the_density_of_what_was_seen() -> None:
 
 
 def _stacked(
-    problem: tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    training: tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    designs, y, sd, mean, precision = problem
+    designs, y, sd, mean, precision = training
     return block_diag(*designs), y, sd, mean, precision
 
 
@@ -742,7 +742,7 @@ def test_leaving_a_view_out_in_closed_form_is_leaving_it_out() -> None:
     models, points, camera_views = two_cameras(proper=False)
     posterior = converged(models, points, camera_views)
     seen, inliers = camera_views[0], np.ones(len(camera_views[0].rows), dtype=np.bool_)
-    residual, spread = left_out(posterior, 0, points, seen, inliers)
+    residual, spread = left_out_residuals(posterior, 0, points, seen, inliers)
     distance = squared_distances(posterior, 0, points, seen, inliers)
     for i in (0, 7, 20, 43):
         without = inliers.copy()
@@ -759,7 +759,7 @@ def test_leaving_a_view_out_in_closed_form_is_leaving_it_out() -> None:
         np.testing.assert_allclose(residual[i], difference, atol=1e-3 * np.sqrt(expected[0, 0]))
         assert distance[i] == pytest.approx(difference @ np.linalg.solve(expected, difference), rel=5e-3, abs=1e-4)
         # a view that was not used is simply predicted, by the camera that has moved a little
-        unused, its_spread = left_out(again, 0, points, seen, without)
+        unused, its_spread = left_out_residuals(again, 0, points, seen, without)
         predicted = seen.uv[i] - again.models[0].predict(where)[0][0]
         np.testing.assert_allclose(unused[i], predicted, atol=1e-9)
         np.testing.assert_allclose(unused[i], residual[i], atol=0.05 * np.sqrt(expected[0, 0]))
@@ -784,10 +784,14 @@ def test_the_update_of_the_shots_sds_maximises_their_posterior(size: float) -> N
         assert np.ptp(new) == 0
         second = ((mean**2 + variance) * sd**2)[:, columns]
         u = np.log(new[0, 0]) + np.linspace(-2, 2, 400001)
-        objective = -second.size * u - 0.5 * second.sum() * np.exp(-2 * u) - 0.5 * ((u - LIKELY[0]) / LIKELY[1]) ** 2
+        objective = (
+            -second.size * u
+            - 0.5 * second.sum() * np.exp(-2 * u)
+            - 0.5 * ((u - SHOT_SD_PRIOR[0]) / SHOT_SD_PRIOR[1]) ** 2
+        )
         assert np.exp(u[np.argmax(objective)]) == pytest.approx(new[0, 0], rel=2e-5)
         told = np.sum(1 - variance[:, columns])
-        np.testing.assert_allclose(label[:, columns], new * np.exp(1 / (2 * told + 1 / LIKELY[1] ** 2)))
+        np.testing.assert_allclose(label[:, columns], new * np.exp(1 / (2 * told + 1 / SHOT_SD_PRIOR[1] ** 2)))
 
 
 def plates(
@@ -809,7 +813,7 @@ def test_a_shot_is_displaced_as_a_rigid_body() -> None:
     errors = shots.errors(points)
     k = errors.basis.shape[2]
     assert errors.estimated
-    assert k == 6 * (7 - SMOOTH)
+    assert k == 6 * (7 - WORLD_POLYNOMIAL_TERMS)
     every = []
     for s in range(7):
         members = labels == f"shot{s}"
@@ -838,7 +842,7 @@ def test_what_is_smooth_along_the_traverse_is_no_error_of_a_shot() -> None:
         shift = (t**degree)[np.repeat(np.arange(7), 25), None] * coefficients
         smooth = sum(np.linalg.lstsq(basis, shift.reshape(-1, 1), rcond=None)[1].tolist())
         represented = 1 - smooth / np.sum(shift**2)
-        if degree < SMOOTH:
+        if degree < WORLD_POLYNOMIAL_TERMS:
             np.testing.assert_allclose(basis.T @ shift.ravel(), 0, atol=1e-9)
             assert abs(represented) < 1e-9
         else:
@@ -874,11 +878,11 @@ def test_the_label_at_a_shot_is_known_and_far_away_it_is_not() -> None:
     shots = Shots.of(points, labels)
     assert shots is not None
     errors = shots.errors(points)
-    sd = np.repeat([3e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4], 7 - SMOOTH)
+    sd = np.repeat([3e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4], 7 - WORLD_POLYNOMIAL_TERMS)
     known, left = shots.labels(points, sd)
     np.testing.assert_allclose(known, errors.basis * sd, atol=1e-12)
     np.testing.assert_allclose(left, 0, atol=1e-15)
-    shift_only = np.where(np.repeat(np.arange(6) < 3, 7 - SMOOTH), 2e-3, 0.0)
+    shift_only = np.where(np.repeat(np.arange(6) < 3, 7 - WORLD_POLYNOMIAL_TERMS), 2e-3, 0.0)
     known, left = shots.labels(points[:5] + 50 * shots.along[0], shift_only)
     np.testing.assert_allclose(known, 0, atol=1e-15)
     np.testing.assert_allclose(left, np.broadcast_to(4e-6 * np.eye(3), (5, 3, 3)), atol=1e-12)
@@ -893,7 +897,7 @@ def test_the_unknown_part_of_a_label_turns_with_the_world() -> None:
     points, labels, along, _ = plates(seed=2)
     shots = Shots.of(points, labels)
     assert shots is not None
-    sd = np.repeat([3e-3, 1e-3, 1e-3, 0, 0, 0], 7 - SMOOTH)
+    sd = np.repeat([3e-3, 1e-3, 1e-3, 0, 0, 0], 7 - WORLD_POLYNOMIAL_TERMS)
     _, left = shots.labels(points[:1] + 50 * along, sd)
     expected = 9e-6 * np.outer(along, along) + 1e-6 * (np.eye(3) - np.outer(along, along))
     np.testing.assert_allclose(left[0], expected, atol=1e-12)
@@ -901,7 +905,7 @@ def test_the_unknown_part_of_a_label_turns_with_the_world() -> None:
 
 def test_the_unknown_tilt_of_a_label_turns_with_the_world() -> None:
     points, labels, along, _ = plates()
-    turn, sd = rotation(12), np.repeat([0, 0, 0, 1e-3, 1e-3, 1e-3], 7 - SMOOTH)
+    turn, sd = rotation(12), np.repeat([0, 0, 0, 1e-3, 1e-3, 1e-3], 7 - WORLD_POLYNOMIAL_TERMS)
     at = points[::10] + 5 * along
     a, b = Shots.of(points, labels), Shots.of(points @ turn.T, labels)
     assert a is not None

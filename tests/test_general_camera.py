@@ -7,15 +7,15 @@ import pytest
 
 from implicam.cameras import KannalaBrandt
 from implicam.geometry import Pose, rotation_from_vector
-from implicam.rig_model.camera import TANGENT, CentralCamera
-from implicam.rig_model.general_camera import SMALLEST_RHO, GeneralCamera
+from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera
+from implicam.rig_model.general_camera import MIN_RHO, GeneralCamera
 
 RNG = np.random.default_rng(0)
 
 
 def camera(distance: float, *, mirrored: bool, angle: float = 0.2, tilt: float = 0.2) -> GeneralCamera:
     """One that sees the unit ball at a distance, `angle` off its axis; everything odd at once."""
-    k = 0.5 * TANGENT * 0.4 + np.array([0.02, -0.01, 0.003, 0.0])
+    k = 0.5 * PERSPECTIVE_K * 0.4 + np.array([0.02, -0.01, 0.003, 0.0])
     direction = np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, np.cos(angle)])
     pose = Pose(rotation_from_vector(np.array([0.3, -0.2, 0.5])), distance * direction)
     return GeneralCamera(
@@ -112,7 +112,7 @@ def test_a_telephoto_lens_may_go_far_and_no_pixel_jumps() -> None:
     one = camera(1000.0, mirrored=False, angle=0.003, tilt=0.0)
     step = np.zeros(17)
     step[11] = -1.0
-    assert one.moved(step).rho == pytest.approx(SMALLEST_RHO)
+    assert one.moved(step).rho == pytest.approx(MIN_RHO)
     assert np.abs(one.moved(step).pixel(POINTS) - one.pixel(POINTS)).max() < 2.0
 
 

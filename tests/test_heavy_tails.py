@@ -20,14 +20,14 @@ from implicam.rig_model.heavy_tails import (
     _solved,
     consistency,
     degrees_of_agreement,
+    equivalent_normal_noise,
     information_loss,
     looks_heavy,
     outlier_distance,
-    refined,
-    taken_as_normal,
-    weights_of,
+    refine_positions,
+    student_t_weights,
 )
-from implicam.rig_model.wrong_views import Linear
+from implicam.rig_model.wrong_views import LinearisedViews
 from implicam.simulate import build_rig, random_positions, simulate
 
 SCALE = 0.2
@@ -87,31 +87,31 @@ def test_the_wrong_are_as_rare_as_with_normal_noise() -> None:
 
 
 def test_weights_and_information_end_at_normal_noise() -> None:
-    np.testing.assert_allclose(weights_of(np.array([0.0, 9.0]), 1e9), 1, rtol=1e-7)
-    assert weights_of(np.array([300.0]), 3.0)[0] < 0.02
+    np.testing.assert_allclose(student_t_weights(np.array([0.0, 9.0]), 1e9), 1, rtol=1e-7)
+    assert student_t_weights(np.array([300.0]), 3.0)[0] < 0.02
     assert information_loss(None) == 1
     assert information_loss(1e9) == pytest.approx(1)
     # Fisher information of a location, by simulation: the square of the score
     draw = np.random.default_rng(1)
     r = draw.normal(size=(200_000, 2)) / np.sqrt(draw.chisquare(4, 200_000) / 4)[:, None]
-    score = weights_of(np.sum(r**2, axis=1), 4.0) * r[:, 0]
+    score = student_t_weights(np.sum(r**2, axis=1), 4.0) * r[:, 0]
     assert 1 / np.mean(score**2) == pytest.approx(information_loss(4.0), rel=0.02)
 
 
-def linear_views(n: int, C: int, degrees: float, seed: int) -> Linear:
+def linear_views(n: int, C: int, degrees: float, seed: int) -> LinearisedViews:
     """About the true position, scale one."""
     draw = np.random.default_rng(seed)
     r = draw.normal(size=(n, C, 2))
     if np.isfinite(degrees):
         r /= np.sqrt(draw.chisquare(degrees, (n, C)) / degrees)[..., None]
     D = draw.normal(size=(n, C, 2, 3))
-    return Linear(r, D, np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy(), None)
+    return LinearisedViews(r, D, np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy(), None)
 
 
 @pytest.mark.parametrize("C", [2, 3, 6])
 def test_error_bars_are_those_of_the_t(C: int) -> None:
     views = linear_views(3000, C, 3.0, C)
-    found = refined(views, 3.0)
+    found = refine_positions(views, 3.0)
     ok = np.isfinite(found.step).all(axis=1)
     assert ok.mean() > 0.99
     distance = np.einsum("ni,nij,nj->n", found.step[ok], np.linalg.inv(found.cov[ok]), found.step[ok])
@@ -121,7 +121,7 @@ def test_error_bars_are_those_of_the_t(C: int) -> None:
     assert np.mean(p < 1e-4) < 0.004
     if C > 2:
         assert kstest(p, "uniform").statistic < 0.12
-        normal = refined(views, 1e6)
+        normal = refine_positions(views, 1e6)
         assert np.mean(np.sum(found.step[ok] ** 2, axis=1)) < 0.9 * np.mean(np.sum(normal.step[ok] ** 2, axis=1))
 
 
@@ -133,15 +133,15 @@ def test_two_places_are_none() -> None:
     left = np.linalg.svd(D[0].reshape(6, 3))[0][:, 3:]  # what no position explains
     r[0] = (left @ [60.0, 0.0, 0.0]).reshape(3, 2)
     each = np.broadcast_to(np.eye(2), (1, 3, 2, 2)).copy()
-    found = refined(Linear(r, D, each, None), 3.0)
+    found = refine_positions(LinearisedViews(r, D, each, None), 3.0)
     assert np.isnan(found.step).all()
-    assert np.isfinite(refined(Linear(0 * r, D, each, None), 3.0).step).all()
+    assert np.isfinite(refine_positions(LinearisedViews(0 * r, D, each, None), 3.0).step).all()
 
 
 def test_the_posterior_of_a_position_is_integrated_rightly() -> None:
     """Against a fine grid, for three views of a point."""
     views = linear_views(4, 3, 3.0, 8)
-    found = refined(views, 3.0)
+    found = refine_positions(views, 3.0)
     for i in range(4):
         half = 12 * np.sqrt(np.diagonal(found.cov[i]))
         axes = [np.linspace(m - h, m + h, 81) for m, h in zip(found.step[i], half, strict=True)]
@@ -164,7 +164,7 @@ def test_the_posterior_of_a_position_is_integrated_rightly() -> None:
 
 def test_nearly_normal_noise_is_measured_as_normal_noise() -> None:
     views = linear_views(20, 4, np.inf, 3)
-    found = refined(views, 1e6)
+    found = refine_positions(views, 1e6)
     D, r = views.D.reshape(20, 8, 3), views.r.reshape(20, 8)
     cov = np.linalg.inv(D.swapaxes(1, 2) @ D)
     step = np.einsum("nij,nj->ni", cov, np.einsum("nki,nk->ni", D, r))
@@ -174,7 +174,9 @@ def test_nearly_normal_noise_is_measured_as_normal_noise() -> None:
 
 
 def test_two_views_are_taken_as_they_are() -> None:
-    noise = taken_as_normal(np.ones((2, 3)), np.full((2, 3), 50.0), np.array([[1, 1, 0], [1, 1, 1]], dtype=bool), 4.0)
+    noise = equivalent_normal_noise(
+        np.ones((2, 3)), np.full((2, 3), 50.0), np.array([[1, 1, 0], [1, 1, 1]], dtype=bool), 4.0
+    )
     np.testing.assert_allclose(noise[0], np.sqrt(2))
     assert (noise[1] > 2).all()
 

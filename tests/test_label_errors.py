@@ -15,17 +15,17 @@ from implicam.dataset import Dataset, KnownPositions
 from implicam.evaluation import cross_validate, evaluate
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.leave_one_out import left_out_points
-from implicam.rig_model.level_errors import LEVEL, SHOT, levels, untold
+from implicam.rig_model.level_errors import LEVEL_SD, SHOT_SD, levels, untold
 from implicam.rig_model.position_errors import (
     Agreement,
-    LabelErrors,
+    PositionErrors,
     _evidence,
     _most_probable,
     _nodes,
     _objective,
     _Scales,
     _symmetric,
-    estimated,
+    estimate_position_errors,
 )
 from implicam.rig_model.shot_errors import Shots
 from implicam.rig_model.tied import Scatter, condition_scattered
@@ -105,7 +105,7 @@ def test_the_estimate_turns_with_the_world() -> None:
     agreement, _ = views(40, np.diag([1e-3, 1e-3, 4e-3]) ** 2, 0.7)
     turn = rotation(3)
     turned = agreement._replace(information=turn @ agreement.information @ turn.T, pull=agreement.pull @ turn.T)
-    a, b = estimated(agreement), estimated(turned)
+    a, b = estimate_position_errors(agreement), estimate_position_errors(turned)
     assert a is not None
     assert b is not None
     np.testing.assert_allclose(turn.T @ b.scale @ turn, a.scale, atol=0.03 * np.trace(a.scale))
@@ -116,7 +116,7 @@ def test_the_estimate_turns_with_the_world() -> None:
 def test_a_known_covariance_is_found_again() -> None:
     scale = covariance(5, 2e-3)
     agreement, _ = views(300, scale, 0.6)
-    found = estimated(agreement)
+    found = estimate_position_errors(agreement)
     assert found is not None
     assert np.isinf(found.freedom)
     assert found.noise == pytest.approx(0.6, rel=0.05)
@@ -129,15 +129,15 @@ def test_positions_that_are_exact_are_left_so() -> None:
     gains = []
     for seed in range(20):
         agreement, _ = views(40, np.zeros((3, 3)), 1.0, seed=seed)
-        assert estimated(agreement) is None
+        assert estimate_position_errors(agreement) is None
         gains.append(_evidence(agreement, _most_probable(agreement, np.inf, None)))
     assert np.mean(gains) < 0
-    assert estimated(agreement.select(np.arange(3))) is None
+    assert estimate_position_errors(agreement.select(np.arange(3))) is None
 
 
 def test_a_few_points_far_off_are_a_tail() -> None:
     scale = np.eye(3) * 1e-6
-    normal, heavy = (estimated(views(300, scale, 0.6, freedom=f, seed=1)[0]) for f in (np.inf, 3.0))
+    normal, heavy = (estimate_position_errors(views(300, scale, 0.6, freedom=f, seed=1)[0]) for f in (np.inf, 3.0))
     assert normal is not None
     assert heavy is not None
     assert np.isinf(normal.freedom)
@@ -184,7 +184,7 @@ def test_a_stepped_target_has_levels(name: str) -> None:
     assert len(np.unique(found.number)) == len(np.unique(z))
     planes = untold(stepped(z) / 20, np.full(len(z) * 10, "target"))
     assert planes is not None
-    assert planes.sd[0] == pytest.approx(LEVEL)
+    assert planes.sd[0] == pytest.approx(LEVEL_SD)
     assert planes.shots.pattern.shape[1] == max(len(np.unique(z)) - 3, 0)
     np.testing.assert_allclose(planes.shots.untold(stepped(z) / 20, planes.sd), 0, atol=1e-15)
 
@@ -229,7 +229,7 @@ def test_the_world_is_the_parabola_or_the_line_through_its_shots() -> None:
     np.testing.assert_allclose(two.drawn_along(at), [5, 0.5], rtol=1e-9)
     planes = untold(three, np.repeat(["a", "b", "c"], 20))
     assert planes is not None
-    assert planes.sd[0] == pytest.approx(SHOT)
+    assert planes.sd[0] == pytest.approx(SHOT_SD)
 
 
 # the whole method
@@ -272,7 +272,7 @@ def dots() -> ForwardGPCalibration:
 
 def test_dots_that_are_off_are_found_noted_and_judged_by() -> None:
     calibration = dots()
-    errors = calibration.fitted.label_errors
+    errors = calibration.fitted.position_errors
     assert errors is not None
     sd = np.sqrt(np.trace(calibration.known_position_covariance(np.zeros((1, 3)))[0]) / 3) / rig().units_per_mm
     assert sd == pytest.approx(DOTS, rel=0.25)
@@ -289,14 +289,14 @@ def test_dots_that_are_off_are_found_noted_and_judged_by() -> None:
 
 def test_noise_is_told_from_errors_of_known_positions() -> None:
     exact = ForwardGP().fit(known())
-    assert exact.fitted.label_errors is None
+    assert exact.fitted.position_errors is None
     noise = [np.median([m.noise for m in c.posterior.models]) for c in (exact, dots())]
     assert noise[1] == pytest.approx(noise[0], rel=0.25)
 
 
 def test_what_is_declared_is_not_estimated() -> None:
     calibration = ForwardGP().fit(moved(known(), DOTS, 5, declared=DOTS))
-    assert calibration.fitted.label_errors is None
+    assert calibration.fitted.position_errors is None
     assert calibration.fitted.untold_sd is None
     assert not calibration.known_position_covariance(known().xyz).any()
     # what the held-out positions declare is judged by, and not the estimate besides
@@ -309,7 +309,7 @@ def test_exact_positions_are_fitted_as_before(seed: int) -> None:
     one = build_rig("bar6", seed=seed, frame="random", cameras="2R2W")
     data = without_sd(simulate(one, random_positions(one, 25, np.random.default_rng(seed + 100)), seed=seed + 200))
     calibration = ForwardGP().fit(data)
-    assert calibration.fitted.label_errors is None
+    assert calibration.fitted.position_errors is None
     assert not calibration.posterior.tied
     assert not calibration.known_position_covariance(data.xyz).any()
 
@@ -318,7 +318,7 @@ def test_known_positions_left_out_in_closed_form_are_left_out() -> None:
     """Whole points, of the cameras as they are conditioned: against conditioning without them."""
     calibration = dots()
     fitted, frame, data = calibration.fitted, calibration.frame, calibration.data
-    errors, points = fitted.label_errors, frame.to_working(data.xyz)
+    errors, points = fitted.position_errors, frame.to_working(data.xyz)
     assert errors is not None
     assert errors.size is not None
     all_seen = camera_views_of(data.observations, stated_noise(data.observations))
@@ -366,7 +366,7 @@ def test_boards_that_are_too_few_widen_the_bars_between_them() -> None:
     calibration = ForwardGP().fit(data.select(~inner))
     assert calibration.fitted.untold_sd is not None
     assert any(note.startswith("2 shots cannot contradict each other") for note in calibration.notes())
-    size = SHOT * calibration.frame.scale
+    size = SHOT_SD * calibration.frame.scale
     measured = calibration.measure(data.observations)
     own = calibration.known_position_covariance(data.xyz)
     assert np.sqrt(np.linalg.eigvalsh(own[inner])[:, -1]).min() > 0.9 * size
@@ -387,13 +387,13 @@ def test_levels_of_one_target_widen_the_bars_between_them() -> None:
     assert any(note.startswith("3 levels of one target") for note in calibration.notes())
     between = pose.apply(np.array([[0.0, 0, 30], [5, 20, -30]]) * one.units_per_mm)
     own = np.sqrt(np.linalg.eigvalsh(calibration.known_position_covariance(between))[:, -1])
-    assert (own > 0.9 * LEVEL * calibration.frame.scale).all()
+    assert (own > 0.9 * LEVEL_SD * calibration.frame.scale).all()
 
 
 def test_label_errors_with_no_tail_have_their_scale_as_covariance() -> None:
     scale = covariance(1, 1e-3)
-    np.testing.assert_array_equal(LabelErrors(scale, np.inf, 0.5, 10).covariance, scale)
-    root = LabelErrors(scale, 3.0, 0.5, 10).root
+    np.testing.assert_array_equal(PositionErrors(scale, np.inf, 0.5, 10).covariance, scale)
+    root = PositionErrors(scale, 3.0, 0.5, 10).root
     np.testing.assert_allclose(root @ root.T, scale)
 
 
@@ -410,7 +410,7 @@ def test_plates_follow_each_other_along_their_normal() -> None:
 def test_a_calibration_that_grows_finds_them_again() -> None:
     before, data = dots(), moved(known(), DOTS, 5)
     grown = before.refit_from(data)
-    errors, again = before.fitted.label_errors, grown.fitted.label_errors
+    errors, again = before.fitted.position_errors, grown.fitted.position_errors
     assert errors is not None
     assert again is not None
     assert np.trace(again.covariance) == pytest.approx(np.trace(errors.covariance), rel=0.1)

@@ -34,6 +34,6 @@ def test_dots_that_are_off_are_not_taken_for_heavy_tails_of_the_pixels() -> None
     train, _ = two_sided_tank().split(45, seed=1)  # tails would gain 32 nats, the dots 10
     fitted = ForwardGP().fit(train).fitted
     assert fitted.tails is None
-    assert fitted.label_errors is not None
-    sd = np.sqrt(np.diag(fitted.label_errors.scale))
+    assert fitted.position_errors is not None
+    sd = np.sqrt(np.diag(fitted.position_errors.scale))
     assert sd[2] > 3 * max(sd[0], sd[1])  # in depth

@@ -46,7 +46,7 @@ def test_known_positions_that_are_slightly_off_are_no_doubt_where_the_fit_has_fo
     """What was held out are known positions, whose errors are estimated by the fit though nobody states them."""
     data = rig(50, noise_of_positions=0.1)
     calibration = ic.ForwardGP().fit(data)
-    assert calibration.fitted.label_errors is not None
+    assert calibration.fitted.position_errors is not None
     verdict = ic.judge(calibration)
     assert (verdict.word, verdict.reasons) == (USABLE, ())
     assert verdict.held_out is not None

@@ -14,7 +14,13 @@ from implicam.calibrators import ForwardGP
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
 from implicam.dataset import Dataset, Observations
 from implicam.rig_model.triangulate import Located, _Seen, locate
-from implicam.rig_model.wrong_views import DISAGREE, Linear, _Choices, most_wrong, without_wrong_views
+from implicam.rig_model.wrong_views import (
+    DISAGREE_P_VALUE,
+    LinearisedViews,
+    _Choices,
+    exclude_wrong_views,
+    max_wrong_views,
+)
 from implicam.simulate import build_rig, random_positions, simulate
 
 
@@ -118,12 +124,12 @@ def test_a_wrong_view_costs_a_few_solutions_whatever_the_number_of_cameras(spec:
             bad, _ = spoilt(uv, count, size)
             points = Counted(_Seen(fitted(spec).posterior, bad, noise, None))
             n = len(bad)
-            list(without_wrong_views(points, np.arange(n), np.isfinite(bad).all(axis=2)))
+            list(exclude_wrong_views(points, np.arange(n), np.isfinite(bad).all(axis=2)))
             assert sum(map(len, points.solved_rows)) <= 2.2 * n
             assert sum(map(len, points.linear_rows)) <= 3.2 * n
 
 
-def dense(linear: Linear, i: int, kept: np.ndarray) -> float:
+def dense(linear: LinearisedViews, i: int, kept: np.ndarray) -> float:
     """Chi-squared of the kept views of point i, by the normal equations."""
     C = linear.r.shape[1]
     if linear.joint is None:
@@ -143,7 +149,7 @@ class Given:
 
     degrees = None
 
-    def __init__(self, linear: Linear) -> None:
+    def __init__(self, linear: LinearisedViews) -> None:
         self.given = linear
 
     def lines(self, rows):
@@ -152,7 +158,7 @@ class Given:
     def linear(self, rows, x, seen, before=None):
         r = np.where(seen[..., None], self.given.r[rows] - np.einsum("ncij,nj->nci", self.given.D[rows], x), 0)
         joint = None if self.given.joint is None else self.given.joint[rows]
-        return Linear(r, self.given.D[rows].copy(), self.given.each[rows].copy(), joint)
+        return LinearisedViews(r, self.given.D[rows].copy(), self.given.each[rows].copy(), joint)
 
 
 @pytest.mark.parametrize("tied", [False, True])
@@ -163,7 +169,7 @@ def test_chi_squared_without_some_views_in_closed_form(tied: bool) -> None:
     S = root @ root.swapaxes(1, 2) + np.eye(2 * C)
     blocks = S.reshape(n, C, 2, C, 2)
     each = np.linalg.inv(np.stack([blocks[:, c, :, c] for c in range(C)], axis=1))
-    linear = Linear(
+    linear = LinearisedViews(
         draw.normal(size=(n, C, 2)) * 2, draw.normal(size=(n, C, 2, 3)), each, np.linalg.inv(S) if tied else None
     )
     points = Given(linear)
@@ -180,7 +186,7 @@ def test_chi_squared_without_some_views_in_closed_form(tied: bool) -> None:
 
 
 def test_how_many_views_may_be_left_out() -> None:
-    np.testing.assert_array_equal(most_wrong(np.arange(2, 13)), [0, 1, 1, 2, 2, 2, 3, 3, 4, 4, 5])
+    np.testing.assert_array_equal(max_wrong_views(np.arange(2, 13)), [0, 1, 1, 2, 2, 2, 3, 3, 4, 4, 5])
 
 
 def test_two_against_two_stays_undecided() -> None:
@@ -214,5 +220,5 @@ def test_three_against_two_are_believed() -> None:
 def test_good_points_are_left_alone() -> None:
     uv, noise = fitted("dome8").map.views(seen_by_all("dome8").observations)
     found: Located = locate(fitted("dome8").posterior, uv, noise)
-    assert (found.p > DISAGREE).mean() > 0.95
+    assert (found.p > DISAGREE_P_VALUE).mean() > 0.95
     assert found.left_out.any(axis=1).mean() < 0.05

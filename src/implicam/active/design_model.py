@@ -24,7 +24,7 @@ from implicam.calibrators.inverse_maps import Part
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
 from implicam.gp.linalg import solve_lower
-from implicam.rig_model.rig import FittedRig, Sensitivity
+from implicam.rig_model import FittedRig, Sensitivity
 
 Bools = NDArray[np.bool_]
 

@@ -38,7 +38,7 @@ from implicam.calibrators import (
 from implicam.dataset import Dataset, Floats, join
 from implicam.errors import FitError, ImplicamError, UsageError
 from implicam.progress import Progress, silent
-from implicam.rig_model.training_data import FEWEST
+from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.threads import blas_threads
 
 GROWTH = 1.25
@@ -108,7 +108,7 @@ class Loop:
     workspace: Workspace
     acquisition: Acquisition = field(default_factory=lambda: acquisition(DEFAULT))
     rule: Rule = field(default_factory=Never)
-    start: int = FEWEST
+    start: int = MIN_POINTS_PER_CAMERA
     candidates: int = 1500
     judged: int = 400
     reach: float = np.inf
@@ -156,7 +156,7 @@ class Loop:
         rng = np.random.default_rng([self.seed, self._asked, 3])
         try:
             with blas_threads(1):  # thousands of small matrices: two threads would wait for each other
-                design = self._outlook()
+                design = self._design_model()
                 chosen = choose(design, self.acquisition, rng, count=number, here=here, reach=self.reach)
         except FitError as error:  # the forward model of inverse-gp: more points will help
             self.problem = error
@@ -250,7 +250,7 @@ class Loop:
             return str(self.pool.points[int(np.argmin(np.linalg.norm(self.pool.xyz - xyz, axis=1)))])
         return next(islice(free_names(self.data), k, None))
 
-    def _outlook(self) -> ForwardDesignModel | InverseDesignModel:
+    def _design_model(self) -> ForwardDesignModel | InverseDesignModel:
         assert self.calibration is not None
         candidates: Floats | Places
         if self.pool is not None:

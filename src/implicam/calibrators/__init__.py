@@ -103,6 +103,6 @@ __all__ = [
     "Rejected",
     "Unused",
     "calibrator",
+    "calibrator_from_name",
     "load_calibration",
-    "named",
 ]

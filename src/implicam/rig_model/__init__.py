@@ -1,1 +1,99 @@
-"""What every method that maps positions to pixels shares."""
+"""What every method that maps positions to pixels shares: cameras, what is known of them, and how they measure.
+
+From data to a fitted rig, in the order of the modules: `training_data` (known points in the working frame),
+`initialise` (a camera from no guess), `camera`, `general_camera`, `field` and `camera_model` (what a camera is),
+`normal_equations`, `schur`, `tied`, `posterior` and `linearise` (what is known of all cameras), `leave_one_out` and
+`diagnostics` (views that contradict the others), `shot_errors`, `level_errors`, `position_errors` and `heavy_tails`
+(how positions and pixels are off), `fit_result`; then `rig`, `triangulate`, `wrong_views` and `alarm` (measuring). The
+mathematics: docs/method.md.
+"""
+
+from implicam.rig_model.camera import (
+    CENTRE_PRIOR_SD,
+    LOG_ASPECT_PRIOR_SD,
+    PERSPECTIVE_K,
+    CentralCamera,
+    Image,
+    Prior,
+    ProjectiveCamera,
+    View,
+)
+from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
+from implicam.rig_model.diagnostics import MAX_NAMED_IN_NOTE, Diagnosis
+from implicam.rig_model.field import Hyperparameters
+from implicam.rig_model.fit_result import FitResult
+from implicam.rig_model.general_camera import AnyCamera, GeneralCamera
+from implicam.rig_model.heavy_tails import HeavyTails
+from implicam.rig_model.initialise import (
+    MAX_ERROR_MEDIANS,
+    InitialCamera,
+    lens_only_model,
+    levenberg_marquardt,
+    start_rig,
+)
+from implicam.rig_model.leave_one_out import update_inliers
+from implicam.rig_model.linearise import iterate_linearisation
+from implicam.rig_model.normal_equations import solve_normal
+from implicam.rig_model.position_errors import PositionErrors
+from implicam.rig_model.posterior import Posterior, condition
+from implicam.rig_model.rig import FittedRig, Sensitivity
+from implicam.rig_model.shot_errors import ShotErrors, Shots
+from implicam.rig_model.tied import Scatter, condition_scattered
+from implicam.rig_model.training_data import (
+    MIN_POINTS_PER_CAMERA,
+    Frame,
+    TrainingData,
+    image_of,
+    relative_noise,
+    stated_noise,
+    training_data_of,
+)
+from implicam.rig_model.triangulate import Labels, Located, locate
+
+__all__ = [
+    "CENTRE_PRIOR_SD",
+    "LOG_ASPECT_PRIOR_SD",
+    "MAX_ERROR_MEDIANS",
+    "MAX_NAMED_IN_NOTE",
+    "MIN_POINTS_PER_CAMERA",
+    "PERSPECTIVE_K",
+    "AnyCamera",
+    "CameraModel",
+    "CameraViews",
+    "CentralCamera",
+    "Diagnosis",
+    "FitResult",
+    "FittedRig",
+    "Frame",
+    "GeneralCamera",
+    "HeavyTails",
+    "Hyperparameters",
+    "Image",
+    "InitialCamera",
+    "Labels",
+    "Located",
+    "PositionErrors",
+    "Posterior",
+    "Prior",
+    "ProjectiveCamera",
+    "Scatter",
+    "Sensitivity",
+    "ShotErrors",
+    "Shots",
+    "TrainingData",
+    "View",
+    "apply_covariance_root",
+    "condition",
+    "condition_scattered",
+    "image_of",
+    "iterate_linearisation",
+    "lens_only_model",
+    "levenberg_marquardt",
+    "locate",
+    "relative_noise",
+    "solve_normal",
+    "start_rig",
+    "stated_noise",
+    "training_data_of",
+    "update_inliers",
+]

@@ -14,29 +14,29 @@ import numpy as np
 from implicam.cameras import BrownConrady, KannalaBrandt, Lens
 from implicam.geometry import Floats, Pose, camera_centre, rotation_from_vector
 
-TANGENT = np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
+PERSPECTIVE_K = np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
 """k1 ... k4 of a perspective lens: tan(t) = t + t^3/3 + 2 t^5/15 + ..."""
 
-BENT = np.array([0.15, 0.1, 0.05, 0.02])
+DISTORTION_PRIOR_SD = np.array([0.15, 0.1, 0.05, 0.02])
 """Prior sd of k1 ... k4 about the line from an equidistant to a perspective lens ..."""
 
-BENT_AT_EDGE = np.array([0.15, 0.1, 0.07, 0.05])
+DISTORTION_AT_EDGE_PRIOR_SD = np.array([0.15, 0.1, 0.07, 0.05])
 """... and of what each term may do at the edge of the image, as a part of the radius: it tames fisheyes."""
 
-DISTORTED, DISTORTED_AT_EDGE = np.array([0.5, 0.5, 0.3]), np.array([0.4, 0.3, 0.15])
+BROWN_PRIOR_SD, BROWN_AT_EDGE_PRIOR_SD = np.array([0.5, 0.5, 0.3]), np.array([0.4, 0.3, 0.15])
 """The same of k1, k2, k3 of a Brown-Conrady lens, about none, and of each term at the edge of the image."""
 
-DECENTRED = 0.005
+DECENTRING_PRIOR_SD = 0.005
 """Prior sd of p1 and p2."""
 
-ASPECT = 0.002
+LOG_ASPECT_PRIOR_SD = 0.002
 """Prior sd of log(fy / fx): pixels are square."""
 
-CENTRE = 0.02
+CENTRE_PRIOR_SD = 0.02
 """Prior sd of the principal point about the image's centre, as a part of the longer side."""
 
 
-NEAR = 0.3
+PROJECTION_PRIOR_RELATIVE_SD = 0.3
 """Prior sd of the numbers of a linear projection about those of its start, as a part of them."""
 
 
@@ -128,17 +128,19 @@ class CentralCamera:
     def prior(self, image: Image, widest: float) -> Prior:
         """Eq. (3), for a lens that is used up to `widest` radians off its axis."""
         mean, precision = np.zeros(self.size), np.zeros((self.size, self.size))
-        aspect = 1 / (ASPECT * self.lens.fx) ** 2
+        aspect = 1 / (LOG_ASPECT_PRIOR_SD * self.lens.fx) ** 2
         precision[:2, :2] = aspect * np.array([[1, -1], [-1, 1]])
         mean[2:4] = image.centre
-        precision[2, 2] = precision[3, 3] = 1 / (CENTRE * 2 * image.half) ** 2
+        precision[2, 2] = precision[3, 3] = 1 / (CENTRE_PRIOR_SD * 2 * image.half) ** 2
         if isinstance(self.lens, KannalaBrandt):
-            own = np.minimum(BENT, BENT_AT_EDGE / widest ** np.array([2, 4, 6, 8]))
-            mean[4:8] = 0.5 * TANGENT
-            precision[4:8, 4:8] = np.linalg.inv(np.diag(own**2) + 0.25 * np.outer(TANGENT, TANGENT))
+            own = np.minimum(DISTORTION_PRIOR_SD, DISTORTION_AT_EDGE_PRIOR_SD / widest ** np.array([2, 4, 6, 8]))
+            mean[4:8] = 0.5 * PERSPECTIVE_K
+            precision[4:8, 4:8] = np.linalg.inv(np.diag(own**2) + 0.25 * np.outer(PERSPECTIVE_K, PERSPECTIVE_K))
         else:
-            radial = np.minimum(DISTORTED, DISTORTED_AT_EDGE / np.tan(min(widest, 1.5)) ** np.array([2, 4, 6]))
-            sd = np.array([radial[0], radial[1], DECENTRED, DECENTRED, radial[2]])
+            radial = np.minimum(
+                BROWN_PRIOR_SD, BROWN_AT_EDGE_PRIOR_SD / np.tan(min(widest, 1.5)) ** np.array([2, 4, 6])
+            )
+            sd = np.array([radial[0], radial[1], DECENTRING_PRIOR_SD, DECENTRING_PRIOR_SD, radial[2]])
             precision[range(4, 9), range(4, 9)] = 1 / sd**2
         return Prior(mean, precision)
 
@@ -220,7 +222,10 @@ class ProjectiveCamera:
         """Roughly what the linear resection found; and the scale of P, which no pixel shows, stays what it is."""
         scale = np.maximum(np.abs(self.P), 1e-3 * np.abs(self.P).max(axis=1, keepdims=True))
         along = (self.P / scale**2).ravel()
-        return Prior(self.P.ravel(), np.diag(1 / (NEAR * scale.ravel()) ** 2) + 1e4 * np.outer(along, along))
+        return Prior(
+            self.P.ravel(),
+            np.diag(1 / (PROJECTION_PRIOR_RELATIVE_SD * scale.ravel()) ** 2) + 1e4 * np.outer(along, along),
+        )
 
     def as_array(self) -> Floats:
         """(12,)."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from implicam.geometry import Bools, Floats
 from implicam.gp.low_rank import LowRank
 from implicam.rig_model.camera import Image, Prior, View
-from implicam.rig_model.field import AS_IT_IS, DepthScale, field_coordinates
+from implicam.rig_model.field import UNSCALED_DEPTH, DepthScale, field_coordinates
 from implicam.rig_model.general_camera import AnyCamera
 
 
@@ -32,7 +32,7 @@ class CameraModel:
     signal: float  # px
     noise: float  # px, of a view with the camera's usual noise
     weights: Floats
-    depth: DepthScale = AS_IT_IS
+    depth: DepthScale = UNSCALED_DEPTH
     family: str = "ordinary"
 
     @property

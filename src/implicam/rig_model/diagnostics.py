@@ -14,10 +14,10 @@ from implicam.dataset.unused import Rejected, Unused
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.leave_one_out import left_out, left_out_points
+from implicam.rig_model.leave_one_out import left_out_points, left_out_residuals
 from implicam.rig_model.training_data import Frame, camera_views_of, stated_noise
 
-NAMED = 5
+MAX_NAMED_IN_NOTE = 5
 """Things that a note names one by one; of more it gives the number."""
 
 
@@ -38,7 +38,7 @@ class Diagnosis:
             if inliers.all():
                 continue
             seen = self._camera_views[c]
-            residual, _ = left_out(self.fitted.posterior, number, self._points, seen, inliers)
+            residual, _ = left_out_residuals(self.fitted.posterior, number, self._points, seen, inliers)
             for row in np.flatnonzero(~inliers):
                 point = str(self.data.points[seen.rows[row]])
                 found.append(Rejected(point, names[c], float(np.linalg.norm(residual[row]))))
@@ -63,7 +63,7 @@ class Diagnosis:
         the known positions themselves are part of both, where they are estimated."""
         n = len(self.data)
         posterior = self.fitted.posterior
-        if self.fitted.label_errors is not None:
+        if self.fitted.position_errors is not None:
             all_seen = tuple(self._camera_views[c] for c in self.fitted.cameras)
             error, cov = left_out_points(self.fitted, self._points, all_seen)
             return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
@@ -71,7 +71,7 @@ class Diagnosis:
         views = np.zeros(n)
         for number, c in enumerate(self.fitted.cameras):
             seen, inliers = self._camera_views[c], self.fitted.inliers[number]
-            residual, spread = left_out(posterior, number, self._points, seen, inliers)
+            residual, spread = left_out_residuals(posterior, number, self._points, seen, inliers)
             rows = seen.rows[inliers]
             where = self._points[rows]
             if posterior.displacement is not None:
@@ -136,14 +136,14 @@ class Diagnosis:
             return []
         n, total = len(self.rejected), int(sum(len(inliers) for inliers in self.fitted.inliers))
         named = ", ".join(
-            f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in self.rejected[:NAMED]
+            f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in self.rejected[:MAX_NAMED_IN_NOTE]
         )
-        more = f" and {n - NAMED} more" if n > NAMED else ""
+        more = f" and {n - MAX_NAMED_IN_NOTE} more" if n > MAX_NAMED_IN_NOTE else ""
         notes = [f"{n} of {total} views contradict the others and are not used: {named}{more}."]
         seen = np.stack([self.data.observations.seen[:, c] for c in self.fitted.cameras], axis=1)
         wrong = (seen.sum(axis=1) >= 2) & ((seen & ~self._used).sum(axis=1) > 0.5 * seen.sum(axis=1))
         if wrong.any():
-            points = ", ".join(map(str, self.data.points[wrong][:NAMED]))
+            points = ", ".join(map(str, self.data.points[wrong][:MAX_NAMED_IN_NOTE]))
             notes.append(f"Most views of {points} are among them: look at the known position rather than the images.")
         return notes
 

@@ -11,7 +11,7 @@ from implicam.gp import Kernel
 from implicam.gp.low_rank import LowRank
 from implicam.rig_model.camera import Image, View
 
-TYPICAL_DEPTH_SPREAD = 0.12
+TYPICAL_LOG_DISTANCE_SD = 0.12
 """Standard deviation of the log distance of the known points in an ordinary rig. Where the volume is thinner, depth
 counts in its own spread: what a window or water does varies over the volume, however far that is."""
 
@@ -40,10 +40,10 @@ class DepthScale(NamedTuple):
     def of(cls, view: View) -> DepthScale:
         """Of the known points that a camera sees."""
         spread = float(np.std(view.log_distance))
-        return cls(float(np.mean(view.log_distance)), min(max(spread / TYPICAL_DEPTH_SPREAD, 1e-6), 1.0))
+        return cls(float(np.mean(view.log_distance)), min(max(spread / TYPICAL_LOG_DISTANCE_SD, 1e-6), 1.0))
 
 
-AS_IT_IS = DepthScale()
+UNSCALED_DEPTH = DepthScale()
 """Log distance itself is the coordinate."""
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.field import Hyperparameters
-from implicam.rig_model.heavy_tails import Tails
-from implicam.rig_model.position_errors import LabelErrors
+from implicam.rig_model.heavy_tails import HeavyTails
+from implicam.rig_model.position_errors import PositionErrors
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.shot_errors import ShotErrors
 
@@ -18,7 +18,7 @@ class FitResult:
     others. inliers: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are;
     label_sd (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. label_errors:
     how single known positions are off besides, if they are; untold_sd (6,): how planes may be off that are too few to
-    tell. ordinary_px: per fitted camera, see `Started`."""
+    tell. ordinary_px: per fitted camera, see `InitialCamera`."""
 
     posterior: Posterior
     cameras: tuple[int, ...]
@@ -27,8 +27,8 @@ class FitResult:
     hyperparameters: Hyperparameters
     errors: ShotErrors | None
     label_sd: Floats | None
-    tails: Tails | None = None
-    label_errors: LabelErrors | None = None
+    tails: HeavyTails | None = None
+    position_errors: PositionErrors | None = None
     untold_sd: Floats | None = None
     ordinary_px: tuple[float, ...] = ()
 

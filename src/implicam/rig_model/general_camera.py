@@ -23,7 +23,7 @@ import numpy as np
 
 from implicam.cameras import KannalaBrandt
 from implicam.geometry import Floats, Pose, rotation_from_vector
-from implicam.rig_model.camera import TANGENT, CentralCamera, ProjectiveCamera, View, cross
+from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, ProjectiveCamera, View, cross
 
 MIN_FOCAL_PX = 0.1
 """A picture smaller than a pixel: every point is in one place, which fits anything equally badly."""
@@ -31,7 +31,7 @@ MIN_FOCAL_PX = 0.1
 MAX_SHAPE = 3.0
 """Of p and q: pixels 400 times as long as wide are none."""
 
-SMALLEST_RHO = 5e-4
+MIN_RHO = 5e-4
 """Of the inverse distance, in the working frame: farther away nothing shows it, and the evidence loses its digits."""
 
 PARAMETERS = (
@@ -70,7 +70,7 @@ class GeneralCamera:
     def parameters(self) -> Floats:
         """(17,) what the prior is about; the rotation has no prior and is zero here."""
         rho = self.rho
-        kappa = (self.k - 0.5 * TANGENT) * rho**_POWERS
+        kappa = (self.k - 0.5 * PERSPECTIVE_K) * rho**_POWERS
         direction = self.pose.translation * rho
         sine = float(np.hypot(*direction[:2]))
         arc = np.arctan2(sine, direction[2]) / (sine * rho) if sine > 0 else 1 / rho
@@ -88,7 +88,7 @@ class GeneralCamera:
     def moved(self, step: Floats) -> GeneralCamera:
         """The camera with its parameters changed by (17,)."""
         x = self.parameters + step
-        rho = max(float(x[RHO]), SMALLEST_RHO)
+        rho = max(float(x[RHO]), MIN_RHO)
         across = x[12:14]
         angle = rho * float(np.hypot(*across))
         translation = np.append(across * _sinc(angle), np.cos(angle) / rho)
@@ -98,7 +98,7 @@ class GeneralCamera:
             x[SHAPE],
             x[TILT],
             x[CENTRE],
-            0.5 * TANGENT + x[KAPPA] / rho**_POWERS,
+            0.5 * PERSPECTIVE_K + x[KAPPA] / rho**_POWERS,
             self.mirrored,
             Pose(turn @ self.pose.rotation, translation),
         )
@@ -134,7 +134,7 @@ class GeneralCamera:
         out[:, :, 3:5] = -away[:, :, None] * y[:, None, :]
         out[:, :, 5:7] = np.where(np.isnan(uv[:, :1, None]), np.nan, np.eye(2))
         out[:, :, KAPPA] = by_k / rho**_POWERS
-        out[:, :, RHO] = -away / rho + slope @ by_rho - by_k @ (_POWERS * (self.k - 0.5 * TANGENT) / rho)
+        out[:, :, RHO] = -away / rho + slope @ by_rho - by_k @ (_POWERS * (self.k - 0.5 * PERSPECTIVE_K) / rho)
         out[:, :, 12:14] = slope @ by_across
         out[:, :, 14:] = cross(turned[:, None, :], slope)  # slope . (omega x turned)
         squared = np.sum(there**2, axis=1)

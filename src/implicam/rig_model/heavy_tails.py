@@ -17,71 +17,71 @@ from scipy.special import chdtrc, gammaln, logsumexp, ndtri
 
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera_model import CameraViews
-from implicam.rig_model.wrong_views import Ints, Linear
+from implicam.rig_model.wrong_views import Ints, LinearisedViews
 
-DEGREES = (2.2, 2.6, 3.0, 3.5, 4.2, 5.0, 7.0, 10.0, 20.0)
+DEGREES_OF_FREEDOM = (2.2, 2.6, 3.0, 3.5, 4.2, 5.0, 7.0, 10.0, 20.0)
 """Degrees of freedom tried. With two or fewer the noise has no variance, with more than 20 it is as good as normal."""
 
-CLEAR = 5.0
+MIN_GAIN_NATS = 5.0
 """Nats by which a t must be more likely than normal noise, or noise is normal: chance gains so much once in a
 thousand times."""
 
-STEPS = 40
+MAX_EM_STEPS = 40
 """Of EM for scale and share of wrong detections, at each number of degrees ..."""
 
-STILL = 1e-6
+EM_RELATIVE_TOLERANCE = 1e-6
 """... or fewer, where no scale squared changes by this part any more."""
 
-AGREED = 2.0
+MIN_CONFIRMING_GAIN_NATS = 2.0
 """The same of what cameras say among themselves, which is less, and only has to confirm it."""
 
-SHARED = 0.5
+MIN_DISAGREEMENT_VARIANCE_RATIO = 0.5
 """Scale squared of what cameras disagree on, over that of what they miss the known positions by, below which the errors
 are those of the known positions."""
 
-WRONG = 0.3
+MAX_WRONG_SHARE = 0.3
 """Share of wrong detections, anywhere in the image, beyond which nothing is concluded."""
 
-MOST_VIEWS = 1000
+MAX_VIEWS_PER_CAMERA = 1000
 """Views of a camera that the degrees are found from; more cost time and tell little more."""
 
-FEWEST = 60
+MIN_VIEWS = 60
 """Views from which tails can be told."""
 
-DRAWS = 512
+POSTERIOR_DRAWS = 512
 """Places at which the posterior of a position is looked up: its sds are then good to a few per cent."""
 
-FEW_VIEWS = 4
+MAX_VIEWS_WITH_SECOND_MODE = 4
 """Up to so many, the posterior may have a second mode, without one of them."""
 
-AMBIGUOUS = 8.0
+MAX_SD_RATIO = 8.0
 """How many times larger an error bar may be than that of views that agree: beyond, there are two places, and nothing
 says which."""
 
-TO_MODE = 10
+REWEIGHTINGS_TO_MODE = 10
 """Times that views are weighted to find a mode."""
 
-AT_ONCE = 256
+VIEWS_PER_BATCH = 256
 """Views whose positions are integrated at once, so that all fits in the processor's cache."""
 
-FEW_DRAWS, MOST_POINTS = 64, 200
+EVIDENCE_DRAWS, MAX_EVIDENCE_POINTS = 64, 200
 """The same for the evidence of the degrees, and points that it is taken from."""
 
-SINGULAR = 1e10
+MAX_CONDITION = 1e10
 """Condition of a point's normal matrix beyond which its views do not fix it."""
 
-WIDER = 1.5
+PROPOSAL_WIDENING = 1.5
 """How much wider than the posterior at its mode they are spread."""
 
 
-class Tails(NamedTuple):
+class HeavyTails(NamedTuple):
     """degrees: of freedom. weights: per camera (n seen,), how much each of its views counts, eq. (T3)."""
 
     degrees: float
     weights: tuple[Floats, ...]
 
     def weighted(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
-        """The sightings, noisier where they count less; told: by the loss of information too."""
+        """The views, noisier where they count less; told: by the loss of information too."""
         loss = self.loss if told else 1.0
         return tuple(
             s._replace(relative=s.relative * np.sqrt(loss / w)) for s, w in zip(seen, self.weights, strict=True)
@@ -103,7 +103,7 @@ def outlier_distance(degrees: float, normal: float) -> float:
     return float(degrees * np.expm1(normal / degrees))
 
 
-def weights_of(distance: Floats, degrees: float) -> Floats:
+def student_t_weights(distance: Floats, degrees: float) -> Floats:
     """How much views count at these squared distances (in their scale matrix)."""
     return np.asarray((degrees + 2) / (degrees + distance), dtype=np.float64)
 
@@ -116,12 +116,12 @@ def looks_heavy(distance: Floats, background: Floats) -> bool:
     """
     good = np.isfinite(distance) & (distance >= 0)
     q, b = distance[good], background[good]
-    if len(q) < FEWEST:
+    if len(q) < MIN_VIEWS:
         return False
     normal = _likelihoods(q, b, np.array([np.inf]))[0]
-    found = _likelihoods(q, b, np.array(DEGREES))
+    found = _likelihoods(q, b, np.array(DEGREES_OF_FREEDOM))
     best = found[np.argmax(found[:, 0])]
-    return bool(best[0] > normal[0] + CLEAR and best[2] < WRONG)
+    return bool(best[0] > normal[0] + MIN_GAIN_NATS and best[2] < MAX_WRONG_SHARE)
 
 
 def _likelihoods(q: Floats, background: Floats, degrees: Floats) -> Floats:
@@ -130,7 +130,7 @@ def _likelihoods(q: Floats, background: Floats, degrees: Floats) -> Floats:
     t = degrees[:, None]
     scale = np.full(t.shape, max(float(np.median(q)) / (2 * np.log(2)), 1e-300))
     wrong = np.full(t.shape, 0.01)
-    for _ in range(STEPS):
+    for _ in range(MAX_EM_STEPS):
         before = scale
         if np.isinf(degrees).all():
             density, w = np.exp(-0.5 * q / scale) / scale, np.ones_like(scale)
@@ -143,7 +143,7 @@ def _likelihoods(q: Floats, background: Floats, degrees: Floats) -> Floats:
         share = right.mean(axis=1, keepdims=True)
         scale = np.maximum((right * w) @ q[:, None] / (2 * len(q) * share), 1e-300)
         wrong = np.clip(1 - share, 1e-6, 0.9)
-        if (np.abs(scale - before) <= STILL * scale).all():
+        if (np.abs(scale - before) <= EM_RELATIVE_TOLERANCE * scale).all():
             break
     values = np.sum(np.log((1 - wrong) * density + wrong * background), axis=1, keepdims=True)
     return np.concatenate([values, scale, wrong], axis=1)
@@ -157,16 +157,16 @@ def consistency(distance: Floats, seen: Bools, degrees: float) -> Floats:
     return np.asarray(np.where((views >= 2) & np.isfinite(total), chdtrc(free, total), np.nan), dtype=np.float64)
 
 
-def taken_as_normal(noise: Floats, distance: Floats, seen: Bools, degrees: float) -> Floats:
+def equivalent_normal_noise(noise: Floats, distance: Floats, seen: Bools, degrees: float) -> Floats:
     """(n, C) noise of normal views that tell as much as these: by their distances, eq. (T3); of two views,
     where nothing says which is the worse, the standard deviation."""
-    weighted = information_loss(degrees) / weights_of(distance, degrees)
+    weighted = information_loss(degrees) / student_t_weights(distance, degrees)
     plain = degrees / (degrees - 2)
     few = (seen.sum(axis=1) < 3)[:, None]
     return np.asarray(noise * np.sqrt(np.where(few, plain, weighted)), dtype=np.float64)
 
 
-class Refined(NamedTuple):
+class RefinedPositions(NamedTuple):
     """The posterior of n positions: step (n, 3) from where the views were linearised, covariance (n, 3, 3), NaN where
     two places are likely; and squared distances (n, C) of the views at the most probable one."""
 
@@ -175,17 +175,17 @@ class Refined(NamedTuple):
     distance: Floats
 
 
-def refined(linear: Linear, degrees: float) -> Refined:
+def refine_positions(linear: LinearisedViews, degrees: float) -> RefinedPositions:
     """Mean and covariance of the position under t noise, from views linearised near it, eq. (T4)."""
-    A, b = whitened(linear)
+    A, b = whiten(linear)
     n, C = b.shape[:2]
-    out = Refined(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, C)))
+    out = RefinedPositions(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, C)))
     there = np.any(A != 0, axis=(2, 3))
     views = there.sum(axis=1)
     order = np.argsort(~there, axis=1, kind="stable")
     for V in np.unique(views):
         alike = np.flatnonzero(views == V)
-        size = max(1, AT_ONCE // int(V))
+        size = max(1, VIEWS_PER_BATCH // int(V))
         for some in np.split(alike, range(size, len(alike), size)):
             chosen = order[some, :V]
             found = _integrated(A[some[:, None], chosen], b[some[:, None], chosen], degrees)
@@ -194,23 +194,23 @@ def refined(linear: Linear, degrees: float) -> Refined:
     return out
 
 
-def _integrated(A: Floats, b: Floats, degrees: float) -> Refined:
+def _integrated(A: Floats, b: Floats, degrees: float) -> RefinedPositions:
     """By importance sampling, from a mixture of spherical t about every place that may be a mode: with few views, each
     of them may be the wrong one."""
     n = len(b)
     modes = [_about_mode(A, b, degrees, start) for start in _starts(A, b)]
-    z, log_density = _draws(DRAWS)
+    z, log_density = _draws(POSTERIOR_DRAWS)
     centre = np.stack([mode.step for mode in modes], axis=1)  # (n, K, 3)
     spread = np.stack([mode.spread for mode in modes], axis=1)
     K = len(modes)
-    own = np.arange(DRAWS) % K  # the component that each draw belongs to
-    x = centre[:, own] + (spread[:, own] @ z[None, :, :, None])[..., 0]  # (n, DRAWS, 3)
+    own = np.arange(POSTERIOR_DRAWS) % K  # the component that each draw belongs to
+    x = centre[:, own] + (spread[:, own] @ z[None, :, :, None])[..., 0]  # (n, POSTERIOR_DRAWS, 3)
     log_weight = -0.5 * (degrees + 2) * _bent(A, b, x, degrees)
     if K == 1:
         log_weight = log_weight - log_density
     else:
         back = np.linalg.inv(spread)
-        away = (x[:, None] - centre[:, :, None]) @ back.swapaxes(2, 3)  # (n, K, DRAWS, 3)
+        away = (x[:, None] - centre[:, :, None]) @ back.swapaxes(2, 3)  # (n, K, POSTERIOR_DRAWS, 3)
         sizes = np.linalg.slogdet(back)[1][..., None]
         log_weight = log_weight - logsumexp(sizes - 3.5 * np.log1p(np.sum(away**2, axis=3) / 4), axis=1)
     weight = np.exp(log_weight - log_weight.max(axis=1, keepdims=True))
@@ -220,11 +220,11 @@ def _integrated(A: Floats, b: Floats, degrees: float) -> Refined:
     cov = np.einsum("nk,nki,nkj->nij", weight, about, about)
     agreeing = information_loss(degrees) * np.linalg.inv(np.einsum("ncij,ncik->njk", A, A))
     larger = np.linalg.eigvals(np.linalg.solve(agreeing, cov)).real.max(axis=1)
-    mean[larger > AMBIGUOUS**2], cov[larger > AMBIGUOUS**2] = np.nan, np.nan
+    mean[larger > MAX_SD_RATIO**2], cov[larger > MAX_SD_RATIO**2] = np.nan, np.nan
     left = np.stack([mode.left for mode in modes], axis=1)
     distance = np.sum(left**2, axis=3)  # (n, K, V)
     best = np.argmin(np.sum(np.log1p(distance / degrees), axis=2), axis=1)
-    return Refined(mean, cov, distance[np.arange(n), best])
+    return RefinedPositions(mean, cov, distance[np.arange(n), best])
 
 
 def _starts(A: Floats, b: Floats) -> list[Floats]:
@@ -234,13 +234,13 @@ def _starts(A: Floats, b: Floats) -> list[Floats]:
     H, pull = N.sum(axis=1), g.sum(axis=1)
     starts = [np.linalg.solve(H, pull[..., None])[..., 0]]
     V = b.shape[1]
-    if 3 <= V <= FEW_VIEWS:
+    if 3 <= V <= MAX_VIEWS_WITH_SECOND_MODE:
         held = 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         starts += [np.linalg.solve(H - N[:, c] + held, (pull - g[:, c])[..., None])[..., 0] for c in range(V)]
     return starts
 
 
-def whitened(linear: Linear) -> tuple[Floats, Floats]:
+def whiten(linear: LinearisedViews) -> tuple[Floats, Floats]:
     """Slopes A (n, C, 2, 3) and residuals b (n, C, 2) of single views in the scale of their noise."""
     root = np.linalg.cholesky(linear.each).swapaxes(2, 3)  # each = root^T root
     return np.asarray(root @ linear.D), np.asarray((root @ linear.r[..., None])[..., 0])
@@ -255,13 +255,13 @@ def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
     what cameras share is not their noise, and noise is taken for normal.
     """
     views = seen.sum(axis=1)
-    some = np.flatnonzero(views >= 2)[:MOST_POINTS]
+    some = np.flatnonzero(views >= 2)[:MAX_EVIDENCE_POINTS]
     A, b, views = np.where(seen[..., None, None], A, 0)[some], np.where(seen[..., None], b, 0)[some], views[some]
     H = np.einsum("ncij,ncik->njk", A, A)
-    good = np.linalg.cond(H) < SINGULAR
+    good = np.linalg.cond(H) < MAX_CONDITION
     A, b, views, H, seen = A[good], b[good], views[good], H[good], seen[some][good]
     free = float(np.sum(2 * views - 3))
-    if free < FEWEST:
+    if free < MIN_VIEWS:
         return None
     g = np.einsum("ncij,nci->nj", A, b)
     squares = np.sum(b**2, axis=(1, 2)) - np.einsum("ni,ni->n", g, np.linalg.solve(H, g[..., None])[..., 0])
@@ -271,11 +271,17 @@ def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
     usual = max(float(squares.sum()) / free, 1e-300)
     normal = log_sizes - 0.5 * free * (1 + np.log(usual))
 
-    found = [_most_likely(A, b, views, degrees, usual) for degrees in DEGREES]
+    found = [_most_likely(A, b, views, degrees, usual) for degrees in DEGREES_OF_FREEDOM]
     k = int(np.argmax([value for value, _ in found]))
     value, scale = found[k]
-    alone = _likelihoods(np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), np.array(DEGREES[k : k + 1]))[0, 1]
-    return DEGREES[k] if value > normal + AGREED and scale > SHARED * alone else None
+    alone = _likelihoods(
+        np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), np.array(DEGREES_OF_FREEDOM[k : k + 1])
+    )[0, 1]
+    return (
+        DEGREES_OF_FREEDOM[k]
+        if value > normal + MIN_CONFIRMING_GAIN_NATS and scale > MIN_DISAGREEMENT_VARIANCE_RATIO * alone
+        else None
+    )
 
 
 def _most_likely(A: Floats, b: Floats, views: Ints, degrees: float, usual: float) -> tuple[float, float]:
@@ -293,7 +299,7 @@ def _most_likely(A: Floats, b: Floats, views: Ints, degrees: float, usual: float
 def _evidence(A: Floats, b: Floats, views: Ints, degrees: float) -> float:
     """Log density of the views of unit scale (those not there are zero), each point's position integrated out."""
     mode = _about_mode(A, b, degrees)
-    z, log_density = _draws(FEW_DRAWS)
+    z, log_density = _draws(EVIDENCE_DRAWS)
     log_weight = -0.5 * (degrees + 2) * _bent(A, mode.left, z @ mode.spread.swapaxes(1, 2), degrees) - log_density
     sizes = np.linalg.slogdet(mode.spread)[1] - views * np.log(2 * np.pi)
     return float(np.sum(logsumexp(log_weight, axis=1) - np.log(len(z)) + sizes))
@@ -311,9 +317,9 @@ class _Mode(NamedTuple):
 def _about_mode(A: Floats, b: Floats, degrees: float, start: Floats | None = None) -> _Mode:
     step = _mode(A, b, degrees, np.zeros((len(A), 3)) if start is None else start)
     left = b - np.einsum("ncij,nj->nci", A, step)
-    w = weights_of(np.sum(left**2, axis=2), degrees)
+    w = student_t_weights(np.sum(left**2, axis=2), degrees)
     H = np.einsum("nc,ncij,ncik->njk", w, A, A)
-    return _Mode(step, left, WIDER * np.sqrt(information_loss(degrees)) * _inverse_root(H))
+    return _Mode(step, left, PROPOSAL_WIDENING * np.sqrt(information_loss(degrees)) * _inverse_root(H))
 
 
 def _bent(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
@@ -326,9 +332,9 @@ def _bent(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
 
 def _mode(A: Floats, b: Floats, degrees: float, step: Floats) -> Floats:
     """(n, 3) the most probable step near a start: least squares, weighted again and again."""
-    for _ in range(TO_MODE):
+    for _ in range(REWEIGHTINGS_TO_MODE):
         left = b - np.einsum("ncij,nj->nci", A, step)
-        w = weights_of(np.sum(left**2, axis=2), degrees)
+        w = student_t_weights(np.sum(left**2, axis=2), degrees)
         H = np.einsum("nc,ncij,ncik->njk", w, A, A)
         step = step + _solved(H, np.einsum("nc,ncij,nci->nj", w, A, left))
     return step

@@ -14,25 +14,25 @@ import numpy as np
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, resect, resect_any_lens
-from implicam.rig_model.camera import TANGENT, CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, Image, Prior, ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.field import empty_field
 from implicam.rig_model.general_camera import AnyCamera
-from implicam.rig_model.training_data import FEWEST, Problem, pixel_extent
+from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA, TrainingData, pixel_extent
 from implicam.row_order import what_is_wrong
 from implicam.threads import side_by_side
 
-FAR = 8.0
+MAX_ERROR_MEDIANS = 8.0
 """Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
 
 ENOUGH_VIEWS = 12
 """Views of a camera that are too many to call too few the reason why nothing fits them."""
 
-TOLERABLE = {"central": 0.05, "general": 0.05, "none": 0.3}
+MAX_START_ERROR_HALF_EXTENTS = {"central": 0.05, "general": 0.05, "none": 0.3}
 """Median error of a start, in half the extent of the pixels, beyond which it is none."""
 
 
-class Started(NamedTuple):
+class InitialCamera(NamedTuple):
     """A camera that fits, its prior, and the views (n,) it was started from; family: what kind it is;
     ordinary_px: the median error that an ordinary camera would leave, NaN where none was tried beside it."""
 
@@ -43,62 +43,64 @@ class Started(NamedTuple):
     ordinary_px: float = float("nan")
 
 
-def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> Started:
+def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> InitialCamera:
     """A camera of the kind `lens` from points (n, 3), all seen at uv (n, 2); FitError where they do not fix one."""
-    if len(points) < FEWEST:
-        raise FitError(f"{len(points)} known points are seen; a camera needs at least {FEWEST}.")
+    if len(points) < MIN_POINTS_PER_CAMERA:
+        raise FitError(f"{len(points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
     if lens == "none":
         return _start_projective(points, uv, image)
     found = resect_any_lens(points, uv, middle=image.centre)
-    k = TANGENT if found.pinhole else np.zeros(4)
+    k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
     camera = CentralCamera(
         KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist()), found.camera_from_world
     )
     return _with_prior(camera, points, uv, image, found.inliers)
 
 
-def start_again(camera: AnyCamera, points: Floats, uv: Floats, image: Image, lens: str) -> Started:
+def start_again(camera: AnyCamera, points: Floats, uv: Floats, image: Image, lens: str) -> InitialCamera:
     """The same from a camera that fitted most of these points a moment ago; from no guess where it does not."""
     error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    inliers = error <= max(FAR * float(np.nanmedian(error)), 1e-4 * image.half)
-    if not isinstance(camera, CentralCamera) or inliers.sum() < max(FEWEST, len(points) / 2):
+    inliers = error <= max(MAX_ERROR_MEDIANS * float(np.nanmedian(error)), 1e-4 * image.half)
+    if not isinstance(camera, CentralCamera) or inliers.sum() < max(MIN_POINTS_PER_CAMERA, len(points) / 2):
         return start_camera(points, uv, image, lens)
     return _with_prior(camera, points, uv, image, inliers)
 
 
-def _with_prior(camera: CentralCamera, points: Floats, uv: Floats, image: Image, inliers: Bools) -> Started:
+def _with_prior(camera: CentralCamera, points: Floats, uv: Floats, image: Image, inliers: Bools) -> InitialCamera:
     there = camera.pose.apply(points[inliers])
     widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
     return _refined(camera, camera.prior(image, widest), points, uv, image, inliers)
 
 
-def _start_projective(points: Floats, uv: Floats, image: Image) -> Started:
+def _start_projective(points: Floats, uv: Floats, image: Image) -> InitialCamera:
     inliers = resect_any_lens(
         points, uv, middle=image.centre
     ).inliers  # any lens at all tells the wrong views from the right
     for _ in range(5):
         camera = ProjectiveCamera(resect(points[inliers], uv[inliers]))
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        inside = ~(error > FAR * np.nanmedian(error))
-        if inside.sum() < FEWEST or (inside == inliers).all():
+        inside = ~(error > MAX_ERROR_MEDIANS * np.nanmedian(error))
+        if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
         inliers = inside
     front = ~np.isnan(camera.pixel(points)[:, 0])  # no linear projection sees what is behind it
-    return Started(camera, camera.prior(image, 1.0), inliers & front, "none")
+    return InitialCamera(camera, camera.prior(image, 1.0), inliers & front, "none")
 
 
-def _refined(camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, inliers: Bools) -> Started:
+def _refined(
+    camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, inliers: Bools
+) -> InitialCamera:
     """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong."""
     sd = 1e-3 * image.half
     for _ in range(4):
         camera = levenberg_marquardt(camera, prior, points[inliers], uv[inliers], sd)
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         sd = max(float(np.median(error[inliers])), 1e-5 * image.half)
-        inside = error <= max(FAR * float(np.median(error[inliers])), 1e-4 * image.half)
-        if inside.sum() < FEWEST or (inside == inliers).all():
+        inside = error <= max(MAX_ERROR_MEDIANS * float(np.median(error[inliers])), 1e-4 * image.half)
+        if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
         inliers = inside
-    return Started(camera, prior, inliers)
+    return InitialCamera(camera, prior, inliers)
 
 
 def levenberg_marquardt(
@@ -147,86 +149,90 @@ def levenberg_marquardt(
 
 
 def start_rig(
-    problem: Problem, start: Callable[[int, Floats, Floats], Started]
-) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    training: TrainingData, start: Callable[[int, Floats, Floats], InitialCamera]
+) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
     """Each camera that `start` can place from its number, known points (n, 3) and pixels, and why it cannot the others.
 
     FitError where fewer than two can be placed.
     """
 
-    def one(c: int) -> Started | FitError:
-        seen = problem.camera_views[c]
+    def one(c: int) -> InitialCamera | FitError:
+        seen = training.camera_views[c]
         try:
-            _check_places(problem.points[seen.rows])
-            started = start(c, problem.points[seen.rows], seen.uv)
-            check_start(started, problem.points[seen.rows], seen.uv, problem)
+            _check_places(training.points[seen.rows])
+            started = start(c, training.points[seen.rows], seen.uv)
+            check_start(started, training.points[seen.rows], seen.uv, training)
             return started
         except np.linalg.LinAlgError:
-            return FitError(f"the known points do not fix it.{_why(problem, c)}")
+            return FitError(f"the known points do not fix it.{_why(training, c)}")
         except FitError as error:
-            return type(error)(error.what + _why(problem, c), why=error.why, fix=error.fix)
+            return type(error)(error.what + _why(training, c), why=error.why, fix=error.fix)
 
     started, uncalibrated = {}, []
-    for c, found in enumerate(side_by_side(one, range(len(problem.camera_views)))):
+    for c, found in enumerate(side_by_side(one, range(len(training.camera_views)))):
         if isinstance(found, FitError):
             uncalibrated.append((c, found.what))
         else:
             started[c] = found
-    require_two_cameras(problem, started, uncalibrated)
+    require_two_cameras(training, started, uncalibrated)
     return started, uncalibrated
 
 
-def require_two_cameras(problem: Problem, started: dict[int, Started], uncalibrated: list[tuple[int, str]]) -> None:
+def require_two_cameras(
+    training: TrainingData, started: dict[int, InitialCamera], uncalibrated: list[tuple[int, str]]
+) -> None:
     """FitError, which says why, where fewer than two cameras are left."""
     if len(started) < 2:
         raise FitError(
-            f"{len(started)} of {len(problem.names)} cameras can be calibrated; a position takes two.",
-            why="; ".join(f"{problem.names[c]}: {why}" for c, why in uncalibrated) or "there is one camera",
-            fix=_cure(problem, uncalibrated),
+            f"{len(started)} of {len(training.names)} cameras can be calibrated; a position takes two.",
+            why="; ".join(f"{training.names[c]}: {why}" for c, why in uncalibrated) or "there is one camera",
+            fix=_cure(training, uncalibrated),
         )
 
 
-def _why(problem: Problem, c: int) -> str:
+def _why(training: TrainingData, c: int) -> str:
     """What its rows say of a camera that no model fits, as a sentence after another."""
-    seen = problem.camera_views[c]
-    uv = np.full((len(problem.points), 2), np.nan)
+    seen = training.camera_views[c]
+    uv = np.full((len(training.points), 2), np.nan)
     uv[seen.rows] = seen.uv
-    why = what_is_wrong(problem.points, uv)
+    why = what_is_wrong(training.points, uv)
     return f" {why[0].upper()}{why[1:]}." if why else ""
 
 
 def _check_places(points: Floats) -> None:
     """FitError for many views of few places: to click a point again says nothing new of the camera."""
     places = len(np.unique(points, axis=0))
-    if places < FEWEST <= len(points):
-        raise FitError(f"its {len(points)} views are of {places} different positions, and it takes {FEWEST}.")
+    if places < MIN_POINTS_PER_CAMERA <= len(points):
+        raise FitError(
+            f"its {len(points)} views are of {places} different positions, and it takes {MIN_POINTS_PER_CAMERA}."
+        )
 
 
-def _cure(problem: Problem, uncalibrated: list[tuple[int, str]]) -> str:
+def _cure(training: TrainingData, uncalibrated: list[tuple[int, str]]) -> str:
     if not uncalibrated:
         return "use two cameras or more: a position is where their lines of sight meet"
-    if sum(len(seen.rows) >= ENOUGH_VIEWS for seen in problem.camera_views) >= 2:
+    if sum(len(seen.rows) >= ENOUGH_VIEWS for seen in training.camera_views) >= 2:
         return "look whether pixels and known positions belong together: order of the rows, names, axes, units"
     return "show the cameras more known points, in the whole volume"
 
 
-def check_start(started: Started, points: Floats, uv: Floats, problem: Problem) -> None:
+def check_start(started: InitialCamera, points: Floats, uv: Floats, training: TrainingData) -> None:
     """FitError for a start that too few views agree on, or that leaves too much."""
     error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.inliers]
     low, high = pixel_extent(uv)
     half = float((high - low).max()) / 2
-    if len(error) < FEWEST:
+    if len(error) < MIN_POINTS_PER_CAMERA:
         raise FitError(
-            f"{len(error)} of its {len(uv)} views agree on one camera, and it takes {FEWEST}.",
+            f"{len(error)} of its {len(uv)} views agree on one camera, and it takes {MIN_POINTS_PER_CAMERA}.",
             fix="add known points, or look for wrong detections",
         )
-    if not np.median(error) < TOLERABLE[started.camera.kind] * half:
+    if not np.median(error) < MAX_START_ERROR_HALF_EXTENTS[started.camera.kind] * half:
         raise FitError(
             f"no camera sees the known points at these pixels: the best of all fits leaves {np.median(error):.3g} px."
         )
 
 
-def lens_only_model(started: Started, image: Image, noise: float = 1.0) -> CameraModel:
+def lens_only_model(started: InitialCamera, image: Image, noise: float = 1.0) -> CameraModel:
     """A camera model that is nothing but the camera; noise in pixels."""
     field = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
     none = np.zeros((1, 2))

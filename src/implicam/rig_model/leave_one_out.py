@@ -13,10 +13,10 @@ from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.posterior import Posterior
 from implicam.threads import side_by_side
 
-OUTLIER = 25.0
+MAX_SQUARED_MAHALANOBIS = 25.0
 """Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
 
-LEAST_LEFT = 1e-9
+MIN_ONE_MINUS_LEVERAGE = 1e-9
 """One minus the leverage of a view, at least: below, rounding decides."""
 
 MAX_LEVERAGE = 3.0
@@ -26,20 +26,22 @@ and not how it is off itself."""
 
 def squared_distances(posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools) -> Floats:
     """(n,) how far each view is from what the others predict: closed form for the views used, eq. (18)."""
-    residual, covariance = left_out(posterior, c, points, seen, inliers)
+    residual, covariance = left_out_residuals(posterior, c, points, seen, inliers)
     inverse = np.linalg.inv(covariance)
     distance = np.einsum("ni,nij,nj->n", residual, inverse, residual)
     return np.asarray(np.where(np.isfinite(distance), distance, np.inf), dtype=np.float64)
 
 
-def left_out(posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools) -> tuple[Floats, Floats]:
+def left_out_residuals(
+    posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools
+) -> tuple[Floats, Floats]:
     """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px.
 
     A lens is extrapolated behind the camera, to pixels that may be anything, with a spread to match. A view that is
     off by more than the picture is none of that point, whatever the spread: its covariance is that of the noise.
     """
-    at = residuals_of(posterior, c, points, seen)
-    residual, covariance = left_out_from(at, inliers)
+    at = posterior_residuals(posterior, c, points, seen)
+    residual, covariance = left_out_residuals_from(at, inliers)
     elsewhere = ~inliers & ~(np.linalg.norm(at.residual, axis=1) <= 2 * posterior.models[c].image.half)
     return residual, np.where(elsewhere[:, None, None], (at.sd**2)[:, None, None] * np.eye(2), covariance)
 
@@ -54,7 +56,7 @@ class Residuals(NamedTuple):
     sd: Floats
 
 
-def residuals_of(posterior: Posterior, c: int, points: Floats, seen: CameraViews) -> Residuals:
+def posterior_residuals(posterior: Posterior, c: int, points: Floats, seen: CameraViews) -> Residuals:
     """Of all views of camera c."""
     model = posterior.models[c]
     where = points[seen.rows]
@@ -65,12 +67,12 @@ def residuals_of(posterior: Posterior, c: int, points: Floats, seen: CameraViews
     return Residuals(seen.uv - rows.mean, half @ half.swapaxes(1, 2), rows.rest, model.noise * seen.relative)
 
 
-def left_out_from(at: Residuals, inliers: Bools) -> tuple[Floats, Floats]:
-    """As `left_out`; inliers: the views that the posterior is from."""
+def left_out_residuals_from(at: Residuals, inliers: Bools) -> tuple[Floats, Floats]:
+    """As `left_out_residuals`; inliers: the views that the posterior is from."""
     smooth = at.reach / (at.sd**2)[:, None, None]
     left = np.where(inliers[:, None, None] & np.isfinite(smooth), np.eye(2) - smooth, np.eye(2))
     values, vectors = np.linalg.eigh(left)  # rounding can make a view that decides alone more than decisive
-    inside = vectors / np.maximum(values, LEAST_LEFT)[:, None, :] @ vectors.swapaxes(1, 2)
+    inside = vectors / np.maximum(values, MIN_ONE_MINUS_LEVERAGE)[:, None, :] @ vectors.swapaxes(1, 2)
     residual = np.einsum("nij,nj->ni", inside, at.residual)
     extra = np.where(inliers[:, None, None], 0, at.reach)
     return residual, inside * (at.sd**2)[:, None, None] + extra + at.rest[:, None, None] * np.eye(2)
@@ -87,13 +89,13 @@ def update_inliers(
     return tuple(side_by_side(one, range(len(seen))))
 
 
-def next_inliers(distance: Floats, inliers: Bools, limit: float = OUTLIER) -> Bools:
+def next_inliers(distance: Floats, inliers: Bools, limit: float = MAX_SQUARED_MAHALANOBIS) -> Bools:
     """The views to use next: the far ones go, the worst tenth at a time, those that agree come back."""
     worst = np.quantile(distance[inliers], 0.9) if inliers.any() else 0.0
     return np.asarray(np.where(inliers, distance <= max(limit, worst), distance <= limit), dtype=np.bool_)
 
 
-class LeftOut(NamedTuple):
+class LeftOutViews(NamedTuple):
     """Per view of one camera, predicted without it: rows (n,) of the points; residual (n, 2) and covariance inverse
     (n, 2, 2); slope (n, 2, 3) by the position; high (n,) whether its point says how the camera is."""
 
@@ -116,18 +118,18 @@ class LeftOut(NamedTuple):
 
 def left_out_views(
     posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
-) -> list[LeftOut]:
+) -> list[LeftOutViews]:
     """Per camera."""
     found = []
     where = points if posterior.displacement is None else points + posterior.displacement
     for c, (one, k) in enumerate(zip(seen, inliers, strict=True)):
-        residual, covariance = left_out(posterior, c, points, one, k)
+        residual, covariance = left_out_residuals(posterior, c, points, one, k)
         slope = posterior.models[c].predict(where[one.rows])[1]
         noise2 = (posterior.models[c].noise * one.relative) ** 2
         values = np.linalg.eigvalsh(covariance) / noise2[:, None]
         high = ~((values > 0) & (values < MAX_LEVERAGE)).all(axis=1)  # negative: rounding, at a leverage of one
         inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        found.append(LeftOut(one.rows, residual, inverse, slope, np.asarray(high, dtype=np.bool_)))
+        found.append(LeftOutViews(one.rows, residual, inverse, slope, np.asarray(high, dtype=np.bool_)))
     return found
 
 
@@ -144,7 +146,7 @@ def left_out_positions(
         pull[rows] += view.pull[k]
         views[rows] += 1
     values = np.linalg.eigvalsh(np.where(np.isfinite(information), information, 0))
-    good = (views >= 2) & (values[:, 0] > LEAST_LEFT * values[:, 2]) & np.isfinite(pull).all(axis=1)
+    good = (views >= 2) & (values[:, 0] > MIN_ONE_MINUS_LEVERAGE * values[:, 2]) & np.isfinite(pull).all(axis=1)
     error = np.full((n, 3), np.nan)
     error[good] = np.linalg.solve(information[good], pull[good][..., None])[..., 0]
     return error
@@ -154,7 +156,7 @@ def left_out_points(fitted: FitResult, points: Floats, seen: tuple[CameraViews, 
     """Of the known points that two cameras see: the error (m, 3) against the known position of each, measured without
     its own views, and its covariance (m, 3, 3), in which the error of the position is included; eq. (18) with all views
     of a point together. seen: what each fitted camera saw."""
-    errors, posterior = fitted.label_errors, fitted.posterior
+    errors, posterior = fitted.position_errors, fitted.posterior
     assert errors is not None
     assert errors.size is not None
     n, C = len(points), len(seen)

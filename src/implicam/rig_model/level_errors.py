@@ -12,30 +12,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.geometry import Floats
-from implicam.rig_model.shot_errors import LIKELY, SMOOTH, Shots
+from implicam.rig_model.shot_errors import SHOT_SD_PRIOR, WORLD_POLYNOMIAL_TERMS, Shots
 
-SHOT = float(np.exp(sum(LIKELY)))
+SHOT_SD = float(np.exp(sum(SHOT_SD_PRIOR)))
 """Sd of the error of one of two or three shots, in the working frame: eq. (17) where nothing is told."""
 
-LEVEL = 0.3 * SHOT
+LEVEL_SD = 0.3 * SHOT_SD
 """The same of a level of one target: machined in one piece, not moved and stopped again."""
 
-ACROSS = 0.7
+ACROSS_SD_RATIO = 0.7
 """Across the traverse a shot is off by this part of what it is along it."""
 
-TILT = 0.33
+TILT_SD_RATIO = 0.33
 """A tilt moves the rim of a shot by this part of its shift."""
 
-FEWEST_LEVELS, MOST_LEVELS = 2, 12
+MIN_LEVELS, MAX_LEVELS = 2, 12
 """Of a stepped target; more are a lattice."""
 
-PER_LEVEL = 6
+MIN_POINTS_PER_LEVEL = 6
 """Points that a level has on average; a plane takes three."""
 
-THIN = 1e-3
+MAX_RELATIVE_THICKNESS = 1e-3
 """Thickness of a level and a tenth of the gap to the next, as a part of the target's extent."""
 
-TRIED, LOOKED_AT = 600, 200
+TRIPLES_TRIED, MAX_POINTS_LOOKED_AT = 600, 200
 """Levels are looked for along the normals of so many random triples of points, among so many points."""
 
 
@@ -55,15 +55,15 @@ def untold(points: Floats, labels: NDArray[np.str_]) -> Planes | None:
             return None
         there, number = found.number >= 0, found.number.astype(np.str_)
         shots = Shots.of(points[there], number[there], fewest=2, direction=found.normal)
-        return None if shots is None else Planes(shots, _sd(LEVEL))
-    if len(names) > SMOOTH:
+        return None if shots is None else Planes(shots, _sd(LEVEL_SD))
+    if len(names) > WORLD_POLYNOMIAL_TERMS:
         return None
     shots = Shots.of(points, labels, fewest=2)
-    return None if shots is None else Planes(shots, _sd(SHOT))
+    return None if shots is None else Planes(shots, _sd(SHOT_SD))
 
 
 def _sd(size: float) -> Floats:
-    return size * np.array([1, ACROSS, ACROSS, TILT, TILT, TILT])
+    return size * np.array([1, ACROSS_SD_RATIO, ACROSS_SD_RATIO, TILT_SD_RATIO, TILT_SD_RATIO, TILT_SD_RATIO])
 
 
 class Levels(NamedTuple):
@@ -80,18 +80,18 @@ def levels(points: Floats) -> Levels | None:
     target is thinnest; of all directions where no axis is one, since a target may be turned. (Stairs have slanted
     planes too, through the edges of their steps, and these can be fewer.)
     """
-    some = points[np.linspace(0, len(points) - 1, min(LOOKED_AT, len(points))).astype(int)]
+    some = points[np.linspace(0, len(points) - 1, min(MAX_POINTS_LOOKED_AT, len(points))).astype(int)]
     normals = np.concatenate([np.eye(3), _normals(some)])
     along = some @ normals.T
     apart, clear = _steps(np.sort(along, axis=0))
     counts = apart.sum(axis=0) + 1
     slanted = np.arange(len(normals)) >= 3
     for k in np.lexsort((np.ptp(along, axis=0), counts, slanted)):
-        if not clear[k] or not FEWEST_LEVELS <= counts[k] <= min(MOST_LEVELS, len(points) / PER_LEVEL):
+        if not clear[k] or not MIN_LEVELS <= counts[k] <= min(MAX_LEVELS, len(points) / MIN_POINTS_PER_LEVEL):
             continue
         number = _numbers(points @ normals[k])
-        large = np.bincount(number) >= PER_LEVEL
-        if large.sum() >= FEWEST_LEVELS and len(large) <= MOST_LEVELS:
+        large = np.bincount(number) >= MIN_POINTS_PER_LEVEL
+        if large.sum() >= MIN_LEVELS and len(large) <= MAX_LEVELS:
             return Levels(np.where(large[number], number, -1), normals[k])
     return None
 
@@ -99,7 +99,7 @@ def levels(points: Floats) -> Levels | None:
 def _normals(points: Floats) -> Floats:
     """(k, 3) normals of planes through three of the points (n, 3)."""
     rng = np.random.default_rng(0)
-    a, b, c = (points[rng.integers(len(points), size=TRIED)] for _ in range(3))
+    a, b, c = (points[rng.integers(len(points), size=TRIPLES_TRIED)] for _ in range(3))
     first, second = b - a, c - a
     normal = np.cross(first, second)
     size = np.linalg.norm(normal, axis=1)
@@ -111,10 +111,12 @@ def _steps(t: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Of sorted values t (n, k): (n - 1, k) where a level ends; and (k,) whether the levels are thin and well apart."""
     step = np.diff(t, axis=0)
     extent = np.ptp(t, axis=0)
-    apart = step >= 10 * THIN * extent
+    apart = step >= 10 * MAX_RELATIVE_THICKNESS * extent
     within = np.where(apart, 0, step)
-    thin = within.max(axis=0) <= THIN * extent
-    return apart, thin & (within.sum(axis=0) <= THIN * extent * (apart.sum(axis=0) + 1)) & (extent > 0)
+    thin = within.max(axis=0) <= MAX_RELATIVE_THICKNESS * extent
+    return apart, thin & (within.sum(axis=0) <= MAX_RELATIVE_THICKNESS * extent * (apart.sum(axis=0) + 1)) & (
+        extent > 0
+    )
 
 
 def _numbers(t: Floats) -> NDArray[np.int64]:

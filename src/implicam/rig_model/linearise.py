@@ -17,7 +17,7 @@ from implicam.rig_model.shot_errors import ShotErrors
 from implicam.rig_model.tied import Scatter, condition_scattered
 from implicam.threads import side_by_side
 
-MAX_SETTLING_STEPS = 15
+MAX_GAUSS_NEWTON_STEPS = 15
 """Gauss-Newton steps of the cameras; ordinary ones take one to four."""
 
 MAX_MISFIT_VIEWS = 1000
@@ -38,7 +38,7 @@ def iterate_linearisation(
     if errors is None and scatter is None and len(models) > 1:
         return _linearise_alone(models, points, used)
     misfits: list[_Misfit] = []
-    for _ in range(MAX_SETTLING_STEPS):
+    for _ in range(MAX_GAUSS_NEWTON_STEPS):
         if scatter is None:
             posterior = condition(models, points, used, errors)
         else:

@@ -16,7 +16,7 @@ from implicam.threads import side_by_side
 JITTERS = (0.0, 1e-13, 1e-11, 1e-9)
 """Added to a unit diagonal, one after the other, where the matrix is indefinite by rounding."""
 
-CHUNK = 4096
+POINTS_PER_CHUNK = 4096
 """Points at a time."""
 
 
@@ -118,7 +118,7 @@ def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
     return root, root.T @ (root @ b), float(2 * np.sum(np.log(np.diag(L) / scale)))
 
 
-def slices(n: int, size: int = CHUNK) -> Iterator[slice]:
+def slices(n: int, size: int = POINTS_PER_CHUNK) -> Iterator[slice]:
     """Of n rows, so many at a time."""
     for start in range(0, n, size):
         yield slice(start, min(start + size, n))

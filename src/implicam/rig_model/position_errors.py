@@ -20,37 +20,37 @@ from scipy.special import chdtri, fdtri, gammainccinv
 
 from implicam.geometry import Floats
 
-USUAL = (np.log(5e-4), 1.5)
+POSITION_SD_PRIOR = (np.log(5e-4), 1.5)
 """Prior of the sd of a known position, median and log sd, in the working frame: machined, printed or driven there."""
 
-UNLIKE = 0.7
+ANISOTROPY_PRIOR_SD = 0.7
 """Prior sd of how the log sds of the directions differ from each other."""
 
-LESS_NOISE = 0.7
+LOG_NOISE_PRIOR_SD = 0.7
 """Prior sd of the log of how much of the noise is left; the fit took the errors of positions for noise."""
 
-GAIN = 3.0
+MIN_GAIN_NATS = 3.0
 """Nats of evidence by which errors of known positions must explain the views better than noise alone: 20 to 1."""
 
-TAILS = (np.inf, 8.0, 4.0, 3.0)
+DEGREES_OF_FREEDOM = (np.inf, 8.0, 4.0, 3.0)
 """Degrees of freedom to choose from, the fewest with a variance; and that of the normal distribution."""
 
-TAIL_GAIN = 3.0
+MIN_TAIL_GAIN_NATS = 3.0
 """Nats by which a tail must do better than the normal distribution."""
 
-LEVEL = 0.95
+ERROR_BAR_LEVEL = 0.95
 """What error bars are judged by. The variance of a t would do for all levels together and too little for this one."""
 
-NODES = 7
+QUADRATURE_NODES = 7
 """Of the quadrature over a point's own scale."""
 
-SHRINKS, WIDENS = 0.25, 1.0
+MAX_LOG_NOISE_VARIANCE, MAX_LOG_SD_VARIANCE = 0.25, 1.0
 """At most these variances of the log noise and of a log sd enter a mean variance: their tails are not normal."""
 
-LEAST_CURVED = 0.05
+MIN_CURVATURE = 0.05
 """Of minus the log posterior: the prior alone is more curved; what is less is rounding, or not yet the optimum."""
 
-NOISE_BOUNDS, SIZE_BOUNDS = (-3.0, 0.0), (2 * np.log(1e-7), 2 * np.log(0.3))
+LOG_NOISE_BOUNDS, LOG_VARIANCE_BOUNDS = (-3.0, 0.0), (2 * np.log(1e-7), 2 * np.log(0.3))
 """Of the log noise factor, and of the log variance of a position in the working frame."""
 
 
@@ -72,7 +72,7 @@ class Agreement(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LabelErrors:
+class PositionErrors:
     """Errors of known positions: Student t with `scale` (3, 3), a squared length in the working frame, and `freedom`.
 
     noise: what is left of the noise that the fit without them has found, at most 1. gain: nats of evidence by which
@@ -91,7 +91,7 @@ class LabelErrors:
         """(3, 3) of the normal distribution whose 95 % ellipsoid holds 95 % of the errors: more than theirs."""
         if np.isinf(self.freedom):
             return self.scale
-        ratio = 3 * fdtri(3, self.freedom, LEVEL) / chdtri(3, 1 - LEVEL)
+        ratio = 3 * fdtri(3, self.freedom, ERROR_BAR_LEVEL) / chdtri(3, 1 - ERROR_BAR_LEVEL)
         return np.asarray(self.scale * ratio, dtype=np.float64)
 
     @property
@@ -106,18 +106,18 @@ class LabelErrors:
         return np.asarray(1 / np.sum(found.share / _nodes(self.freedom)[0][:, None], axis=0), dtype=np.float64)
 
 
-def estimated(agreement: Agreement) -> LabelErrors | None:
+def estimate_position_errors(agreement: Agreement) -> PositionErrors | None:
     """The most probable errors of known positions; None where noise alone explains the views as well."""
     if len(agreement.coordinates) < 4:
         return None
     found = _most_probable(agreement, np.inf, None)
     gain = _evidence(agreement, found)
-    if gain < GAIN:
+    if gain < MIN_GAIN_NATS:
         return None
     normal = found.value
-    for freedom in TAILS[1:]:
+    for freedom in DEGREES_OF_FREEDOM[1:]:
         other = _most_probable(agreement, freedom, found.at)
-        if other.value < min(found.value, normal - TAIL_GAIN):
+        if other.value < min(found.value, normal - MIN_TAIL_GAIN_NATS):
             found = other
     return _mean_variances(agreement, found, gain + normal - found.value)
 
@@ -133,7 +133,7 @@ class _Found(NamedTuple):
 def _evidence(agreement: Agreement, found: _Found) -> float:
     """Log of how much more probable the views are with errors of any size than with none: Laplace, the noise at its
     most probable either way, eq. (25)."""
-    alone = float(_noise_alone(agreement, np.linspace(*NOISE_BOUNDS, 121)).min())
+    alone = float(_noise_alone(agreement, np.linspace(*LOG_NOISE_BOUNDS, 121)).min())
     prior = np.array([_prior(z)[1] - _prior(0 * z)[1] for z in np.eye(7)])
     shrunk = np.linalg.slogdet(prior[:6, :6])[1] - np.linalg.slogdet(_curvature(agreement, found)[:6, :6])[1]
     return float(alone - found.value + 0.5 * shrunk)
@@ -144,12 +144,12 @@ def _curvature(agreement: Agreement, found: _Found) -> Floats:
     objective, h = _objective(agreement, found.freedom), 1e-3
     hessian = np.array([(objective(found.at + d)[1] - objective(found.at - d)[1]) / (2 * h) for d in h * np.eye(7)])
     values, turned = np.linalg.eigh(0.5 * (hessian + hessian.T))
-    return np.asarray(turned * np.maximum(values, LEAST_CURVED) @ turned.T, dtype=np.float64)
+    return np.asarray(turned * np.maximum(values, MIN_CURVATURE) @ turned.T, dtype=np.float64)
 
 
 def _noise_alone(agreement: Agreement, log_noise: Floats) -> Floats:
     squares, coordinates = float(agreement.squares.sum()), float(agreement.coordinates.sum())
-    terms = squares * np.exp(-2 * log_noise) + 2 * coordinates * log_noise + (log_noise / LESS_NOISE) ** 2
+    terms = squares * np.exp(-2 * log_noise) + 2 * coordinates * log_noise + (log_noise / LOG_NOISE_PRIOR_SD) ** 2
     return np.asarray(0.5 * terms, dtype=np.float64)
 
 
@@ -159,7 +159,7 @@ def _most_probable(agreement: Agreement, freedom: float, start: Floats | None) -
         sizes = [(size, noise) for size in (5e-4, 2e-3, 8e-3) for noise in (-0.1, -0.7)]
         trials = [np.array([*np.full(3, 2 * np.log(size)), 0, 0, 0, noise]) for size, noise in sizes]
         start = min(trials, key=lambda z: objective(z)[0])
-    bounds = [SIZE_BOUNDS] * 3 + [(-10.0, 10.0)] * 3 + [NOISE_BOUNDS]
+    bounds = [LOG_VARIANCE_BOUNDS] * 3 + [(-10.0, 10.0)] * 3 + [LOG_NOISE_BOUNDS]
     z = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-6}).x
     return _Found(z, freedom, objective(z)[0])
 
@@ -202,11 +202,14 @@ def _prior(z: Floats) -> tuple[float, Floats]:
     usual = z[:3].sum() / 6  # log sd, mean over the directions
     unlike = np.array([*(0.5 * z[:3] - usual), *(0.5 * z[3:6])])
     twice = np.array([1.0, 1, 1, 2, 2, 2])
-    value = 0.5 * ((usual - USUAL[0]) / USUAL[1]) ** 2 + 0.5 * np.sum(twice * unlike**2) / UNLIKE**2
-    value += 0.5 * (z[6] / LESS_NOISE) ** 2
-    slope = 0.5 * twice * unlike / UNLIKE**2  # the mean of `unlike` is zero
-    slope[:3] += (usual - USUAL[0]) / USUAL[1] ** 2 / 6
-    return float(value), np.append(slope, z[6] / LESS_NOISE**2)
+    value = (
+        0.5 * ((usual - POSITION_SD_PRIOR[0]) / POSITION_SD_PRIOR[1]) ** 2
+        + 0.5 * np.sum(twice * unlike**2) / ANISOTROPY_PRIOR_SD**2
+    )
+    value += 0.5 * (z[6] / LOG_NOISE_PRIOR_SD) ** 2
+    slope = 0.5 * twice * unlike / ANISOTROPY_PRIOR_SD**2  # the mean of `unlike` is zero
+    slope[:3] += (usual - POSITION_SD_PRIOR[0]) / POSITION_SD_PRIOR[1] ** 2 / 6
+    return float(value), np.append(slope, z[6] / LOG_NOISE_PRIOR_SD**2)
 
 
 class _Likelihood(NamedTuple):
@@ -269,17 +272,17 @@ def _nodes(freedom: float) -> tuple[Floats, Floats]:
     """Scales of a point over the usual one, and their weights: Gauss's rule in the probability of an inverse gamma."""
     if np.isinf(freedom):
         return np.ones(1), np.ones(1)
-    at, weight = np.polynomial.legendre.leggauss(NODES)
+    at, weight = np.polynomial.legendre.leggauss(QUADRATURE_NODES)
     own = freedom / 2 / gammainccinv(freedom / 2, 0.5 * (at + 1))
     return np.asarray(own, dtype=np.float64), np.asarray(weight / 2, dtype=np.float64)
 
 
-def _mean_variances(agreement: Agreement, found: _Found, gain: float) -> LabelErrors:
+def _mean_variances(agreement: Agreement, found: _Found, gain: float) -> PositionErrors:
     """With mean variances, larger than the most probable ones where there are few points: as eq. (12)."""
     spread = np.linalg.inv(_curvature(agreement, found))
     logs, axes = np.linalg.eigh(_symmetric(found.at))
     along = 0.5 * np.array([[*(q**2), 2 * q[0] * q[1], 2 * q[0] * q[2], 2 * q[1] * q[2]] for q in axes.T])
-    variance = np.minimum(np.einsum("ai,ij,aj->a", along, spread[:6, :6], along), WIDENS)
-    noise = float(np.exp(found.at[6] + min(spread[6, 6], SHRINKS)))
+    variance = np.minimum(np.einsum("ai,ij,aj->a", along, spread[:6, :6], along), MAX_LOG_SD_VARIANCE)
+    noise = float(np.exp(found.at[6] + min(spread[6, 6], MAX_LOG_NOISE_VARIANCE)))
     scale = (axes * np.exp(logs + 2 * variance)) @ axes.T
-    return LabelErrors(scale, found.freedom, min(noise, 1.0), gain)
+    return PositionErrors(scale, found.freedom, min(noise, 1.0), gain)

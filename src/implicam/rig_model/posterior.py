@@ -92,7 +92,7 @@ def _independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]
         value += 0.5 * (float(normal.b @ mean) - log_determinant - normal.squares - normal.logs)
         means.append(mean)
         roots.append(root)
-    return Posterior(moved(models, means), tuple(roots), None, _steps(models, means), value)
+    return Posterior(move_to_mean(models, means), tuple(roots), None, _steps(models, means), value)
 
 
 def _tied(
@@ -127,11 +127,11 @@ def _tied(
     displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
     unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
     return Posterior(
-        moved(models, means), tuple(alone), joint, _steps(models, means), 0.5 * value, unknowns, displacement
+        move_to_mean(models, means), tuple(alone), joint, _steps(models, means), 0.5 * value, unknowns, displacement
     )
 
 
-def moved(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
+def move_to_mean(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
     """Each camera at its posterior mean, the weights of its field too."""
     return tuple(
         replace(

@@ -20,7 +20,7 @@ from implicam.rig_model.heavy_tails import information_loss
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
 from implicam.rig_model.triangulate import Labels, Located, locate
-from implicam.rig_model.wrong_views import AGREE
+from implicam.rig_model.wrong_views import AGREE_P_VALUE
 
 
 class Sensitivity(NamedTuple):
@@ -85,7 +85,7 @@ class FittedRig:
         """(n,) whether all views (n, C, 2) of each point agree, with the usual noise."""
         noise = np.broadcast_to([model.noise for model in self.posterior.models], uv.shape[:2])
         found = locate(self.posterior, uv, noise, self.labels)
-        return np.asarray((found.p >= AGREE) & ~found.left_out.any(axis=1))
+        return np.asarray((found.p >= AGREE_P_VALUE) & ~found.left_out.any(axis=1))
 
     def _lines(self, uv: Floats) -> Iterator[tuple[Floats, Floats]]:
         """Per calibrated camera the centre (3,) and directions (n, 3) of the lines of sight of pixels (n, C, 2)."""

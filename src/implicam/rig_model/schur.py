@@ -29,7 +29,7 @@ class Unknowns(NamedTuple):
 def views_by_shots(
     camera_views: tuple[CameraViews, ...], errors: ShotErrors
 ) -> Iterator[tuple[tuple[CameraViews, ...], slice]]:
-    """The sightings of some shots at a time, so that memory does not grow with their number."""
+    """The views of some shots at a time, so that memory does not grow with their number."""
     for part in slices(errors.count, 512):
         inside = (errors.shot >= part.start) & (errors.shot < part.stop)
         yield tuple(seen.select(inside[seen.rows]) for seen in camera_views), part

@@ -18,30 +18,30 @@ from numpy.typing import NDArray
 
 from implicam.geometry import Floats
 
-POINTS = 6
+MIN_POINTS_PER_SHOT = 6
 """A shot's position is judged by its own points: so many at least."""
 
-SMOOTH = 3
+WORLD_POLYNOMIAL_TERMS = 3
 """Constant, linear, quadratic: what of the shots' errors is the world."""
 
-FIRST_GUESS = 2e-3
+INITIAL_SHOT_SD = 2e-3
 """Sd of a shot's error to begin with, in the working frame."""
 
-FARTHEST_TILT = 2.0
+MAX_TILT_RADII = 2.0
 """Plate radii off its centre beyond which a tilt says no more: it is small, and not a matter of the whole world."""
 
-FARTHEST_WORLD, MOST_DRAWN = 3.0, 100.0
+MAX_WORLD_HALF_LENGTHS, MAX_WORLD_VARIANCE_RATIO = 3.0, 100.0
 """Half lengths of the traverse off its middle, and times the variance of a shot's error, to which the parabola through
 the shots is followed: beyond, nobody believes it."""
 
-FLAT, PARALLEL = 0.01, 1e-4
+MAX_RELATIVE_THICKNESS, MAX_ONE_MINUS_COSINE = 0.01, 1e-4
 """Thickness over width of a plate, and one less the cosine between two (0.8 degrees), up to which they are parallel
 plates."""
 
-REACH = 0.25
+LABEL_REACH_GAPS = 0.25
 """How far the label of a shot holds around it, as a part of the distance to the next one."""
 
-LIKELY = (np.log(3e-3), 1.0)
+SHOT_SD_PRIOR = (np.log(3e-3), 1.0)
 """Prior of how far a shot is off, median and log sd, in the working frame: a thousandth of the volume's size."""
 
 
@@ -49,7 +49,8 @@ LIKELY = (np.log(3e-3), 1.0)
 class Shots:
     """Shots whose errors are estimated. shot (n,) of each point; centre (S, 3); axes (S, 3, 3) rows: principal
     directions of each shot's points; extent (S, 3) half sizes along them; radius (S,); along (3, 3) rows: first the
-    direction in which the shots follow each other; pattern (S, S - SMOOTH) orthonormal, what is not smooth."""
+    direction in which the shots follow each other; pattern (S, S - WORLD_POLYNOMIAL_TERMS) orthonormal, what is not
+    smooth."""
 
     shot: NDArray[np.int64]
     centre: Floats
@@ -65,16 +66,18 @@ class Shots:
         points: Floats,
         labels: NDArray[np.str_],
         *,
-        fewest: int = SMOOTH + 1,
+        fewest: int = WORLD_POLYNOMIAL_TERMS + 1,
         direction: Floats | None = None,
     ) -> Shots | None:
-        """None where there are too few shots, or too few points in them; up to `SMOOTH` shots have no unknowns.
+        """None where there are too few shots, or too few points in them.
+
+        Up to `WORLD_POLYNOMIAL_TERMS` shots have no unknowns.
 
         direction: (3,) in which the shots follow each other, where it is known.
         """
         _, shot, count = np.unique(labels, return_inverse=True, return_counts=True)
         S = len(count)
-        if fewest > S or count.min() < POINTS:
+        if fewest > S or count.min() < MIN_POINTS_PER_SHOT:
             return None
         members = [points[shot == s] for s in range(S)]
         centre = np.array([m.mean(axis=0) for m in members])
@@ -87,8 +90,8 @@ class Shots:
         t = (centre - centre.mean(axis=0)) @ along[0]
         if np.ptp(t) < 1e-9 or len(np.unique(np.round(t / np.ptp(t), 6))) < min(fewest, S):
             return None
-        smooth = np.vander(t / np.abs(t).max(), SMOOTH)
-        pattern = np.linalg.qr(smooth, mode="complete")[0][:, SMOOTH:]
+        smooth = np.vander(t / np.abs(t).max(), WORLD_POLYNOMIAL_TERMS)
+        pattern = np.linalg.qr(smooth, mode="complete")[0][:, WORLD_POLYNOMIAL_TERMS:]
         return cls(shot.astype(np.int64), centre, axes, extent, radius, along, pattern)
 
     def errors(self, points: Floats) -> ShotErrors:
@@ -98,7 +101,7 @@ class Shots:
         group = np.repeat([0, 1, 1, 2, 2, 2], self.pattern.shape[1])
         basis = basis.reshape(len(points), 3, -1)
         return ShotErrors(
-            np.zeros(len(points), dtype=np.int64), basis, np.full((1, basis.shape[2]), FIRST_GUESS), group
+            np.zeros(len(points), dtype=np.int64), basis, np.full((1, basis.shape[2]), INITIAL_SHOT_SD), group
         )
 
     def _rigid(self, points: Floats, shot: NDArray[np.int64]) -> Floats:
@@ -115,7 +118,7 @@ class Shots:
             np.min(self._outside(self.centre[[s]])[0, np.arange(len(self.centre)) != s])
             for s in range(len(self.centre))
         ]
-        return REACH * float(np.median(nearest))
+        return LABEL_REACH_GAPS * float(np.median(nearest))
 
     def _outside(self, points: Floats) -> Floats:
         """(n, S) how far points are outside the box of each shot's points."""
@@ -143,7 +146,7 @@ class Shots:
             return np.zeros((len(points), 3, 3))
         holds = np.exp(-0.5 * (outside[np.arange(len(points)), nearest] / self._reach) ** 2)
         lengths = np.linalg.norm(points - self.centre[nearest], axis=1) / self.radius[nearest]
-        within = np.minimum(1, FARTHEST_TILT / np.maximum(lengths, 1e-12))
+        within = np.minimum(1, MAX_TILT_RADII / np.maximum(lengths, 1e-12))
         lever = self._rigid(points, nearest) * sd
         lever[:, :, 3:] *= within[:, None, None]
         return np.asarray((1 - holds**2)[:, None, None] * (lever @ lever.swapaxes(1, 2)), dtype=np.float64)
@@ -153,18 +156,18 @@ class Shots:
         through the shots by definition, or the line through two."""
         t = (self.centre - (middle := self.centre.mean(axis=0))) @ self.along[0]
         half = np.abs(t).max()
-        terms = min(SMOOTH, len(t))
-        at = np.clip((points - middle) @ self.along[0] / half, -FARTHEST_WORLD, FARTHEST_WORLD)
+        terms = min(WORLD_POLYNOMIAL_TERMS, len(t))
+        at = np.clip((points - middle) @ self.along[0] / half, -MAX_WORLD_HALF_LENGTHS, MAX_WORLD_HALF_LENGTHS)
         weights = np.vander(at, terms) @ np.linalg.pinv(np.vander(t / half, terms))
-        return np.asarray(np.minimum(np.sum(weights**2, axis=1), MOST_DRAWN), dtype=np.float64)
+        return np.asarray(np.minimum(np.sum(weights**2, axis=1), MAX_WORLD_VARIANCE_RATIO), dtype=np.float64)
 
 
 def _common_normal(axes: Floats, extent: Floats) -> Floats | None:
     """(3,) of parallel plates, None of other shots. Where some of a plate's points are missing, its centre lies beside
     the others', so that the centres say poorly where thin slabs follow each other."""
     normals = axes[:, 2]
-    flat = extent[:, 2] <= FLAT * extent[:, 1]
-    parallel = np.abs(normals @ normals[0]) >= 1 - PARALLEL
+    flat = extent[:, 2] <= MAX_RELATIVE_THICKNESS * extent[:, 1]
+    parallel = np.abs(normals @ normals[0]) >= 1 - MAX_ONE_MINUS_COSINE
     return np.asarray(normals[0], dtype=np.float64) if (flat & parallel).all() else None
 
 
@@ -211,8 +214,10 @@ class ShotErrors:
             u = 0.5 * np.log(total / n)
             for _ in range(30):  # Newton; the log posterior is concave in u = log sd
                 pull = total * np.exp(-2 * u)
-                u -= (n - pull + (u - LIKELY[0]) / LIKELY[1] ** 2) / (2 * pull + 1 / LIKELY[1] ** 2)
+                u -= (n - pull + (u - SHOT_SD_PRIOR[0]) / SHOT_SD_PRIOR[1] ** 2) / (
+                    2 * pull + 1 / SHOT_SD_PRIOR[1] ** 2
+                )
             told = float(np.sum(1 - np.minimum(variance[:, members], 1)))  # of n, how many the data tell
             sd[:, members] = np.exp(u)
-            mean_sd[:, members] = np.exp(u + 1 / (2 * told + 1 / LIKELY[1] ** 2))
+            mean_sd[:, members] = np.exp(u + 1 / (2 * told + 1 / SHOT_SD_PRIOR[1] ** 2))
         return replace(self, sd=sd), mean_sd

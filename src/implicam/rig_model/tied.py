@@ -15,18 +15,18 @@ import numpy as np
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
 from implicam.rig_model.normal_equations import camera_normals, solve_normal
-from implicam.rig_model.posterior import Posterior, moved
+from implicam.rig_model.posterior import Posterior, move_to_mean
 from implicam.rig_model.schur import Unknowns
 from implicam.rig_model.shot_errors import ShotErrors
 from implicam.threads import side_by_side
 
-TOGETHER = 512
+POINTS_PER_CHUNK = 512
 """Points at a time: each has a row of all cameras' unknowns."""
 
-NEGLIGIBLE = 1e-4
+MIN_VARIANCE_GROWTH = 1e-4
 """Relative growth of a variance by the tie below which it is left out."""
 
-LOST = 1 - 1e-12
+MAX_INFORMATION_LOST = 1 - 1e-12
 """At most this part of what a camera alone knows is taken away: the rest is rounding."""
 
 
@@ -68,16 +68,16 @@ def condition_scattered(
         M += half[:, :-1].T @ half[:, :-1]
         b -= half[:, :-1].T @ half[:, -1]
     lost, turned = np.linalg.eigh(M)
-    lost = np.clip(lost, 0, LOST)
+    lost = np.clip(lost, 0, MAX_INFORMATION_LOST)
     grown = lost / (1 - lost)
     white = b + turned @ (grown * (turned.T @ b))  # (I - M)^-1 b
     value += float(b @ white) - float(np.sum(np.log1p(-lost)))
-    kept = grown > NEGLIGIBLE
+    kept = grown > MIN_VARIANCE_GROWTH
     ties = np.sqrt(grown[kept])[:, None] * turned[:, kept].T
     unknowns = _unknowns(shots, white, ties) if k else None
     means = [root.T @ part for root, part in zip(rig.alone, rig.split(white), strict=True)]
     return Posterior(
-        moved(models, means),
+        move_to_mean(models, means),
         rig.alone,
         None,
         tuple(mean[: model.camera.size] for model, mean in zip(models, means, strict=True)),
@@ -133,8 +133,8 @@ class _Rig:
     def views(self) -> Iterator[tuple[Floats, Floats]]:
         """Some points at a time, in units of the noise: (m, 2 C, k + P + 1) how their views depend on the shots and on
         the white unknowns of the cameras, and what was seen; (m, 2 C, 3) on their own displacement, in its sds."""
-        for start in range(0, len(self.points), TOGETHER):
-            yield self._views(slice(start, min(start + TOGETHER, len(self.points))))
+        for start in range(0, len(self.points), POINTS_PER_CHUNK):
+            yield self._views(slice(start, min(start + POINTS_PER_CHUNK, len(self.points))))
 
     def _views(self, part: slice) -> tuple[Floats, Floats]:
         m, C, k = part.stop - part.start, len(self.models), self.shot_unknowns

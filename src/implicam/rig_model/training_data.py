@@ -13,7 +13,7 @@ from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.shot_errors import ShotErrors, Shots
 
-FEWEST = 8
+MIN_POINTS_PER_CAMERA = 8
 """Known points that a camera must see: 16 numbers for the 14 of lens and pose."""
 
 
@@ -35,7 +35,7 @@ class Frame:
         places = len(np.unique(data.places[seen]))
         if places < len(xyz):
             why += f"; {len(xyz)} known points stand at {places} different positions"
-        require_points(places, FEWEST, method, why)
+        require_points(places, MIN_POINTS_PER_CAMERA, method, why)
         require_volume(xyz, method)
         offset = xyz.mean(axis=0)
         return cls(offset, float(np.sqrt(np.mean((xyz - offset) ** 2))))
@@ -60,15 +60,15 @@ class Frame:
         return points * self.scale + self.offset
 
 
-def problem_of(lens: str, data: Dataset, frame: Frame, *, shots_off: bool = True) -> Problem:
-    """The problem of known points, in the working frame; shots_off: estimate how shots are off as a whole."""
+def training_data_of(lens: str, data: Dataset, frame: Frame, *, shots_off: bool = True) -> TrainingData:
+    """What known points say, in the working frame; shots_off: estimate how shots are off as a whole."""
     observations, points = data.observations, frame.to_working(data.xyz)
     stated = stated_noise(observations)
     images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
     shots = _shots(data, points) if shots_off else None
     errors = shots.errors(points) if shots is not None else _declared(data, frame)
     camera_views = camera_views_of(observations, stated)
-    return Problem(points, observations.camera_names, camera_views, images, stated, errors, lens)
+    return TrainingData(points, observations.camera_names, camera_views, images, stated, errors, lens)
 
 
 def camera_views_of(observations: Observations, stated: Floats) -> tuple[CameraViews, ...]:
@@ -137,7 +137,7 @@ def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class TrainingData:
     """Known points (n, 3) in the working frame; per camera what it saw (all of it), its image, and its stated noise in
     pixels or NaN; how the points may be off; lens: "auto", "central" or "none"."""
 

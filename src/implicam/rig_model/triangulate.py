@@ -13,28 +13,28 @@ from scipy.special import chdtrc
 
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera_model import apply_covariance_root
-from implicam.rig_model.heavy_tails import consistency, refined, taken_as_normal
-from implicam.rig_model.normal_equations import CHUNK
+from implicam.rig_model.heavy_tails import consistency, equivalent_normal_noise, refine_positions
+from implicam.rig_model.normal_equations import POINTS_PER_CHUNK
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.schur import Unknowns
 from implicam.rig_model.shot_errors import Shots
-from implicam.rig_model.wrong_views import DISAGREE, Linear, weighted, without_wrong_views
+from implicam.rig_model.wrong_views import DISAGREE_P_VALUE, LinearisedViews, apply_weights, exclude_wrong_views
 from implicam.threads import side_by_side
 
-ITERATIONS = 12
-CONVERGED = 1e-3
+MAX_GAUSS_NEWTON_STEPS = 12
+CONVERGED_STEP_SDS = 1e-3
 """Of a step, in standard deviations of the position."""
 
-LEAST_INFORMATION = 1e-14
+MIN_INFORMATION_RATIO = 1e-14
 """Of a position, in its worst direction over that in its best: what is less is rounding, and may be negative."""
 
-REWEIGHTED = 3
+REWEIGHTINGS = 3
 """Times that the views of tied cameras are weighted, where their noise has heavy tails."""
 
-MENDED, HOPELESS = 3, 1e4
+STEPS_TO_MEND, HOPELESS_CHI_SQUARED = 3, 1e4
 """Steps after which chi-squared beyond this, at the end of the next step, will not come down to what is possible."""
 
-IMPOSSIBLE = 1e-10
+MIN_P_VALUE = 1e-10
 """Below this p-value there is no position, but a wrong match: a number would be worse than none."""
 
 
@@ -79,7 +79,7 @@ def locate(
     with so many degrees of freedom."""
     if len(uv) == 0:
         return Located(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(uv.shape[:2], dtype=np.bool_))
-    parts = [slice(i, i + CHUNK) for i in range(0, len(uv), CHUNK)]
+    parts = [slice(i, i + POINTS_PER_CHUNK) for i in range(0, len(uv), POINTS_PER_CHUNK)]
     found = side_by_side(lambda part: _locate(_Seen(posterior, uv[part], noise[part], labels, degrees)), parts)
     return Located(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
@@ -88,12 +88,12 @@ def _locate(points: _Seen) -> Located:
     seen = np.asarray(np.isfinite(points.uv).all(axis=2))
     xyz, cov, p = points.solved(np.arange(len(seen)), seen)
     left_out = np.zeros_like(seen)
-    bad = np.flatnonzero((seen.sum(axis=1) >= 3) & ~(p >= DISAGREE))
-    for some in np.split(bad, range(CHUNK // 16, len(bad), CHUNK // 16)):
-        for better in without_wrong_views(points, some, seen[some]):
+    bad = np.flatnonzero((seen.sum(axis=1) >= 3) & ~(p >= DISAGREE_P_VALUE))
+    for some in np.split(bad, range(POINTS_PER_CHUNK // 16, len(bad), POINTS_PER_CHUNK // 16)):
+        for better in exclude_wrong_views(points, some, seen[some]):
             rows = better.rows
             xyz[rows], cov[rows], p[rows], left_out[rows] = better.xyz, better.cov, better.p, better.left_out
-    impossible = p < IMPOSSIBLE
+    impossible = p < MIN_P_VALUE
     xyz[impossible], cov[impossible] = np.nan, np.nan
     return Located(xyz, cov, p, left_out)
 
@@ -127,13 +127,13 @@ class _Seen:
         rows, seen = rows[good], seen[good]
         linear = self.linear(rows, found.x[good], seen)
         if linear.joint is None:
-            better = refined(linear, degrees)
+            better = refine_positions(linear, degrees)
             xyz[good], cov[good] = found.x[good] + better.step, better.cov
             p[good] = consistency(better.distance, seen, degrees)
             return xyz, cov, p
-        for _ in range(REWEIGHTED):
+        for _ in range(REWEIGHTINGS):
             distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
-            noise = taken_as_normal(self.noise[rows], distance, seen, degrees)
+            noise = equivalent_normal_noise(self.noise[rows], distance, seen, degrees)
             again = _solve(self.posterior, found.x[good], self.uv[rows], noise, seen, self.labels)
             linear = self.linear(rows, again.x, seen, linear)
         xyz[good], cov[good] = again.xyz, again.cov
@@ -141,11 +141,13 @@ class _Seen:
         p[good] = consistency(distance, seen, degrees)
         return xyz, cov, p
 
-    def linear(self, rows: NDArray[np.int64], x: Floats, seen: Bools, before: Linear | None = None) -> Linear:
+    def linear(
+        self, rows: NDArray[np.int64], x: Floats, seen: Bools, before: LinearisedViews | None = None
+    ) -> LinearisedViews:
         """The views about x (n, 3)."""
         weights = _Weights(self.posterior, x, self.noise[rows], seen) if before is None else before
         r, D = _residuals(self.posterior, x, self.uv[rows], seen)
-        return Linear(r, D, weights.each, weights.joint)
+        return LinearisedViews(r, D, weights.each, weights.joint)
 
     def lines(self, rows: NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Centres (C, 3) and directions (n, C, 3) of the lines of sight."""
@@ -173,13 +175,13 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
     hopeless = done.copy()
     going = np.arange(len(rows))  # those that have not converged
     weights = _Weights(posterior, x, noise, seen)
-    for iteration in range(ITERATIONS):
+    for iteration in range(MAX_GAUSS_NEWTON_STEPS):
         H, g, squares = weights.normal(x[going], uv[going], seen[going])
         step = _solved(H, g)
         size = np.einsum("ni,nij,nj->n", step, H, step)
         x[going] += step
-        done[going] = size < CONVERGED**2
-        hopeless[going] = (iteration >= MENDED) & (squares - size > HOPELESS)
+        done[going] = size < CONVERGED_STEP_SDS**2
+        hopeless[going] = (iteration >= STEPS_TO_MEND) & (squares - size > HOPELESS_CHI_SQUARED)
         on = ~done[going] & ~hopeless[going] & np.isfinite(size)
         going = going[on]
         if not len(going):
@@ -193,7 +195,7 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
     step = _solved(H, g)
     found = done & np.isfinite(H).all(axis=(1, 2)) & np.isfinite(step).all(axis=1)
     information = np.linalg.eigvalsh(np.where(found[:, None, None], H, np.eye(3)))
-    found &= information[:, 0] > LEAST_INFORMATION * information[:, 2]
+    found &= information[:, 0] > MIN_INFORMATION_RATIO * information[:, 2]
     covariance = _inverted(H)
     found &= np.isfinite(covariance).all(axis=(1, 2))
     x = x + step
@@ -204,7 +206,7 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
     xyz[kept] = x[found]
     cov[kept] = covariance[found]
     chi2[kept] = (squares - np.einsum("ni,ni->n", g, step))[found]
-    chi2[rows[hopeless]] = HOPELESS
+    chi2[rows[hopeless]] = HOPELESS_CHI_SQUARED
     return _Solved(xyz, cov, chi2, before)
 
 
@@ -308,8 +310,8 @@ class _Weights:
         """H (n, 3, 3), gradient (n, 3) and weighted squares (n,) of the residuals at x (n, 3)."""
         n, C = seen.shape
         r, D = _residuals(self.posterior, x, uv, seen)
-        linear = Linear(r, D, self.each, self.joint)
-        WD, Wr = weighted(linear, D), weighted(linear, r[..., None])[..., 0]
+        linear = LinearisedViews(r, D, self.each, self.joint)
+        WD, Wr = apply_weights(linear, D), apply_weights(linear, r[..., None])[..., 0]
         Dt = D.reshape(n, 2 * C, 3).swapaxes(1, 2)
         H = Dt @ WD.reshape(n, 2 * C, 3)
         g = (Dt @ Wr.reshape(n, 2 * C, 1))[..., 0]

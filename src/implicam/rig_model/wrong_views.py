@@ -20,40 +20,40 @@ from implicam.geometry import Bools, Floats
 
 Ints = NDArray[np.int64]
 
-DISAGREE = 1e-4
+DISAGREE_P_VALUE = 1e-4
 """Below this p-value the views disagree, and those are looked for that the others would do better without."""
 
-AGREE = 1e-3
+AGREE_P_VALUE = 1e-3
 """The p-value that the others must have among themselves then."""
 
-CLEARLY = 100.0
+CLEARLY_BETTER_RATIO = 100.0
 """How many times better they must agree than without any other choice of as many views."""
 
-TRIED = 40
+MAX_PAIRS_TRIED = 40
 """Pairs of lines of sight that a place is tried from: all of up to nine views. Of more, with 45 % of them wrong, one in
 a million points has no good pair among so many."""
 
-SUSPECTS = 8
-"""Views of a point that are combined to pairs; SUSPECTS_OF_THREE of them to triples."""
-SUSPECTS_OF_THREE = 4
+MAX_SUSPECTS_OF_TWO = 8
+"""Views of a point that are combined to pairs; MAX_SUSPECTS_OF_THREE of them to triples."""
+MAX_SUSPECTS_OF_THREE = 4
 
-FAR_STEP = 10.0
+FAR_STEP_PX = 10.0
 """Pixels: a step from a robust place beyond which the cameras are linearised once more."""
 
-LINEARISED = 3
+MAX_LINEARISATIONS = 3
 """At most so many times."""
 
-SLACK = 20.0
+P_VALUE_SLACK = 20.0
 """How wrong the p-value in closed form may be before a choice is solved again: the cameras are not quite linear."""
 
-HOPELESS = 1e3
+HOPELESS_CHI_SQUARED = 1e3
 """Chi-squared in closed form beyond which four views or more do not agree anywhere."""
 
-BLIND = 1e4
+UNANSWERED_RESIDUAL_SDS = 1e4
 """Residual, in standard deviations, given to a view whose camera has no answer at the robust place."""
 
 
-class Linear(NamedTuple):
+class LinearisedViews(NamedTuple):
     """The views of n points about a place each: residuals r (n, C, 2) and slopes D (n, C, 2, 3), zero where not seen;
     each: inverse covariances (n, C, 2, 2) of single views; joint: (n, 2C, 2C) of all together where the cameras are
     tied, else None. Both are unity where a view is not seen."""
@@ -74,7 +74,7 @@ class Points(Protocol):
     def lines(self, rows: Ints) -> tuple[Floats, Floats]:
         """Centres (C, 3) of the cameras and directions (n, C, 3) of the lines of sight, NaN for none."""
 
-    def linear(self, rows: Ints, x: Floats, seen: Bools, before: Linear | None = None) -> Linear:
+    def linear(self, rows: Ints, x: Floats, seen: Bools, before: LinearisedViews | None = None) -> LinearisedViews:
         """The views `seen` (n, C) about x (n, 3); NaN where a camera has no answer. The covariances are those of
         `before`, if it is given: of a place nearby."""
 
@@ -82,7 +82,7 @@ class Points(Protocol):
         """Positions (n, 3), covariances and p-values (n,) from the views `seen` alone; NaN for none."""
 
 
-class Better(NamedTuple):
+class BetterChoice(NamedTuple):
     """Points (rows) with a position from views of one mind, and the views left out (n, C)."""
 
     rows: Ints
@@ -92,14 +92,14 @@ class Better(NamedTuple):
     left_out: Bools
 
 
-def most_wrong(views: Ints) -> Ints:
+def max_wrong_views(views: Ints) -> Ints:
     """How many views of a point may be left out: the others must be able to contradict, and be more."""
     views = np.asarray(views)
     few = np.clip((views - 1) // 2, 0, 2)
     return np.asarray(np.where(views >= 8, (views - 2) // 2, few), dtype=np.int64)
 
 
-def without_wrong_views(points: Points, rows: Ints, seen: Bools) -> Iterator[Better]:
+def exclude_wrong_views(points: Points, rows: Ints, seen: Bools) -> Iterator[BetterChoice]:
     """Of points (rows) whose views `seen` (n, C) disagree, those that agree without a few, clearly the wrong ones."""
     views = seen.sum(axis=1)
     if (views == 3).any():
@@ -111,7 +111,7 @@ def without_wrong_views(points: Points, rows: Ints, seen: Bools) -> Iterator[Bet
     left = np.ones(len(rows), dtype=np.bool_)
     for size in (1, 2, 3, 0):
         sizes = choices.clearly_off if size == 0 else np.full(len(rows), size)
-        eligible = left & (sizes <= most_wrong(seen.sum(axis=1))) & ((size > 0) | (sizes > 3))
+        eligible = left & (sizes <= max_wrong_views(seen.sum(axis=1))) & ((size > 0) | (sizes > 3))
         if not eligible.any():
             continue
         for number in np.unique(sizes[eligible]):
@@ -130,21 +130,21 @@ def without_wrong_views(points: Points, rows: Ints, seen: Bools) -> Iterator[Bet
 def _close(views: Ints, chi2: Floats) -> Bools:
     """Whether the second best choice, which leaves these views with that chi-squared in closed form, must be solved:
     three views of which one is wrong may agree somewhere far away, by chance; four hardly."""
-    return np.asarray((views <= 3) | (chi2 < HOPELESS))
+    return np.asarray((views <= 3) | (chi2 < HOPELESS_CHI_SQUARED))
 
 
-def _tried_each(points: Points, rows: Ints, seen: Bools) -> Better:
+def _tried_each(points: Points, rows: Ints, seen: Bools) -> BetterChoice:
     """Three views: the three pairs are tried."""
     member = np.argsort(~seen, axis=1, kind="stable")[:, :3]
     return _clearly_better(points, rows, seen, tuple(member[:, [k]] for k in range(3)))
 
 
-def _clearly_better(points: Points, rows: Ints, seen: Bools, groups: tuple[Ints, ...]) -> Better:
+def _clearly_better(points: Points, rows: Ints, seen: Bools, groups: tuple[Ints, ...]) -> BetterChoice:
     """Solve without each group of views (n, k), and keep the points where one of them clearly makes the rest agree."""
     n = len(rows)
     if n == 0:
         C = seen.shape[1]
-        return Better(rows, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, C), dtype=np.bool_))
+        return BetterChoice(rows, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros((0, C), dtype=np.bool_))
     out = np.zeros((len(groups), *seen.shape), dtype=np.bool_)
     for k, group in enumerate(groups):
         np.put_along_axis(out[k], group, True, axis=1)
@@ -154,9 +154,9 @@ def _clearly_better(points: Points, rows: Ints, seen: Bools, groups: tuple[Ints,
     order = np.argsort(-ps, axis=0)
     best, index = order[0], np.arange(n)
     second = ps[order[1], index] if len(groups) > 1 else np.zeros(n)
-    good = np.flatnonzero((ps[best, index] > AGREE) & (ps[best, index] > CLEARLY * second))
+    good = np.flatnonzero((ps[best, index] > AGREE_P_VALUE) & (ps[best, index] > CLEARLY_BETTER_RATIO * second))
     where = best[good] * n + good
-    return Better(rows[good], x[where], cov[where], p[where], out[best[good], good])
+    return BetterChoice(rows[good], x[where], cov[where], p[where], out[best[good], good])
 
 
 class _Groups(NamedTuple):
@@ -178,7 +178,7 @@ class _Choices(NamedTuple):
     """
 
     seen: Bools
-    weights: Linear
+    weights: LinearisedViews
     u: Floats
     B: Floats
     inverse: Floats
@@ -192,7 +192,7 @@ class _Choices(NamedTuple):
         linear = _about_most(points, rows, seen)
         n, C = seen.shape
         D, r = linear.D, linear.r
-        B, Wr = weighted(linear, D), weighted(linear, r[..., None])[..., 0]
+        B, Wr = apply_weights(linear, D), apply_weights(linear, r[..., None])[..., 0]
         Dt = D.reshape(n, 2 * C, 3).swapaxes(1, 2)
         inverse = _inverse(Dt @ B.reshape(n, 2 * C, 3))
         g = (Dt @ Wr.reshape(n, 2 * C, 1))[..., 0]
@@ -205,7 +205,7 @@ class _Choices(NamedTuple):
     @property
     def clearly_off(self) -> Ints:
         """(n,) how many views are far from the place."""
-        return np.asarray((chdtrc(2, self._as_normal) < DISAGREE).sum(axis=1), dtype=np.int64)
+        return np.asarray((chdtrc(2, self._as_normal) < DISAGREE_P_VALUE).sum(axis=1), dtype=np.int64)
 
     @property
     def _as_normal(self) -> Floats:
@@ -234,7 +234,9 @@ class _Choices(NamedTuple):
         free = np.maximum(2 * (self.seen[some].sum(axis=1) - size) - 3, 1)
         p = [np.where(np.isfinite(g.chi2), chdtrc(free, self._misfit(some, g)), 0) for g in (best, second)]
         known = (best.group >= 0).all(axis=1) & (second.group >= 0).all(axis=1)
-        return np.asarray(known & (p[0] * SLACK > AGREE) & (p[0] * SLACK > CLEARLY * p[1]))
+        return np.asarray(
+            known & (p[0] * P_VALUE_SLACK > AGREE_P_VALUE) & (p[0] * P_VALUE_SLACK > CLEARLY_BETTER_RATIO * p[1])
+        )
 
     def _misfit(self, some: Ints, without: _Groups) -> Floats:
         """(n,) chi-squared without a group of views; with heavy tails, at the place instead of the best one."""
@@ -297,9 +299,9 @@ def _all_but_one(size: int, C: int) -> list[tuple[int, ...]]:
     if size == 1:
         return [()]
     if size == 2:
-        return [(place,) for place in range(min(SUSPECTS, C))]
+        return [(place,) for place in range(min(MAX_SUSPECTS_OF_TWO, C))]
     if size == 3:
-        return list(combinations(range(min(SUSPECTS_OF_THREE, C)), 2))
+        return list(combinations(range(min(MAX_SUSPECTS_OF_THREE, C)), 2))
     return [tuple(k for k in range(size) if k != without) for without in range(size - 3, size)]
 
 
@@ -316,22 +318,22 @@ def _insert(best: list[_Groups], group: Ints, value: Floats) -> None:
     best[0] = _Groups(np.where(first[:, None], group, best[0].group), np.where(first, value, best[0].chi2))
 
 
-def _about_most(points: Points, rows: Ints, seen: Bools) -> Linear:
+def _about_most(points: Points, rows: Ints, seen: Bools) -> LinearisedViews:
     """The views about a place that most of them agree on; those whose camera has no answer there are as far off as can
     be."""
-    trusted = seen.sum(axis=1) - most_wrong(seen.sum(axis=1))
+    trusted = seen.sum(axis=1) - max_wrong_views(seen.sum(axis=1))
     centres, directions = points.lines(rows)
     usable = seen & np.isfinite(directions).all(axis=2)
     across = _across(np.where(usable[..., None], directions, [0.0, 0.0, 1.0]))
     x = _agreed(across, np.einsum("ncij,cj->nci", across, centres), usable, trusted)
     linear = points.linear(rows, x, seen)
     far = np.arange(len(rows))
-    for number in range(LINEARISED):
+    for number in range(MAX_LINEARISATIONS):
         if number:
             linear = _replaced(linear, far, points.linear(rows[far], x[far], seen[far]))
         step, pixels = _step(linear, far, seen, trusted)
         x[far] += step
-        far = far[pixels > FAR_STEP]
+        far = far[pixels > FAR_STEP_PX]
         if not len(far):
             break
     linear = points.linear(rows, x, seen, linear)
@@ -339,10 +341,10 @@ def _about_most(points: Points, rows: Ints, seen: Bools) -> Linear:
     if there.all():
         return linear
     again = points.linear(rows, x, seen & there)
-    return again._replace(r=np.where(there[..., None], again.r, BLIND))
+    return again._replace(r=np.where(there[..., None], again.r, UNANSWERED_RESIDUAL_SDS))
 
 
-def _step(linear: Linear, some: Ints, seen: Bools, trusted: Ints) -> tuple[Floats, Floats]:
+def _step(linear: LinearisedViews, some: Ints, seen: Bools, trusted: Ints) -> tuple[Floats, Floats]:
     """(n, 3) from the place of some points to where most of their views agree, and (n,) how many pixels that is."""
     fine = (seen & _answered(linear))[some]
     root = _half(np.where(fine[..., None, None], linear.each[some], np.eye(2)))
@@ -353,13 +355,13 @@ def _step(linear: Linear, some: Ints, seen: Bools, trusted: Ints) -> tuple[Float
     return step, moved.sum(axis=1) / np.maximum(fine.sum(axis=1), 1)
 
 
-def _answered(linear: Linear) -> Bools:
+def _answered(linear: LinearisedViews) -> Bools:
     """(n, C) where the camera has an answer."""
     there = np.isfinite(linear.r).all(axis=2) & np.isfinite(linear.D).all(axis=(2, 3))
     return np.asarray(there & np.isfinite(linear.each).all(axis=(2, 3)))
 
 
-def _replaced(linear: Linear, some: Ints, new: Linear) -> Linear:
+def _replaced(linear: LinearisedViews, some: Ints, new: LinearisedViews) -> LinearisedViews:
     """With that of some points anew; in place."""
     for old, other in zip(linear, new, strict=True):
         if old is not None and other is not None:
@@ -375,7 +377,7 @@ def _agreed(A: Floats, b: Floats, usable: Bools, trusted: Ints) -> Floats:
     pairs = _pairs(usable)
     N, g = A.swapaxes(2, 3) @ A, (A.swapaxes(2, 3) @ b[..., None])[..., 0]
     row = np.arange(n)[:, None, None]
-    tried = _least_squares(N[row, pairs].sum(axis=2), g[row, pairs].sum(axis=2))  # (n, TRIED, 3)
+    tried = _least_squares(N[row, pairs].sum(axis=2), g[row, pairs].sum(axis=2))  # (n, MAX_PAIRS_TRIED, 3)
     trusted = np.minimum(trusted, np.maximum(usable.sum(axis=1), 1))
     error = _errors(flat, b, tried, usable)
     total = np.take_along_axis(np.cumsum(np.sort(error, axis=2), axis=2), (trusted - 1)[:, None, None], axis=2)
@@ -398,7 +400,7 @@ def _errors(flat: Floats, b: Floats, x: Floats, usable: Bools) -> Floats:
 
 
 def _pairs(usable: Bools) -> Ints:
-    """(n, TRIED, 2) pairs of usable views: all of few, some of many."""
+    """(n, MAX_PAIRS_TRIED, 2) pairs of usable views: all of few, some of many."""
     order = np.argsort(~usable, axis=1, kind="stable")
     chosen = _pair_table(usable.shape[1])[usable.sum(axis=1)]
     pairs = np.take_along_axis(order, chosen.reshape(len(order), -1), axis=1).reshape(chosen.shape)
@@ -407,13 +409,13 @@ def _pairs(usable: Bools) -> Ints:
 
 @lru_cache(maxsize=8)
 def _pair_table(C: int) -> Ints:
-    """(C + 1, TRIED, 2) for each number of views."""
-    table = np.zeros((C + 1, TRIED, 2), dtype=np.int64)
+    """(C + 1, MAX_PAIRS_TRIED, 2) for each number of views."""
+    table = np.zeros((C + 1, MAX_PAIRS_TRIED, 2), dtype=np.int64)
     draw = np.random.default_rng(0)
     for views in range(2, C + 1):
         pairs = np.array(list(combinations(range(views), 2)))
-        some = draw.permutation(len(pairs))[:TRIED]
-        table[views] = pairs[np.resize(some, TRIED)]
+        some = draw.permutation(len(pairs))[:MAX_PAIRS_TRIED]
+        table[views] = pairs[np.resize(some, MAX_PAIRS_TRIED)]
     return table
 
 
@@ -459,7 +461,7 @@ def _inverse(A: Floats) -> Floats:
         return out
 
 
-def weighted(linear: Linear, what: Floats) -> Floats:
+def apply_weights(linear: LinearisedViews, what: Floats) -> Floats:
     """W times what (n, C, 2, k)."""
     if linear.joint is None:
         return np.asarray(linear.each @ what, dtype=np.float64)

@@ -11,10 +11,10 @@ from implicam.dataset import Floats
 from implicam.detect import Detected
 from implicam.hardware import Frame
 
-FAR = 6.0
+FAR_SDS = 6.0
 """A detection that is so many standard deviations from where it must be is another thing ..."""
 
-AT_LEAST = 8.0
+FAR_PX = 8.0
 """... if it is so many pixels away, too."""
 
 
@@ -52,7 +52,7 @@ def reject_implausible(
         sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))
     plausible = []
     for look, there, spread in zip(looks, uv, sd, strict=True):
-        far = max(AT_LEAST, FAR * spread) if np.isfinite(spread) else np.inf
+        far = max(FAR_PX, FAR_SDS * spread) if np.isfinite(spread) else np.inf
         near = _nearest(look.found, there)
         if near is None or np.linalg.norm(near.uv[0] - there) <= far or not np.isfinite(there).all():
             plausible.append(replace(look, found=look.found if near is None else near))

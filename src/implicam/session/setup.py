@@ -19,7 +19,7 @@ from implicam.dataset.model import METRES
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import FrameSource, Robot, Trigger, camera_from, exposed, robot_from, simulated_rig, trigger_from
-from implicam.rig_model.training_data import FEWEST
+from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
 from implicam.session.journal import Session
@@ -89,8 +89,10 @@ class Setup:
             value = getattr(self, what)
             if value is not None and not 0 < value < np.inf:
                 raise UsageError(f"{what} = {value:g} is not possible.", fix="give a number greater than zero")
-        if self.budget < FEWEST:
-            raise UsageError(f"{self.budget} points are too few to calibrate.", fix=f"a budget of {FEWEST} or more")
+        if self.budget < MIN_POINTS_PER_CAMERA:
+            raise UsageError(
+                f"{self.budget} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
+            )
         if self.sd is not None and self.robot.startswith("csv:"):
             raise UsageError("the table says how well its positions are known.", fix="give it columns sd_x, sd_y, sd_z")
 

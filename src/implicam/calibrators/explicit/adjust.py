@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from implicam.calibrators.explicit.boards import BoardView
 from implicam.geometry import Bools, Floats, Pose, rotation_from_vector
 from implicam.progress import Progress, silent
-from implicam.rig_model.camera import CentralCamera, Prior
-from implicam.rig_model.normal_equations import solve_normal
+from implicam.rig_model import CentralCamera, Prior, solve_normal
 
 ROBUST = 3.0
 """Residuals, in standard deviations, beyond which a view counts less: Cauchy's loss."""

@@ -26,7 +26,7 @@ from implicam.calibrators.explicit.adjust import (
 from implicam.calibrators.explicit.boards import BoardView
 from implicam.geometry import Floats, Pose
 from implicam.progress import Progress, silent
-from implicam.rig_model.camera import CentralCamera
+from implicam.rig_model import CentralCamera
 
 WORSE = 2.0
 """Together so many times what is left alone: lens models that do not hold their lenses make at most 1.25 of it where

@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 from implicam.dataset import Names
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, register, rotation_from_vector
-from implicam.rig_model.camera import CentralCamera
-from implicam.rig_model.camera_model import CameraModel
+from implicam.rig_model import CameraModel, CentralCamera
 
 FAR = 25.0
 """Squared distance, in its own covariance, of a known point from where it should be: one in 65,000 of good ones."""

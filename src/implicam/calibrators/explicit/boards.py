@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from implicam.dataset import Camera, Dataset, Names
 from implicam.errors import FitError
 from implicam.geometry import Floats
-from implicam.rig_model.camera import Image
-from implicam.rig_model.training_data import image_of, relative_noise, stated_noise
+from implicam.rig_model import Image, image_of, relative_noise, stated_noise
 
 FEWEST_CORNERS = 12
 """Corners of one picture; with fewer it says little more than that there is a board."""

@@ -32,7 +32,7 @@ from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
-from implicam.rig_model.rig import FittedRig
+from implicam.rig_model import FittedRig
 from implicam.threads import blas_threads
 
 

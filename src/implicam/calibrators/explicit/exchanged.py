@@ -14,10 +14,16 @@ from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import UsageError
 from implicam.exchange import UNKNOWN, ExplicitCamera, Rig
 from implicam.geometry import Floats, Pose
-from implicam.rig_model.camera import CentralCamera, Image, Prior
-from implicam.rig_model.general_camera import GeneralCamera
-from implicam.rig_model.initialise import Started, lens_only_model, levenberg_marquardt
-from implicam.rig_model.training_data import Frame
+from implicam.rig_model import (
+    CentralCamera,
+    Frame,
+    GeneralCamera,
+    Image,
+    InitialCamera,
+    Prior,
+    lens_only_model,
+    levenberg_marquardt,
+)
 
 DRAWN = 2000
 """Positions in the workspace at which a lens is fitted to what forward-gp predicts."""
@@ -101,7 +107,7 @@ def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
     known = KnownPositions(np.zeros(0, dtype=np.str_), np.zeros((0, 3)), np.zeros((0, 3)))
     frame = _frame(rig)
     models = tuple(
-        lens_only_model(Started(*_working(camera, frame), np.zeros(0, dtype=np.bool_)), _image(camera), noise)
+        lens_only_model(InitialCamera(*_working(camera, frame), np.zeros(0, dtype=np.bool_)), _image(camera), noise)
         for camera in rig.cameras
     )
     fitted = Fitted(

@@ -18,14 +18,20 @@ from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_
 from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.progress import Progress
-from implicam.rig_model.camera import CentralCamera
-from implicam.rig_model.camera_model import CameraModel
-from implicam.rig_model.diagnostics import NAMED, Diagnosis
-from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.initialise import Started, lens_only_model
-from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.rig import FittedRig
-from implicam.rig_model.training_data import Frame, problem_of, stated_noise
+from implicam.rig_model import (
+    MAX_NAMED_IN_NOTE,
+    CameraModel,
+    CentralCamera,
+    Diagnosis,
+    FitResult,
+    FittedRig,
+    Frame,
+    InitialCamera,
+    Posterior,
+    lens_only_model,
+    stated_noise,
+    training_data_of,
+)
 
 METHOD = "explicit"
 
@@ -53,7 +59,7 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
     """Every camera from the known points; FitError where fewer than two can be calibrated."""
     used = without_copies(data)
     frame = Frame.of(used, METHOD)
-    fitted, choices = fit_points(problem_of("central", used, frame, shots_off=False), family, progress)
+    fitted, choices = fit_points(training_data_of("central", used, frame, shots_off=False), family, progress)
     fitted = replace(fitted, uncalibrated=uncalibrated_with_copies(data, fitted.uncalibrated))
     diagnosis = Diagnosis(used, frame, fitted)
     return Fitted(
@@ -143,7 +149,7 @@ def network_posterior(network: Network, cameras: Sequence[CentralCamera], root: 
     """Cameras of a network, wherever they have been moved to, with the root of their covariance."""
     none = [np.ones(camera.size, dtype=np.bool_) for camera in cameras]  # only a fit asks which views started it
     models = tuple(
-        lens_only_model(Started(camera, prior, inliers), image, float(noise))
+        lens_only_model(InitialCamera(camera, prior, inliers), image, float(noise))
         for camera, prior, inliers, image, noise in zip(
             cameras, network.bundle.priors, none, network.images, network.bundle.noise, strict=True
         )
@@ -181,9 +187,9 @@ def network_notes(network: Network, trained: Observations, boards: Dataset) -> l
         for one in network.doubts
     ]
     if network.wrong:
-        worst = wrong_corners(network, boards)[:NAMED]
+        worst = wrong_corners(network, boards)[:MAX_NAMED_IN_NOTE]
         named = ", ".join(f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in worst)
-        more = f" and {len(network.wrong) - NAMED} more" if len(network.wrong) > NAMED else ""
+        more = f" and {len(network.wrong) - MAX_NAMED_IN_NOTE} more" if len(network.wrong) > MAX_NAMED_IN_NOTE else ""
         count = f"{len(network.wrong)} corner{'s' * (len(network.wrong) != 1)}"
         notes.append(f"{count} not used, far from where the others predict them: {named}{more}.")
     return [*notes, *_lens_notes(network, trained)]

@@ -31,11 +31,7 @@ from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
-from implicam.rig_model.camera_model import CameraModel
-from implicam.rig_model.diagnostics import Diagnosis
-from implicam.rig_model.rig import FittedRig
-from implicam.rig_model.training_data import Frame, problem_of
-from implicam.rig_model.triangulate import locate
+from implicam.rig_model import CameraModel, Diagnosis, FittedRig, Frame, locate, training_data_of
 
 
 class Part(NamedTuple):
@@ -161,8 +157,8 @@ def _placed(
 ) -> tuple[Part, list[tuple[int, str]]]:
     """Cameras that saw their boards alone, by the known points; and why not the others."""
     mine = data.with_cameras(trained.camera_names)
-    problem = problem_of("central", mine, frame, shots_off=False)
-    fitted = place(problem, {network.cameras[0]: network for network in networks}, progress)
+    training = training_data_of("central", mine, frame, shots_off=False)
+    fitted = place(training, {network.cameras[0]: network for network in networks}, progress)
     uncalibrated = list(fitted.uncalibrated)
     by_camera = {network.cameras[0]: network for network in networks}
     if not fitted.cameras:

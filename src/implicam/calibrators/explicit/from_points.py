@@ -18,14 +18,23 @@ from implicam.calibrators.explicit.start import MirroredError, start_with_lens
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
-from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
-from implicam.rig_model.field import Hyperparameters
-from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.initialise import Started, lens_only_model, levenberg_marquardt, start_rig
-from implicam.rig_model.leave_one_out import update_inliers
-from implicam.rig_model.linearise import iterate_linearisation
-from implicam.rig_model.posterior import Posterior, condition
-from implicam.rig_model.training_data import FEWEST, Problem
+from implicam.rig_model import (
+    MIN_POINTS_PER_CAMERA,
+    CameraModel,
+    CameraViews,
+    FitResult,
+    Hyperparameters,
+    InitialCamera,
+    Posterior,
+    TrainingData,
+    apply_covariance_root,
+    condition,
+    iterate_linearisation,
+    lens_only_model,
+    levenberg_marquardt,
+    start_rig,
+    update_inliers,
+)
 
 ROUNDS = 8
 
@@ -36,60 +45,63 @@ AS_IF = 2.0
 """The stated noise counts like so many residuals; so does the noise of all cameras together where none is stated."""
 
 
-def fit_points(problem: Problem, family: str, progress: Progress) -> tuple[FitResult, dict[int, Choice]]:
+def fit_points(training: TrainingData, family: str, progress: Progress) -> tuple[FitResult, dict[int, Choice]]:
     """Fit every camera that can be fitted; and the lens model that each got, by its number."""
     progress("fitting", 0, 3)
     choices: dict[int, Choice] = {}
 
-    def start(c: int, points: Floats, uv: Floats) -> Started:
-        started, choices[c] = start_with_lens(points, uv, problem.images[c], family)
+    def start(c: int, points: Floats, uv: Floats) -> InitialCamera:
+        started, choices[c] = start_with_lens(points, uv, training.images[c], family)
         return started
 
-    started, uncalibrated = _started(problem, start)
-    fitted = refined(problem, started, uncalibrated, progress)
+    started, uncalibrated = _started(training, start)
+    fitted = refined(training, started, uncalibrated, progress)
     return fitted, {c: choices[c] for c in fitted.cameras}
 
 
 def refined(
-    problem: Problem, started: Mapping[int, Started], uncalibrated: Sequence[tuple[int, str]], progress: Progress
+    training: TrainingData,
+    started: Mapping[int, InitialCamera],
+    uncalibrated: Sequence[tuple[int, str]],
+    progress: Progress,
 ) -> FitResult:
     """Cameras from where they start, with the noise that the residuals show and without the views that contradict."""
     cameras = tuple(started)
     progress("fitting", 1, 3)
-    seen = tuple(problem.camera_views[c] for c in cameras)
+    seen = tuple(training.camera_views[c] for c in cameras)
     inliers = tuple(started[c].inliers for c in cameras)
-    stated = problem.stated[list(cameras)]
-    models = tuple(lens_only_model(started[c], problem.images[c]) for c in cameras)
-    first = _first_noise(problem, models, seen, inliers)
+    stated = training.stated[list(cameras)]
+    models = tuple(lens_only_model(started[c], training.images[c]) for c in cameras)
+    first = _first_noise(training, models, seen, inliers)
     models = with_noise(models, first)
     for number in range(ROUNDS):
         used = tuple(
-            s.select(k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1))
+            s.select(k & np.isfinite(m.camera.pixel(training.points[s.rows])).all(axis=1))
             for s, k, m in zip(seen, inliers, models, strict=True)
         )
-        posterior = _settled(models, problem, used, first)
-        noise = _noise(problem, posterior, used, stated)
+        posterior = _settled(models, training, used, first)
+        noise = _noise(training, posterior, used, stated)
         close = np.allclose(noise, [m.noise for m in models], rtol=0.01)
         models = with_noise(posterior.models, noise)
-        judged = update_inliers(replace(posterior, models=models), problem.points, seen, inliers)
+        judged = update_inliers(replace(posterior, models=models), training.points, seen, inliers)
         if close and all((a == b).all() for a, b in zip(judged, inliers, strict=True)):
             break
         if number < ROUNDS - 1:
             inliers = judged
         progress("fitting", 2, 3)
-    posterior = _settled(models, problem, tuple(s.select(k) for s, k in zip(seen, inliers, strict=True)), first)
+    posterior = _settled(models, training, tuple(s.select(k) for s, k in zip(seen, inliers, strict=True)), first)
     progress("fitting", 3, 3)
     hyper = Hyperparameters(np.ones(2), np.zeros(len(cameras)), noise)
-    return FitResult(posterior, cameras, tuple(uncalibrated), inliers, hyper, problem.errors, None)
+    return FitResult(posterior, cameras, tuple(uncalibrated), inliers, hyper, training.errors, None)
 
 
 def _started(
-    problem: Problem, start: Callable[[int, Floats, Floats], Started]
-) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    training: TrainingData, start: Callable[[int, Floats, Floats], InitialCamera]
+) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
     """As start_rig; where mirrors are why it fails, the error says so."""
     mirrored: dict[int, MirroredError] = {}
 
-    def noting(c: int, points: Floats, uv: Floats) -> Started:
+    def noting(c: int, points: Floats, uv: Floats) -> InitialCamera:
         try:
             return start(c, points, uv)
         except MirroredError as error:
@@ -97,13 +109,13 @@ def _started(
             raise
 
     try:
-        return start_rig(problem, noting)
+        return start_rig(training, noting)
     except FitError as error:
         if not mirrored:
             raise
-        names = [problem.names[c] for c in sorted(mirrored)]
+        names = [training.names[c] for c in sorted(mirrored)]
         listed = " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-        everyone = len(names) == sum(len(seen.rows) >= FEWEST for seen in problem.camera_views)
+        everyone = len(names) == sum(len(seen.rows) >= MIN_POINTS_PER_CAMERA for seen in training.camera_views)
         raise FitError(
             f"{listed} see{'s' * (len(names) == 1)} the known points as in a mirror.",
             why=error.why,
@@ -116,14 +128,14 @@ def _started(
 
 
 def _settled(
-    models: tuple[CameraModel, ...], problem: Problem, used: tuple[CameraViews, ...], first: Floats
+    models: tuple[CameraModel, ...], training: TrainingData, used: tuple[CameraViews, ...], first: Floats
 ) -> Posterior:
     """As linearise.iterate_linearisation; a camera that Gauss-Newton would lead astray, as a lens can that bends much,
     is taken there by damped steps, and stays. first (C,): the noise at the start, pixels."""
-    posterior = iterate_linearisation(models, problem.points, used, problem.errors)
+    posterior = iterate_linearisation(models, training.points, used, training.errors)
 
     def left(model: CameraModel, seen: CameraViews) -> float:
-        off = np.sum((seen.uv - model.camera.pixel(problem.points[seen.rows])) ** 2)
+        off = np.sum((seen.uv - model.camera.pixel(training.points[seen.rows])) ** 2)
         return float(off) if np.isfinite(off) else np.inf
 
     astray = [
@@ -136,9 +148,9 @@ def _settled(
     for model, lost, seen in zip(models, astray, used, strict=True):
         camera = model.camera
         if lost:
-            camera = levenberg_marquardt(camera, model.prior, problem.points[seen.rows], seen.uv, model.noise)
+            camera = levenberg_marquardt(camera, model.prior, training.points[seen.rows], seen.uv, model.noise)
         damped.append(replace(model, camera=camera, field_camera=camera))
-    posterior = condition(tuple(damped), problem.points, used, problem.errors)
+    posterior = condition(tuple(damped), training.points, used, training.errors)
     ends = (
         replace(after, camera=before.camera, field_camera=before.camera) if lost else after
         for before, after, lost in zip(damped, posterior.models, astray, strict=True)
@@ -152,24 +164,24 @@ def with_noise(models: Sequence[CameraModel], noise: Floats) -> tuple[CameraMode
 
 
 def _first_noise(
-    problem: Problem, models: Sequence[CameraModel], seen: Sequence[CameraViews], inliers: Sequence[Bools]
+    training: TrainingData, models: Sequence[CameraModel], seen: Sequence[CameraViews], inliers: Sequence[Bools]
 ) -> Floats:
     """(C,) from the residuals of the start, never nothing."""
     noise = []
     for m, s, k in zip(models, seen, inliers, strict=True):
-        error = (s.uv - m.camera.pixel(problem.points[s.rows]))[k] / s.relative[k, None]
+        error = (s.uv - m.camera.pixel(training.points[s.rows]))[k] / s.relative[k, None]
         noise.append(max(float(np.sqrt(np.nanmean(error**2))), 1e-5 * m.image.half))
     return np.array(noise)
 
 
-def _noise(problem: Problem, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats) -> Floats:
+def _noise(training: TrainingData, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats) -> Floats:
     """(C,) the noise of each camera in pixels: the residuals' sum of squares over the degrees of freedom left."""
-    if problem.errors is not None:
-        return _noise_beside_errors(problem, posterior, used, stated)
+    if training.errors is not None:
+        return _noise_beside_errors(training, posterior, used, stated)
     squares, freedom = np.zeros(len(used)), np.zeros(len(used))
     for c, seen in enumerate(used):
         model = posterior.models[c]
-        rows = model.rows(problem.points[seen.rows])
+        rows = model.rows(training.points[seen.rows])
         squares[c] = np.sum(((seen.uv - rows.mean) / seen.relative[:, None]) ** 2)
         reach = apply_covariance_root(rows, posterior.alone[c]) / (model.noise * seen.relative)[:, None, None]
         freedom[c] = max(2 * len(seen.rows) - float(np.sum(reach**2)), 0.0)
@@ -181,7 +193,7 @@ def _noise(problem: Problem, posterior: Posterior, used: tuple[CameraViews, ...]
 
 
 def _noise_beside_errors(
-    problem: Problem, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats
+    training: TrainingData, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats
 ) -> Floats:
     """(C,) where known positions have errors of their own: one factor for all cameras, the most probable one."""
     now = np.array([model.noise for model in posterior.models])
@@ -190,7 +202,8 @@ def _noise_beside_errors(
     def loss(log_factor: float) -> float:
         models = with_noise(posterior.models, base * np.exp(log_factor))
         return (
-            -iterate_linearisation(models, problem.points, used, problem.errors).evidence + 0.5 * AS_IF * log_factor**2
+            -iterate_linearisation(models, training.points, used, training.errors).evidence
+            + 0.5 * AS_IF * log_factor**2
         )
 
     found = minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded", options={"xatol": 0.02})

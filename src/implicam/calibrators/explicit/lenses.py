@@ -10,8 +10,7 @@ import numpy as np
 from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Floats
-from implicam.rig_model.camera import CentralCamera
-from implicam.rig_model.initialise import FAR
+from implicam.rig_model import MAX_ERROR_MEDIANS, CentralCamera
 
 FAMILIES: dict[str, type[BrownConrady] | type[KannalaBrandt]] = {
     "brown-conrady": BrownConrady,
@@ -114,10 +113,10 @@ def chosen(
 
 def _with_far(squares: Floats) -> Floats:
     """(n,) squared errors, with NaN replaced by what `clipped` makes of an error that is far off."""
-    return np.where(np.isnan(squares), FAR**2 * np.nanmedian(squares), squares)
+    return np.where(np.isnan(squares), MAX_ERROR_MEDIANS**2 * np.nanmedian(squares), squares)
 
 
 def clipped(errors: Floats) -> Floats:
     """Errors, none of them so far off that it decides alone."""
     errors = np.where(np.isfinite(errors), errors, np.inf)
-    return np.minimum(errors, FAR * float(np.median(errors)))
+    return np.minimum(errors, MAX_ERROR_MEDIANS * float(np.median(errors)))

@@ -31,7 +31,7 @@ from implicam.dataset import Names
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose
 from implicam.progress import Progress, silent
-from implicam.rig_model.camera import CentralCamera, Image
+from implicam.rig_model import CentralCamera, Image
 from implicam.threads import side_by_side
 
 FAR = 5.0

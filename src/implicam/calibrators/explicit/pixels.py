@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.calibrators.explicit.lenses import USUAL
-from implicam.rig_model.camera import ASPECT, CENTRE, CentralCamera, Image, Prior
+from implicam.rig_model import CENTRE_PRIOR_SD, LOG_ASPECT_PRIOR_SD, CentralCamera, Image, Prior
 
 ASPECTS = (1.0, 0.5, 0.63, 0.79, 1.26, 1.59, 2.0)
 """Ratios fy / fx that a start tries: the steps of 26 % are close enough for what follows."""
@@ -41,9 +41,9 @@ class Pixels(NamedTuple):
     odds: float
 
 
-def square(centre: float = CENTRE) -> Pixels:
+def square(centre: float = CENTRE_PRIOR_SD) -> Pixels:
     """Square pixels and a lens over the middle of the picture: the usual."""
-    return Pixels(USUAL, ASPECT, centre, 1.0)
+    return Pixels(USUAL, LOG_ASPECT_PRIOR_SD, centre, 1.0)
 
 
 def kinds(usual: Pixels) -> tuple[Pixels, ...]:
@@ -51,7 +51,7 @@ def kinds(usual: Pixels) -> tuple[Pixels, ...]:
     return (
         usual,
         Pixels("stretched", ANY_ASPECT, usual.centre, 20.0),
-        Pixels("cropped", ASPECT, ANYWHERE, 20.0),
+        Pixels("cropped", LOG_ASPECT_PRIOR_SD, ANYWHERE, 20.0),
         Pixels("any", ANY_ASPECT, ANYWHERE, 50.0),
     )
 
@@ -62,7 +62,7 @@ def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels)
     mean, precision = usual.mean.copy(), usual.precision.copy()
     lens = camera.lens
     # log(fy / fx) about 0, made linear where the lens is: (fy - fx) over their mean has the same slope
-    typical = lens.fx if pixels.aspect == ASPECT else 0.5 * (lens.fx + lens.fy)
+    typical = lens.fx if pixels.aspect == LOG_ASPECT_PRIOR_SD else 0.5 * (lens.fx + lens.fy)
     precision[:2, :2] = np.array([[1, -1], [-1, 1]]) / (pixels.aspect * typical) ** 2
     precision[2, 2] = precision[3, 3] = 1 / (pixels.centre * 2 * image.half) ** 2
     return Prior(mean, precision)

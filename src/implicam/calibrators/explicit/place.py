@@ -16,12 +16,17 @@ from implicam.calibrators.explicit.network import Network
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, poses_from_rays
 from implicam.progress import Progress
-from implicam.rig_model.camera import CentralCamera, Prior
-from implicam.rig_model.field import Hyperparameters
-from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.initialise import FAR, Started, levenberg_marquardt
-from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.training_data import Problem
+from implicam.rig_model import (
+    MAX_ERROR_MEDIANS,
+    CentralCamera,
+    FitResult,
+    Hyperparameters,
+    InitialCamera,
+    Posterior,
+    Prior,
+    TrainingData,
+    levenberg_marquardt,
+)
 
 FEWEST = 4
 """Known points that place a camera whose lens is known: three leave up to four places."""
@@ -42,28 +47,28 @@ SUBSETS = 30
 """Random sets of five points; with a third of the views wrong, four of them are clean."""
 
 
-def place(problem: Problem, networks: Mapping[int, Network], progress: Progress) -> FitResult:
-    """The cameras of networks of one camera, by number, placed by the problem's known points; there may be none."""
-    stated = problem.stated.copy()
-    started: dict[int, Started] = {}
+def place(training: TrainingData, networks: Mapping[int, Network], progress: Progress) -> FitResult:
+    """The cameras of networks of one camera, by number, placed by the training data; there may be none."""
+    stated = training.stated.copy()
+    started: dict[int, InitialCamera] = {}
     uncalibrated: list[tuple[int, str]] = []
-    images = list(problem.images)
+    images = list(training.images)
     for c, network in networks.items():
-        seen, images[c] = problem.camera_views[c], network.images[0]
+        seen, images[c] = training.camera_views[c], network.images[0]
         if not np.isfinite(stated[c]):
             stated[c] = network.bundle.noise[0]  # until the residuals of the known points say more
         try:
-            started[c] = _placed(network, problem.points[seen.rows], seen.uv)
+            started[c] = _placed(network, training.points[seen.rows], seen.uv)
         except FitError as error:
             uncalibrated.append((c, error.what))
-    problem = replace(problem, stated=stated, images=tuple(images))
+    training = replace(training, stated=stated, images=tuple(images))
     if not started:
         none = Hyperparameters(np.ones(2), np.zeros(0), np.zeros(0))
         return FitResult(Posterior((), (), None, (), 0.0), (), tuple(uncalibrated), (), none, None, None)
-    return refined(problem, started, uncalibrated, progress)
+    return refined(training, started, uncalibrated, progress)
 
 
-def _placed(network: Network, points: Floats, uv: Floats) -> Started:
+def _placed(network: Network, points: Floats, uv: Floats) -> InitialCamera:
     """The camera of a network of one, in the place from which it sees points (n, 3) at uv (n, 2)."""
     known, sd, half = network.bundle.cameras[0], float(network.bundle.noise[0]), network.images[0].half
     rays, valid = known.lens.ray_from_pixel(uv)
@@ -71,7 +76,7 @@ def _placed(network: Network, points: Floats, uv: Floats) -> Started:
     prior = _prior(network)
     found = _best(known, prior, points, uv, rays, valid, sd)
     left = _median(found[0][0], points, uv) if found else np.inf
-    if left > max(FAR * sd, MIRROR_FROM * half):
+    if left > max(MAX_ERROR_MEDIANS * sd, MIRROR_FROM * half):
         _check_mirror(known, prior, points, uv, rays, valid, sd, left)
     if not found:
         raise FitError("from no place does its lens see the known points at these pixels.")
@@ -90,7 +95,7 @@ def _placed(network: Network, points: Floats, uv: Floats) -> Started:
             raise FitError(
                 f"its {int(inliers.sum())} known points place it in two ways: show it more, spread out in depth."
             )
-    return Started(camera, prior, inliers)
+    return InitialCamera(camera, prior, inliers)
 
 
 def _check_mirror(
@@ -136,7 +141,7 @@ def _best(
     found = [_refined(replace(known, pose=pose), prior, points, uv, valid, sd) for pose in _poses(points, rays, valid)]
     off = min((_median(camera, points, uv) for camera, _ in found), default=np.inf)
     good = np.flatnonzero(valid)
-    if off > FAR * sd and len(good) > FEWEST + 1:
+    if off > MAX_ERROR_MEDIANS * sd and len(good) > FEWEST + 1:
         rng = np.random.default_rng(0)
         some = np.zeros(len(points), dtype=np.bool_)
         for _ in range(SUBSETS):
@@ -172,7 +177,7 @@ def _refined(
         assert isinstance(fitted, CentralCamera)
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        inside = np.asarray(error <= FAR * max(float(np.median(error[inliers])), sd))
+        inside = np.asarray(error <= MAX_ERROR_MEDIANS * max(float(np.median(error[inliers])), sd))
         if inside.sum() < FEWEST or (inside == inliers).all():
             break
         inliers = inside

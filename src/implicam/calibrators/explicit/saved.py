@@ -14,11 +14,16 @@ from implicam.calibrators.explicit.lenses import FAMILIES, USUAL, Choice, name_o
 from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.unused import Rejected, Unused
-from implicam.rig_model.camera import CentralCamera, Image, Prior
-from implicam.rig_model.camera_model import CameraModel
-from implicam.rig_model.initialise import Started, lens_only_model
-from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.training_data import Frame
+from implicam.rig_model import (
+    CameraModel,
+    CentralCamera,
+    Frame,
+    Image,
+    InitialCamera,
+    Posterior,
+    Prior,
+    lens_only_model,
+)
 
 BOARDS = "boards/"
 
@@ -117,5 +122,5 @@ def _model(arrays: Arrays, number: int, sizes: NDArray[np.float64], lens: str) -
     if not (noise > 0 and half > 0):
         raise ValueError("noise and image size must be positive")
     prior = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))  # only a fit needs it
-    started = Started(camera, prior, np.zeros(0, dtype=np.bool_))
+    started = InitialCamera(camera, prior, np.zeros(0, dtype=np.bool_))
     return lens_only_model(started, Image(np.array(centre), half), noise)

@@ -25,9 +25,16 @@ from implicam.calibrators.explicit.pixels import (
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, resect_any_pixels
-from implicam.rig_model.camera import CENTRE, TANGENT, CentralCamera, Image
-from implicam.rig_model.initialise import FAR, Started, levenberg_marquardt
-from implicam.rig_model.training_data import FEWEST
+from implicam.rig_model import (
+    CENTRE_PRIOR_SD,
+    MAX_ERROR_MEDIANS,
+    MIN_POINTS_PER_CAMERA,
+    PERSPECTIVE_K,
+    CentralCamera,
+    Image,
+    InitialCamera,
+    levenberg_marquardt,
+)
 
 SHIFTED = 5.0
 """How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""
@@ -51,7 +58,7 @@ class MirroredError(FitError):
 class _Candidate(NamedTuple):
     """A camera fitted with the prior of some pixels; kept (n,): the views it was fitted to."""
 
-    started: Started
+    started: InitialCamera
     camera: CentralCamera
     pixels: Pixels
 
@@ -60,11 +67,11 @@ class _Candidate(NamedTuple):
         return self.started.inliers
 
 
-def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tuple[Started, Choice]:
+def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tuple[InitialCamera, Choice]:
     """A camera from known points (n, 3), all seen at uv (n, 2), its lens model and pixels; FitError where they do not
     fix one, MirroredError where a mirrored camera would see them so."""
-    if len(points) < FEWEST:
-        raise FitError(f"{len(points)} known points are seen; a camera needs at least {FEWEST}.")
+    if len(points) < MIN_POINTS_PER_CAMERA:
+        raise FitError(f"{len(points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
     first = _resected(points, uv, image)
     _check_mirror(first, points, uv, image)
     tried = _with_pixels([first], points, uv, image)
@@ -82,16 +89,16 @@ def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tu
 def _resected(points: Floats, uv: Floats, image: Image) -> _Candidate:
     """The ladder's best, refined with the usual pixels where they fit, and with any where they do not."""
     found, aspect = resect_any_pixels(points, uv, middle=image.centre, aspects=ASPECTS)
-    k = TANGENT if found.pinhole else np.zeros(4)
+    k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
     lens = KannalaBrandt(found.focal, found.focal * aspect, *image.centre.tolist(), *k.tolist())
-    pixels = square(CENTRE) if aspect == 1 else kinds(square(CENTRE))[1]
+    pixels = square(CENTRE_PRIOR_SD) if aspect == 1 else kinds(square(CENTRE_PRIOR_SD))[1]
     return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.inliers, points, uv, image, 1e-3)
 
 
 def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image: Image) -> list[_Candidate]:
     """The cameras refined with each prior of their pixels that may be right, the most probable one first; one alone
     where the usual one is clearly right."""
-    usual, *between, widest = kinds(square(SHIFTED * CENTRE))
+    usual, *between, widest = kinds(square(SHIFTED * CENTRE_PRIOR_SD))
 
     def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
         return _refined(start.camera, pixels, start.inliers, points, uv, image)
@@ -132,17 +139,17 @@ def _refined(
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         sd = max(float(np.median(error[inliers])), 1e-5 * image.half)
-        inside = np.asarray(error <= max(FAR * float(np.median(error[inliers])), 1e-4 * image.half))
-        if inside.sum() < FEWEST or (inside == inliers).all():
+        inside = np.asarray(error <= max(MAX_ERROR_MEDIANS * float(np.median(error[inliers])), 1e-4 * image.half))
+        if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
         inliers = inside
-    return _Candidate(Started(camera, prior, inliers), camera, pixels)
+    return _Candidate(InitialCamera(camera, prior, inliers), camera, pixels)
 
 
 def _evidence(found: list[_Candidate], points: Floats, uv: Floats, image: Image) -> list[float]:
     """Log marginal likelihood of each, by Laplace's method at its best noise, on the views that all of them keep."""
     common = np.logical_and.reduce([one.inliers for one in found])
-    if common.sum() < FEWEST:
+    if common.sum() < MIN_POINTS_PER_CAMERA:
         common = found[-1].inliers
     return [_log_evidence(one, points[common], uv[common], image) for one in found]
 
@@ -201,7 +208,7 @@ def _sd(camera: CentralCamera, points: Floats, uv: Floats, image: Image) -> floa
     return max(float(np.nanmedian(error)), 1e-5 * image.half)
 
 
-def _held_out(started: Started, points: Floats, uv: Floats, image: Image) -> Floats:
+def _held_out(started: InitialCamera, points: Floats, uv: Floats, image: Image) -> Floats:
     """(n,) squared errors of views in `FOLDS` random folds, each predicted from the others; far ones count little, and
     views that the camera could not keep are NaN."""
     squares = np.full(len(points), np.nan)

@@ -38,7 +38,7 @@ from implicam.calibrators.explicit.pixels import (
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, candidate_rays, rotation_from_vector
-from implicam.rig_model.camera import TANGENT, CentralCamera, Image, Prior
+from implicam.rig_model import PERSPECTIVE_K, CentralCamera, Image, Prior
 
 FEW = 30
 """Boards that the lens is looked for with; the adjustment has them all."""
@@ -158,7 +158,7 @@ def _start(views: Sequence[BoardView], image: Image, aspect: float) -> tuple[flo
         _, errors = planar_poses(views[i].xyz[:, :2], rays, focal)
         total = total + np.sum(np.minimum(errors, 3 * np.median(errors, axis=1, keepdims=True)) ** 2, axis=1)
     best = int(np.argmin(total))
-    k = TANGENT if pinhole[best] else np.zeros(4)
+    k = PERSPECTIVE_K if pinhole[best] else np.zeros(4)
     lens = KannalaBrandt(float(focal[best]), float(focal[best] * aspect), *image.centre.tolist(), *k.tolist())
     poses = [
         _trimmed_pose(view.xyz[:, :2], ladder(offset)[2][best], float(focal[best]))

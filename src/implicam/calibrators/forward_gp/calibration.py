@@ -19,7 +19,7 @@ from implicam import calibration_file
 from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
-from implicam.calibrators.forward_gp.position_error_fit import with_noise_told_apart
+from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
 from implicam.calibrators.protocol import Arrays, finite_column, solvable
 from implicam.dataset import Dataset, Observations, without_copies
 from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
@@ -34,7 +34,7 @@ from implicam.rig_model.level_errors import untold
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.rig import FittedRig
 from implicam.rig_model.shot_errors import Shots
-from implicam.rig_model.training_data import Frame, problem_of
+from implicam.rig_model.training_data import Frame, training_data_of
 from implicam.rig_model.triangulate import Labels
 from implicam.threads import blas_threads
 
@@ -68,8 +68,8 @@ class ForwardGP:
         # many small matrices, one after the other: two threads would wait
         with mistakes_named(data), solvable(), blas_threads(1):
             frame = Frame.of(used, self.method)
-            problem = problem_of(self.lens, used, frame)
-            fitted = with_noise_told_apart(problem, fit_rig(problem, progress), used.shots)
+            training = training_data_of(self.lens, used, frame)
+            fitted = separate_position_errors(training, fit_rig(training, progress), used.shots)
         return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
 
 
@@ -169,8 +169,8 @@ class ForwardGPCalibration:
             return self.refit(data, progress)
         with solvable(), blas_threads(1):
             used = without_copies(data)
-            problem = problem_of(self.calibrator.lens, used, self.frame)
-            fitted = with_noise_told_apart(problem, fit_rig(problem, progress, self.fitted), used.shots)
+            training = training_data_of(self.calibrator.lens, used, self.frame)
+            fitted = separate_position_errors(training, fit_rig(training, progress, self.fitted), used.shots)
         return ForwardGPCalibration(self.calibrator, data, self.frame, _copies_named(data, fitted))
 
     def notes(self) -> list[str]:
@@ -196,7 +196,7 @@ class ForwardGPCalibration:
         ]
 
     def _single_notes(self) -> list[str]:
-        errors = self.fitted.label_errors
+        errors = self.fitted.position_errors
         if errors is None:
             return []
         sd = ", ".join(f"{x:.2g}" for x in np.sqrt(np.diagonal(errors.covariance)) * self.frame.scale)
@@ -226,8 +226,8 @@ class ForwardGPCalibration:
     def known_position_covariance(self, xyz: Floats) -> Floats:
         """(n, 3, 3) of the error of a known position near each of xyz (n, 3), as estimated; zero if none seems off."""
         out = np.zeros((len(xyz), 3, 3))
-        if self.fitted.label_errors is not None:
-            out += self.fitted.label_errors.covariance
+        if self.fitted.position_errors is not None:
+            out += self.fitted.position_errors.covariance
         if self._labels is not None:
             out += self._labels.own(self.frame.to_working(xyz))
         return out * self.frame.scale**2

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.evidence import NOISE
+from implicam.calibrators.forward_gp.evidence import LOG_NOISE_PRIOR
 from implicam.calibrators.forward_gp.families import (
     FAMILIES,
     MAX_CHOICE_VIEWS,
-    MIRRORED_WEIGHT,
+    MIRRORED_PRIOR_ODDS,
     Views,
     family_prior,
     log_evidences,
@@ -35,10 +35,10 @@ from implicam.geometry import (
     resect_any_lens,
     resect_robustly,
 )
-from implicam.rig_model.camera import TANGENT, CentralCamera, Image
-from implicam.rig_model.general_camera import RHO, SMALLEST_RHO, AnyCamera, GeneralCamera
-from implicam.rig_model.initialise import FAR, Started, levenberg_marquardt
-from implicam.rig_model.training_data import FEWEST
+from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, Image
+from implicam.rig_model.general_camera import MIN_RHO, RHO, AnyCamera, GeneralCamera
+from implicam.rig_model.initialise import MAX_ERROR_MEDIANS, InitialCamera, levenberg_marquardt
+from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA
 
 QUICK_MEDIAN = 2e-3
 """Median error of an ordinary camera, in half the longer side; more needs a look at everything else."""
@@ -65,13 +65,13 @@ ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-7
 MAX_MEDIAN = 0.05
 """Median error, in half the longer side, beyond which a camera explains nothing."""
 
-FAR_BEHIND = 10.0
+MAX_ERROR_RATIO = 10.0
 """A start whose errors are so many times the best camera's is no start for the kinds."""
 
 BEST_STARTS = 3
 """Starts of each sign that go on."""
 
-CLEARLY_WRONG = 0.3
+CLEARLY_WRONG_RATIO = 0.3
 """The sign whose best camera leaves the other's median times this is the right one without further question."""
 
 MIN_TOLERATED_NOISES = 10.0
@@ -129,19 +129,19 @@ class Scene(NamedTuple):
     def near(self, error: Floats, inliers: Bools) -> Bools:
         """The views that a camera explains, judged by the median of those kept; of few views, which a camera of
         seventeen numbers may nearly go through, by the noise."""
-        limit = max(FAR * float(np.median(error[inliers])), MIN_TOLERATED_NOISES * self.noise)
+        limit = max(MAX_ERROR_MEDIANS * float(np.median(error[inliers])), MIN_TOLERATED_NOISES * self.noise)
         return np.asarray(error <= limit, dtype=np.bool_)
 
     @property
     def noise(self) -> float:
         """Px, as stated or usual."""
-        return float(self.stated) if np.isfinite(self.stated) else float(np.exp(NOISE[0])) * self.image.half
+        return float(self.stated) if np.isfinite(self.stated) else float(np.exp(LOG_NOISE_PRIOR[0])) * self.image.half
 
 
 def candidates(whole: Scene) -> list[Candidate]:
     """The kinds of camera that explain the views; one where it is ordinary. FitError where there is none."""
-    if len(whole.points) < FEWEST:
-        raise FitError(f"{len(whole.points)} known points are seen; a camera needs at least {FEWEST}.")
+    if len(whole.points) < MIN_POINTS_PER_CAMERA:
+        raise FitError(f"{len(whole.points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
     ladder = _ladder(whole, mirrored=False, subsets=False)
     if ladder is not None and not ladder.doubtful:
         quick = _quick(whole, ladder)
@@ -177,13 +177,13 @@ def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate |
         return None
     error = whole.error(camera)
     inliers = whole.near(error, np.isfinite(error))
-    if inliers.sum() < max(FEWEST, len(error) / 2):
+    if inliers.sum() < max(MIN_POINTS_PER_CAMERA, len(error) / 2):
         return None
     found, inliers = _refined(camera, family, whole, inliers, FINAL_STEPS, rounds=4)
     return Candidate(found, family, inliers, 0.0)
 
 
-def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> Started:
+def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> InitialCamera:
     """What the fit starts from; some: all candidates of the camera."""
     prior = family_prior(one.camera, one.family, whole.image, _widest(one.camera, whole.points[one.inliers]))
     left = float(np.median(whole.error(one.camera)[one.inliers]))
@@ -192,18 +192,18 @@ def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> Start
     inliers = one.inliers & np.isfinite(whole.error(one.camera))
     ordinary = [float(np.median(whole.error(other.camera))) for other in some if other.kind == ("ordinary", False)]
     left = ordinary[0] if ordinary and one.kind != ("ordinary", False) else float("nan")
-    return Started(one.camera, prior, inliers, one.family, left)
+    return InitialCamera(one.camera, prior, inliers, one.family, left)
 
 
 def _weight(one: Candidate, others: list[tuple[str, bool]]) -> float:
     families = sum(family == one.family for family, _ in others)
     signs = sum(mirrored == one.camera.mirrored for _, mirrored in others)
     total = sum(kind.weight for kind in FAMILIES.values())
-    of_sign = MIRRORED_WEIGHT if one.camera.mirrored else 1.0
+    of_sign = MIRRORED_PRIOR_ODDS if one.camera.mirrored else 1.0
     return (
         (FAMILIES[one.family].weight + families)
         / (total + len(others))
-        * ((of_sign + signs) / (1 + MIRRORED_WEIGHT + len(others)))
+        * ((of_sign + signs) / (1 + MIRRORED_PRIOR_ODDS + len(others)))
     )
 
 
@@ -234,7 +234,7 @@ def _refined(
         assert isinstance(found, GeneralCamera)
         camera = found
         inside = scene.near(scene.error(camera), inliers)
-        if inside.sum() < FEWEST or (inside == inliers).all():
+        if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
         inliers = inside
     return camera, inliers
@@ -254,18 +254,18 @@ def _ladder(scene: Scene, *, mirrored: bool, subsets: bool) -> Start | None:
     if mirrored:
         uv = uv * [-1.0, 1.0] + [2 * middle[0], 0.0]
     found = resect_any_lens(scene.points, uv, middle=middle, subsets=subsets)
-    k = TANGENT if found.pinhole else np.zeros(4)
+    k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
     lens = KannalaBrandt(found.focal, found.focal, *middle.tolist(), *k.tolist())
     central = CentralCamera(lens, found.camera_from_world)
     about = float(middle[0]) if mirrored else None
     camera = GeneralCamera.from_central(central, mirrored_about=about)
-    if camera.rho < SMALLEST_RHO:
+    if camera.rho < MIN_RHO:
         return None
     inliers = found.inliers
     if len(inliers) > inliers.sum() and len(scene.points) > 120:  # the ladder looked at some of many
         error = scene.error(camera)
         inliers = scene.near(error, found.inliers)
-    return Start(camera, inliers if inliers.sum() >= FEWEST else found.inliers, found.doubtful)
+    return Start(camera, inliers if inliers.sum() >= MIN_POINTS_PER_CAMERA else found.inliers, found.doubtful)
 
 
 def _quick(scene: Scene, ladder: Start) -> Candidate | None:
@@ -273,7 +273,11 @@ def _quick(scene: Scene, ladder: Start) -> Candidate | None:
     camera, inliers = _refined(ladder.camera, "ordinary", scene, ladder.inliers, FINAL_STEPS * 5, rounds=4)
     error = scene.error(camera)
     median = float(np.median(error[inliers]))
-    if inliers.sum() < FEWEST or not median < QUICK_MEDIAN * scene.image.half or camera.rho < 4 * SMALLEST_RHO:
+    if (
+        inliers.sum() < MIN_POINTS_PER_CAMERA
+        or not median < QUICK_MEDIAN * scene.image.half
+        or camera.rho < 4 * MIN_RHO
+    ):
         return None
     views = _common_views(scene, inliers)
     tight, free_from_here = _evidences(camera, ("ordinary", "free"), views)
@@ -308,7 +312,7 @@ def _thorough(scene: Scene, ladder: Start | None, linear: Start | None) -> list[
         ]
         best[sign] = sorted(((_score(scene, c), c, k) for c, k in again), key=lambda one: one[0])
     leading = {sign: some[0][0] if some else np.inf for sign, some in best.items()}
-    signs = [sign for sign in best if best[sign] and not leading[sign] * CLEARLY_WRONG > leading[not sign]]
+    signs = [sign for sign in best if best[sign] and not leading[sign] * CLEARLY_WRONG_RATIO > leading[not sign]]
     common = min((best[sign][0] for sign in signs), key=lambda one: one[0])[2]
     views = _common_views(scene, common)
     found_all = [one for sign in signs for one in _kinds(scene, views, best[sign][0], sign)]
@@ -333,7 +337,7 @@ def _kinds(
         shape = free.shape if kind.p > 0.01 else np.zeros(2)
         tilt = free.tilt if kind.tilt > 0.01 else np.zeros(2)
         some = []
-        near = [one for one in others if family == "ordinary" or _score(scene, one) < FAR_BEHIND * best[0]]
+        near = [one for one in others if family == "ordinary" or _score(scene, one) < MAX_ERROR_RATIO * best[0]]
         for camera in (free.with_shape(shape, tilt), *near):
             found, explained = _refined(camera, family, scene, inliers, FINAL_STEPS, rounds=2)
             plausible = np.median(scene.error(found)[explained]) < MAX_MEDIAN * scene.image.half
@@ -393,9 +397,9 @@ def _from_linear(P: Floats) -> GeneralCamera | None:
     if parts is None:
         return None
     focal, shape, centre, mirrored, pose = parts
-    if not SMALLEST_RHO < 1 / max(float(np.linalg.norm(pose.translation)), 1e-12) < 100:
+    if not MIN_RHO < 1 / max(float(np.linalg.norm(pose.translation)), 1e-12) < 100:
         return None
-    return GeneralCamera(focal, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose)
+    return GeneralCamera(focal, shape, np.zeros(2), centre, PERSPECTIVE_K.copy(), mirrored, pose)
 
 
 def _from_affine(scene: Scene) -> Iterator[Start]:
@@ -421,5 +425,5 @@ def _from_affine(scene: Scene) -> Iterator[Start]:
             translation = np.append(offset * np.sinc(angle / np.pi), np.cos(angle) / rho)
             pose = Pose(rotation, translation)
             centre = scene.image.centre
-            camera = GeneralCamera(scale / rho, shape, np.zeros(2), centre, TANGENT.copy(), mirrored, pose)
+            camera = GeneralCamera(scale / rho, shape, np.zeros(2), centre, PERSPECTIVE_K.copy(), mirrored, pose)
             yield Start(camera, inliers)

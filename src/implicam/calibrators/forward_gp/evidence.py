@@ -20,42 +20,42 @@ from implicam.rig_model.camera import Prior
 from implicam.rig_model.field import Hyperparameters, field_kernel
 from implicam.rig_model.normal_equations import stable_cholesky
 
-LENGTHSCALE = np.log([1.0, 2.0])
+LOG_LENGTHSCALE_MEDIAN = np.log([1.0, 2.0])
 """Prior medians: across the image in half its longer side, and in log distance. Optics vary smoothly across the image;
 refraction and the entrance pupil vary with the distance as 1 / distance does."""
 
-LENGTHSCALE_SD = np.array([0.7, 1.0])
+LOG_LENGTHSCALE_SD = np.array([0.7, 1.0])
 
-SHORTEST = np.log([0.5, 0.1])
+MIN_LOG_LENGTHSCALE = np.log([0.5, 0.1])
 
-LONGEST = np.log([30.0, 100.0])
+MAX_LOG_LENGTHSCALE = np.log([30.0, 100.0])
 
-GRID = ((0.6, 1.5, 4.0), (0.15, 0.5, 2.0))
+LENGTHSCALE_GRID = ((0.6, 1.5, 4.0), (0.15, 0.5, 2.0))
 """Where the search looks first."""
 
-SIGNAL = {"central": (np.log(5e-4), 1.0), "general": (np.log(5e-4), 1.0), "none": (np.log(2e-2), 2.0)}
+LOG_SIGNAL_PRIOR = {"central": (np.log(5e-4), 1.0), "general": (np.log(5e-4), 1.0), "none": (np.log(2e-2), 2.0)}
 """Prior of the field's sd, median and log sd, in half the longer side: what good lens models leave, 0.3 px in 1280."""
 
-NOISE = (np.log(3e-4), 1.0)
+LOG_NOISE_PRIOR = (np.log(3e-4), 1.0)
 """The same for the noise: 0.2 px in 1280."""
 
-STATED = 0.2
+STATED_NOISE_LOG_SD = 0.2
 """Log sd of the noise about what the observations state, where they do."""
 
-OWN_SIGNAL, OWN_NOISE = 0.3, 0.15
+CAMERA_SIGNAL_LOG_SD, CAMERA_NOISE_LOG_SD = 0.3, 0.15
 """Log sd of one camera's field and noise about the rig's."""
 
 FTOL = 1e-4
 """Change of the log posterior at which the search for the sizes ends, as a part of what it has gained: hundredths of a
 nat."""
 
-KNOWN_TO = 0.1
+FIRST_LOG_STEP = 0.1
 """What log sizes are known to from a dozen points or more: the first step of the search for them."""
 
 GTOL = 0.02
 """Slope by such a step at which the search ends while lengthscales are compared: thousandths of a nat."""
 
-DETERMINED = 1e-12
+MIN_EIGENVALUE_RATIO = 1e-12
 """Eigenvalues below this part of the largest add nothing."""
 
 
@@ -93,7 +93,7 @@ class CameraEvidence:
         phi /= self.relative[:, None]
         both = np.concatenate([self.residual[:, :, None], self.X], axis=2) / self.relative[:, None, None]
         e, V = np.linalg.eigh(phi.T @ phi)
-        good = e > DETERMINED * e[-1]
+        good = e > MIN_EIGENVALUE_RATIO * e[-1]
         e, V = e[good], V[:, good]
         basis = (phi @ V) / np.sqrt(e)
         flat = both.reshape(len(both), -1)
@@ -201,11 +201,11 @@ class RigEvidence:
 
         def at(log_lengthscale: Floats) -> float:
             nonlocal shared
-            inside = np.clip(log_lengthscale, SHORTEST, LONGEST)
+            inside = np.clip(log_lengthscale, MIN_LOG_LENGTHSCALE, MAX_LOG_LENGTHSCALE)
             spectra[tuple(inside)] = self._spectra(inside)
             found = self._minimum(self._sizes_objective(spectra[tuple(inside)], own=False)[0], shared, GTOL)
             shared = found.x
-            penalty = 0.5 * np.sum(((inside - LENGTHSCALE) / LENGTHSCALE_SD) ** 2)
+            penalty = 0.5 * np.sum(((inside - LOG_LENGTHSCALE_MEDIAN) / LOG_LENGTHSCALE_SD) ** 2)
             known[tuple(inside)] = float(found.fun + penalty), shared
             return known[tuple(inside)][0] + float(np.sum((log_lengthscale - inside) ** 2))
 
@@ -213,8 +213,8 @@ class RigEvidence:
             at(np.log(start.lengthscale[0]))
             return self._found(known, spectra)
         if start is None:  # a second, shorter range can be as likely: look everywhere first
-            for across in GRID[0]:
-                for along in GRID[1]:
+            for across in LENGTHSCALE_GRID[0]:
+                for along in LENGTHSCALE_GRID[1]:
                     at(np.log([across, along]))
             first, size = np.array(min(known, key=lambda key: known[key][0])), 0.5
         else:
@@ -267,8 +267,8 @@ class RigEvidence:
 
     def _medians(self) -> tuple[Floats, Floats]:
         known = np.isfinite(self.stated)
-        noise = np.where(known, self.stated, np.exp(NOISE[0]) * self.half)
-        return np.exp(SIGNAL[self.lens][0]) * self.half, noise
+        noise = np.where(known, self.stated, np.exp(LOG_NOISE_PRIOR[0]) * self.half)
+        return np.exp(LOG_SIGNAL_PRIOR[self.lens][0]) * self.half, noise
 
     def penalty(self, signal: Floats, noise: Floats) -> float:
         """Minus the log prior of sizes (C,) in pixels, as far as the rig shares them."""
@@ -279,7 +279,12 @@ class RigEvidence:
         return 0.5 * float(np.sum((np.array(shared) / self._shared_sds()) ** 2))
 
     def _shared_sds(self) -> Floats:
-        return np.array([SIGNAL[self.lens][1], STATED if np.isfinite(self.stated).all() else NOISE[1]])
+        return np.array(
+            [
+                LOG_SIGNAL_PRIOR[self.lens][1],
+                STATED_NOISE_LOG_SD if np.isfinite(self.stated).all() else LOG_NOISE_PRIOR[1],
+            ]
+        )
 
     def _sizes(self, z: Floats) -> tuple[Floats, Floats]:
         """Signal and noise (C,) from (shared signal, shared noise, own signals, own noises)."""
@@ -295,7 +300,7 @@ class RigEvidence:
         C = len(self.cameras)
         sds = self._shared_sds()
         if own:
-            sds = np.concatenate([sds, np.full(C, OWN_SIGNAL), np.full(C, OWN_NOISE)])
+            sds = np.concatenate([sds, np.full(C, CAMERA_SIGNAL_LOG_SD), np.full(C, CAMERA_NOISE_LOG_SD)])
 
         alike: dict[int, list[int]] = {}
         for c, camera in enumerate(self.cameras):
@@ -320,17 +325,17 @@ class RigEvidence:
     @staticmethod
     def _minimum(objective: Callable[[Floats], tuple[float, Floats]], start: Floats, gtol: float = 1e-5) -> Any:
         """The sizes z of the least objective near `start`; looked for in steps that sizes are known to."""
-        bounds = [(-6.0 / KNOWN_TO, 6.0 / KNOWN_TO)] * len(start)
+        bounds = [(-6.0 / FIRST_LOG_STEP, 6.0 / FIRST_LOG_STEP)] * len(start)
         before, slope = objective(start)  # its zero depends on the unit: what counts is what is gained
 
         def gained(u: Floats) -> tuple[float, Floats]:
-            if np.array_equal(u, start / KNOWN_TO):
-                return 0.0, slope * KNOWN_TO
-            value, gradient = objective(u * KNOWN_TO)
-            return value - before, gradient * KNOWN_TO
+            if np.array_equal(u, start / FIRST_LOG_STEP):
+                return 0.0, slope * FIRST_LOG_STEP
+            value, gradient = objective(u * FIRST_LOG_STEP)
+            return value - before, gradient * FIRST_LOG_STEP
 
         options = {"ftol": FTOL, "gtol": gtol}
-        found = minimize(gained, start / KNOWN_TO, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        found = minimize(gained, start / FIRST_LOG_STEP, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         found.fun += before
-        found.x = found.x * KNOWN_TO
+        found.x = found.x * FIRST_LOG_STEP
         return found

@@ -12,11 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from implicam.calibrators.forward_gp.evidence import NOISE, SIGNAL, STATED, CameraEvidence, Spectrum
+from implicam.calibrators.forward_gp.evidence import (
+    LOG_NOISE_PRIOR,
+    LOG_SIGNAL_PRIOR,
+    STATED_NOISE_LOG_SD,
+    CameraEvidence,
+    Spectrum,
+)
 from implicam.geometry import Floats
-from implicam.rig_model.camera import BENT, BENT_AT_EDGE, TANGENT, Image, Prior
+from implicam.rig_model.camera import DISTORTION_AT_EDGE_PRIOR_SD, DISTORTION_PRIOR_SD, PERSPECTIVE_K, Image, Prior
 from implicam.rig_model.field import field_coordinates
-from implicam.rig_model.general_camera import CENTRE, KAPPA, RHO, SMALLEST_RHO, GeneralCamera
+from implicam.rig_model.general_camera import CENTRE, KAPPA, MIN_RHO, RHO, GeneralCamera
 
 
 class Family(NamedTuple):
@@ -39,24 +45,24 @@ FAMILIES = {
 """ordinary: square pixels, the lens over the image's centre. aspect: pixels of any shape. crop: the lens anywhere.
 free: all of it, and a tilted image plane."""
 
-MIRRORED_WEIGHT = 0.2
+MIRRORED_PRIOR_ODDS = 0.2
 """Prior odds of a mirrored picture; each kind and sign gains 1 for every other camera of the rig that has it."""
 
-TELEPHOTO_EDGE = np.array([0.01, 0.0005])
+TELEPHOTO_EDGE_SD = np.array([0.01, 0.0005])
 """What k1 and k2 may do at the edge of the image at least, as a part of the radius: at 2 degrees a prior of the angle
 alone would allow no distortion at all."""
 
-RHO_SD = 3.0
+RHO_PRIOR_SD = 3.0
 """Prior sd of the inverse distance of the working frame's origin, in the working frame."""
 
-NEAR = Family(0.05, 0.05, 0.25, 0.25, 0.0)
+NEAR_FAMILY = Family(0.05, 0.05, 0.25, 0.25, 0.0)
 """Of a free camera after the choice: sds about the camera found. Where its field is large it would wander without."""
-NEAR_RHO = 0.75
+NEAR_RHO_RELATIVE_SD = 0.75
 
 CHOICE_SIGNAL_LOG_SD = 0.5
 """Log sd of the field's size while kinds are compared: a field of 100 px must not stand in for a tilt."""
 
-AT_INFINITY = 3.0
+AT_INFINITY_NATS = 3.0
 """Nats against a camera at the largest distance there is: a perspective of the wrong sign ends there."""
 
 CHOICE_LENGTHSCALE = np.array([1.0, 2.0])
@@ -76,13 +82,13 @@ def family_prior(camera: GeneralCamera, family: str, image: Image, widest: float
     sd = np.array([kind.p, kind.q, kind.tilt, kind.tilt, *2 * [kind.centre * 2 * image.half]])
     precision[range(1, 7), range(1, 7)] = 1 / sd**2
     powers = np.array([2, 4, 6, 8])
-    own = BENT.copy()
-    own[:2] = np.maximum(own[:2], TELEPHOTO_EDGE / widest ** powers[:2])
-    own = np.minimum(own, BENT_AT_EDGE / widest**powers)
+    own = DISTORTION_PRIOR_SD.copy()
+    own[:2] = np.maximum(own[:2], TELEPHOTO_EDGE_SD / widest ** powers[:2])
+    own = np.minimum(own, DISTORTION_AT_EDGE_PRIOR_SD / widest**powers)
     unit = camera.rho**powers
-    covariance = np.diag(own**2) + 0.25 * np.outer(TANGENT, TANGENT)
+    covariance = np.diag(own**2) + 0.25 * np.outer(PERSPECTIVE_K, PERSPECTIVE_K)
     precision[KAPPA, KAPPA] = np.linalg.inv(covariance) / np.outer(unit, unit)
-    precision[RHO, RHO] = 1 / RHO_SD**2
+    precision[RHO, RHO] = 1 / RHO_PRIOR_SD**2
     return Prior(mean, precision)
 
 
@@ -90,10 +96,12 @@ def near_prior(camera: GeneralCamera, prior: Prior, image: Image) -> Prior:
     """The prior of a free camera about where it was found."""
     mean, precision = prior.mean.copy(), prior.precision.copy()
     at = camera.parameters
-    sd = np.array([NEAR.p, NEAR.q, NEAR.tilt, NEAR.tilt, *2 * [NEAR.centre * 2 * image.half]])
+    sd = np.array(
+        [NEAR_FAMILY.p, NEAR_FAMILY.q, NEAR_FAMILY.tilt, NEAR_FAMILY.tilt, *2 * [NEAR_FAMILY.centre * 2 * image.half]]
+    )
     mean[1:7] = at[1:7]
     precision[range(1, 7), range(1, 7)] = 1 / sd**2
-    mean[RHO], precision[RHO, RHO] = at[RHO], 1 / (NEAR_RHO * at[RHO]) ** 2
+    mean[RHO], precision[RHO, RHO] = at[RHO], 1 / (NEAR_RHO_RELATIVE_SD * at[RHO]) ** 2
     return Prior(mean, precision)
 
 
@@ -129,15 +137,15 @@ def log_evidences(camera: GeneralCamera, priors: Sequence[Prior], views: Views) 
         spectrum = every[0].spectrum(CHOICE_LENGTHSCALE, 1e-6)
     except np.linalg.LinAlgError:
         return [-np.inf for _ in priors]
-    at_infinity = AT_INFINITY if camera.rho < 1.01 * SMALLEST_RHO else 0.0
+    at_infinity = AT_INFINITY_NATS if camera.rho < 1.01 * MIN_RHO else 0.0
     return [_log_evidence(one, spectrum, views) - at_infinity for one in every]
 
 
 def _log_evidence(one: CameraEvidence, spectrum: Spectrum, views: Views) -> float:
     stated = np.isfinite(views.stated)
-    median = np.log([np.exp(SIGNAL["general"][0]) * views.image.half, 1.0])
-    median[1] = np.log(views.stated) if stated else NOISE[0] + np.log(views.image.half)
-    sd = np.array([CHOICE_SIGNAL_LOG_SD, STATED if stated else NOISE[1]])
+    median = np.log([np.exp(LOG_SIGNAL_PRIOR["general"][0]) * views.image.half, 1.0])
+    median[1] = np.log(views.stated) if stated else LOG_NOISE_PRIOR[0] + np.log(views.image.half)
+    sd = np.array([CHOICE_SIGNAL_LOG_SD, STATED_NOISE_LOG_SD if stated else LOG_NOISE_PRIOR[1]])
 
     def loss(z: Floats) -> tuple[float, Floats]:
         value, by_signal, by_noise = one.objective(spectrum, *np.exp(median + z))

@@ -18,7 +18,7 @@ from implicam.calibrators.forward_gp.choose_camera import (
     choose,
 )
 from implicam.calibrators.forward_gp.linear_projections import (
-    LARGE_FIELD,
+    LARGE_FIELD_HALF_SIDES,
     measures_better,
     predicts_better,
     start_without_lens,
@@ -30,7 +30,7 @@ from implicam.progress import Progress, silent
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.initialise import (
-    Started,
+    InitialCamera,
     lens_only_model,
     require_two_cameras,
     start_again,
@@ -39,106 +39,110 @@ from implicam.rig_model.initialise import (
 )
 from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.normal_equations import CameraFailedError
-from implicam.rig_model.training_data import Problem
+from implicam.rig_model.training_data import TrainingData
 from implicam.threads import side_by_side
 
 AUTO = "auto"
 """The kind of each camera is chosen by the data."""
 
-ROUNDS, ROUNDS_WITH_SHOTS = 6, 18
+MAX_ROUNDS, MAX_ROUNDS_WITH_SHOTS = 6, 18
 
-SEARCHED, FEW_CHANGED = 2, 0.01
+MIN_SEARCH_ROUNDS, MAX_SHARE_CHANGED = 2, 0.01
 """Of these, those that look for lengthscales in any case, where known positions are exact; and the part of the views
 which, when they change later, tell nothing new of how smooth a field is."""
 
 
-def fit_rig(problem: Problem, progress: Progress, before: FitResult | None = None) -> FitResult:
+def fit_rig(training: TrainingData, progress: Progress, before: FitResult | None = None) -> FitResult:
     """Fit every camera that can be fitted. before: a fit in the same working frame to most of these points, from a
     moment ago: its cameras and hyperparameters are the guess. Where known positions have declared errors, which make
     hyperparameters costly, they are kept."""
     progress("fitting", 0, 3)
-    started, uncalibrated = _started(problem, before)
-    fitted = _fit_without_failures(problem, progress, before, started, uncalibrated)
-    return _with_projections(problem, fitted, started) if problem.lens == AUTO else fitted
+    started, uncalibrated = _start_cameras(training, before)
+    fitted = _fit_without_failing_cameras(training, progress, before, started, uncalibrated)
+    return _try_linear_projections(training, fitted, started) if training.lens == AUTO else fitted
 
 
-def _fit_without_failures(
-    problem: Problem,
+def _fit_without_failing_cameras(
+    training: TrainingData,
     progress: Progress,
     before: FitResult | None,
-    started: dict[int, Started],
+    started: dict[int, InitialCamera],
     uncalibrated: list[tuple[int, str]],
 ) -> FitResult:
     """One bad camera never takes the rig down: it goes on without a lens model, or is left out. Changes `started` and
     `uncalibrated`."""
     while True:
         try:
-            return _fit_started(problem, progress, before, started, uncalibrated)
+            return _fit_from_start(training, progress, before, started, uncalibrated)
         except CameraFailedError as error:
             failed = list(started)[error.number]
             again = None
-            if problem.lens == AUTO and started[failed].family != "none":
-                again = start_without_lens(problem, failed)
+            if training.lens == AUTO and started[failed].family != "none":
+                again = start_without_lens(training, failed)
             if again is not None:
                 started[failed] = again._replace(ordinary_px=started[failed].ordinary_px)
                 continue
             uncalibrated.append((failed, f"no camera model fits its views: {error}."))
             del started[failed]
-            require_two_cameras(problem, started, uncalibrated)
+            require_two_cameras(training, started, uncalibrated)
 
 
-def _with_projections(problem: Problem, fitted: FitResult, started: dict[int, Started]) -> FitResult:
+def _try_linear_projections(training: TrainingData, fitted: FitResult, started: dict[int, InitialCamera]) -> FitResult:
     """The rig with those cameras as linear projections that clearly predict left-out views better so."""
     tried = {}
     for number, c in enumerate(fitted.cameras):
         model = fitted.posterior.models[number]
-        odd = model.family in ("free", "crop") or model.signal > LARGE_FIELD * model.image.half
+        odd = model.family in ("free", "crop") or model.signal > LARGE_FIELD_HALF_SIDES * model.image.half
         if odd and model.family != "none" and c in started:
-            found = start_without_lens(problem, c)
+            found = start_without_lens(training, c)
             if found is not None:
                 tried[c] = found._replace(ordinary_px=started[c].ordinary_px)
     if not tried:
         return fitted
     uncalibrated = list(fitted.uncalibrated)
     try:
-        other = _fit_started(problem, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, uncalibrated)
+        other = _fit_from_start(
+            training, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, uncalibrated
+        )
     except np.linalg.LinAlgError:
         return fitted
-    if measures_better(problem, other, fitted):
+    if measures_better(training, other, fitted):
         return other
     better = {
-        c for number, c in enumerate(fitted.cameras) if c in tried and predicts_better(problem, other, fitted, number)
+        c for number, c in enumerate(fitted.cameras) if c in tried and predicts_better(training, other, fitted, number)
     }
     if better == set(tried) or not better:
         return other if better else fitted
     mixed = {c: tried[c] if c in better else started[c] for c in fitted.cameras}
     try:
-        return _fit_started(problem, silent, None, mixed, uncalibrated)
+        return _fit_from_start(training, silent, None, mixed, uncalibrated)
     except np.linalg.LinAlgError:
         return fitted
 
 
-def _started(problem: Problem, before: FitResult | None) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+def _start_cameras(
+    training: TrainingData, before: FitResult | None
+) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
     guess = {} if before is None else dict(zip(before.cameras, before.posterior.models, strict=True))
-    if problem.lens == AUTO:
-        return choose_cameras(problem, guess)
+    if training.lens == AUTO:
+        return choose_cameras(training, guess)
 
-    def start(c: int, points: Floats, uv: Floats) -> Started:
+    def start(c: int, points: Floats, uv: Floats) -> InitialCamera:
         if c in guess:
-            return start_again(guess[c].camera, points, uv, problem.images[c], problem.lens)
-        return start_camera(points, uv, problem.images[c], problem.lens)
+            return start_again(guess[c].camera, points, uv, training.images[c], training.lens)
+        return start_camera(points, uv, training.images[c], training.lens)
 
-    return start_rig(problem, start)
+    return start_rig(training, start)
 
 
 def choose_cameras(
-    problem: Problem, guess: Mapping[int, CameraModel]
-) -> tuple[dict[int, Started], list[tuple[int, str]]]:
+    training: TrainingData, guess: Mapping[int, CameraModel]
+) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
     """The kind of each camera, and where it starts; guess: cameras that fitted most of the points a moment ago."""
 
     def scene(c: int) -> Scene:
-        seen = problem.camera_views[c]
-        return Scene(problem.points[seen.rows], seen.uv, seen.relative, problem.images[c], float(problem.stated[c]))
+        seen = training.camera_views[c]
+        return Scene(training.points[seen.rows], seen.uv, seen.relative, training.images[c], float(training.stated[c]))
 
     def look(c: int) -> list[Candidate] | FitError:
         try:
@@ -149,44 +153,44 @@ def choose_cameras(
         except np.linalg.LinAlgError as error:
             return FitError(f"its equations have no solution: {error}.")
 
-    found = side_by_side(look, range(len(problem.camera_views)))
+    found = side_by_side(look, range(len(training.camera_views)))
     seeing = [c for c, some in enumerate(found) if not isinstance(some, FitError)]
     chosen = dict(zip(seeing, choose([some for some in found if not isinstance(some, FitError)]), strict=True))
 
-    def start(c: int, points: Floats, uv: Floats) -> Started:
+    def start(c: int, points: Floats, uv: Floats) -> InitialCamera:
         some = found[c]
         if isinstance(some, FitError):
             raise some
         return as_started(chosen[c], scene(c), some)
 
-    return start_rig(problem, start)
+    return start_rig(training, start)
 
 
-def _fit_started(
-    problem: Problem,
+def _fit_from_start(
+    training: TrainingData,
     progress: Progress,
     before: FitResult | None,
-    started: dict[int, Started],
+    started: dict[int, InitialCamera],
     uncalibrated: list[tuple[int, str]],
 ) -> FitResult:
     cameras = tuple(started)
-    seen = tuple(problem.camera_views[c] for c in cameras)
-    images = tuple(problem.images[c] for c in cameras)
+    seen = tuple(training.camera_views[c] for c in cameras)
+    images = tuple(training.images[c] for c in cameras)
     inliers = tuple(started[c].inliers for c in cameras)
     models = tuple(lens_only_model(started[c], image) for c, image in zip(cameras, images, strict=True))
     progress("fitting", 1, 3)
-    stated = problem.stated[list(cameras)]
-    rounds = ROUNDS_WITH_SHOTS if problem.errors is not None and problem.errors.estimated else ROUNDS
+    stated = training.stated[list(cameras)]
+    rounds = MAX_ROUNDS_WITH_SHOTS if training.errors is not None and training.errors.estimated else MAX_ROUNDS
     hyper = before.hyperparameters if before is not None and before.cameras == cameras else None
-    tied = problem.errors is not None and not problem.errors.estimated
-    state = Round(hyper, models, None, inliers, problem.errors, None, settled=False, fixed=hyper if tied else None)
+    tied = training.errors is not None and not training.errors.estimated
+    state = Round(hyper, models, None, inliers, training.errors, None, settled=False, fixed=hyper if tied else None)
     changed = 1.0  # part of the views
     for number in range(rounds):
-        search = number < SEARCHED or changed > FEW_CHANGED
-        state = next_round(problem, state, seen, images, stated, search=search)
+        search = number < MIN_SEARCH_ROUNDS or changed > MAX_SHARE_CHANGED
+        state = next_round(training, state, seen, images, stated, search=search)
         judged = state.inliers
         if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
-            judged = update_inliers(state.posterior, problem.points, seen, state.inliers)
+            judged = update_inliers(state.posterior, training.points, seen, state.inliers)
         changed = float(np.mean(np.concatenate(judged) != np.concatenate(state.inliers)))
         if state.settled and not changed:
             break
@@ -195,7 +199,7 @@ def _fit_started(
             state = state._replace(inliers=judged)
     progress("fitting", 3, 3)
     assert state.hyper is not None
-    check_fitted(problem, state, seen)
+    check_fitted(training, state, seen)
     ordinary_px = tuple(one.ordinary_px for one in started.values())
     return FitResult(
         state.posterior,

@@ -14,29 +14,34 @@ from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraViews, random_subset
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.heavy_tails import (
-    DEGREES,
-    MOST_VIEWS,
-    Tails,
+    DEGREES_OF_FREEDOM,
+    MAX_VIEWS_PER_CAMERA,
+    HeavyTails,
     degrees_of_agreement,
     looks_heavy,
     outlier_distance,
-    weights_of,
-    whitened,
+    student_t_weights,
+    whiten,
 )
-from implicam.rig_model.leave_one_out import OUTLIER, left_out_from, next_inliers, residuals_of
+from implicam.rig_model.leave_one_out import (
+    MAX_SQUARED_MAHALANOBIS,
+    left_out_residuals_from,
+    next_inliers,
+    posterior_residuals,
+)
 from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.training_data import Problem
-from implicam.rig_model.wrong_views import Linear
+from implicam.rig_model.training_data import TrainingData
+from implicam.rig_model.wrong_views import LinearisedViews
 
-REWEIGHTED = 3
+REWEIGHTING_ROUNDS = 3
 """Rounds more where the noise has heavy tails."""
 
 
-def with_heavy_tails(problem: Problem, fitted: FitResult) -> FitResult:
+def refit_with_heavy_tails(training: TrainingData, fitted: FitResult) -> FitResult:
     """After a few rounds more with views weighted by a t, where the noise of the fit clearly is one; else the same."""
     cameras = fitted.cameras
-    seen, images = tuple(problem.camera_views[c] for c in cameras), tuple(problem.images[c] for c in cameras)
-    stated, hyper, errors = problem.stated[list(cameras)], fitted.hyperparameters, fitted.errors
+    seen, images = tuple(training.camera_views[c] for c in cameras), tuple(training.images[c] for c in cameras)
+    stated, hyper, errors = training.stated[list(cameras)], fitted.hyperparameters, fitted.errors
     fixed = hyper if errors is not None and not errors.estimated else None
     state = Round(
         hyper,
@@ -50,16 +55,16 @@ def with_heavy_tails(problem: Problem, fitted: FitResult) -> FitResult:
         fixed=fixed,
     )
     try:
-        for number in range(REWEIGHTED):
-            found = _tails(problem, state, seen, images)
+        for number in range(REWEIGHTING_ROUNDS):
+            found = _tails(training, state, seen, images)
             if found is None:
                 break
             tails, inliers = found
             again = state._replace(tails=tails, inliers=inliers)
-            state = next_round(problem, again, seen, images, stated, search=number == 0)
+            state = next_round(training, again, seen, images, stated, search=number == 0)
         if state.tails is None:
             return fitted
-        check_fitted(problem, state, seen)
+        check_fitted(training, state, seen)
     except np.linalg.LinAlgError:
         return fitted
     assert state.hyper is not None
@@ -75,8 +80,8 @@ def with_heavy_tails(problem: Problem, fitted: FitResult) -> FitResult:
 
 
 def _tails(
-    problem: Problem, state: Round, seen: tuple[CameraViews, ...], images: tuple[Image, ...]
-) -> tuple[Tails, tuple[Bools, ...]] | None:
+    training: TrainingData, state: Round, seen: tuple[CameraViews, ...], images: tuple[Image, ...]
+) -> tuple[HeavyTails, tuple[Bools, ...]] | None:
     """Degrees of freedom of the noise, from how far all views are from what the others predict; the weight of each view
     by how far it is from what all say; and the views to use. None where the noise is normal."""
     weighted = state.weighted(seen, told=True)
@@ -84,27 +89,27 @@ def _tails(
     def one(c: int, most: int) -> _Predicted:
         some = random_subset(len(seen[c].rows), most)
         return _Predicted.of(
-            state.posterior, c, problem.points, seen[c].select(some), weighted[c].select(some), state.inliers[c][some]
+            state.posterior, c, training.points, seen[c].select(some), weighted[c].select(some), state.inliers[c][some]
         )
 
     if state.tails is None:
-        few = [one(c, MOST_VIEWS) for c in range(len(seen))]
+        few = [one(c, MAX_VIEWS_PER_CAMERA) for c in range(len(seen))]
         areas = [(2 * image.half) ** 2 for image in images]
         background = [2 * np.pi * f.variance / area for f, area in zip(few, areas, strict=True)]
         if not looks_heavy(np.concatenate([f.distance for f in few]), np.concatenate(background)):
             return None
         try:
-            degrees = degrees_of_agreement(*_agreement(state.posterior, problem.points, few))
+            degrees = degrees_of_agreement(*_agreement(state.posterior, training.points, few))
         except np.linalg.LinAlgError:  # the cameras among themselves say nothing of the noise
             return None
     else:
         degrees = state.tails.degrees
     if degrees is None:
         return None
-    every = [one(c, len(problem.points)) for c in range(len(seen))]
-    limit = outlier_distance(degrees, OUTLIER)
+    every = [one(c, len(training.points)) for c in range(len(seen))]
+    limit = outlier_distance(degrees, MAX_SQUARED_MAHALANOBIS)
     judged = tuple(next_inliers(p.distance, k, limit) for p, k in zip(every, state.inliers, strict=True))
-    return Tails(degrees, tuple(weights_of(p.own, degrees) for p in every)), judged
+    return HeavyTails(degrees, tuple(student_t_weights(p.own, degrees) for p in every)), judged
 
 
 class _Predicted(NamedTuple):
@@ -123,9 +128,9 @@ class _Predicted(NamedTuple):
     def of(
         cls, posterior: Posterior, c: int, points: Floats, seen: CameraViews, weighted: CameraViews, inliers: Bools
     ) -> _Predicted:
-        at = residuals_of(posterior, c, points, weighted)
+        at = posterior_residuals(posterior, c, points, weighted)
         variance = (posterior.models[c].noise * seen.relative) ** 2
-        residual, covariance = left_out_from(at, inliers)
+        residual, covariance = left_out_residuals_from(at, inliers)
         covariance = covariance - (at.sd**2 - variance)[:, None, None] * np.eye(2)
         distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
         sound = np.isfinite(distance) & (covariance[:, 0, 0] > 0) & (np.linalg.det(covariance) > 0)
@@ -137,7 +142,7 @@ class _Predicted(NamedTuple):
 def _agreement(posterior: Posterior, points: Floats, predicted: list[_Predicted]) -> tuple[Floats, Floats, Bools]:
     """Of points, slopes and residuals of their views in the scale of the noise, and which there are: not those that are
     wrong even with heavy tails."""
-    limit = outlier_distance(min(DEGREES), OUTLIER)
+    limit = outlier_distance(min(DEGREES_OF_FREEDOM), MAX_SQUARED_MAHALANOBIS)
     n, C = len(points), len(predicted)
     each = np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy()
     r, D, there = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3)), np.zeros((n, C), dtype=np.bool_)
@@ -147,4 +152,4 @@ def _agreement(posterior: Posterior, points: Floats, predicted: list[_Predicted]
         each[rows, c] = np.linalg.inv(view.covariance[good])
         r[rows, c], there[rows, c] = view.residual[good], True
         D[rows, c] = posterior.models[c].predict(points[rows])[1]
-    return *whitened(Linear(r, D, each, None)), there
+    return *whiten(LinearisedViews(r, D, each, None)), there

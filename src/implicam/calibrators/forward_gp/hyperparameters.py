@@ -13,20 +13,20 @@ from implicam.rig_model.camera import Image, ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel, CameraViews, thin_views
 from implicam.rig_model.field import DepthScale, Hyperparameters, empty_field, field_coordinates
 from implicam.rig_model.posterior import condition
-from implicam.rig_model.training_data import Problem
+from implicam.rig_model.training_data import TrainingData
 
-MOST = 300
+MAX_POINTS = 300
 """Points of one camera that the hyperparameters are found from; more cost time and tell little more."""
 
-MOST_UNCERTAIN = 50
+MAX_UNCERTAIN_POINTS = 50
 """The same where every point has an error of its own: three unknowns each."""
 
-TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
+FIELD_VARIANCE_TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
 
 
 def estimate_hyperparameters(
-    problem: Problem,
+    training: TrainingData,
     models: tuple[CameraModel, ...],
     used: tuple[CameraViews, ...],
     images: tuple[Image, ...],
@@ -40,17 +40,17 @@ def estimate_hyperparameters(
     found = Hyperparameters(np.ones((len(models), 2)), np.ones(len(models)), np.ones(len(models)))
     groups = []
     for numbers in _alike(models):
-        evidence = [_evidence(problem, models[c], used[c], moved) for c in numbers]
+        evidence = [_evidence(training, models[c], used[c], moved) for c in numbers]
         half = np.array([images[c].half for c in numbers])
         kind = models[numbers[0]].camera.kind
-        rig = RigEvidence(evidence, half, stated[numbers], kind, TOLERANCE[kind])
+        rig = RigEvidence(evidence, half, stated[numbers], kind, FIELD_VARIANCE_TOLERANCE[kind])
         guess = None if before is None else Hyperparameters(*(values[numbers] for values in before))
         for values, part in zip(found, rig.maximise(guess, search=search or moved is not None), strict=True):
             values[numbers] = part
         groups.append((numbers, rig))
-    if problem.errors is None or problem.errors.estimated:
+    if training.errors is None or training.errors.estimated:
         return found
-    return _joint_sizes(problem, models, used, found, groups)
+    return _joint_sizes(training, models, used, found, groups)
 
 
 def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
@@ -59,12 +59,14 @@ def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
     return [group for group in ([c for c in range(len(models)) if c not in none], none) if group]
 
 
-def _evidence(problem: Problem, model: CameraModel, seen: CameraViews, moved: Floats | None) -> CameraEvidence:
+def _evidence(training: TrainingData, model: CameraModel, seen: CameraViews, moved: Floats | None) -> CameraEvidence:
     """One camera's evidence. The error of a shot of many points is known well, so the points are where it says
     (`moved`); that of a single point is not, and is one more unknown of the camera."""
-    errors = problem.errors if problem.errors is not None and not problem.errors.estimated else None
-    seen = thin_views(seen, MOST if errors is None or errors.count <= MOST_UNCERTAIN else MOST_UNCERTAIN)
-    points = problem.points if moved is None else problem.points + moved
+    errors = training.errors if training.errors is not None and not training.errors.estimated else None
+    seen = thin_views(
+        seen, MAX_POINTS if errors is None or errors.count <= MAX_UNCERTAIN_POINTS else MAX_UNCERTAIN_POINTS
+    )
+    points = training.points if moved is None else training.points + moved
     view = model.camera.view(points[seen.rows])
     X, off, prior = view.by_parameters, model.prior.mean - model.camera.parameters, model.prior
     if errors is not None:
@@ -83,16 +85,16 @@ def _evidence(problem: Problem, model: CameraModel, seen: CameraViews, moved: Fl
 
 
 def size_fields(
-    problem: Problem, models: tuple[CameraModel, ...], used: tuple[CameraViews, ...], hyper: Hyperparameters
+    training: TrainingData, models: tuple[CameraModel, ...], used: tuple[CameraViews, ...], hyper: Hyperparameters
 ) -> tuple[CameraModel, ...]:
     """The cameras with fields laid out anew."""
 
     def one(c: int) -> CameraModel:
         model = models[c]
-        points = problem.points[used[c].rows]
+        points = training.points[used[c].rows]
         view = model.camera.view(points[:: max(1, len(points) // 4000)])
         depth = DepthScale.of(view)
-        tolerance = TOLERANCE[model.camera.kind]
+        tolerance = FIELD_VARIANCE_TOLERANCE[model.camera.kind]
         field = empty_field(hyper.lengthscale[c], field_coordinates(view, model.image, depth), tolerance)
         return replace(
             model,
@@ -108,7 +110,7 @@ def size_fields(
 
 
 def _joint_sizes(
-    problem: Problem,
+    training: TrainingData,
     models: tuple[CameraModel, ...],
     used: tuple[CameraViews, ...],
     hyper: Hyperparameters,
@@ -119,15 +121,15 @@ def _joint_sizes(
     One camera cannot tell the error of a position from its own noise; together they can, for all see the same error.
     """
     points = np.unique(np.concatenate([seen.rows for seen in used]))
-    if len(points) > MOST:
-        points = np.random.default_rng(0).choice(points, MOST, replace=False)
+    if len(points) > MAX_POINTS:
+        points = np.random.default_rng(0).choice(points, MAX_POINTS, replace=False)
     some = tuple(seen.select(np.isin(seen.rows, points)) for seen in used)
-    laid_out = size_fields(problem, models, some, hyper)
+    laid_out = size_fields(training, models, some, hyper)
 
     def loss(z: Floats) -> float:
         signal, noise = np.exp(z)
         sized = tuple(replace(m, signal=m.signal * signal, noise=m.noise * noise) for m in laid_out)
-        evidence = condition(sized, problem.points, some, problem.errors).evidence
+        evidence = condition(sized, training.points, some, training.errors).evidence
         penalties = (rig.penalty(hyper.signal[c] * signal, hyper.noise[c] * noise) for c, rig in groups)
         return float(sum(penalties)) - evidence
 

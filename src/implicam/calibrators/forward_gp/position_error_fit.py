@@ -10,22 +10,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.heavy_tail_fit import with_heavy_tails
+from implicam.calibrators.forward_gp.heavy_tail_fit import refit_with_heavy_tails
 from implicam.dataset import Names
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.leave_one_out import OUTLIER, LeftOut, left_out_views
+from implicam.rig_model.leave_one_out import MAX_SQUARED_MAHALANOBIS, LeftOutViews, left_out_views
 from implicam.rig_model.level_errors import untold
 from implicam.rig_model.linearise import iterate_linearisation
-from implicam.rig_model.position_errors import Agreement, LabelErrors, estimated
+from implicam.rig_model.position_errors import Agreement, PositionErrors, estimate_position_errors
 from implicam.rig_model.tied import Scatter
-from implicam.rig_model.training_data import Problem
+from implicam.rig_model.training_data import TrainingData
 
-MOST = 400
+MAX_POINTS = 400
 """Points that the errors are estimated from; more cost time and tell little more."""
 
 
-def with_noise_told_apart(problem: Problem, fitted: FitResult, shots: Names) -> FitResult:
+def separate_position_errors(training: TrainingData, fitted: FitResult, shots: Names) -> FitResult:
     """The rig where what the fit took for normal pixel noise is something else: errors of known positions if all
     cameras agree on them, else heavy tails; else the same. shots: (n,) of the points.
 
@@ -33,24 +33,24 @@ def with_noise_told_apart(problem: Problem, fitted: FitResult, shots: Names) -> 
     to each of them; tails of the pixels, which cameras do not share, never look like dots that are off. What is
     declared is not estimated.
     """
-    if problem.errors is not None and not problem.errors.estimated:
-        return with_heavy_tails(problem, fitted)
-    planes = untold(problem.points, shots) if problem.errors is None else None
+    if training.errors is not None and not training.errors.estimated:
+        return refit_with_heavy_tails(training, fitted)
+    planes = untold(training.points, shots) if training.errors is None else None
     if planes is not None:
         fitted = replace(fitted, untold_sd=planes.sd)
-    scattered = _with_scatter(problem, fitted)
-    if scattered.label_errors is not None:
+    scattered = _with_scatter(training, fitted)
+    if scattered.position_errors is not None:
         return scattered
-    heavy = with_heavy_tails(problem, fitted)
-    return fitted if heavy.tails is None else _with_scatter(problem, heavy)
+    heavy = refit_with_heavy_tails(training, fitted)
+    return fitted if heavy.tails is None else _with_scatter(training, heavy)
 
 
-def _with_scatter(problem: Problem, fitted: FitResult) -> FitResult:
-    seen = tuple(problem.camera_views[c] for c in fitted.cameras)
+def _with_scatter(training: TrainingData, fitted: FitResult) -> FitResult:
+    seen = tuple(training.camera_views[c] for c in fitted.cameras)
     if fitted.tails is not None:
         seen = fitted.tails.weighted(seen, told=True)
-    views = left_out_views(fitted.posterior, problem.points, seen, fitted.inliers)
-    inliers, n = fitted.inliers, len(problem.points)
+    views = left_out_views(fitted.posterior, training.points, seen, fitted.inliers)
+    inliers, n = fitted.inliers, len(training.points)
     found = _estimated(views, inliers, n)
     if found is None:
         return fitted
@@ -62,13 +62,13 @@ def _with_scatter(problem: Problem, fitted: FitResult) -> FitResult:
     models = tuple(replace(model, noise=model.noise * errors.noise) for model in fitted.posterior.models)
     used = tuple(one.select(k) for one, k in zip(seen, inliers, strict=True))
     try:
-        posterior = iterate_linearisation(models, problem.points, used, fitted.errors, Scatter(errors.root, size))
+        posterior = iterate_linearisation(models, training.points, used, fitted.errors, Scatter(errors.root, size))
     except np.linalg.LinAlgError:  # then the cameras stay as they were, with more noise than there is
         return fitted
-    return replace(fitted, posterior=posterior, inliers=inliers, label_errors=errors)
+    return replace(fitted, posterior=posterior, inliers=inliers, position_errors=errors)
 
 
-def _sums(views: list[LeftOut], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
+def _sums(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
     """Of all points, and which of them may be used: seen twice, and not of high leverage."""
     total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
     high = np.zeros(n, dtype=np.bool_)
@@ -83,12 +83,12 @@ def _sums(views: list[LeftOut], inliers: tuple[Bools, ...], n: int) -> tuple[Agr
     return total, (total.coordinates >= 4) & ~high
 
 
-def _estimated(views: list[LeftOut], inliers: tuple[Bools, ...], n: int) -> tuple[LabelErrors, Floats] | None:
+def _estimated(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[PositionErrors, Floats] | None:
     """The errors, and (n,) how much larger than usual each point's own scale is."""
     agreement, good = _sums(views, inliers, n)
     rows = np.flatnonzero(good).astype(np.int64)
-    some = rows if len(rows) <= MOST else np.random.default_rng(0).choice(rows, MOST, replace=False)
-    errors = estimated(agreement.select(some))
+    some = rows if len(rows) <= MAX_POINTS else np.random.default_rng(0).choice(rows, MAX_POINTS, replace=False)
+    errors = estimate_position_errors(agreement.select(some))
     if errors is None:
         return None
     size = np.ones(len(good))
@@ -96,7 +96,7 @@ def _estimated(views: list[LeftOut], inliers: tuple[Bools, ...], n: int) -> tupl
     return errors, size
 
 
-def _judged(views: list[LeftOut], inliers: tuple[Bools, ...], found: LabelErrors, n: int) -> tuple[Bools, ...]:
+def _judged(views: list[LeftOutViews], inliers: tuple[Bools, ...], found: PositionErrors, n: int) -> tuple[Bools, ...]:
     """The views to use: those that agree with what the others say of where their point is."""
     total, _ = _sums(views, inliers, n)
     noise2 = found.noise**2
@@ -110,5 +110,5 @@ def _judged(views: list[LeftOut], inliers: tuple[Bools, ...], found: LabelErrors
         residual = view.residual - np.einsum("nij,njk,nk->ni", view.slope, where, drawn)
         covariance = noise2 * np.linalg.inv(view.inverse) + view.slope @ where @ view.slope.swapaxes(1, 2)
         distance = np.einsum("ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
-        judged.append(np.asarray(distance <= OUTLIER, dtype=np.bool_))
+        judged.append(np.asarray(distance <= MAX_SQUARED_MAHALANOBIS, dtype=np.bool_))
     return tuple(judged)

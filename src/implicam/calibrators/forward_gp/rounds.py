@@ -11,29 +11,29 @@ from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.field import Hyperparameters
-from implicam.rig_model.heavy_tails import Tails
+from implicam.rig_model.heavy_tails import HeavyTails
 from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.normal_equations import CameraFailedError
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.shot_errors import ShotErrors
-from implicam.rig_model.training_data import FEWEST, Problem
+from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA, TrainingData
 
-FAR_OFF = 4.0
+MAX_MEDIAN_ERROR_NOISES = 4.0
 """Median error of a fitted camera at its own views, in its noise, beyond which the fit has failed."""
 
-SETTLED = 0.1
+SHOT_SD_TOLERANCE = 0.1
 """Relative change of the shots' errors between two rounds below which they are found."""
 
 
-def check_fitted(problem: Problem, state: Round, seen: tuple[CameraViews, ...]) -> None:
+def check_fitted(training: TrainingData, state: Round, seen: tuple[CameraViews, ...]) -> None:
     """A camera that ends far off its own known points is no camera, whatever its covariance says."""
-    points = problem.points
+    points = training.points
     if state.posterior.displacement is not None:
         points = points + state.posterior.displacement
     for number, (model, views, inliers) in enumerate(zip(state.posterior.models, seen, state.inliers, strict=True)):
         rows = views.rows[inliers]
         error = np.linalg.norm(model.predict(points[rows])[0] - views.uv[inliers], axis=1) / views.relative[inliers]
-        if len(rows) < FEWEST or not np.median(error) < FAR_OFF * model.noise:
+        if len(rows) < MIN_POINTS_PER_CAMERA or not np.median(error) < MAX_MEDIAN_ERROR_NOISES * model.noise:
             off = float(np.median(error)) if len(rows) else np.nan
             raise CameraFailedError(number, f"it ends {off:.3g} px off its own known points")
 
@@ -51,10 +51,10 @@ class Round(NamedTuple):
     settled: bool
     errors: ShotErrors | None = None
     fixed: Hyperparameters | None = None
-    tails: Tails | None = None
+    tails: HeavyTails | None = None
 
     def weighted(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
-        """The sightings with their weights as noise; told: as much as they tell, for what is known of the cameras."""
+        """The views with their weights as noise; told: as much as they tell, for what is known of the cameras."""
         return seen if self.tails is None else self.tails.weighted(seen, told=told)
 
     @property
@@ -65,7 +65,7 @@ class Round(NamedTuple):
 
 
 def next_round(
-    problem: Problem,
+    training: TrainingData,
     last: Round,
     seen: tuple[CameraViews, ...],
     images: tuple[Image, ...],
@@ -75,36 +75,36 @@ def next_round(
 ) -> Round:
     """Sizes, posterior, and how far the shots are off. search: for other lengthscales too."""
     inliers = tuple(
-        k & np.isfinite(m.camera.pixel(problem.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
+        k & np.isfinite(m.camera.pixel(training.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
         for k, m, s in zip(last.inliers, last.models, seen, strict=True)
     )
     for number, k in enumerate(inliers):
-        if k.sum() < FEWEST:
+        if k.sum() < MIN_POINTS_PER_CAMERA:
             raise CameraFailedError(number, f"{k.sum()} of its {len(k)} views agree with the others")
     used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=False), inliers, strict=True))
     moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
     hyper = last.fixed or estimate_hyperparameters(
-        problem, last.models, used, images, stated, last.hyper, moved, search
+        training, last.models, used, images, stated, last.hyper, moved, search
     )
     errors = last.next_errors
     used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=True), inliers, strict=True))
-    posterior = condition_with_new_fields(problem, last.models, used, hyper, errors)
+    posterior = condition_with_new_fields(training, last.models, used, hyper, errors)
     following, label_sd, settled = errors, None, True
     if errors is not None and posterior.unknowns is not None:
         mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
         following, label_sd = errors.updated(mean.reshape(errors.sd.shape), variance.reshape(errors.sd.shape))
-        settled = bool(np.allclose(following.sd, errors.sd, rtol=SETTLED))
+        settled = bool(np.allclose(following.sd, errors.sd, rtol=SHOT_SD_TOLERANCE))
     return Round(
         hyper, posterior.models, posterior, inliers, following, label_sd, settled, errors, last.fixed, last.tails
     )
 
 
 def condition_with_new_fields(
-    problem: Problem,
+    training: TrainingData,
     models: tuple[CameraModel, ...],
     used: tuple[CameraViews, ...],
     hyper: Hyperparameters,
     errors: ShotErrors | None,
 ) -> Posterior:
     """The posterior with fields laid out anew."""
-    return iterate_linearisation(size_fields(problem, models, used, hyper), problem.points, used, errors)
+    return iterate_linearisation(size_fields(training, models, used, hyper), training.points, used, errors)

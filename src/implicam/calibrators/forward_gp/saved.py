@@ -18,8 +18,8 @@ from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.field import DepthScale, Hyperparameters, field_kernel
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.general_camera import GeneralCamera
-from implicam.rig_model.heavy_tails import Tails
-from implicam.rig_model.position_errors import LabelErrors
+from implicam.rig_model.heavy_tails import HeavyTails
+from implicam.rig_model.position_errors import PositionErrors
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.schur import Unknowns
 from implicam.rig_model.shot_errors import ShotErrors, Shots
@@ -53,7 +53,7 @@ def state(fitted: FitResult, names: Sequence[str]) -> tuple[dict[str, Any], dict
         arrays["joint"] = posterior.joint
     if posterior.displacement is not None:
         arrays["displacement"] = posterior.displacement
-    if posterior.ties is not None and (found := fitted.label_errors) is not None and found.size is not None:
+    if posterior.ties is not None and (found := fitted.position_errors) is not None and found.size is not None:
         arrays |= {
             "ties": posterior.ties,
             "labels/scale": found.scale,
@@ -113,7 +113,7 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
     errors, label_sd = _shot_errors(data, points, arrays, posterior)
     hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
     ordinary = tuple(float(one.get("ordinary_would_leave_px", np.nan)) for one in described)
-    label_errors, untold_sd = _label_errors(data, arrays, posterior), None
+    position_errors, untold_sd = _position_errors(data, arrays, posterior), None
     if "untold_sd" in arrays:
         untold_sd = finite_column(arrays, "untold_sd", (6,), positive=True)
     tails = _tails(arrays, inliers)
@@ -126,13 +126,13 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
         errors,
         label_sd,
         tails,
-        label_errors,
+        position_errors,
         untold_sd,
         ordinary,
     )
 
 
-def _tails(arrays: Arrays, inliers: Sequence[NDArray[np.bool_]]) -> Tails | None:
+def _tails(arrays: Arrays, inliers: Sequence[NDArray[np.bool_]]) -> HeavyTails | None:
     """None where the noise is normal, as in files from before there were tails."""
     if "tails" not in arrays:
         return None
@@ -143,10 +143,10 @@ def _tails(arrays: Arrays, inliers: Sequence[NDArray[np.bool_]]) -> Tails | None
         finite_column(arrays, f"{number}/tail_weights", used.shape, positive=True)
         for number, used in enumerate(inliers)
     )
-    return Tails(degrees, tuple(weights))
+    return HeavyTails(degrees, tuple(weights))
 
 
-def _label_errors(data: Dataset, arrays: Arrays, posterior: Posterior) -> LabelErrors | None:
+def _position_errors(data: Dataset, arrays: Arrays, posterior: Posterior) -> PositionErrors | None:
     if posterior.ties is None:
         if any(name.startswith("labels/") for name in arrays):
             raise ValueError("errors of known positions tie the cameras: ties is missing")
@@ -160,7 +160,7 @@ def _label_errors(data: Dataset, arrays: Arrays, posterior: Posterior) -> LabelE
     if not np.allclose(scale, scale.T) or np.linalg.eigvalsh(scale)[0] <= 0:
         raise ValueError("labels/scale must be a covariance")
     size = finite_column(arrays, "labels/size", (len(data),), positive=True)
-    return LabelErrors(scale, 1 / thickness if thickness else np.inf, noise, gain, size)
+    return PositionErrors(scale, 1 / thickness if thickness else np.inf, noise, gain, size)
 
 
 def _shot_errors(
