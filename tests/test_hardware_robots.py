@@ -230,7 +230,7 @@ SESSION = """
 import sys
 import numpy as np
 from implicam.hardware import URRobot
-robot = URRobot(sys.argv[1], box=((0, 0, 0), (600, 600, 600)), speed=0.1)
+robot = URRobot(sys.argv[1], box=((0, 0, 0), (600, 600, 600)), speed=0.02)
 robot.open()
 print("ready", flush=True)
 robot.move(np.array([590.0, 590.0, 400.0]))
@@ -247,7 +247,7 @@ def test_the_arm_stops_when_the_session_is_interrupted_or_dies(controller: Contr
         time.sleep(0.01)
     session.send_signal(kill)
     session.communicate()
-    end = time.monotonic() + 3
+    end = time.monotonic() + 10
     while ((state := controller.tell())["moving"] or state["running"]) and time.monotonic() < end:
         time.sleep(0.01)
     assert not state["moving"]
