@@ -138,7 +138,7 @@ def test_no_permission(saved: Path, tmp_path: Path) -> None:
 
 def test_a_place_that_cannot_be_written(original: InverseGPCalibration, tmp_path: Path) -> None:
     (tmp_path / "dir.implicam").mkdir()
-    with pytest.raises(ImplicamError, match="cannot write|is a folder, and a file is to be written"):
+    with pytest.raises(ImplicamError, match="is a folder, and a file is to be written"):
         original.save(tmp_path / "dir.implicam")
     (tmp_path / "file").write_text("")
     with pytest.raises(ImplicamError, match="cannot create the folder"):

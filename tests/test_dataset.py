@@ -381,7 +381,7 @@ def test_writing_over_something(tmp_path: Path) -> None:
         write_dataset(data, tmp_path / "file", overwrite=True)
     for name in ("dir.csv", "dir.npz", "dir.parquet"):
         (tmp_path / name).mkdir()
-        with pytest.raises(ImplicamError, match="cannot write|is a folder, and a file is to be written"):
+        with pytest.raises(ImplicamError, match="is a folder, and a file is to be written"):
             write_dataset(data, tmp_path / name)
     (tmp_path / "empty").mkdir()
     write_dataset(data, tmp_path / "empty")

@@ -104,7 +104,7 @@ def test_writing_is_whole_or_not_at_all(tmp_path: Path) -> None:
     measurement().write_csv(str(path))  # and replaces the file
     assert [p.name for p in path.parent.iterdir()] == ["measured.csv"]
     (tmp_path / "dir.csv").mkdir()
-    with pytest.raises(ImplicamError, match="cannot write|is a folder, and a file is to be written"):
+    with pytest.raises(ImplicamError, match="is a folder, and a file is to be written"):
         measurement().write_csv(tmp_path / "dir.csv")
 
 
