@@ -15,8 +15,8 @@ from implicam.cli import commands, main
 from implicam.dataset import Dataset, Floats
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.measurement import Measurement
-from implicam.simulate import build_rig, random_positions, simulate
-from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _moved_at, _of_data
+from implicam.simulate import ball_grid, build_rig, random_positions, simulate
+from implicam.verdict import DOUBTFUL, NOT_USABLE, USABLE, _moved_at, _of_data, _of_surface
 
 CASES = Path(__file__).parent / "data" / "cases"
 
@@ -237,3 +237,13 @@ def test_not_usable_writes_nothing_unless_forced(
         main(["calibrate", str(tmp_path / "d"), "-o", str(file), "--force"])
     assert left.value.code == 0
     assert calibration_file.describe(file)["verdict"]["word"] == NOT_USABLE
+
+
+@pytest.mark.parametrize(("lens", "levels", "said"), [("none", 2, True), ("none", 3, False), ("auto", 2, False)])
+def test_two_planes_are_doubtful_where_no_lens_restrains_the_cameras(lens: str, levels: int, said: bool) -> None:
+    """A tank of the menagerie: 30 points on two levels, errors of 11 times the limit between them, folds as they
+    should be."""
+    built = build_rig("bar3", seed=1)
+    grid = ball_grid(built, (6, 6, levels))
+    findings = list(_of_surface(ic.ForwardGP(lens).fit(simulate(built, grid, seed=2))))
+    assert ["two planes" in finding.reason for finding in findings] == [True] * said

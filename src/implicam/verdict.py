@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri, fdtrc
 
-from implicam.calibrators import MLP, Calibration, InverseGP
+from implicam.calibrators import MLP, Calibration, ExplicitCalibration, ForwardGPCalibration, InverseGP
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
@@ -30,6 +30,13 @@ from implicam.rig_model.training_data import stated_noise
 from implicam.row_order import change_of, other_camera
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
+
+ON_SURFACE = 0.05
+"""Rms of the best quadratic equation at known points, in coordinates of unit variance: with 14 or more points all over
+less was never seen in 2000 draws, two planes good to a hundredth of their distance have 0.03."""
+
+RESTRAINED = ("ordinary", "aspect")
+"""Kinds of cameras that cannot follow anything that lenses do not do."""
 
 FEW_POINTS = 12
 """Fewer known points fix a rig, but leave too little to check it by."""
@@ -120,6 +127,7 @@ def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
     sds = list(_of_stated_sds(calibration))
     cure = _SDS if _declared(calibration.data) and not sds else _LOOK
     findings = [*failed, *_of_held_out(held_out, calibration, cure), *sds, *_of_data(calibration.data)]
+    findings += _of_surface(calibration)
     findings += _of_cameras(calibration, {name for finding in findings for name in finding.cameras})
     reasons = tuple(finding.reason for finding in sorted(findings, key=lambda finding: not finding.grave))
     word = NOT_USABLE if any(finding.grave for finding in findings) else DOUBTFUL if findings else USABLE
@@ -312,6 +320,32 @@ def _of_data(data: Dataset) -> Iterator[Finding]:
             False,
             f"The known points lie nearly on a {shape}: away from it positions are guessed. Add known points in front "
             "of it and behind.",
+        )
+
+
+def _of_surface(calibration: Calibration) -> Iterator[Finding]:
+    """Known points on two planes, or on another surface of the second degree. What vanishes there may be added to a map
+    that no lens restrains, and no known point tells, held out or not."""
+    if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration):
+        models = calibration.map.posterior.models
+        if all(model.family in RESTRAINED for model in models):
+            return
+    data = calibration.data
+    xyz = data.xyz[data.observations.seen.any(axis=1)]
+    n = len(xyz)
+    if n < FEW_POINTS:
+        return
+    left, extents, _ = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
+    if extents[-1] <= FLAT_RATIO * extents[0]:
+        return
+    q = left * np.sqrt(n)
+    first, second = np.triu_indices(3)
+    monomials = np.column_stack([np.ones(n), q, q[:, first] * q[:, second]])
+    if np.linalg.svd(monomials / np.sqrt(n), compute_uv=False)[-1] < ON_SURFACE:
+        yield Finding(
+            False,
+            "The known points lie on two planes, or on another surface that a quadratic equation describes: between "
+            "its parts positions are guessed, and held-out points cannot show it. Add known points between them.",
         )
 
 
