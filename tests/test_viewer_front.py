@@ -533,7 +533,7 @@ def test_a_head_may_be_large_but_not_huge(front, behind):
 
 
 def test_a_slow_head_is_hung_up_on_and_does_not_hold_up_others(front, behind, monkeypatch):
-    monkeypatch.setattr(door, "PATIENCE", 0.5)
+    monkeypatch.setattr(door, "PATIENCE_SECONDS", 0.5)
     with contextlib.ExitStack() as stack:
         stalled = [stack.enter_context(connect(front)) for _ in range(60)]
         for line in stalled[:30]:
@@ -562,13 +562,13 @@ def test_clients_that_reset_the_connection_leave_no_trace(front, caplog):
 
 
 def test_a_body_that_does_not_come_ends_in_time(front, monkeypatch):
-    monkeypatch.setattr(door, "PATIENCE", 0.3)
-    monkeypatch.setattr(door, "ANSWER", 0.3)
+    monkeypatch.setattr(door, "PATIENCE_SECONDS", 0.3)
+    monkeypatch.setattr(door, "ANSWER_SECONDS", 0.3)
     assert send(front, b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")[0] == 502
 
 
 def test_too_many_at_once_are_told_so(front, monkeypatch):
-    monkeypatch.setattr(door, "MOST_CLIENTS", 3)
+    monkeypatch.setattr(door, "MAX_CLIENTS", 3)
     with connect(front), connect(front), connect(front):
         assert get(front)[0] == 503
     deadline = time.monotonic() + 5

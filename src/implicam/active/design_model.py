@@ -60,7 +60,7 @@ class Places:
         return cls(data.xyz, data.observations.uv, data.observations.seen)
 
 
-UNTOLD = 0.25
+UNTOLD_IMAGE_MARGIN = 0.25
 """Where nobody told a picture's size, it is taken to reach beyond what was seen by this part of its extent."""
 
 
@@ -72,7 +72,7 @@ def on_image(observations: Observations, uv: Floats) -> Bools:
             low, high = np.array([-0.5, -0.5]), np.array([camera.width, camera.height]) - 0.5
         elif observations.seen[:, c].any():
             pixels = observations.uv[observations.seen[:, c], c]
-            margin = UNTOLD * np.ptp(pixels, axis=0)
+            margin = UNTOLD_IMAGE_MARGIN * np.ptp(pixels, axis=0)
             low, high = pixels.min(axis=0) - margin, pixels.max(axis=0) + margin
         else:
             continue

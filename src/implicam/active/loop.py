@@ -41,14 +41,14 @@ from implicam.progress import Progress, silent
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.threads import blas_threads
 
-GROWTH = 1.25
+MAX_GROWTH = 1.25
 """Between two fits from no guess the points grow by this factor at most; also of the forward model that predicts pixels
 for inverse-gp."""
 
-FEW = 16
+FEW_POINTS = 16
 """So few points say little of where the best fit is: each fit is one from no guess."""
 
-MOST_SKIPPED = 20
+MAX_SKIPPED = 20
 """So many targets in a row that nobody could measure are no accident."""
 
 
@@ -113,7 +113,7 @@ class Loop:
     judged: int = 400
     reach: float = np.inf
     seed: int = 0
-    growth: float = GROWTH
+    growth: float = MAX_GROWTH
     pool: Dataset | None = None
     data: Dataset | None = None
 
@@ -199,7 +199,7 @@ class Loop:
     def run(self, oracle: Oracle, progress: Progress = silent) -> Loop:
         """Ask and tell until a rule says stop, or no place is left; the loop itself."""
         in_vain = 0
-        while not self.stop and in_vain < MOST_SKIPPED:
+        while not self.stop and in_vain < MAX_SKIPPED:
             try:
                 (target, *_) = self.ask(here=None if self.data is None else self.data.xyz[-1])
             except UsageError:
@@ -214,7 +214,7 @@ class Loop:
         """A fit with everything, from the last one's result; from no guess, too, when the points have grown by much."""
         if self.growth <= 1:
             return self.calibrator.fit(data, progress)
-        anew = not FEW < len(data) < self.growth * self._from_no_guess
+        anew = not FEW_POINTS < len(data) < self.growth * self._from_no_guess
         if anew:
             self._from_no_guess = len(data)
         if isinstance(before, ForwardGPCalibration | InverseGPCalibration) and len(before.data) < len(data):
@@ -292,7 +292,7 @@ class Loop:
         """For inverse-gp a forward model of the same points, which predicts pixels; None where it is not needed."""
         if not isinstance(self.calibrator, InverseGP) or self.data is None:
             return None
-        if self._pilot is None or len(self.data) >= GROWTH * len(self._pilot.data):
+        if self._pilot is None or len(self.data) >= MAX_GROWTH * len(self._pilot.data):
             self._pilot = ForwardGP().fit(self.data)
             self._judged_by_pilot = Places.predicted(self._pilot, self.judged_at)
         return self._pilot

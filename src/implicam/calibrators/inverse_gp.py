@@ -27,7 +27,7 @@ from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_prin
 from implicam.calibrators.pixel_cloud import FAR, FAR_FROM_A_PLANE, PixelCloud
 from implicam.calibrators.protocol import Arrays, finite_column, why_not_all_seen
 from implicam.dataset import Dataset, Floats, Names, Observations, copy_notes, without_copies
-from implicam.dataset.requirements import FLAT, require_points, require_two_values, same_cameras
+from implicam.dataset.requirements import MAX_RELATIVE_THICKNESS, require_points, require_two_values, same_cameras
 from implicam.dataset.unused import Rejected, Unused, copied_points
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
@@ -454,7 +454,7 @@ def unlike_reason(far: float) -> str:
 def flat_note(data: Dataset) -> list[str]:
     """A note on known points in one plane, whichever way it lies."""
     extents = np.linalg.svd(data.xyz - data.xyz.mean(axis=0), compute_uv=False)
-    if extents[-1] > FLAT * extents[0]:
+    if extents[-1] > MAX_RELATIVE_THICKNESS * extents[0]:
         return []
     return [
         "The known positions lie in one plane. Positions off it are not measured but guessed, and their error bars "

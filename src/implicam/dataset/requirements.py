@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from implicam.dataset import Observations
 from implicam.errors import DatasetError, FitError
 
-FLAT = 1e-3
+MAX_RELATIVE_THICKNESS = 1e-3
 """Thickness over width of what is called a plane, or a line."""
 
 
@@ -51,9 +51,9 @@ def require_volume(xyz: NDArray[np.float64], method: str) -> None:
     """FitError for points (n, 3) on one plane or line."""
     require_two_values(xyz, method)
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
-    if extents[2] > FLAT * extents[0]:
+    if extents[2] > MAX_RELATIVE_THICKNESS * extents[0]:
         return
-    shape = "line" if extents[1] <= FLAT * extents[0] else "plane"
+    shape = "line" if extents[1] <= MAX_RELATIVE_THICKNESS * extents[0] else "plane"
     raise FitError(
         f"the {len(xyz)} known points lie on one {shape}.",
         why=f"{method} cannot tell from them how far a camera is",

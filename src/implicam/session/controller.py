@@ -36,16 +36,16 @@ from implicam.session.journal import Session
 
 CALIBRATION, REPORT = "calibration.implicam", "report.html"
 
-IN_VAIN = 5
+MAX_TARGETS_IN_VAIN = 5
 """Targets in a row without a ball, after which a session does not go on by itself."""
 
-HALTING = 2.0
+HALTING_SECONDS = 2.0
 """Seconds during which a robot that was to stop is told so again."""
 
 HISTORY = "history"
 """The setting of the session that keeps the curve."""
 
-LEAST_REPORTED = 12
+MIN_REPORTED_POINTS = 12
 """Known points from which a report by cross-validation says anything."""
 
 
@@ -207,7 +207,7 @@ class SessionController:
         """At once, from any thread; nothing goes by itself after that, and nothing moves until `go`."""
         self._halted.set()
         self._show(auto=False)
-        end = time.monotonic() + HALTING
+        end = time.monotonic() + HALTING_SECONDS
         try:
             self.equipment.robot.stop()
             while self.state.phase == "moving" and time.monotonic() < end:  # a move may have been about to begin
@@ -248,7 +248,7 @@ class SessionController:
             report.unlink(missing_ok=True)  # that of an earlier, other calibration
             words = f"{self.loop.points} points. Saved: {path}"
             try:
-                if len(calibration.data) >= LEAST_REPORTED:
+                if len(calibration.data) >= MIN_REPORTED_POINTS:
                     write_report(report, report_of(_judged(calibration), f"{self.session.name}: a guided calibration"))
                     words += f" and {report}"
             except ImplicamError as error:
@@ -278,14 +278,14 @@ class SessionController:
             self.accept()
             return
         self._in_vain += 1
-        if self._in_vain < IN_VAIN:
+        if self._in_vain < MAX_TARGETS_IN_VAIN:
             self.skip("the ball was not found")
             return
         self._in_vain = 0
         reasons = "; ".join(f"{look.camera}: {look.found.reason}" for look in self.state.looks)
         self._trouble(
             HardwareError(
-                f"the ball was not found at {IN_VAIN} targets in a row.",
+                f"the ball was not found at {MAX_TARGETS_IN_VAIN} targets in a row.",
                 why=reasons,
                 fix="look at the pictures, and retry",
             )

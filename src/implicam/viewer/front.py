@@ -38,12 +38,12 @@ from urllib.parse import parse_qsl, quote, unquote, urlsplit
 from implicam.errors import ImplicamError, UsageError
 
 HEAD_BYTES = 16 * 1024
-CHUNK = 1 << 18  # a picture of a camera in one or two reads
-PATIENCE = 10.0  # seconds: for a head, for the next piece of a body, for the last bytes to leave
-ANSWER = 30.0  # seconds that the page behind has until its first line
-STALL = 60.0  # seconds without reading, after which the other side counts as gone
-WRONG_TOKEN = 0.5  # seconds that a wrong token costs
-MOST_CLIENTS = 128  # more would take file descriptors from the cameras and the journal
+CHUNK_BYTES = 1 << 18  # a picture of a camera in one or two reads
+PATIENCE_SECONDS = 10.0  # seconds: for a head, for the next piece of a body, for the last bytes to leave
+ANSWER_SECONDS = 30.0  # seconds that the page behind has until its first line
+STALL_SECONDS = 60.0  # seconds without reading, after which the other side counts as gone
+WRONG_TOKEN_SECONDS = 0.5  # seconds that a wrong token costs
+MAX_CLIENTS = 128  # more would take file descriptors from the cameras and the journal
 WILDCARDS = ("", "0.0.0.0", "::")
 
 REQUEST_LINE = re.compile(
@@ -339,17 +339,17 @@ class Front:
 
     async def _read_head(self, reader: StreamReader) -> _Head | None:
         """The next head; None where the client hung up before it was complete."""
-        if len(self._clients) > MOST_CLIENTS:
-            raise _RefusedError(503, f"More than {MOST_CLIENTS} connections are open. Close other pages and reload.")
+        if len(self._clients) > MAX_CLIENTS:
+            raise _RefusedError(503, f"More than {MAX_CLIENTS} connections are open. Close other pages and reload.")
         try:
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(PATIENCE_SECONDS):
                 return _Head.parse(await reader.readuntil(b"\r\n\r\n"))
         except asyncio.IncompleteReadError:
             return None
         except asyncio.LimitOverrunError:
             raise _RefusedError(431, f"The head of the request is longer than {HEAD_BYTES} bytes.") from None
         except TimeoutError:
-            raise _RefusedError(408, f"No complete request within {PATIENCE:.0f} seconds.") from None
+            raise _RefusedError(408, f"No complete request within {PATIENCE_SECONDS:.0f} seconds.") from None
 
     def _check_source(self, head: _Head) -> None:
         """Refuse a Host that is not ours, and what a page from elsewhere asks for."""
@@ -389,7 +389,7 @@ class Front:
         if not given and any(name == self.cookie and _same(value, ticket) for name, value in head.cookies()):
             return None
         if given:
-            await asyncio.sleep(WRONG_TOKEN)
+            await asyncio.sleep(WRONG_TOKEN_SECONDS)
         return _Reply(401, TOKEN_PAGE.encode(), ("Content-Type: text/html; charset=utf-8",))
 
     async def _file(self, head: _Head) -> _Reply | None:
@@ -411,8 +411,8 @@ class Front:
         """Pass one request on and its answer back; None once a byte of the answer is out."""
         length = head.body_bytes()
         try:
-            async with asyncio.timeout(PATIENCE):
-                behind = await asyncio.open_connection(*self._behind, limit=CHUNK)
+            async with asyncio.timeout(PATIENCE_SECONDS):
+                behind = await asyncio.open_connection(*self._behind, limit=CHUNK_BYTES)
         except (OSError, TimeoutError):
             return _words(502, "The page behind this door does not answer. Is implicam acquire still running?")
         try:
@@ -427,7 +427,7 @@ class Front:
             questions.write(head.passed_on(cookie=self.cookie, origin=self._origin))
             await _copy(reader, questions, length)
         with suppress(OSError, TimeoutError, ValueError):
-            async with asyncio.timeout(ANSWER):
+            async with asyncio.timeout(ANSWER_SECONDS):
                 status = await answers.readline()
         if not re.fullmatch(rb"HTTP/1\.[01] [0-9]{3}.*\r\n", status):
             return _words(502, "The page behind this door hung up without an answer.")
@@ -445,14 +445,14 @@ _Pipe = tuple[StreamReader, StreamWriter]
 
 async def _copy(source: StreamReader, sink: StreamWriter, length: int | None = None) -> None:
     """Copy `length` bytes, or all until the end. TimeoutError where a piece of known length or the sink stalls."""
-    left = CHUNK if length is None else length
+    left = CHUNK_BYTES if length is None else length
     while left > 0:
-        async with asyncio.timeout(None if length is None else PATIENCE):
-            data = await source.read(min(CHUNK, left))
+        async with asyncio.timeout(None if length is None else PATIENCE_SECONDS):
+            data = await source.read(min(CHUNK_BYTES, left))
         if not data:
             return
         sink.write(data)
-        async with asyncio.timeout(STALL):
+        async with asyncio.timeout(STALL_SECONDS):
             await sink.drain()
         left -= 0 if length is None else len(data)
 
@@ -470,7 +470,7 @@ async def _both_ways(one: _Pipe, other: _Pipe) -> None:
     ways = [asyncio.create_task(through(a, b)) for a, b in ((one[0], other[1]), (other[0], one[1]))]
     try:
         await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-        await asyncio.wait(ways, timeout=PATIENCE)
+        await asyncio.wait(ways, timeout=PATIENCE_SECONDS)
     finally:
         for way in ways:
             way.cancel()
@@ -479,9 +479,9 @@ async def _both_ways(one: _Pipe, other: _Pipe) -> None:
 
 async def _finish(reader: StreamReader, writer: StreamWriter) -> None:
     """Send what is left and wait for the client to hang up: closing on unread bytes would destroy the answer."""
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(PATIENCE_SECONDS):
         writer.write_eof()
-        while await reader.read(CHUNK):
+        while await reader.read(CHUNK_BYTES):
             pass
 
 
@@ -531,7 +531,7 @@ def _listen(host: str, port: int) -> socket.socket:
         if where == "::" and socket.has_dualstack_ipv6():
             return socket.create_server((where, port), family=socket.AF_INET6, dualstack_ipv6=True)
         family = socket.getaddrinfo(where or "0.0.0.0", port, type=socket.SOCK_STREAM)[0][0]
-        return socket.create_server((where, port), family=family, backlog=MOST_CLIENTS)
+        return socket.create_server((where, port), family=family, backlog=MAX_CLIENTS)
     except OSError as error:
         raise ImplicamError(
             f"The page cannot be opened on {host or 'all addresses'}, port {port}.",

@@ -21,21 +21,21 @@ from implicam.geometry import Bools, Floats, Pose, rotation_from_vector
 from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera, Prior, solve_normal
 
-ROBUST = 3.0
+CAUCHY_SCALE_SDS = 3.0
 """Residuals, in standard deviations, beyond which a view counts less: Cauchy's loss."""
 
-LOST = 1e4
+LOST_SQUARED_RESIDUAL = 1e4
 """Squared residual of a corner that the lens has no pixel for."""
 
-ITERATIONS = 60
+MAX_ITERATIONS = 60
 
-CONVERGED = 1e-8
+RELATIVE_TOLERANCE = 1e-8
 """Relative change of the sum of squares in one step."""
 
-NOTHING = 1e-14
+MIN_EIGENVALUE = 1e-14
 """Least eigenvalue of a normal matrix with a diagonal of ones."""
 
-BARELY = 1e-9
+MIN_BOARD_INFORMATION = 1e-9
 """Keeps a board of which nothing is left solvable; one corner counts a million million times as much."""
 
 
@@ -164,7 +164,7 @@ class Adjusted(NamedTuple):
 
 
 def adjust(
-    bundle: Bundle, *, robust: bool = True, progress: Progress = silent, iterations: int = ITERATIONS
+    bundle: Bundle, *, robust: bool = True, progress: Progress = silent, iterations: int = MAX_ITERATIONS
 ) -> Adjusted:
     """The bundle with the least robust (or plain) sum of squares, from where it starts."""
     cost, damping, converged = _cost(bundle, robust), 1e-3, False
@@ -180,7 +180,7 @@ def adjust(
                 normal = _Normal.of(bundle, robust)
                 break
             damping *= 10
-        if cost > previous * (1 - CONVERGED):
+        if cost > previous * (1 - RELATIVE_TOLERANCE):
             converged = True
             break
     progress("adjusting the bundle", iterations, iterations)
@@ -198,14 +198,14 @@ def _cost(bundle: Bundle, robust: bool) -> float:
             total += float(np.sum(_whitened(bundle, c, robust)[0] ** 2))
             continue
         squares = _squares(bundle, c)
-        total += float(np.sum(ROBUST**2 * np.log1p(squares / ROBUST**2) if robust else squares))
+        total += float(np.sum(CAUCHY_SCALE_SDS**2 * np.log1p(squares / CAUCHY_SCALE_SDS**2) if robust else squares))
     return total
 
 
 def _squares(bundle: Bundle, c: int) -> Floats:
     """(n,) squared residuals of a camera in standard deviations."""
     squares = (bundle.lengths(c) / bundle.noise[c]) ** 2
-    return np.where(np.isfinite(squares), squares, LOST)
+    return np.where(np.isfinite(squares), squares, LOST_SQUARED_RESIDUAL)
 
 
 class _Normal(NamedTuple):
@@ -223,7 +223,7 @@ class _Normal(NamedTuple):
         starts, n = bundle.starts, len(bundle.boards.translation)
         P = starts[-1]
         A, a = np.zeros((P, P)), np.zeros(P)
-        D, d, B = np.tile(BARELY * np.eye(6), (n, 1, 1)), np.zeros((n, 6)), np.zeros((n, P, 6))
+        D, d, B = np.tile(MIN_BOARD_INFORMATION * np.eye(6), (n, 1, 1)), np.zeros((n, 6)), np.zeros((n, P, 6))
         for c, (camera, prior) in enumerate(zip(bundle.cameras, bundle.priors, strict=True)):
             own = slice(starts[c], starts[c + 1])
             r, J, K = _whitened(bundle, c, robust)
@@ -274,7 +274,7 @@ def _definite(S: Floats, s: Floats) -> tuple[Floats, Floats]:
     an adjustment has got lost."""
     scale = np.sqrt(np.maximum(np.diag(S), np.finfo(np.float64).tiny))
     least = float(np.linalg.eigvalsh(S / scale[:, None] / scale)[0])
-    return S + np.diag(scale**2) * max(NOTHING - least, 0), s
+    return S + np.diag(scale**2) * max(MIN_EIGENVALUE - least, 0), s
 
 
 def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Floats]:
@@ -286,7 +286,7 @@ def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Flo
     weight = 1 / (bundle.noise[c] * stack.relative)
     if robust:  # iteratively reweighted: Cauchy's weight
         squares = np.sum((stack.uv - seen.uv) ** 2, axis=1) * weight**2
-        weight = weight / np.sqrt(1 + squares / ROBUST**2)
+        weight = weight / np.sqrt(1 + squares / CAUCHY_SCALE_SDS**2)
     there = np.isfinite(seen.uv).all(axis=1) & np.isfinite(seen.by_parameters).all(axis=(1, 2))
     weight = np.where(there, weight, 0)[:, None]
     by_board = np.concatenate([np.cross(turned[:, None, :], seen.by_point), seen.by_point], axis=2)

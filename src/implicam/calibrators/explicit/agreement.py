@@ -28,35 +28,35 @@ from implicam.geometry import Floats, Pose
 from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera
 
-WORSE = 2.0
+MAX_RESIDUAL_RATIO = 2.0
 """Together so many times what is left alone: lens models that do not hold their lenses make at most 1.25 of it where
 they leave as much as the noise, 1.7 where they leave three times as much (docs/decisions/0018)."""
 
-ENOUGH_BOARDS = 3
+MIN_SHARED_BOARDS = 3
 """Boards that two cameras must share before what they leave says anything of the rig."""
 
-CONTRADICT = 0.15
+MAX_WRONG_SHARE = 0.15
 """Share of the corners that do not fit, beyond which cameras contradict each other and nothing makes up for it."""
 
-TOO_FAR = 0.1
+MAX_MOVED_EXTENTS = 0.1
 """Part of the boards' extent that they may seem to have moved: more is no lag of a camera."""
 
-HOPELESS = 0.01
+MAX_RESIDUAL_HALF_SIDES = 0.01
 """Usual residual together, in half the longer side of the image, beyond which no error bar makes up for it."""
 
-FAR = 5.0
+WRONG_CORNER_SDS = 5.0
 """Standard deviations off, beyond which a corner is wrong: one in 270,000 of good ones."""
 
-LITTLE = (3e-4, 1e-3)
+UNNOTICED_MOVES_EXTENTS = (3e-4, 1e-3)
 """Parts of the extent of the boards that they may have moved without anybody having noticed."""
 
-CLEARLY = 10.0
+MIN_GAIN_NATS = 10.0
 """Log evidence that moved boards must gain."""
 
-MIRRORED = 0.3
+MAX_MIRRORED_RATIO = 0.3
 """Two cameras that leave so many times less with one turned left to right are mirrored."""
 
-RAYLEIGH = 1.1774
+RAYLEIGH_MEDIAN = 1.1774
 """Median length of a residual with sd 1 in u and in v."""
 
 
@@ -73,12 +73,12 @@ class Agreement(NamedTuple):
     @property
     def contradict(self) -> bool:
         """They fit alone and not together."""
-        return self.boards >= ENOUGH_BOARDS and self.together > WORSE * self.alone
+        return self.boards >= MIN_SHARED_BOARDS and self.together > MAX_RESIDUAL_RATIO * self.alone
 
     @property
     def hopeless(self) -> bool:
         """They contradict each other, and by so much that it is not for a board held by hand that moved a little."""
-        return self.contradict and self.together > HOPELESS * self.half
+        return self.contradict and self.together > MAX_RESIDUAL_HALF_SIDES * self.half
 
 
 def agreements(bundle: Bundle, half: Floats, alone: Mapping[tuple[int, int], Floats]) -> list[Agreement]:
@@ -102,7 +102,7 @@ def agreements(bundle: Bundle, half: Floats, alone: Mapping[tuple[int, int], Flo
 
 def _usual(a: Sequence[Floats], b: Sequence[Floats]) -> float:
     """Root mean square of both cameras' usual residual on a usual board: a few bad pictures do not matter."""
-    sizes = [np.median([np.median(lengths) for lengths in of]) / RAYLEIGH for of in (a, b)]
+    sizes = [np.median([np.median(lengths) for lengths in of]) / RAYLEIGH_MEDIAN for of in (a, b)]
     return float(np.hypot(*sizes) / np.sqrt(2))
 
 
@@ -120,10 +120,10 @@ def with_slack(bundle: Bundle, progress: Progress = silent) -> tuple[Adjusted, l
         bundle = _most_probable(replace(bundle, views=everything.select([~bad for bad in wrong])), progress)
         whole = replace(bundle, views=everything)
         off = [unexplained(whole, c) for c in range(len(bundle.cameras))]
-        now = [length > FAR * noise for length, noise in zip(off, alone, strict=True)]
+        now = [length > WRONG_CORNER_SDS * noise for length, noise in zip(off, alone, strict=True)]
         same = all((a == b).all() for a, b in zip(now, wrong, strict=True))
         wrong = now
-        if same or np.mean(np.concatenate(wrong)) > CONTRADICT:
+        if same or np.mean(np.concatenate(wrong)) > MAX_WRONG_SHARE:
             break
     found = adjust(bundle, robust=False)
     listed = [
@@ -141,13 +141,13 @@ def loosened(found: Adjusted, progress: Progress = silent) -> Adjusted:
     bundle, seen = found.bundle, np.zeros(len(found.bundle.boards.translation), dtype=np.int64)
     for view in bundle.views.each:
         seen[view.board] += 1
-    if np.sum(seen >= 2) < ENOUGH_BOARDS:
+    if np.sum(seen >= 2) < MIN_SHARED_BOARDS:
         return found
     extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
     before = log_marginal_with_slack(bundle)
-    for part in LITTLE:
+    for part in UNNOTICED_MOVES_EXTENTS:
         trial = adjust(replace(bundle, slack=part * extent), robust=False, iterations=4).bundle
-        if log_marginal_with_slack(trial) > before + CLEARLY:
+        if log_marginal_with_slack(trial) > before + MIN_GAIN_NATS:
             slack = _most_probable(trial, progress).slack
             return found._replace(root=root_with_slack(replace(bundle, slack=slack), found.root))
     return found

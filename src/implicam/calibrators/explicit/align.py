@@ -19,20 +19,20 @@ from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, register, rotation_from_vector
 from implicam.rig_model import CameraModel, CentralCamera
 
-FAR = 25.0
+MAX_SQUARED_MAHALANOBIS = 25.0
 """Squared distance, in its own covariance, of a known point from where it should be: one in 65,000 of good ones."""
 
 MATCHING = ("points", "icp")
 
-ROUNDS = 60
+MAX_ROUNDS = 60
 
-ALIKE = 1.3
+MIN_RESIDUAL_RATIO = 1.3
 """Two ways to match points by closeness are told apart where one leaves so many times what the other leaves."""
 
-MIRRORED = 0.3
+MAX_MIRRORED_RATIO = 0.3
 """What is left with one axis turned, over what is left as they are: less, and the known points are mirrored."""
 
-HOPELESS = 0.05
+MAX_RESIDUAL_EXTENTS = 0.05
 """Part of the extent of the known points that the boards may be off without being of another rig."""
 
 
@@ -84,7 +84,7 @@ def align(
         xyz, sd = known.xyz[pairs], known.sd[pairs]
         pose, Q, G, W, residual = _weighted(pose, measured, cov, xyz, sd, used, there)
         distance = np.einsum("ni,nij,nj->n", residual, W, residual)
-        good = there & (distance <= max(FAR, float(np.quantile(distance[used], 0.9))))
+        good = there & (distance <= max(MAX_SQUARED_MAHALANOBIS, float(np.quantile(distance[used], 0.9))))
         if (good == used).all():
             break
         if good.sum() < max(3, 0.5 * there.sum()):  # no few wrong points: the whole does not fit, and a note says so
@@ -146,7 +146,7 @@ def closest_points(known: Floats, measured: Floats, named: Pose) -> Pose:
     starts = [named, *_by_axes(known, measured)]
     found = sorted(((icp(known, measured, start), i) for i, start in enumerate(starts)), key=lambda one: one[0][1])
     least = max(found[0][0][1], 1e-9 * float(np.ptp(known)))
-    alike = [(pose, i) for (pose, rms), i in found if rms <= ALIKE * least]
+    alike = [(pose, i) for (pose, rms), i in found if rms <= MIN_RESIDUAL_RATIO * least]
     for pose, i in alike:
         if i == 0:
             return pose
@@ -177,7 +177,7 @@ def icp(known: Floats, measured: Floats, start: Pose) -> tuple[Pose, float]:
     point (m, 3) is matched with the known point (n, 3) closest to it."""
     tree, pose = cKDTree(known), start
     pairs = np.full(len(measured), -1)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         _, nearest = tree.query(pose.inverse().apply(measured))
         if (nearest == pairs).all() or len(np.unique(nearest)) < 3:
             break
@@ -241,10 +241,10 @@ def _scale(measured: Floats, xyz: Floats) -> float:
 def _check(found: Alignment, residual: Floats, xyz: Floats, measured: Floats, extent: float) -> None:
     """FitError where boards and known points are not of one rig, or not of one unit."""
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
-    if rms < HOPELESS * extent and abs(found.scale - 1) < HOPELESS:
+    if rms < MAX_RESIDUAL_EXTENTS * extent and abs(found.scale - 1) < MAX_RESIDUAL_EXTENTS:
         return
     _, mirrored = register(xyz * np.array([1.0, 1.0, -1.0]), measured)
-    if mirrored < MIRRORED * min(rms, HOPELESS * extent):
+    if mirrored < MAX_MIRRORED_RATIO * min(rms, MAX_RESIDUAL_EXTENTS * extent):
         raise FitError(
             f"the known points are as in a mirror: aligned, {rms:.3g} are left; with one axis turned, {mirrored:.2g}.",
             why="the pictures are flipped (webcams do so), v is counted from below, or the known positions are "

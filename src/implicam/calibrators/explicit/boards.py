@@ -15,13 +15,13 @@ from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.rig_model import Image, image_of, relative_noise, stated_noise
 
-FEWEST_CORNERS = 12
+MIN_CORNERS = 12
 """Corners of one picture; with fewer it says little more than that there is a board."""
 
-MOST = 500
+MAX_ROWS_OR_COLUMNS = 500
 """Rows or columns of a board."""
 
-FEWEST_BOARDS = 3
+MIN_BOARDS = 3
 """Pictures that a camera needs: Zhang's method takes three planes for a lens."""
 
 CORNER = re.compile(r"(?P<shot>.+)-c(?P<number>[0-9]+)")
@@ -81,7 +81,7 @@ def boards_of(data: Dataset, scale: float = 1.0) -> Boards:
     for c in range(len(observations.cameras)):
         for board in range(len(names)):
             rows = np.flatnonzero(observations.seen[:, c] & (number == board))
-            if len(rows) >= FEWEST_CORNERS and _spread(flat[rows]):
+            if len(rows) >= MIN_CORNERS and _spread(flat[rows]):
                 xyz = np.column_stack([flat[rows], np.zeros(len(rows))])
                 views.append(BoardView(c, board, xyz, observations.uv[rows, c], relative[rows, c], rows))
     images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
@@ -111,8 +111,8 @@ def _by_target(data: Dataset, target: Mapping[str, Any]) -> tuple[Names, Floats]
     try:
         rows, columns, square = target["rows"], target["columns"], float(target["square"])
         for what, count in (("rows", rows), ("columns", columns)):
-            if type(count) is not int or not 2 <= count <= MOST:
-                raise ValueError(f"{what} = {count!r} must be a whole number from 2 to {MOST}")
+            if type(count) is not int or not 2 <= count <= MAX_ROWS_OR_COLUMNS:
+                raise ValueError(f"{what} = {count!r} must be a whole number from 2 to {MAX_ROWS_OR_COLUMNS}")
         if not 1e-9 < square < 1e9:
             raise ValueError(f"square = {square!r} must be a length")
     except (KeyError, TypeError, ValueError) as error:
@@ -142,10 +142,10 @@ def _by_positions(data: Dataset) -> Floats:
         rows = data.shots == shot
         centred = data.xyz[rows] - data.xyz[rows].mean(axis=0)
         _, extents, axes = np.linalg.svd(centred, full_matrices=False)
-        if len(centred) < FEWEST_CORNERS or extents[2] > 1e-3 * extents[0]:
+        if len(centred) < MIN_CORNERS or extents[2] > 1e-3 * extents[0]:
             raise FitError(
                 f"the points of shot {str(shot)!r} are no flat board.",
-                why=f"it has {len(centred)} points; a board has {FEWEST_CORNERS} or more, on one plane",
+                why=f"it has {len(centred)} points; a board has {MIN_CORNERS} or more, on one plane",
                 fix="give pictures of a board with --boards, and balls as the dataset itself",
             )
         flat[rows] = centred @ axes[:2].T
@@ -160,14 +160,14 @@ def _spread(flat: Floats) -> bool:
 def usable_cameras(boards: Boards) -> tuple[list[int], list[tuple[int, str]]]:
     """Numbers of the cameras that saw enough boards; number and reason of the others."""
     counts = [len(boards.of_camera(c)) for c in range(len(boards.cameras))]
-    good = [c for c, count in enumerate(counts) if count >= FEWEST_BOARDS]
+    good = [c for c, count in enumerate(counts) if count >= MIN_BOARDS]
     poor = [
         (
             c,
-            f"it saw {count} of the {FEWEST_BOARDS} boards that it takes, each with {FEWEST_CORNERS} corners or more",
+            f"it saw {count} of the {MIN_BOARDS} boards that it takes, each with {MIN_CORNERS} corners or more",
         )
         for c, count in enumerate(counts)
-        if count < FEWEST_BOARDS
+        if count < MIN_BOARDS
     ]
     return good, poor
 

@@ -94,12 +94,12 @@ def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple
     placed = _placed(data, network)
     posterior = network_posterior(network, network.bundle.cameras, network.root)
     measured = FittedRig(
-        data.observations, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True
+        data.observations, data.length_unit, WORLD_FRAME, network.cameras, posterior, misfit_adds=True
     ).measure(placed.observations)
     first = data.observations.camera_names[network.cameras[0]]
     fitted = Fitted(
         data.observations,
-        UNIT,
+        WORLD_FRAME,
         network.cameras,
         posterior,
         tuple(network.choices[c] for c in network.cameras),
@@ -117,7 +117,7 @@ def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple
     return placed, fitted
 
 
-UNIT = Frame(np.zeros(3), 1.0)
+WORLD_FRAME = Frame(np.zeros(3), 1.0)
 
 
 def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
@@ -204,7 +204,7 @@ def _lens_notes(network: Network, trained: Observations) -> list[str]:
         name, lens = trained.camera_names[c], bundle.cameras[number].lens
         notes += told(name, bundle.cameras[number], network.images[number], network.choices[c].pixels)
         loose = float(sd[bundle.starts[number]] / lens.fx)
-        if loose > LOOSE:
+        if loose > MAX_UNKNOWN_FOCAL_PART:
             notes.append(
                 f"{name}: the boards fix its focal length to {100 * loose:.1g} % only. Show them tilted, near and far."
             )
@@ -218,5 +218,5 @@ def _lens_notes(network: Network, trained: Observations) -> list[str]:
     return notes
 
 
-LOOSE = 0.01
+MAX_UNKNOWN_FOCAL_PART = 0.01
 """Part of the focal length that may be unknown without a note."""

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 
 from implicam.calibrators.explicit.align import MATCHING, Alignment, Known, align, in_frame, in_world
 from implicam.calibrators.explicit.fitted import (
-    UNIT,
+    WORLD_FRAME,
     Fitted,
     by_cameras_of,
     network_notes,
@@ -123,7 +123,7 @@ def _aligned(data: Dataset, trained: Observations, network: Network, boards: Dat
     """A group of cameras that boards join, by the known points that it measures."""
     known, bundle = data.positions, network.bundle
     posterior = network_posterior(network, bundle.cameras, network.root)
-    in_rig = FittedRig(trained, data.length_unit, UNIT, network.cameras, posterior, misfit_adds=True)
+    in_rig = FittedRig(trained, data.length_unit, WORLD_FRAME, network.cameras, posterior, misfit_adds=True)
     uv, noise = in_rig.views(data.observations)
     found = locate(posterior, uv, noise)
     uv[found.left_out] = np.nan

@@ -36,12 +36,12 @@ from implicam.rig_model import (
     update_inliers,
 )
 
-ROUNDS = 8
+MAX_ROUNDS = 8
 
-ASTRAY = 2.0
+MAX_MISFIT_RATIO = 2.0
 """Times what was left: a step to more than that was no step towards the optimum."""
 
-AS_IF = 2.0
+PRIOR_RESIDUALS = 2.0
 """The stated noise counts like so many residuals; so does the noise of all cameras together where none is stated."""
 
 
@@ -74,7 +74,7 @@ def refined(
     models = tuple(lens_only_model(started[c], training.images[c]) for c in cameras)
     first = _first_noise(training, models, seen, inliers)
     models = with_noise(models, first)
-    for number in range(ROUNDS):
+    for number in range(MAX_ROUNDS):
         used = tuple(
             s.select(k & np.isfinite(m.camera.pixel(training.points[s.rows])).all(axis=1))
             for s, k, m in zip(seen, inliers, models, strict=True)
@@ -86,7 +86,7 @@ def refined(
         judged = update_inliers(replace(posterior, models=models), training.points, seen, inliers)
         if close and all((a == b).all() for a, b in zip(judged, inliers, strict=True)):
             break
-        if number < ROUNDS - 1:
+        if number < MAX_ROUNDS - 1:
             inliers = judged
         progress("fitting", 2, 3)
     posterior = _settled(models, training, tuple(s.select(k) for s, k in zip(seen, inliers, strict=True)), first)
@@ -139,7 +139,7 @@ def _settled(
         return float(off) if np.isfinite(off) else np.inf
 
     astray = [
-        left(after, seen) > (ASTRAY * noise) ** 2 * 2 * len(seen.rows) + left(before, seen)
+        left(after, seen) > (MAX_MISFIT_RATIO * noise) ** 2 * 2 * len(seen.rows) + left(before, seen)
         for before, after, seen, noise in zip(models, posterior.models, used, first, strict=True)
     ]
     if not any(astray):
@@ -189,7 +189,10 @@ def _noise(training: TrainingData, posterior: Posterior, used: tuple[CameraViews
     together = float(np.sum(squares) / max(np.sum(freedom), 1e-3))
     believed = np.where(told, np.nan_to_num(stated) ** 2, together)
     floor = np.array([1e-6 * model.image.half for model in posterior.models])
-    return np.asarray(np.maximum(np.sqrt((squares + AS_IF * believed) / (freedom + AS_IF)), floor), dtype=np.float64)
+    return np.asarray(
+        np.maximum(np.sqrt((squares + PRIOR_RESIDUALS * believed) / (freedom + PRIOR_RESIDUALS)), floor),
+        dtype=np.float64,
+    )
 
 
 def _noise_beside_errors(
@@ -203,7 +206,7 @@ def _noise_beside_errors(
         models = with_noise(posterior.models, base * np.exp(log_factor))
         return (
             -iterate_linearisation(models, training.points, used, training.errors).evidence
-            + 0.5 * AS_IF * log_factor**2
+            + 0.5 * PRIOR_RESIDUALS * log_factor**2
         )
 
     found = minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded", options={"xatol": 0.02})

@@ -20,12 +20,12 @@ FAMILIES: dict[str, type[BrownConrady] | type[KannalaBrandt]] = {
 
 AUTO = "auto"
 
-WIDEST = np.radians(75.0)
+MAX_PERSPECTIVE_ANGLE_RAD = np.radians(75.0)
 """Off the axis; a perspective lens is not tried beyond."""
 
 FOLDS = 5
 
-USUAL = "square"
+USUAL_PIXELS = "square"
 """The name of the usual pixels (pixels.py)."""
 
 
@@ -34,7 +34,7 @@ class Choice(NamedTuple):
 
     lens: str
     held_out: Mapping[str, float]
-    pixels: str = USUAL
+    pixels: str = USUAL_PIXELS
 
 
 def name_of(camera: CentralCamera) -> str:
@@ -52,7 +52,7 @@ def as_brown_conrady(camera: CentralCamera, points: Floats) -> CentralCamera:
     """The same camera with a perspective lens: least squares on the pixels of points (n, 3). FitError where they are
     too far off the axis for one."""
     widest = float(angles(camera, points).max())
-    if not widest < WIDEST:
+    if not widest < MAX_PERSPECTIVE_ANGLE_RAD:
         raise FitError(
             f"a perspective lens cannot look {np.degrees(widest):.0f}° off its axis.",
             fix="use kannala-brandt, or auto, for this camera",

@@ -13,9 +13,9 @@ import numpy as np
 
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
 from implicam.calibrators.explicit.agreement import (
-    CONTRADICT,
-    MIRRORED,
-    TOO_FAR,
+    MAX_MIRRORED_RATIO,
+    MAX_MOVED_EXTENTS,
+    MAX_WRONG_SHARE,
     Agreement,
     agreements,
     lengths_alone,
@@ -26,7 +26,13 @@ from implicam.calibrators.explicit.agreement import (
 from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import Choice, angles
 from implicam.calibrators.explicit.pixels import prior_of
-from implicam.calibrators.explicit.zhang import STUCK, OneCamera, calibrate_camera, median_error, pose_and_mirror
+from implicam.calibrators.explicit.zhang import (
+    MAX_BOARD_ERROR_RATIO,
+    OneCamera,
+    calibrate_camera,
+    median_error,
+    pose_and_mirror,
+)
 from implicam.dataset import Names
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose
@@ -34,13 +40,13 @@ from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera, Image
 from implicam.threads import side_by_side
 
-FAR = 5.0
+WRONG_CORNER_SDS = 5.0
 """Standard deviations off, beyond which a corner is wrong: one in 270,000 of good ones."""
 
-AS_IF = 2.0
+PRIOR_RESIDUALS = 2.0
 """The stated noise counts like so many residuals."""
 
-TOLERABLE = 0.02
+MAX_RESIDUAL_HALF_SIDES = 0.02
 """Usual residual of a camera in the whole rig, in half the longer side of its image, beyond which there is no fit."""
 
 
@@ -272,7 +278,7 @@ def _placed_again(bundle: Bundle) -> Bundle | None:
     stuck = set()
     for c, view, rows in bundle.views.in_stacks():
         views.setdefault(view.board, []).append(view)
-        if np.median(lengths[c][rows]) > STUCK * usual[c]:
+        if np.median(lengths[c][rows]) > MAX_BOARD_ERROR_RATIO * usual[c]:
             stuck.add(view.board)
     rotation, translation, changed = bundle.boards.rotation.copy(), bundle.boards.translation.copy(), False
     for k in sorted(stuck):
@@ -304,7 +310,7 @@ def _off(bundle: Bundle, usual: Floats, views: list[BoardView], pose: Pose) -> f
 def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floats) -> None:
     usual = spreads(found.bundle)
     worst = int(np.argmax(usual / half))
-    if usual[worst] < TOLERABLE * half[worst]:
+    if usual[worst] < MAX_RESIDUAL_HALF_SIDES * half[worst]:
         return
     raise _contradiction(boards, [cameras[worst]], f"its corners are left {usual[worst]:.3g} px off")
 
@@ -342,10 +348,10 @@ def _with_slack(
     found, wrong = with_slack(replace(bundle, noise=own), progress)
     extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
     wrong_share = len(wrong) / sum(len(stack.uv) for stack in bundle.views.stacks)
-    if wrong_share > CONTRADICT or found.bundle.slack > TOO_FAR * extent:
+    if wrong_share > MAX_WRONG_SHARE or found.bundle.slack > MAX_MOVED_EXTENTS * extent:
         worst = max(doubts, key=lambda one: one.together / one.alone)
         told = f"alone {worst.alone:.2g} px, together {worst.together:.2g} px"
-        if found.bundle.slack > TOO_FAR * extent:
+        if found.bundle.slack > MAX_MOVED_EXTENTS * extent:
             told += f", as if boards had moved by {np.sqrt(6) * found.bundle.slack:.1g} between their pictures"
         raise _contradiction(boards, [cameras[c] for c in _culprits(doubts)], told)
     pairs = {one.pair for one in doubts}
@@ -375,7 +381,7 @@ def _check_mirrors(
     for one in doubts:
         a, b = (cameras[c] for c in one.pair)
         left = mirrored(singles[a].camera, seen[a], placed[a], placed[b])
-        if left < MIRRORED * one.together:
+        if left < MAX_MIRRORED_RATIO * one.together:
             found.append(one._replace(alone=left))
     if not found:
         return
@@ -398,32 +404,32 @@ def _refined(
     bundle = replace(found.bundle, noise=np.maximum(spreads(found.bundle), 1e-6))
     for _ in range(3):
         bundle = replace(bundle, views=everything)
-        kept = [bundle.lengths(c) <= FAR * bundle.noise[c] for c in range(len(cameras))]
-        found = adjust(replace(bundle, views=everything.select(kept)), robust=False, progress=progress)
+        inliers = [bundle.lengths(c) <= WRONG_CORNER_SDS * bundle.noise[c] for c in range(len(cameras))]
+        found = adjust(replace(bundle, views=everything.select(inliers)), robust=False, progress=progress)
         noise = _noise(found.bundle, stated)
         settled = np.allclose(noise, bundle.noise, rtol=0.02)
         bundle = replace(found.bundle, noise=noise)
         if settled:
             break
-    _check_shared(boards, cameras, everything, kept)
+    _check_shared(boards, cameras, everything, inliers)
     wrong = []
     off = [np.linalg.norm(replace(bundle, views=everything).residuals(c), axis=1) for c in range(len(cameras))]
     for c, view, rows in everything.in_stacks():
-        bad = np.flatnonzero(~kept[c][rows])
+        bad = np.flatnonzero(~inliers[c][rows])
         wrong += [(int(view.rows[i]), cameras[c], float(off[c][rows][i])) for i in bad]
     return adjust(bundle, robust=False), wrong
 
 
-def _check_shared(boards: Boards, cameras: tuple[int, ...], views: Views, kept: list[Bools]) -> None:
+def _check_shared(boards: Boards, cameras: tuple[int, ...], views: Views, inliers: list[Bools]) -> None:
     """FitError where a camera's corners do not fit on boards that another camera saw too, though alone they do."""
     rows_of: dict[int, dict[int, Bools]] = {}
     for c, view, rows in views.in_stacks():
-        rows_of.setdefault(view.board, {})[c] = kept[c][rows]
+        rows_of.setdefault(view.board, {})[c] = inliers[c][rows]
     lost: dict[tuple[int, int], list[float]] = {}
     for seen in rows_of.values():
         for a, b in combinations(sorted(seen), 2):
             lost.setdefault((a, b), []).append(1 - float(np.mean(np.concatenate([seen[a], seen[b]]))))
-    bad = [pair for pair, shares in lost.items() if np.mean(shares) > CONTRADICT]
+    bad = [pair for pair, shares in lost.items() if np.mean(shares) > MAX_WRONG_SHARE]
     if not bad:
         return
     in_all = set(bad[0]).intersection(*bad)
@@ -460,5 +466,7 @@ def _noise(bundle: Bundle, stated: Floats) -> Floats:
         freedom[c] += float(np.sum(2 - 6 / corners[stack.board]))
     own = np.sqrt(squares / np.maximum(freedom, 1.0))
     told = np.isfinite(stated)
-    mixed = np.sqrt((squares + AS_IF * np.nan_to_num(stated) ** 2) / (np.maximum(freedom, 1.0) + AS_IF))
+    mixed = np.sqrt(
+        (squares + PRIOR_RESIDUALS * np.nan_to_num(stated) ** 2) / (np.maximum(freedom, 1.0) + PRIOR_RESIDUALS)
+    )
     return np.asarray(np.maximum(np.where(told, mixed, own), 1e-6), dtype=np.float64)

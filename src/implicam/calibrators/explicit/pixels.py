@@ -12,22 +12,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from implicam.calibrators.explicit.lenses import USUAL
+from implicam.calibrators.explicit.lenses import USUAL_PIXELS
 from implicam.rig_model import CENTRE_PRIOR_SD, LOG_ASPECT_PRIOR_SD, CentralCamera, Image, Prior
 
 ASPECTS = (1.0, 0.5, 0.63, 0.79, 1.26, 1.59, 2.0)
 """Ratios fy / fx that a start tries: the steps of 26 % are close enough for what follows."""
 
-ANY_ASPECT = 0.35
+FREE_LOG_ASPECT_SD = 0.35
 """Prior sd of log(fy / fx) of pixels that need not be square: 0.5 and 2 are two of them away."""
 
-ANYWHERE = 0.4
+FREE_CENTRE_SD = 0.4
 """Prior sd of the principal point of a cut-out picture, as a part of the longer side."""
 
-USUAL_NOISE, NOISE_SPREAD = 3e-4, 2.0
+NOISE_PRIOR_MEDIAN, NOISE_PRIOR_LOG_SD = 3e-4, 2.0
 """Prior of the noise, median in half the longer side and log sd: without it six views would be explained exactly."""
 
-SURPRISING = 6.0
+MAX_USUAL_GAIN_NATS = 6.0
 """The widest prior loses less than so much log evidence to the usual one: then those between are looked at, too."""
 
 
@@ -43,16 +43,16 @@ class Pixels(NamedTuple):
 
 def square(centre: float = CENTRE_PRIOR_SD) -> Pixels:
     """Square pixels and a lens over the middle of the picture: the usual."""
-    return Pixels(USUAL, LOG_ASPECT_PRIOR_SD, centre, 1.0)
+    return Pixels(USUAL_PIXELS, LOG_ASPECT_PRIOR_SD, centre, 1.0)
 
 
 def kinds(usual: Pixels) -> tuple[Pixels, ...]:
     """The usual and what else there is; the last allows all."""
     return (
         usual,
-        Pixels("stretched", ANY_ASPECT, usual.centre, 20.0),
-        Pixels("cropped", LOG_ASPECT_PRIOR_SD, ANYWHERE, 20.0),
-        Pixels("any", ANY_ASPECT, ANYWHERE, 50.0),
+        Pixels("stretched", FREE_LOG_ASPECT_SD, usual.centre, 20.0),
+        Pixels("cropped", LOG_ASPECT_PRIOR_SD, FREE_CENTRE_SD, 20.0),
+        Pixels("any", FREE_LOG_ASPECT_SD, FREE_CENTRE_SD, 50.0),
     )
 
 
@@ -88,4 +88,4 @@ def log_density_at_peak(prior: Prior, camera: CentralCamera, image: Image, pixel
 
 def noise_prior(sd: float, image: Image) -> float:
     """Log prior of a noise in pixels."""
-    return float(-0.5 * (np.log(sd / (USUAL_NOISE * image.half)) / NOISE_SPREAD) ** 2)
+    return float(-0.5 * (np.log(sd / (NOISE_PRIOR_MEDIAN * image.half)) / NOISE_PRIOR_LOG_SD) ** 2)

@@ -28,22 +28,22 @@ from implicam.rig_model import (
     levenberg_marquardt,
 )
 
-FEWEST = 4
+MIN_POINTS = 4
 """Known points that place a camera whose lens is known: three leave up to four places."""
 
-SPREAD = 0.02
+MIN_RELATIVE_WIDTH = 0.02
 """Extent of the known points across their longest line, as a part of that: less is a line."""
 
-TOLERABLE = 0.02
+MAX_ERROR_HALF_SIDES = 0.02
 """Median error of the best place, in half the longer side of the image, beyond which it is none."""
 
-MIRRORED, MIRROR_FROM = 0.3, 2e-3
+MAX_MIRRORED_RATIO, MIRROR_FROM_HALF_SIDES = 0.3, 2e-3
 """A mirror is looked for where more than so much of half the longer side is left; it must leave so many times less."""
 
-AS_GOOD = 9.0
+MAX_SQUARES_AS_GOOD = 9.0
 """Squared residuals, in the noise, that a second place may have more than the first and be as good."""
 
-SUBSETS = 30
+RANDOM_SUBSETS = 30
 """Random sets of five points; with a third of the views wrong, four of them are clean."""
 
 
@@ -76,13 +76,13 @@ def _placed(network: Network, points: Floats, uv: Floats) -> InitialCamera:
     prior = _prior(network)
     found = _best(known, prior, points, uv, rays, valid, sd)
     left = _median(found[0][0], points, uv) if found else np.inf
-    if left > max(MAX_ERROR_MEDIANS * sd, MIRROR_FROM * half):
+    if left > max(MAX_ERROR_MEDIANS * sd, MIRROR_FROM_HALF_SIDES * half):
         _check_mirror(known, prior, points, uv, rays, valid, sd, left)
     if not found:
         raise FitError("from no place does its lens see the known points at these pixels.")
     (camera, inliers), *others = found
     error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    if not np.median(error) < TOLERABLE * half or inliers.sum() < FEWEST:
+    if not np.median(error) < MAX_ERROR_HALF_SIDES * half or inliers.sum() < MIN_POINTS:
         raise FitError(
             f"with the lens from its boards, the known points are left {np.median(error):.3g} px off: they are not "
             "where they are said to be, or its pictures are of another size or another zoom."
@@ -91,7 +91,7 @@ def _placed(network: Network, points: Floats, uv: Floats) -> InitialCamera:
     for other, _ in others:
         more = np.sum((other.pixel(points[inliers]) - uv[inliers]) ** 2) - np.sum(error[inliers] ** 2)
         apart = np.linalg.norm(other.pose.centre - camera.pose.centre) / np.linalg.norm(camera.pose.translation)
-        if more < AS_GOOD * usual**2 and apart > 0.02:
+        if more < MAX_SQUARES_AS_GOOD * usual**2 and apart > 0.02:
             raise FitError(
                 f"its {int(inliers.sum())} known points place it in two ways: show it more, spread out in depth."
             )
@@ -105,7 +105,7 @@ def _check_mirror(
     other = points * np.array([1.0, 1.0, -1.0])
     found = _best(known, prior, other, uv, rays, valid, sd)
     mirrored = _median(found[0][0], other, uv) if found else np.inf
-    if mirrored < MIRRORED * left:
+    if mirrored < MAX_MIRRORED_RATIO * left:
         raise FitError(
             f"it sees the known points as in a mirror: as they are {left:.3g} px are left, mirrored {mirrored:.2g} px. "
             "Are its pictures flipped, or is v counted from below, or are the known positions left-handed?"
@@ -113,12 +113,12 @@ def _check_mirror(
 
 
 def _check_spread(points: Floats) -> None:
-    if len(points) < FEWEST:
+    if len(points) < MIN_POINTS:
         raise FitError(
-            f"{len(points)} known points are seen; with the lens from its boards it takes {FEWEST} to place it."
+            f"{len(points)} known points are seen; with the lens from its boards it takes {MIN_POINTS} to place it."
         )
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if extents[1] < SPREAD * extents[0]:
+    if extents[1] < MIN_RELATIVE_WIDTH * extents[0]:
         raise FitError(f"its {len(points)} known points lie on one line, which does not place it.")
 
 
@@ -141,17 +141,17 @@ def _best(
     found = [_refined(replace(known, pose=pose), prior, points, uv, valid, sd) for pose in _poses(points, rays, valid)]
     off = min((_median(camera, points, uv) for camera, _ in found), default=np.inf)
     good = np.flatnonzero(valid)
-    if off > MAX_ERROR_MEDIANS * sd and len(good) > FEWEST + 1:
+    if off > MAX_ERROR_MEDIANS * sd and len(good) > MIN_POINTS + 1:
         rng = np.random.default_rng(0)
         some = np.zeros(len(points), dtype=np.bool_)
-        for _ in range(SUBSETS):
+        for _ in range(RANDOM_SUBSETS):
             some[:] = False
-            some[rng.choice(good, FEWEST + 1, replace=False)] = True
+            some[rng.choice(good, MIN_POINTS + 1, replace=False)] = True
             for pose in _poses(points, rays, some)[:1]:
                 camera = replace(known, pose=pose)
                 error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
                 near = valid & (error <= np.nanquantile(error, 0.6))
-                if near.sum() >= FEWEST:
+                if near.sum() >= MIN_POINTS:
                     found.append(_refined(camera, prior, points, uv, np.asarray(near), sd))
     return sorted(found, key=lambda one: _median(one[0], points, uv))
 
@@ -178,7 +178,7 @@ def _refined(
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         inside = np.asarray(error <= MAX_ERROR_MEDIANS * max(float(np.median(error[inliers])), sd))
-        if inside.sum() < FEWEST or (inside == inliers).all():
+        if inside.sum() < MIN_POINTS or (inside == inliers).all():
             break
         inliers = inside
     return camera, inliers

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.explicit.fitted import Fitted
-from implicam.calibrators.explicit.lenses import FAMILIES, USUAL, Choice, name_of
+from implicam.calibrators.explicit.lenses import FAMILIES, USUAL_PIXELS, Choice, name_of
 from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.unused import Rejected, Unused
@@ -93,7 +93,7 @@ def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[F
             Choice(
                 str(one["name"]),
                 {str(k): float(v) for k, v in one["held_out_px"].items()},
-                str(one.get("pixels", USUAL)),
+                str(one.get("pixels", USUAL_PIXELS)),
             )
             for one in table["lenses"]
         ),

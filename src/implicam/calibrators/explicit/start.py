@@ -14,7 +14,7 @@ import numpy as np
 from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
 from implicam.calibrators.explicit.pixels import (
     ASPECTS,
-    SURPRISING,
+    MAX_USUAL_GAIN_NATS,
     Pixels,
     kinds,
     log_density_at_peak,
@@ -36,18 +36,18 @@ from implicam.rig_model import (
     levenberg_marquardt,
 )
 
-SHIFTED = 5.0
+CENTRE_PRIOR_WIDENING = 5.0
 """How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""
 
 FOLDS = 5
 
-HOPELESS = 100.0
+MAX_LACKING_NATS = 100.0
 """Log evidence that a kind of pixels may lack from one start and still be looked at from others."""
 
-MIRRORED = 0.3
+MAX_MIRRORED_RATIO = 0.3
 """A mirrored picture leaves less than this part of what the picture as it is leaves: then it is mirrored."""
 
-POOR = 2e-3
+MIRROR_FROM_HALF_SIDES = 2e-3
 """Median error of a start, in half the longer side, above which the pictures may be mirrored."""
 
 
@@ -98,19 +98,19 @@ def _resected(points: Floats, uv: Floats, image: Image) -> _Candidate:
 def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image: Image) -> list[_Candidate]:
     """The cameras refined with each prior of their pixels that may be right, the most probable one first; one alone
     where the usual one is clearly right."""
-    usual, *between, widest = kinds(square(SHIFTED * CENTRE_PRIOR_SD))
+    usual, *between, widest = kinds(square(CENTRE_PRIOR_WIDENING * CENTRE_PRIOR_SD))
 
     def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
         return _refined(start.camera, pixels, start.inliers, points, uv, image)
 
     found = [fitted(usual, starts[0]), fitted(widest, starts[0])]
     simple, free = _evidence(found, points, uv, image)
-    if free < simple - SURPRISING:
+    if free < simple - MAX_USUAL_GAIN_NATS:
         return found[:1]
     found = [found[0], *(fitted(pixels, starts[0]) for pixels in between), found[1]]
     evidence = _evidence(found, points, uv, image)
     best = found[int(np.argmax(evidence))]
-    found = [one for one, log in zip(found, evidence, strict=True) if log > max(evidence) - HOPELESS]
+    found = [one for one, log in zip(found, evidence, strict=True) if log > max(evidence) - MAX_LACKING_NATS]
     for i, one in enumerate(found):  # an unusual lens has optima that are not the best
         others = [start for start in (best, *starts[1:]) if start is not one]
         tries = [one, *(fitted(one.pixels, start) for start in others)]
@@ -183,7 +183,7 @@ def _log_evidence(one: _Candidate, points: Floats, uv: Floats, image: Image) -> 
 def _check_mirror(found: _Candidate, points: Floats, uv: Floats, image: Image) -> None:
     """MirroredError where the picture turned left to right fits far better than it does as it is."""
     left = _median(found, points, uv)
-    if left < POOR * image.half:
+    if left < MIRROR_FROM_HALF_SIDES * image.half:
         return
     turned = np.column_stack([2 * image.centre[0] - uv[:, 0], uv[:, 1]])
     try:
@@ -191,7 +191,7 @@ def _check_mirror(found: _Candidate, points: Floats, uv: Floats, image: Image) -
     except FitError:
         return
     mirrored = _median(other, points, turned)
-    if mirrored < MIRRORED * left:
+    if mirrored < MAX_MIRRORED_RATIO * left:
         raise MirroredError(
             f"its pictures are mirrored, or the known positions are: as they are {left:.3g} px are left, mirrored "
             f"{mirrored:.2g} px."

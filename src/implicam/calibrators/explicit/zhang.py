@@ -23,11 +23,11 @@ from implicam.calibrators.explicit.adjust import (
     log_marginal,
     spreads,
 )
-from implicam.calibrators.explicit.boards import FEWEST_CORNERS, BoardView, renumbered
+from implicam.calibrators.explicit.boards import MIN_CORNERS, BoardView, renumbered
 from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
 from implicam.calibrators.explicit.pixels import (
     ASPECTS,
-    SURPRISING,
+    MAX_USUAL_GAIN_NATS,
     Pixels,
     kinds,
     log_density_at_peak,
@@ -40,21 +40,21 @@ from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, candidate_rays, rotation_from_vector
 from implicam.rig_model import PERSPECTIVE_K, CentralCamera, Image, Prior
 
-FEW = 30
+MAX_BOARDS_FOR_LENS = 30
 """Boards that the lens is looked for with; the adjustment has them all."""
 
-FEW_TO_TELL = 6
+MAX_BOARDS_FOR_PIXELS = 6
 """Boards that the shape of the pixels is first looked for with."""
 
-TOLERABLE = 0.03
+MAX_START_ERROR_HALF_SIDES = 0.03
 """Median error of a start, in half the longer side of the image, beyond which it is none."""
 
 FOLDS = 3
 
-STUCK = 4.0
+MAX_BOARD_ERROR_RATIO = 4.0
 """Median error of a board, in the camera's usual residual, beyond which its pose is looked for again."""
 
-SUBSETS = 40
+RANDOM_SUBSETS = 40
 """Random sets of eight corners; with a fifth of the corners wrong, seven of them are clean."""
 
 
@@ -82,7 +82,7 @@ def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> t
     own, _ = renumbered([replace(view, camera=0) for view in views])
     first = _with_pixels(_starts(own, image), Views(own, 1), image)
     left = float(spreads(first.bundle)[0])
-    if not left < TOLERABLE * image.half:
+    if not left < MAX_START_ERROR_HALF_SIDES * image.half:
         raise FitError(
             f"no lens explains the corners of its {len(own)} boards: the best of all fits leaves {left:.3g} px.",
             fix="look at the overlays of its pictures (detections/), and take out those with wrong corners",
@@ -118,7 +118,7 @@ def _with_pixels(starts: Sequence[tuple[CentralCamera, Placed]], views: Views, i
     if len(starts) == 1:  # two steps tell whether there is anything to gain
         prior = prior_of(camera, image, _widest(simple.bundle), widest)
         nearly = adjust(replace(simple.bundle, priors=(prior,)), iterations=2)
-        if evidence(_Candidate(nearly, widest)) < evidence(simple) - SURPRISING:
+        if evidence(_Candidate(nearly, widest)) < evidence(simple) - MAX_USUAL_GAIN_NATS:
             return simple
     free = fitted(widest, *[(camera, simple.bundle.boards), *starts[1:]][-1])
     start = (free.bundle.cameras[0], free.bundle.boards)
@@ -137,7 +137,7 @@ def log_evidence(bundle: Bundle, image: Image, pixels: Pixels) -> float:
 
 def _starts(views: Sequence[BoardView], image: Image) -> list[tuple[CentralCamera, Placed]]:
     """A start with square pixels; and one with others, where they fit better."""
-    some = sorted(views, key=lambda view: -len(view.rows))[:FEW_TO_TELL]
+    some = sorted(views, key=lambda view: -len(view.rows))[:MAX_BOARDS_FOR_PIXELS]
     best = min(ASPECTS, key=lambda aspect: _start(some, image, aspect)[0])
     return [_start(views, image, aspect)[1] for aspect in dict.fromkeys((1.0, best))]
 
@@ -153,7 +153,7 @@ def _start(views: Sequence[BoardView], image: Image, aspect: float) -> tuple[flo
         return focal, pinhole, rays[:, :-1]
 
     total: Floats | float = 0.0
-    for i in sorted(range(len(views)), key=lambda i: -len(views[i].rows))[:FEW]:
+    for i in sorted(range(len(views)), key=lambda i: -len(views[i].rows))[:MAX_BOARDS_FOR_LENS]:
         focal, pinhole, rays = ladder(offsets[i])
         _, errors = planar_poses(views[i].xyz[:, :2], rays, focal)
         total = total + np.sum(np.minimum(errors, 3 * np.median(errors, axis=1, keepdims=True)) ** 2, axis=1)
@@ -201,7 +201,7 @@ def _trimmed_pose(flat: Floats, rays: Floats, focal: float) -> Pose:
         there = poses[0].apply(np.column_stack([flat, np.zeros(len(flat))]))
         off = np.arccos(np.clip(np.sum(there * rays, axis=1) / np.linalg.norm(there, axis=1), -1, 1))
         inside = off <= 3 * np.median(off)
-        if inside.sum() < FEWEST_CORNERS or (inside == keep).all():
+        if inside.sum() < MIN_CORNERS or (inside == keep).all():
             break
         keep = inside
     return poses[0]
@@ -214,7 +214,7 @@ def placed_again(bundle: Bundle) -> Bundle | None:
     rotation, translation, changed = bundle.boards.rotation.copy(), bundle.boards.translation.copy(), False
     for (k, rows), view in zip(bundle.views.stacks[0].sections, bundle.views.each, strict=True):
         now = float(np.median(lengths[rows]))
-        if now <= STUCK * usual:
+        if now <= MAX_BOARD_ERROR_RATIO * usual:
             continue
         pose, error = _best_pose(bundle.cameras[0], view, bundle.boards.pose(k), float(bundle.noise[0]))
         if error < 0.5 * now:
@@ -244,7 +244,7 @@ def pose_and_mirror(camera: CentralCamera, view: BoardView, now: Pose, noise: fl
     rays, valid = camera.lens.ray_from_pixel(view.uv)
     good = np.flatnonzero(valid)
     found = [now]
-    for _ in range(SUBSETS if len(good) >= 8 else 0):
+    for _ in range(RANDOM_SUBSETS if len(good) >= 8 else 0):
         some = rng.choice(good, 8, replace=False)
         found.append(planar_poses(view.xyz[some, :2], rays[None, some], np.ones(1))[0][0])
     best = min(found, key=lambda pose: median_error(camera, view, pose))
