@@ -9,7 +9,7 @@ import numpy as np
 from implicam.calibrators.explicit.calibration import Explicit, ExplicitCalibration
 from implicam.calibrators.explicit.fitted import Fitted, posterior_of
 from implicam.calibrators.explicit.lenses import Choice, name_of
-from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
+from implicam.calibrators.forward_gp import ForwardGPCalibration
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import UsageError
 from implicam.exchange import UNKNOWN, ExplicitCamera, Rig
