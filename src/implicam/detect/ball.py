@@ -25,41 +25,41 @@ from implicam.detect.model import Detected, View, nothing
 from implicam.errors import ImageError, UsageError
 from implicam.images import Grey, opencv, read_picture
 
-SMALLEST = 4.0
+MIN_RADIUS_PX = 4.0
 """Least radius in pixels of a ball whose edge can be told from its inside."""
 
-DISCS = (2.5, 3.5)
+TEMPLATE_RADII_PX = (2.5, 3.5)
 """Radii of the drawn template, in pixels of a picture that is halved again and again."""
 
-ALIKE = 0.45
+MIN_CORRELATION = 0.45
 """Correlation with the template from which on a place is looked at."""
 
-MOST, FITTED = 10, 4
+MAX_PLACES, MAX_EDGES_FITTED = 10, 4
 """Places that are looked at in one picture, and edges that are fitted."""
 
-FAINTER = 0.6
+MIN_RIVAL_QUALITY_RATIO = 0.6
 """An edge whose rough quality is less than this part of the best one's is no rival of a ball that was found."""
 
-FLATTEST = 0.65
+MIN_AXIS_RATIO = 0.65
 """A sphere far off the axis of a wide lens is an ellipse; its shorter axis is at least this part of the longer."""
 
-WHOLE = 0.7
+MIN_EDGE_SEEN = 0.7
 """Part of the edge that must be seen."""
 
-CLEAR, CLEAN = 8.0, 0.12
+MIN_STEP_NOISES, MAX_RESIDUAL_STEPS = 8.0, 0.12
 """The step at the edge in times its noise; and what the fit may leave over, as a part of the step."""
 
-WHITE, STEP, DARK = 0.5, 0.38, 0.5
+MIN_PLATE_BRIGHTNESS, MIN_STEP_BRIGHTNESS, MAX_BALL_BRIGHTNESS = 0.5, 0.38, 0.5
 """The plate, and the step from ball to plate, as parts of the brightest in the picture; the ball, of the plate."""
 
-USUAL, MANY = 0.6, 5
+MIN_USUAL_STEP_RATIO, MIN_BALLS_PER_CAMERA = 0.6, 5
 """A ball whose step is less than this part of the usual one in the camera's pictures, or, where they show fewer than so
 many balls, in those of all cameras, is another thing."""
 
-RIVAL = 0.75
+MIN_RIVAL_SCORE_RATIO = 0.75
 """A second ball whose score is this part of the first's is one too many."""
 
-STILL, SAME_SIZE, STILL_SHOTS = 2.0, 0.03, 3
+SAME_PLACE_PX, SAME_SIZE_RADII, MIN_STILL_SHOTS = 2.0, 0.03, 3
 """Pixels within which a thing is at the same place, and the part of its radius within which it has the same size (a
 ball that comes nearer along a line of sight grows); and in so many shots at least it must be there to be furniture."""
 
@@ -116,7 +116,7 @@ class Ball:
     """
 
     bright: bool = False
-    smallest: float = SMALLEST
+    smallest: float = MIN_RADIUS_PX
     largest: float = 120.0
     template: Template | None = None
 
@@ -153,7 +153,11 @@ class Ball:
             moving |= {view: _without(found[view], furniture) for view in own}
         steps = {camera: [moving[v].notes["step"] for v in own if len(moving[v])] for camera, own in views.items()}
         every = [step for own in steps.values() for step in own]
-        usual = {camera: np.median(own if len(own) >= MANY else every) for camera, own in steps.items() if every}
+        usual = {
+            camera: np.median(own if len(own) >= MIN_BALLS_PER_CAMERA else every)
+            for camera, own in steps.items()
+            if every
+        }
         return {view: _if_usual(moving[view], usual.get(view.camera, 0.0)) for view in found}
 
     def _balls(self, picture: Grey) -> list[Edge]:
@@ -162,13 +166,13 @@ class Ball:
         rough: list[Rough] = []
         for centre, radius in self._places(picture):
             if not any(_overlap(centre, one) for one in rough):
-                one = rough_edge(picture, centre, radius, step=STEP * bright)
+                one = rough_edge(picture, centre, radius, step=MIN_STEP_BRIGHTNESS * bright)
                 if one is not None and not any(_overlap(one.ellipse.centre, other) for other in rough):
                     rough.append(one)
         rough.sort(key=lambda one: -one.quality)
         good: list[Edge] = []
-        for one in rough[:FITTED]:
-            if good and one.quality < FAINTER * rough[0].quality:
+        for one in rough[:MAX_EDGES_FITTED]:
+            if good and one.quality < MIN_RIVAL_QUALITY_RATIO * rough[0].quality:
                 break
             edge = _ball(picture, one)
             if edge is not None and self._fits(edge, bright):
@@ -178,7 +182,11 @@ class Ball:
     def _fits(self, edge: Edge, bright: float) -> bool:
         """Whether a ball has a radius that was asked for, and its plate is white."""
         size = self.smallest <= edge.ellipse.radius <= self.largest
-        return size and edge.outer > WHITE * bright and edge.outer - edge.inner > STEP * bright
+        return (
+            size
+            and edge.outer > MIN_PLATE_BRIGHTNESS * bright
+            and edge.outer - edge.inner > MIN_STEP_BRIGHTNESS * bright
+        )
 
     def _places(self, picture: Grey) -> list[tuple[Floats, float]]:
         """Where the picture is like the template: centres and rough radii, the likeliest first."""
@@ -187,8 +195,8 @@ class Ball:
         cv2 = opencv()
         places: list[tuple[float, Floats, float]] = []
         small, scale = picture, 1.0
-        while DISCS[0] * scale < self.largest and min(small.shape) > 24:
-            for disc in DISCS:
+        while TEMPLATE_RADII_PX[0] * scale < self.largest and min(small.shape) > 24:
+            for disc in TEMPLATE_RADII_PX:
                 if self.smallest <= 1.1 * disc * scale and disc * scale <= 1.2 * self.largest:
                     places += _peaks(small, _disc(disc), disc, scale)
             small, scale = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
@@ -208,11 +216,11 @@ def _ball(picture: Grey, rough: Rough) -> Edge | None:
     long, short = edge.ellipse.axes
     found = edge.outer - edge.inner
     good = (
-        short >= FLATTEST * long
-        and edge.support >= WHOLE
-        and found > CLEAR * edge.residual
-        and edge.residual < CLEAN * found
-        and edge.inner < DARK * edge.outer
+        short >= MIN_AXIS_RATIO * long
+        and edge.support >= MIN_EDGE_SEEN
+        and found > MIN_STEP_NOISES * edge.residual
+        and edge.residual < MAX_RESIDUAL_STEPS * found
+        and edge.inner < MAX_BALL_BRIGHTNESS * edge.outer
         and edge.blur < 0.45 * short
     )
     return edge if good else None
@@ -239,7 +247,7 @@ def _detected(edge: Edge, view: View) -> Detected:
 def _chosen(made: list[Detected]) -> Detected:
     """The first of several, unless the second is as good."""
     best, rest = made[0], tuple(made[1:4])
-    if rest and rest[0].notes["score"] > RIVAL * best.notes["score"]:
+    if rest and rest[0].notes["score"] > MIN_RIVAL_SCORE_RATIO * best.notes["score"]:
         (u, v), (s, t) = best.uv[0], rest[0].uv[0]
         reason = f"two balls, at ({u:.0f}, {v:.0f}) and ({s:.0f}, {t:.0f}): cover one, or take it away"
         return nothing(reason, others=(replace(best, others=()), *rest))
@@ -260,7 +268,7 @@ def _furniture(shots: list[list[Detected]]) -> Floats:
         near = _same(uvr, uvr[0])
         times = len(set(shot[near].tolist()))
         # A ball that never moves in any shot is a person's test of repeatability, not furniture.
-        if times >= max(STILL_SHOTS, 0.1 * looked_at) and (times < 0.8 * looked_at or _elsewhere(shot, near)):
+        if times >= max(MIN_STILL_SHOTS, 0.1 * looked_at) and (times < 0.8 * looked_at or _elsewhere(shot, near)):
             places.append(np.median(uvr[near], axis=0))
         uvr, shot = uvr[~near], shot[~near]
     return np.array(places).reshape(-1, 3)
@@ -268,8 +276,8 @@ def _furniture(shots: list[list[Detected]]) -> Floats:
 
 def _same(uvr: Floats, place: Floats) -> NDArray[np.bool_]:
     """Which of (k, 3) places and radii are this one."""
-    near = np.linalg.norm(uvr[:, :2] - place[:2], axis=1) < STILL
-    return np.asarray(near & (np.abs(uvr[:, 2] / place[2] - 1) < SAME_SIZE), dtype=np.bool_)
+    near = np.linalg.norm(uvr[:, :2] - place[:2], axis=1) < SAME_PLACE_PX
+    return np.asarray(near & (np.abs(uvr[:, 2] / place[2] - 1) < SAME_SIZE_RADII), dtype=np.bool_)
 
 
 def _elsewhere(shot: NDArray[np.int64], near: NDArray[np.bool_]) -> bool:
@@ -289,7 +297,7 @@ def _without(found: Detected, furniture: Floats) -> Detected:
 
 
 def _if_usual(found: Detected, usual: float) -> Detected:
-    if not len(found) or found.notes["step"] >= USUAL * usual:
+    if not len(found) or found.notes["step"] >= MIN_USUAL_STEP_RATIO * usual:
         return found
     u, v = found.uv[0]
     return nothing(f"no ball: the disc at ({u:.0f}, {v:.0f}) is much fainter than it is elsewhere")
@@ -310,7 +318,7 @@ def _peaks(picture: Grey, template: Grey, radius: float, scale: float) -> list[t
     if min(picture.shape) <= max(template.shape):
         return []
     alike = cv2.matchTemplate(picture, template, cv2.TM_CCOEFF_NORMED)
-    rows, columns = np.nonzero((alike > ALIKE) & (alike == cv2.dilate(alike, np.ones((5, 5), np.uint8))))
+    rows, columns = np.nonzero((alike > MIN_CORRELATION) & (alike == cv2.dilate(alike, np.ones((5, 5), np.uint8))))
     if len(rows) > 400:
         best = np.argsort(-alike[rows, columns])[:400]
         rows, columns = rows[best], columns[best]
@@ -330,7 +338,7 @@ def _apart(places: list[tuple[float, Floats, float]]) -> list[tuple[float, Float
     """The best of those that are about the same place and size."""
     kept: list[tuple[float, Floats, float]] = []
     for place in places:
-        if len(kept) >= MOST:
+        if len(kept) >= MAX_PLACES:
             break
         _, centre, radius = place
         if all(np.linalg.norm(centre - c) > 0.5 * r or not 0.6 < radius / r < 1.7 for _, c, r in kept):

@@ -30,37 +30,37 @@ from implicam.images import Grey, opencv
 
 Bools = NDArray[np.bool_]
 
-LOW, HIGH = 0.3, 0.6
+RAMP_LOW, RAMP_HIGH = 0.3, 0.6
 """Parts of the maximum between which the weight of a pixel goes from 0 to 1; a narrower ramp shows the pixels."""
 
-SMALLEST, STEP = 0.8, 1.2
+MIN_SCALE_PX, SCALE_FACTOR = 0.8, 1.2
 """Scales that are tried where a spot is shown: the first in pixels, and the factor from one to the next."""
 
-CLICK = 3.0
+MAX_CLICK_PX = 3.0
 """Pixels from a click to the spot that is meant."""
 
-FAINT = 5.0
+MIN_RESPONSE_NOISES = 5.0
 """A spot answers the Laplacian so many times its noise at least."""
 
-REACH = (2.5, 2.0)
+MAX_REACH = (2.5, 2.0)
 """Scales, and pixels more, from the middle of a spot to where it ends at the latest."""
 
-SMOOTH = 1.2
+SMOOTHING_PX = 1.2
 """Pixels of the smoothing before a spot is told from its surroundings: noise of single pixels must not do that."""
 
-SLIM = 3.0
+MAX_ELONGATION = 3.0
 """Length over width beyond which it is a scratch or a rim."""
 
-RAISED = (0.0, 0.2, 0.35, 0.5, 0.6)
+BACKGROUND_STEPS = (0.0, 0.2, 0.35, 0.5, 0.6)
 """Parts of the spot's height by which its background is raised, one after the other, until it stands alone."""
 
-PLAIN = 4.0
+MIN_BRIGHTNESS_NOISES = 4.0
 """Noise of its surroundings, smoothed, that a spot is brighter than them at least."""
 
-VAGUE = 0.5
+MAX_SD_SCALES = 0.5
 """Of the scale: a spot of a larger standard uncertainty is not measured."""
 
-FLOOR = 0.006
+MIN_SD_PX = 0.006
 """Pixels that no standard uncertainty goes below: what the sensor's pixels do to a centroid."""
 
 
@@ -89,9 +89,11 @@ def scale_shown(picture: Grey, uv: Floats, largest: float) -> tuple[float, Float
     An answer is negative where the spot is dark, NaN outside the picture. It is one scale for all: specks of noise and
     glints, which are small, are at odds with each other.
     """
-    sigmas = SMALLEST * STEP ** np.arange(0, 1 + np.log(max(largest / SMALLEST, 1.0)) / np.log(STEP))
+    sigmas = MIN_SCALE_PX * SCALE_FACTOR ** np.arange(
+        0, 1 + np.log(max(largest / MIN_SCALE_PX, 1.0)) / np.log(SCALE_FACTOR)
+    )
     answers = np.array([_answers_near(picture, u, v, sigmas) for u, v in uv]).reshape(-1, len(sigmas))
-    clear = np.sign(answers) * np.maximum(np.abs(answers) - FAINT * _answer_noise(picture, sigmas), 0)
+    clear = np.sign(answers) * np.maximum(np.abs(answers) - MIN_RESPONSE_NOISES * _answer_noise(picture, sigmas), 0)
     inside = np.isfinite(answers[:, 0])
     height = np.abs(answers[inside]).max(axis=1, keepdims=True)
     score = np.abs(np.mean(clear[inside] / np.maximum(height, 1e-9), axis=0)) if inside.any() else np.zeros(len(sigmas))
@@ -100,14 +102,14 @@ def scale_shown(picture: Grey, uv: Floats, largest: float) -> tuple[float, Float
 
 
 def _answers_near(picture: Grey, u: float, v: float, sigmas: Floats) -> Floats:
-    """The strongest answer, of either sign, to each scale within `CLICK` of a pixel."""
-    reach = int(np.ceil(4 * sigmas[-1] + CLICK + 2))
+    """The strongest answer, of either sign, to each scale within `MAX_CLICK_PX` of a pixel."""
+    reach = int(np.ceil(4 * sigmas[-1] + MAX_CLICK_PX + 2))
     left, top = max(round(u) - reach, 0), max(round(v) - reach, 0)
     if not (-0.5 <= u < picture.shape[1] - 0.5 and -0.5 <= v < picture.shape[0] - 0.5):
         return np.full(len(sigmas), np.nan)
     window = np.ascontiguousarray(picture[top : round(v) + reach + 1, left : round(u) + reach + 1])
     rows, columns = np.indices(window.shape)
-    near = np.hypot(columns + left - u, rows + top - v) <= CLICK
+    near = np.hypot(columns + left - u, rows + top - v) <= MAX_CLICK_PX
     found = np.array([laplacian(window, float(sigma))[near] for sigma in sigmas], dtype=np.float64)
     return np.asarray(found[np.arange(len(sigmas)), np.argmax(np.abs(found), axis=1)], dtype=np.float64)
 
@@ -124,12 +126,12 @@ def find_spots(picture: Grey, sigma: float) -> tuple[Floats, Floats]:
     cv2 = opencv()
     answer = laplacian(picture, sigma)
     around = cv2.dilate(answer, np.ones((3, 3), np.uint8))
-    least = max(FAINT * float(_answer_noise(picture, np.array([sigma]))[0]), 1e-4)
+    least = max(MIN_RESPONSE_NOISES * float(_answer_noise(picture, np.array([sigma]))[0]), 1e-4)
     v, u = np.nonzero((answer == around) & (answer > least))
     inside = (u > 1) & (v > 1) & (u < picture.shape[1] - 2) & (v < picture.shape[0] - 2)
     u, v = u[inside], v[inside]
     across, along = _bends(answer, u, v)
-    round_enough = (across > 0) & (along < SLIM**2 * across)
+    round_enough = (across > 0) & (along < MAX_ELONGATION**2 * across)
     uv = np.column_stack([u, v]).astype(np.float64)[round_enough]
     return uv, answer[v, u].astype(np.float64)[round_enough]
 
@@ -152,7 +154,7 @@ def measure_spots(picture: Grey, uv: Floats, sigma: float) -> Spots:
     empty = np.full(5, np.nan)
     rows = [empty if window is None else (*window.uv, *window.sd(share), window.area) for window in windows]
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    table[~(table[:, 2:4].max(axis=1) < VAGUE * sigma)] = np.nan
+    table[~(table[:, 2:4].max(axis=1) < MAX_SD_SCALES * sigma)] = np.nan
     return Spots(table[:, :2], table[:, 2:4], table[:, 4])
 
 
@@ -206,10 +208,10 @@ class _Window:
         d = xy - centre
         spread = np.einsum("ij,ijk,ijl->kl", np.maximum(mass, 0), d, d) / total
         narrow, wide = np.linalg.eigvalsh(spread)
-        if not 0 < wide < SLIM**2 * narrow:
+        if not 0 < wide < MAX_ELONGATION**2 * narrow:
             return None
         direct, rim = weight[..., None] * d, (slope * bright)[..., None] * d
-        pull = direct + np.stack([ndimage.gaussian_filter(rim[..., k], SMOOTH) for k in range(2)], axis=2)
+        pull = direct + np.stack([ndimage.gaussian_filter(rim[..., k], SMOOTHING_PX) for k in range(2)], axis=2)
         core = weight > 0
         distance = np.sqrt(np.einsum("ijk,kl,ijl->ij", d, np.linalg.inv(spread), d) * np.sqrt(narrow * wide))
         residual = _about_profile(bright[core], distance[core])
@@ -221,7 +223,7 @@ class _Window:
         odd = float(np.sum(self.residual**2)) / max(float(np.sum(variance[self.core])), 1e-18)
         usual = 1 + 3 * np.sqrt(2 / len(self.residual))
         spread = np.einsum("ijk,ij->k", self.pull**2, variance) * (odd if odd > usual else 1.0)
-        return np.asarray(np.sqrt(spread + FLOOR**2), dtype=np.float64)
+        return np.asarray(np.sqrt(spread + MIN_SD_PX**2), dtype=np.float64)
 
 
 def _level(ring: Floats) -> tuple[float, float]:
@@ -236,23 +238,27 @@ def _level(ring: Floats) -> tuple[float, float]:
 def _weights(bright: Floats, far: Floats, sigma: float, noise: float) -> tuple[Floats, Floats, float] | None:
     """Weights of the pixels (k, k), the slope of the weight with the smoothed brightness, and what the background is
     brighter than `bright` says: it is raised until the spot stands alone, beside a brighter thing or on a slope."""
-    smooth = ndimage.gaussian_filter(bright, SMOOTH)
+    smooth = ndimage.gaussian_filter(bright, SMOOTHING_PX)
     summit = (smooth == ndimage.maximum_filter(smooth, 3)) & (far <= sigma + 1.5)
     if not summit.any():
         return None
     top = int(np.argmax(np.where(summit, smooth, -np.inf)))
-    rough = noise / (2 * np.sqrt(np.pi) * SMOOTH)  # the noise that is left; the largest of several is 2 sd above
+    rough = noise / (2 * np.sqrt(np.pi) * SMOOTHING_PX)  # the noise that is left; the largest of several is 2 sd above
     peak = float(smooth.flat[top]) - 2 * rough
-    end = far > REACH[0] * sigma + REACH[1]
-    for raised in RAISED:
+    end = far > MAX_REACH[0] * sigma + MAX_REACH[1]
+    for raised in BACKGROUND_STEPS:
         height = (1 - raised) * peak
-        if height <= PLAIN * rough:
+        if height <= MIN_BRIGHTNESS_NOISES * rough:
             return None
-        weight = np.clip(((smooth - raised * peak) / height - LOW) / (HIGH - LOW), 0, 1)
+        weight = np.clip(((smooth - raised * peak) / height - RAMP_LOW) / (RAMP_HIGH - RAMP_LOW), 0, 1)
         parts, _ = ndimage.label(weight > 0)
         weight[parts != parts.flat[top]] = 0
         if not (weight[end] > 0).any():
-            return weight, np.where((weight > 0) & (weight < 1), 1 / (height * (HIGH - LOW)), 0), raised * peak
+            return (
+                weight,
+                np.where((weight > 0) & (weight < 1), 1 / (height * (RAMP_HIGH - RAMP_LOW)), 0),
+                raised * peak,
+            )
     return None
 
 

@@ -26,16 +26,16 @@ from implicam.detect.seeds import from_libcbdetect, from_opencv, from_saddles, i
 from implicam.errors import UsageError
 from implicam.images import Grey, opencv
 
-LARGEST_PICTURE = 2_500_000
+MAX_SEARCH_PIXELS = 2_500_000
 """Pixels beyond which the search is done in a smaller picture; corners are always fitted in the original."""
 
-OTHERS = 12
+MAX_OTHER_READINGS = 12
 """Readings that are kept of a board that is refused, at most."""
 
-MANY = 8
+MAX_TIMES_FOUND = 8
 """Times that a checkerboard was found, or found again, after which no more are looked for."""
 
-ANOTHER = 12
+MIN_CORNERS_OF_ANOTHER = 12
 """Corners of a second checkerboard that make it one."""
 
 
@@ -96,7 +96,7 @@ class Board:
             if grid is not None:
                 _enlist(grids, grid)
                 grown += 1
-            if grown == MANY:
+            if grown == MAX_TIMES_FOUND:
                 break
         return self._together(picture, sorted(grids, key=lambda grid: -grid.count), limit)
 
@@ -115,7 +115,7 @@ class Board:
 
     def _seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
         """Seeds for as long as the grids found so far (the list grows meanwhile) do not hold a whole board."""
-        scale = min(1.0, 0.5 ** np.ceil(np.log2(max(picture.size / LARGEST_PICTURE, 1)) / 2))
+        scale = min(1.0, 0.5 ** np.ceil(np.log2(max(picture.size / MAX_SEARCH_PIXELS, 1)) / 2))
         for seeds in (
             lambda: _saddle_seeds(picture, scale, grids),
             lambda: _saddle_seeds(picture, scale / 2, grids),
@@ -149,10 +149,12 @@ class Board:
                 f"which: they can be numbered in {len(possible)} ways. Show more of the board, with the white margin "
                 "after its outermost squares.",
                 outlines=outline,
-                others=tuple(possible[:OTHERS]),
+                others=tuple(possible[:MAX_OTHER_READINGS]),
             )
         for k in fitting[1:]:
-            if grids[k].count >= ANOTHER and not self._may_be_hidden_part(grid, ways[first][0], grids[k]):
+            if grids[k].count >= MIN_CORNERS_OF_ANOTHER and not self._may_be_hidden_part(
+                grid, ways[first][0], grids[k]
+            ):
                 return nothing(
                     f"two checkerboards are in view, of {grid.count} and {grids[k].count} corners, and either may be "
                     "the board. Take the other one away, or cover it.",

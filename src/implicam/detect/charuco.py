@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
-from implicam.detect.board import LARGEST_PICTURE, corner_name, unusable
+from implicam.detect.board import MAX_SEARCH_PIXELS, corner_name, unusable
 from implicam.detect.corners import Corners, fit_corners
-from implicam.detect.grid import ASTRAY, Places, places_from
+from implicam.detect.grid import MAX_ASTRAY_SQUARES, Places, places_from
 from implicam.detect.model import Detected, View, nothing
 from implicam.detect.seeds import in_original, resized
 from implicam.errors import UsageError, did_you_mean
 from implicam.images import Grey, eight_bit, opencv
 
-FEWEST = 6
+MIN_CORNERS = 6
 """Corners from which their neighbourhood can be checked."""
 
-MISFIT = 0.35
+MAX_RESIDUAL_HEIGHTS = 0.35
 
-OFF = 0.3
+MAX_MARKER_OFF_SQUARES = 0.3
 """Squares that a marker may be from where its neighbours put it; more than a fifth beyond, and it is another board."""
 
 
@@ -83,14 +83,14 @@ class Charuco:
         if unfit:
             return nothing(unfit)
         seen = self._seen(picture, 1.0)
-        if len(seen.ids) < self._total and picture.size <= LARGEST_PICTURE:
+        if len(seen.ids) < self._total and picture.size <= MAX_SEARCH_PIXELS:
             again = self._seen(picture, 2.0)  # small markers are read better when they are made larger
             seen = again if len(again.ids) > len(seen.ids) else seen
         if seen.reason:
             return nothing(seen.reason)
         corners, there = self._corners(picture, seen)
         number = np.flatnonzero(there)
-        if len(number) < FEWEST:
+        if len(number) < MIN_CORNERS:
             return nothing(
                 f"{len(seen.ids)} markers of the board were read, and {len(number)} corners between them are clear: "
                 "too few. Show more of the board, sharper or nearer."
@@ -153,12 +153,12 @@ class Charuco:
         known = np.array([name in of for name in names.tolist()])
         if known.mean() < 0.8:
             return False
-        if known.sum() < FEWEST:
+        if known.sum() < MIN_CORNERS:
             return True
         nodes = np.array([of[int(name)] for name in names[known]], dtype=np.float64) / self.square
         places = places_from(nodes, middle[known], nodes)
         off = _squares(middle[known] - places.uv, places)
-        return bool(np.mean(np.abs(off).max(axis=1) > OFF) < 0.2)
+        return bool(np.mean(np.abs(off).max(axis=1) > MAX_MARKER_OFF_SQUARES) < 0.2)
 
     def _corners(self, picture: Grey, seen: _Seen) -> tuple[Corners, NDArray[np.bool_]]:
         """All corners of the board, fitted; and (n,) which of them are clear."""
@@ -169,7 +169,7 @@ class Charuco:
         corners = Corners.unknown(len(nodes))
         for _ in range(self.rows + self.columns):
             before = there
-            if there.sum() < FEWEST:
+            if there.sum() < MIN_CORNERS:
                 break
             places = places_from(nodes[there], start[there], nodes)
             near = np.linalg.norm(nodes[:, None] - nodes[there], axis=2).min(axis=1) < 1.5
@@ -198,7 +198,7 @@ def _nothing_seen(reason: str) -> _Seen:
 def _sound(corners: Corners, nodes: Floats) -> NDArray[np.bool_]:
     """Which corners (n,) look like corners: little left over, and bright and dark in turn as their neighbours."""
     with np.errstate(invalid="ignore"):
-        good = (corners.misfit < MISFIT) & np.isfinite(corners.uv).all(axis=1)
+        good = (corners.misfit < MAX_RESIDUAL_HEIGHTS) & np.isfinite(corners.uv).all(axis=1)
         signed = corners.height * (1 - 2 * (nodes.sum(axis=1) % 2))
         if good.any():
             middle = np.median(signed[good])
@@ -208,12 +208,12 @@ def _sound(corners: Corners, nodes: Floats) -> NDArray[np.bool_]:
 
 def _placed(corners: Corners, nodes: Floats, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which corners (n,) are where those that are `there` say; their own say left out."""
-    if there.sum() < FEWEST:
+    if there.sum() < MIN_CORNERS:
         return np.zeros_like(there)
     places = places_from(nodes[there], corners.uv[there], nodes)
     with np.errstate(invalid="ignore"):
         off = np.abs(_squares(corners.uv - places.uv, places)).max(axis=1)
-    return np.asarray(off < ASTRAY / 2, dtype=np.bool_)
+    return np.asarray(off < MAX_ASTRAY_SQUARES / 2, dtype=np.bool_)
 
 
 def _squares(off: Floats, places: Places) -> Floats:

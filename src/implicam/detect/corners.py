@@ -27,18 +27,18 @@ from implicam.images import Grey
 
 Bools = NDArray[np.bool_]
 
-LARGEST = 9.0
+MAX_WINDOW_PX = 9.0
 """Pixels from the crossing to the window's rim at most: over more, edges are not straight behind a wide lens."""
 
-SMALLEST = 2.5
+MIN_WINDOW_PX = 2.5
 """Pixels to the rim at least: where squares are smaller, there is nothing to fit."""
 
-CLEAR = 1.6
+EDGE_CLEARANCE_PX = 1.6
 """Pixels that the window stays away from the edges of the neighbouring corners, which are blurred too."""
 
-ROUNDS = 12
+MAX_ROUNDS = 12
 
-FLOOR = 0.003
+MIN_SD_PX = 0.003
 """Pixels that no standard uncertainty goes below: what curved edges and the sensor's pixels do to the model."""
 
 
@@ -77,7 +77,9 @@ def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare:
     """
     uv, right, down = (np.asarray(x, dtype=np.float64) for x in (uv, right, down))
     out = Corners.unknown(len(uv))
-    half = int(np.ceil(np.clip(0.9 * np.nanmax(_lengths(right, down), initial=SMALLEST), SMALLEST, LARGEST)))
+    half = int(
+        np.ceil(np.clip(0.9 * np.nanmax(_lengths(right, down), initial=MIN_WINDOW_PX), MIN_WINDOW_PX, MAX_WINDOW_PX))
+    )
     with np.errstate(invalid="ignore"):
         inside = np.isfinite(uv + right + down).all(axis=1)
         inside &= ((uv >= half + 0.5) & (uv <= np.array(picture.shape)[::-1] - half - 1.5)).all(axis=1)
@@ -114,7 +116,7 @@ class _Windows:
         weight = self._weight(parameters)
         error, parameters, linear, jacobian = self._evaluated(parameters, weight)
         damping = np.full(n, 1e-3)
-        for turn in range(ROUNDS):
+        for turn in range(MAX_ROUNDS):
             if turn == 2:  # the window follows the corner, but not for ever: what moves does not converge
                 weight = self._weight(parameters)
                 error, parameters, linear, jacobian = self._evaluated(parameters, weight)
@@ -138,10 +140,10 @@ class _Windows:
         inverse = np.linalg.pinv(self.steps)
         squares = np.abs(d @ inverse.swapaxes(1, 2))
         slope = np.linalg.norm(inverse, axis=2)[:, None]  # squares per pixel
-        reach = np.maximum(1 - CLEAR * slope, 0.35)
+        reach = np.maximum(1 - EDGE_CLEARANCE_PX * slope, 0.35)
         inside = (squares < reach).all(axis=2) & (np.linalg.norm(d, axis=2) < self.half - 0.5)
         if self.bare < 1:
-            bare = np.maximum(self.bare - CLEAR * slope, 1.5 * slope)
+            bare = np.maximum(self.bare - EDGE_CLEARANCE_PX * slope, 1.5 * slope)
             inside &= (squares < bare).any(axis=2)
         return np.asarray(inside, dtype=np.float64)
 
@@ -200,7 +202,7 @@ class _Windows:
             inverse = np.linalg.pinv(normal / (scale[:, :, None] * scale[:, None, :]), hermitian=True)
             variance = np.einsum("nii->ni", inverse)[:, :2] / scale[:, :2] ** 2 * noise[:, None]
         good = np.isfinite(variance).all(axis=1) & np.isfinite(misfit)
-        sd = np.sqrt(np.where(good[:, None], variance, np.nan) + FLOOR**2)
+        sd = np.sqrt(np.where(good[:, None], variance, np.nan) + MIN_SD_PX**2)
         uv = np.where(good[:, None], self.corner + parameters[:, :2], np.nan)
         turned = np.abs(np.sin(parameters[:, 2:4] - self.angle)).max(axis=1)
         return Corners(uv, sd, mean, height, misfit, np.exp(parameters[:, 4]), turned)

@@ -37,29 +37,29 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 Labels = Mapping[View, Mapping[str, tuple[float, float]]]
 
-FEWEST = 6
+MIN_LABELS = 6
 """Labels that a camera needs."""
 
-CLICK = 3.5
+MAX_CLICK_PX = 3.5
 """Pixels from a label to the spot that is meant."""
 
-SURE = 2.0
+MIN_SDS_TO_NEXT = 2.0
 """Standard deviations of a prediction that must stay within the way to the next dot."""
 
-PART = 0.4
+MAX_OFF_TO_NEXT = 0.4
 """Of the distance to the next dot: farther from its prediction a spot may be that dot."""
 
-ASTRAY = 6.0
+MAX_ASTRAY_RATIO = 6.0
 """A dot so many times farther from what the others predict than they are from theirs is none."""
 
-TOLERATED = 1.0
+TOLERATED_OFF = 1.0
 """Pixels, and times the scale of the dots, from what the others predict that are no reason to drop a dot: targets are
 drilled by hand, and a glint at its rim draws a dot's centroid there. Its uncertainty says so."""
 
-SCATTER = 0.05
+MAX_SCATTER_TO_NEXT = 0.05
 """Median distance of dots from what the others predict, as a part of the way to the next dot, that is no fit."""
 
-ROUNDS = 25
+MAX_ROUNDS = 25
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +121,10 @@ class Dots:
             )
         names = [self.points[row] for row in rows]
         marks = self._marks(view, names)
-        if len(marks) < FEWEST:
+        if len(marks) < MIN_LABELS:
             return nothing(
-                f"{len(marks)} labelled dots for camera {view.camera!r} in shot {view.shot!r}, but it takes {FEWEST}: "
-                "label more dots, spread over the target and its depths"
+                f"{len(marks)} labelled dots for camera {view.camera!r} in shot {view.shot!r}, but it takes "
+                f"{MIN_LABELS}: label more dots, spread over the target and its depths"
             )
         search = _Search.begin(picture, names, self.known.xyz[rows], marks, self.polarity)
         if isinstance(search, str):
@@ -164,7 +164,7 @@ def _read_labels(path: Path, points: Sequence[str]) -> dict[View, dict[str, tupl
             raise DatasetError(f"{place}: point {name!r} of camera {camera!r} is labelled twice.", fix="remove one row")
         marks[name] = (u, v)
     if not labels:
-        raise DatasetError(f"{path} has a header and no rows.", fix=f"label {FEWEST} dots or more for each camera")
+        raise DatasetError(f"{path} has a header and no rows.", fix=f"label {MIN_LABELS} dots or more for each camera")
     return labels
 
 
@@ -198,9 +198,9 @@ class _Camera:
     def fit(cls, xyz: Floats, uv: Floats, sd: Floats) -> _Camera:
         """With the most probable of a few departures; with few dots, one per cent of the target's size."""
         first = cls.condition(xyz, uv, sd, _affine(xyz, uv), 0.01, 1.0, 0.001)
-        if len(xyz) < ENOUGH:
+        if len(xyz) < MIN_DOTS_FOR_DEPARTURE:
             return first
-        some = np.random.default_rng(0).permutation(len(xyz))[:MOST]
+        some = np.random.default_rng(0).permutation(len(xyz))[:MAX_DOTS_FOR_DEPARTURE]
         trials = [
             cls.condition(xyz[some], uv[some], sd[some], first.theta, bend, reach, slack, turns=1)
             for bend in (0.001, 0.004, 0.016)
@@ -257,13 +257,13 @@ class _Camera:
         return _Prediction(uv, np.sqrt(np.einsum("nii->n", blocks) / 2))
 
 
-ENOUGH, MOST = 12, 120
+MIN_DOTS_FOR_DEPARTURE, MAX_DOTS_FOR_DEPARTURE = 12, 120
 """Dots from which the departure can be told, and so many of them as suffice for it."""
 
-AFFINE = np.array([1.5] * 3 + [5.0]) ** 2
+AFFINE_PRIOR_VARIANCES = np.array([1.5] * 3 + [5.0]) ** 2
 """Prior variances of a row of the camera matrix, with pixels in units of the labels' size: all that is possible."""
 
-ALONG, ACROSS = 0.2, 0.06
+ALONG_PRIOR_SD, ACROSS_PRIOR_SD = 0.2, 0.06
 """Prior sd of the perspective: how much the distance from the camera changes over the target, as a part of itself,
 along the line of sight; and across it, which is what an axis that does not meet the target does."""
 
@@ -273,8 +273,8 @@ def _prior(theta: Floats) -> Floats:
     sight = np.cross(theta[:3], theta[4:7])
     sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
     S = np.zeros((11, 11))
-    S[np.arange(8), np.arange(8)] = np.tile(AFFINE, 2)
-    S[8:, 8:] = (ALONG**2 - ACROSS**2) * np.outer(sight, sight) + ACROSS**2 * np.eye(3)
+    S[np.arange(8), np.arange(8)] = np.tile(AFFINE_PRIOR_VARIANCES, 2)
+    S[8:, 8:] = (ALONG_PRIOR_SD**2 - ACROSS_PRIOR_SD**2) * np.outer(sight, sight) + ACROSS_PRIOR_SD**2 * np.eye(3)
     return S
 
 
@@ -310,7 +310,7 @@ class _Search:
         self.rough, self.answer = find_spots(picture, sigma)
         self.tree = cKDTree(self.rough.reshape(-1, 2)) if len(self.rough) else None
         self.measured: dict[int, tuple[Floats, Floats, float]] = {}
-        self.tolerated = max(TOLERATED, TOLERATED * sigma)
+        self.tolerated = max(TOLERATED_OFF, TOLERATED_OFF * sigma)
         self.to = np.full(len(xyz), -1)
         self.labelled: list[int] = []
         self.meant: dict[int, int] = {}
@@ -326,7 +326,7 @@ class _Search:
         inside = ((uv > -0.5) & (uv < np.array(picture.shape)[::-1] - 0.5)).all(axis=1)
         outside = [names[row] for row in rows[~inside]]
         rows, uv = rows[inside], uv[inside]
-        if len(rows) < FEWEST:
+        if len(rows) < MIN_LABELS:
             return (
                 f"the labels {_listed(outside)} lie outside the picture, which is {picture.shape[1]} x "
                 f"{picture.shape[0]} pixels: correct them, or check that this is the picture they belong to"
@@ -337,10 +337,10 @@ class _Search:
             picture = 1 - picture
         search = cls(picture, sigma, names, xyz)
         search._label(rows, uv)
-        if len(search.labelled) < FEWEST:
+        if len(search.labelled) < MIN_LABELS:
             return (
-                f"no dot where the labels {_listed([names[row] for row in search.lost])} are, and it takes {FEWEST} "
-                "labels that lie on dots: click within two pixels of dots that this picture shows, "
+                f"no dot where the labels {_listed([names[row] for row in search.lost])} are, and it takes "
+                f"{MIN_LABELS} labels that lie on dots: click within two pixels of dots that this picture shows, "
                 "and check that it is sharp and not turned"
             )
         return search
@@ -350,7 +350,7 @@ class _Search:
         found = [] if self.tree is None else self.tree.query_ball_point(uv, within + self.sigma)
         self._measure(found)
         found = [k for k in found if np.linalg.norm(self.measured[k][0] - uv) <= within]
-        least = FAINTER * max((self.answer[k] for k in found), default=0.0)
+        least = MIN_BRIGHTNESS_RATIO * max((self.answer[k] for k in found), default=0.0)
         return [k for k in found if self.answer[k] >= least]
 
     def _measure(self, spots: Sequence[int]) -> None:
@@ -363,7 +363,7 @@ class _Search:
 
     def _label(self, rows: Ints, uv: Floats) -> None:
         for row, pixel in zip(rows, uv, strict=True):
-            near = self._near(pixel, max(CLICK, self.sigma * np.sqrt(2)))
+            near = self._near(pixel, max(MAX_CLICK_PX, self.sigma * np.sqrt(2)))
             near = [k for k in near if k not in self.to]
             if near:
                 self.meant[int(row)] = self.to[row] = max(near, key=lambda k: self.answer[k])
@@ -374,7 +374,7 @@ class _Search:
     def grow(self) -> None:
         """Match, fit, predict, until nothing changes."""
         before: set[bytes] = set()
-        while len(before) < ROUNDS and self.to.tobytes() not in before:
+        while len(before) < MAX_ROUNDS and self.to.tobytes() not in before:
             before.add(self.to.tobytes())
             self._fit()
             self._drop()
@@ -387,15 +387,15 @@ class _Search:
         uv = np.array([self.measured[k][0] for k in self.to[rows]])
         sd = np.array([np.sqrt(np.mean(self.measured[k][1] ** 2)) for k in self.to[rows]])
         middle, scale = _frame(self.xyz[rows], uv)
-        if len(rows) > MOST:
-            some = np.sort(np.random.default_rng(0).permutation(len(rows))[:MOST])
+        if len(rows) > MAX_DOTS_FOR_DEPARTURE:
+            some = np.sort(np.random.default_rng(0).permutation(len(rows))[:MAX_DOTS_FOR_DEPARTURE])
             rows, uv, sd = rows[some], uv[some], sd[some]
         camera = _Camera.fit(self.xyz[rows], (uv - middle) / scale, sd / scale)
         predicted, by_others = camera.predict(self.xyz), camera.leave_one_out()
         predicted.uv[rows], predicted.sd[rows] = by_others
         self.uv, self.sd = middle + scale * predicted.uv, scale * predicted.sd
         self.apart = cKDTree(self.uv).query(self.uv, k=2)[0][:, 1]
-        self.sure = SURE * self.sd < PART * self.apart
+        self.sure = MIN_SDS_TO_NEXT * self.sd < MAX_OFF_TO_NEXT * self.apart
 
     def _distance(self) -> Floats:
         """(n,) pixels from what the others say of a dot to where it is; NaN where it is not matched."""
@@ -408,12 +408,14 @@ class _Search:
         """Forget the matches that the others contradict."""
         distance = self._distance()
         matched = self.to >= 0
-        if matched.sum() < ENOUGH:
+        if matched.sum() < MIN_DOTS_FOR_DEPARTURE:
             return
         usual = float(np.median(distance[matched]))
         with np.errstate(invalid="ignore"):
-            far = distance > np.maximum(np.maximum(ASTRAY * usual, self.tolerated), 2 * SURE * self.sd)
-            far |= self.sure & (distance > PART * self.apart)
+            far = distance > np.maximum(
+                np.maximum(MAX_ASTRAY_RATIO * usual, self.tolerated), 2 * MIN_SDS_TO_NEXT * self.sd
+            )
+            far |= self.sure & (distance > MAX_OFF_TO_NEXT * self.apart)
         far &= distance >= 0.5 * np.nanmax(distance[far], initial=0.0)  # the worst first: they push others off
         self.off |= set(np.flatnonzero(far).tolist())
         self.to[far] = -1
@@ -423,7 +425,7 @@ class _Search:
         pairs: list[tuple[float, int, int]] = []
         taken = set(self.to[self.to >= 0].tolist())
         for row in np.flatnonzero((self.to < 0) & self.sure & self._inside()):
-            within = min(PART * self.apart[row], 2 * SURE * self.sd[row] + self.tolerated)
+            within = min(MAX_OFF_TO_NEXT * self.apart[row], 2 * MIN_SDS_TO_NEXT * self.sd[row] + self.tolerated)
             free = [k for k in self._near(self.uv[row], within) if k not in taken]
             pairs += [(float(np.linalg.norm(self.measured[k][0] - self.uv[row])), int(row), k) for k in free]
         for _, at, k in sorted(pairs):
@@ -436,7 +438,7 @@ class _Search:
         distance = self._distance()
         usual = float(np.nanmedian(distance))
         with np.errstate(invalid="ignore"):
-            far = distance > np.maximum(ASTRAY * usual, 2 * SURE * self.sd)
+            far = distance > np.maximum(MAX_ASTRAY_RATIO * usual, 2 * MIN_SDS_TO_NEXT * self.sd)
         return np.where(far, distance, 0.0)
 
     def _inside(self) -> Bools:
@@ -451,7 +453,7 @@ class _Search:
         scatter = float(np.nanmedian(self._distance() / self.apart))
         against = [self.names[row] for row, spot in self.meant.items() if self.to[row] != spot]
         outvoted = share >= 0.95 and bool(self.sure[inside].all()) and 3 * len(against) <= len(self.meant)
-        if share >= 0.6 and scatter <= SCATTER and (not against or outvoted):
+        if share >= 0.6 and scatter <= MAX_SCATTER_TO_NEXT and (not against or outvoted):
             return ""
         which = f", least of all {_listed(against)}" if against and len(against) < len(self.meant) else ""
         return (
@@ -492,7 +494,7 @@ class _Search:
         return ". ".join(said)
 
 
-FAINTER = 0.3
+MIN_BRIGHTNESS_RATIO = 0.3
 """Of the brightest spot near a prediction: fainter ones beside it are not meant."""
 
 

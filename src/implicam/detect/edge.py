@@ -26,25 +26,25 @@ SPOKES = 72
 SECTORS = 24
 """Parts of the edge that are judged, each as a whole."""
 
-ODD = 2.5
+ODD_SECTOR_RATIO = 2.5
 """A sector is left out where it fits so many times worse than usual."""
 
-GEOMETRY = 6
+GEOMETRY_NUMBERS = 6
 """Numbers of the edge: centre (2), shape (3), blur. Those of the light follow."""
 
-WAVES, SLOPES = 6, 5
+LIGHT_WAVES, LIGHT_SLOPES = 6, 5
 """How finely the light may vary around the edge, and its slope away from the edge: a stem or a shadow is light, too."""
 
-LIGHT = 1 + 2 * WAVES + SLOPES
+LIGHT_NUMBERS = 1 + 2 * LIGHT_WAVES + LIGHT_SLOPES
 
-UNEVEN, SLOPE = (0.05, 0.2), 0.1
+WAVE_PRIOR_SDS, SLOPE_PRIOR_SD = (0.05, 0.2), 0.1
 """Prior sd of each wave of the light inside and outside, and of the slope per pixel, as parts of the step."""
 
-UNKNOWN = 0.01
+UNMODELLED_SD_BLURS = 0.01
 """Standard deviation, in blurs, of what light that is not of this form does to the centre: rendered balls with shading
 and a soft shadow, without any noise, are off by 0.005 to 0.01 of the blur."""
 
-OUTWARD = 2.0
+OUTWARD_PX = 2.0
 """Pixels beyond the blur that tell the light."""
 
 
@@ -186,7 +186,8 @@ class _Band(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Where Gauss-Newton stands: the edge, its blur, the light (2 LIGHT,), and the noise (2,) inside and outside."""
+    """Where Gauss-Newton stands: the edge, its blur, the light (2 LIGHT_NUMBERS,), and the noise (2,) inside and
+    outside."""
 
     ellipse: Ellipse
     blur: float
@@ -199,7 +200,7 @@ def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
     ellipse, kept = start, np.ones(SECTORS, dtype=np.bool_)
     band = fit = None
     for _ in range(3):
-        band = _band(picture, ellipse, 3 * blur + OUTWARD)
+        band = _band(picture, ellipse, 3 * blur + OUTWARD_PX)
         if band is None:
             return None
         fit = _gauss_newton(band, ellipse, blur, kept[_sector(band.uv, ellipse)])
@@ -208,7 +209,7 @@ def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
         settled = 0.8 < fit.blur / blur < 1.25  # else the band was too narrow, or needlessly wide
         ellipse, blur = fit.ellipse, fit.blur
         worse = _sector_rms(band.grey - _model(band.uv, fit)[0], _sector(band.uv, ellipse))
-        again = worse <= ODD * max(float(np.median(worse)), 0.004)
+        again = worse <= ODD_SECTOR_RATIO * max(float(np.median(worse)), 0.004)
         if again.mean() < 0.4 or (settled and (again == kept).all()):
             break
         kept = again
@@ -230,8 +231,10 @@ def _judged(band: _Band, fit: _Fit, kept: Bools) -> Edge | None:
     except np.linalg.LinAlgError:
         return None
     rms = float(np.sqrt(np.mean(residual**2)))
-    own = covariance[:2, :2] + (UNKNOWN * fit.blur) ** 2 * np.eye(2)
-    return Edge(fit.ellipse, own, float(fit.light[0]), float(fit.light[LIGHT]), rms, fit.blur, float(kept.mean()))
+    own = covariance[:2, :2] + (UNMODELLED_SD_BLURS * fit.blur) ** 2 * np.eye(2)
+    return Edge(
+        fit.ellipse, own, float(fit.light[0]), float(fit.light[LIGHT_NUMBERS]), rms, fit.blur, float(kept.mean())
+    )
 
 
 def _band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:
@@ -266,37 +269,39 @@ def _distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
 
 
 def _model(uv: Floats, fit: _Fit) -> tuple[Floats, Floats, Floats]:
-    """Grey values (n,), their derivative (n, GEOMETRY + 2 LIGHT), and how far outside each pixel is, 0 to 1."""
+    """Grey values (n,), their derivative (n, GEOMETRY_NUMBERS + 2 LIGHT_NUMBERS), and how far outside each pixel is,
+    0 to 1."""
     d, by_ellipse = _distance(uv, fit.ellipse)
     around = _around(uv, fit.ellipse)
     z = d / fit.blur
     step, density = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
-    inner = np.column_stack([around, around[:, :SLOPES] * np.minimum(d, 0)[:, None]])
-    outer = np.column_stack([around, around[:, :SLOPES] * np.maximum(d, 0)[:, None]])
-    jump = outer @ fit.light[LIGHT:] - inner @ fit.light[:LIGHT]
-    J = np.empty((len(uv), GEOMETRY + 2 * LIGHT))
+    inner = np.column_stack([around, around[:, :LIGHT_SLOPES] * np.minimum(d, 0)[:, None]])
+    outer = np.column_stack([around, around[:, :LIGHT_SLOPES] * np.maximum(d, 0)[:, None]])
+    jump = outer @ fit.light[LIGHT_NUMBERS:] - inner @ fit.light[:LIGHT_NUMBERS]
+    J = np.empty((len(uv), GEOMETRY_NUMBERS + 2 * LIGHT_NUMBERS))
     J[:, :5] = (jump * density / fit.blur)[:, None] * by_ellipse
     J[:, 5] = -jump * density * z / fit.blur
-    J[:, GEOMETRY : GEOMETRY + LIGHT] = inner * (1 - step)[:, None]
-    J[:, GEOMETRY + LIGHT :] = outer * step[:, None]
-    return J[:, GEOMETRY:] @ fit.light, J, step
+    J[:, GEOMETRY_NUMBERS : GEOMETRY_NUMBERS + LIGHT_NUMBERS] = inner * (1 - step)[:, None]
+    J[:, GEOMETRY_NUMBERS + LIGHT_NUMBERS :] = outer * step[:, None]
+    return J[:, GEOMETRY_NUMBERS:] @ fit.light, J, step
 
 
 def _around(uv: Floats, ellipse: Ellipse) -> Floats:
-    """(n, 1 + 2 WAVES) 1 and cos, sin of 1, 2, ... times the angle around the centre."""
+    """(n, 1 + 2 LIGHT_WAVES) 1 and cos, sin of 1, 2, ... times the angle around the centre."""
     q = (uv - ellipse.centre) @ ellipse.shape
     turn = (q[:, 0] + 1j * q[:, 1]) / np.maximum(np.hypot(*q.T), 1e-9)
-    powers = np.multiply.accumulate(np.broadcast_to(turn[:, None], (len(q), WAVES)), axis=1)
+    powers = np.multiply.accumulate(np.broadcast_to(turn[:, None], (len(q), LIGHT_WAVES)), axis=1)
     return np.column_stack([np.ones(len(q)), np.stack([powers.real, powers.imag], axis=2).reshape(len(q), -1)])
 
 
 def _precision(fit: _Fit) -> Floats:
-    """(GEOMETRY + 2 LIGHT,) of the prior: the light is nearly even inside, less so outside, and never jumps."""
-    jump = abs(fit.light[LIGHT] - fit.light[0]) + 1e-3
-    wave = np.concatenate([[np.inf], np.full(2 * WAVES, 1.0)])
-    inner = np.concatenate([UNEVEN[0] * jump * wave, np.full(SLOPES, SLOPE * jump)])
-    outer = np.concatenate([UNEVEN[1] * jump * wave, np.full(SLOPES, SLOPE * jump)])
-    return np.concatenate([np.zeros(GEOMETRY), inner**-2, outer**-2])
+    """(GEOMETRY_NUMBERS + 2 LIGHT_NUMBERS,) of the prior: the light is nearly even inside, less so outside, and
+    never jumps."""
+    jump = abs(fit.light[LIGHT_NUMBERS] - fit.light[0]) + 1e-3
+    wave = np.concatenate([[np.inf], np.full(2 * LIGHT_WAVES, 1.0)])
+    inner = np.concatenate([WAVE_PRIOR_SDS[0] * jump * wave, np.full(LIGHT_SLOPES, SLOPE_PRIOR_SD * jump)])
+    outer = np.concatenate([WAVE_PRIOR_SDS[1] * jump * wave, np.full(LIGHT_SLOPES, SLOPE_PRIOR_SD * jump)])
+    return np.concatenate([np.zeros(GEOMETRY_NUMBERS), inner**-2, outer**-2])
 
 
 def _variance(noise: Floats, step: Floats) -> Floats:
@@ -307,11 +312,11 @@ def _gauss_newton(band: _Band, start: Ellipse, blur: float, use: Bools) -> _Fit 
     """The most probable edge and light, given the pixels to be used; None where it runs away."""
     uv, grey = band.uv[use], band.grey[use]
     outside = _distance(uv, start)[0] > 0
-    if outside.sum() < 2 * LIGHT or (~outside).sum() < 10:
+    if outside.sum() < 2 * LIGHT_NUMBERS or (~outside).sum() < 10:
         return None
-    light = np.zeros(2 * LIGHT)
-    light[0], light[LIGHT] = np.median(grey[~outside]), np.median(grey[outside])
-    fit = _Fit(start, blur, light, np.full(2, 0.1 * abs(light[LIGHT] - light[0]) + 1e-3))
+    light = np.zeros(2 * LIGHT_NUMBERS)
+    light[0], light[LIGHT_NUMBERS] = np.median(grey[~outside]), np.median(grey[outside])
+    fit = _Fit(start, blur, light, np.full(2, 0.1 * abs(light[LIGHT_NUMBERS] - light[0]) + 1e-3))
     weight = np.ones(len(uv))
     for iteration in range(15):
         model, J, step = _model(uv, fit)
@@ -321,7 +326,7 @@ def _gauss_newton(band: _Band, start: Ellipse, blur: float, use: Bools) -> _Fit 
             weight = np.maximum(1 - residual**2 / (25 * _variance(fit.noise, step)), 0) ** 2
         JW = J * (weight / _variance(fit.noise, step))[:, None]
         precision = _precision(fit)
-        pull = precision * np.concatenate([np.zeros(GEOMETRY), fit.light])
+        pull = precision * np.concatenate([np.zeros(GEOMETRY_NUMBERS), fit.light])
         try:
             change = np.linalg.solve(JW.T @ J + np.diag(precision), JW.T @ residual - pull)
         except np.linalg.LinAlgError:
@@ -338,13 +343,13 @@ def _moved(fit: _Fit, change: Floats, start: Ellipse) -> _Fit:
     damp = min(1.0, 0.3 * start.radius / max(float(np.linalg.norm(change[:2])), 1e-9))
     blur = float(np.clip(fit.blur + damp * change[5], 0.6 * fit.blur, 1.6 * fit.blur))
     blur = float(np.clip(blur, 0.3, 0.5 * start.radius))
-    return _Fit(_changed(fit.ellipse, damp * change[:5]), blur, fit.light + damp * change[GEOMETRY:], fit.noise)
+    return _Fit(_changed(fit.ellipse, damp * change[:5]), blur, fit.light + damp * change[GEOMETRY_NUMBERS:], fit.noise)
 
 
 def _noise(residual: Floats, step: Floats) -> Floats:
     """(2,) standard deviation inside and outside, bearing outliers; never less than the sensor's steps."""
     sides = (residual[step < 0.5], residual[step >= 0.5])
-    taken = LIGHT + GEOMETRY / 2  # what the fit has explained away
+    taken = LIGHT_NUMBERS + GEOMETRY_NUMBERS / 2  # what the fit has explained away
     return np.array(
         [max(1.48 * float(np.median(np.abs(r))) * np.sqrt(len(r) / max(len(r) - taken, 1)), 1e-3) for r in sides]
     )

@@ -38,7 +38,7 @@ from implicam.progress import Progress, silent
 DETECTIONS, JOURNAL, SUMMARY, WRITTEN = "detections", "journal.jsonl", "summary.csv", "written.toml"
 KEPT = "observations.before-detect"
 
-FIRST, MOST = 5, 20
+MAX_NAMES, MAX_NOTES = 5, 20
 """So many names in a sentence, then "and N more"; so many notes about pictures."""
 
 
@@ -258,9 +258,9 @@ def _unusable(rig: _Rig, problems: Mapping[View, str]) -> list[str]:
         if view in problems:
             files.setdefault(problems[view], []).append(rig.relative(path))
     notes = [f"{_some(names)}: {problem}." for problem, names in files.items()]
-    if len(notes) <= MOST:
+    if len(notes) <= MAX_NOTES:
         return notes
-    return [*notes[:MOST], f"{len(notes) - MOST} more such problems are named in {DETECTIONS}/{SUMMARY}."]
+    return [*notes[:MAX_NOTES], f"{len(notes) - MAX_NOTES} more such problems are named in {DETECTIONS}/{SUMMARY}."]
 
 
 def _wrong_size(camera: Camera, entry: Entry) -> str:
@@ -294,7 +294,7 @@ def _gathered(rig: _Rig, results: Sequence[Result]) -> tuple[Dataset | None, lis
                 uv[i, k], sd[i, k] = result.found.uv[j], result.found.sd[j]
     notes = []
     if unknown:
-        named = _some([f"{name!r}{did_you_mean(name, rows)}" for name in list(unknown)[:FIRST]], len(unknown))
+        named = _some([f"{name!r}{did_you_mean(name, rows)}" for name in list(unknown)[:MAX_NAMES]], len(unknown))
         notes.append(f"points without a known position in points.csv are left out: {named}.")
     if twice:
         notes.append(
@@ -398,5 +398,5 @@ def _nothing_at_all(rig: _Rig, results: Sequence[Result], sheets: Sequence[Path]
 
 def _some(names: Sequence[str], total: int | None = None) -> str:
     """The first few names, and how many more there are."""
-    more = (len(names) if total is None else total) - min(len(names), FIRST)
-    return ", ".join(names[:FIRST]) + (f" and {more} more" if more > 0 else "")
+    more = (len(names) if total is None else total) - min(len(names), MAX_NAMES)
+    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")

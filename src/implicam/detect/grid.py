@@ -20,31 +20,31 @@ from implicam.images import Grey, opencv
 
 NEIGHBOURS = 16
 
-MISFIT = 0.35
+MAX_RESIDUAL_HEIGHTS = 0.35
 """A corner whose residuals are a larger part of its height is none."""
 
-TURNED = 0.35
+MAX_TURN_RAD = 0.35
 """Radians that an edge may be turned from where the neighbours put it: more, and the fit has found other edges."""
 
-QUADRANT = 0.3
+QUADRANT_SQUARES = 0.3
 """How far into a square its colour is looked at, in squares from the corner in both directions."""
 
-PLAIN = 0.35
+MIN_GREY_HEIGHTS = 0.35
 """How far a square's grey must be on its side of the middle, as a part of the height, to have that colour."""
 
-FAINT = 0.3
+MIN_HEIGHT_RATIO = 0.3
 """A corner whose height is a smaller part of the median is dropped."""
 
-ASTRAY = 0.25
+MAX_ASTRAY_SQUARES = 0.25
 """Squares that a corner may lie from where its neighbours put it, when it is first found."""
 
-GAP = 4
+MAX_GAP_SQUARES = 4
 """Squares across which a grid is continued, where something stands before the board."""
 
-ASKEW = 0.4
+MAX_ASKEW_SQUARES = 0.4
 """Squares that corners may lie from the plane of another part of their board: beyond, they are of another one."""
 
-THIN = 2
+MIN_CORNERS_OF_LINE = 2
 """An outermost row or column with fewer corners is dropped: one corner is no row."""
 
 
@@ -160,7 +160,7 @@ def _shift(a: Grid, b: Grid) -> NDArray[np.intp] | None:
     place = np.hstack([b.uv[b.there], np.ones((b.count, 1))]) @ h.T
     away = place[:, :2] / place[:, 2:] - np.argwhere(b.there)
     shift = np.rint(np.median(away, axis=0))
-    return shift.astype(np.intp) if np.abs(away - shift).max() < ASKEW else None
+    return shift.astype(np.intp) if np.abs(away - shift).max() < MAX_ASKEW_SQUARES else None
 
 
 def _overlaid(a: Grid, b: Grid, shift: NDArray[np.intp]) -> Grid | None:
@@ -182,9 +182,9 @@ def _grown_from(picture: Grey, grid: Grid, limit: int) -> Grid | None:
     reach = 1
     while True:
         larger = _extended(picture, grid, reach=reach, limit=limit)
-        if larger.count == grid.count and reach == GAP:
+        if larger.count == grid.count and reach == MAX_GAP_SQUARES:
             return _checked(grid)
-        reach = GAP if larger.count == grid.count else 1
+        reach = MAX_GAP_SQUARES if larger.count == grid.count else 1
         grid = larger
 
 
@@ -226,7 +226,7 @@ def _acceptable(found: Corners, nodes: NDArray[np.intp], places: Places, grid: G
     """Which of the corners fitted (n,) at nodes (n, 2) are corners of this checkerboard."""
     with np.errstate(invalid="ignore"):
         signed = found.height * (1 - 2 * (nodes.sum(axis=1) % 2))
-        sound = found.misfit < MISFIT
+        sound = found.misfit < MAX_RESIDUAL_HEIGHTS
         if grid is None:
             usual = np.median(np.abs(found.height[sound])) if sound.any() else np.inf
             polarity = np.sign(np.median(signed[sound])) if sound.any() else 1.0
@@ -237,8 +237,8 @@ def _acceptable(found: Corners, nodes: NDArray[np.intp], places: Places, grid: G
         steps[~good] = np.eye(2)
         away = np.where(good[:, None], found.uv - places.uv, np.inf)
         moved = np.asarray(np.linalg.solve(steps, away[..., None]), dtype=np.float64)[..., 0]
-        good &= (np.abs(moved) < ASTRAY).all(axis=1) & (found.turned < TURNED)
-        return np.asarray(good & sound & (polarity * signed > FAINT * usual), dtype=np.bool_)
+        good &= (np.abs(moved) < MAX_ASTRAY_SQUARES).all(axis=1) & (found.turned < MAX_TURN_RAD)
+        return np.asarray(good & sound & (polarity * signed > MIN_HEIGHT_RATIO * usual), dtype=np.bool_)
 
 
 def _extended(picture: Grey, grid: Grid, *, reach: int, limit: int) -> Grid:
@@ -282,14 +282,16 @@ def _four_squares(picture: Grey, places: Places, mean: Floats, height: Floats) -
     good = np.isfinite(height)
     for sign, grey in zip((1, -1, -1, 1), _quadrants(picture, places), strict=True):
         with np.errstate(invalid="ignore"):
-            good &= sign * (grey - mean) * np.sign(height) > PLAIN * np.abs(height)
+            good &= sign * (grey - mean) * np.sign(height) > MIN_GREY_HEIGHTS * np.abs(height)
     return good
 
 
 def _quadrants(picture: Grey, places: Places) -> Floats:
     """(4, n) grey in the squares up left, up right, down left, down right of the places."""
     turns = ((-1, -1), (-1, 1), (1, -1), (1, 1))
-    return np.stack([sample(picture, places.uv + QUADRANT * (j * places.right + i * places.down)) for i, j in turns])
+    return np.stack(
+        [sample(picture, places.uv + QUADRANT_SQUARES * (j * places.right + i * places.down)) for i, j in turns]
+    )
 
 
 def sample(picture: Grey, uv: Floats) -> Floats:
@@ -348,7 +350,7 @@ def _without_thin_rims(there: Bools) -> Bools:
         for lines in (there, there.T):
             used = np.flatnonzero(lines.any(axis=1))
             for k in {used[0], used[-1]} if len(used) else ():
-                if 0 < lines[k].sum() < THIN:
+                if 0 < lines[k].sum() < MIN_CORNERS_OF_LINE:
                     lines[k] = False
                     changed = True
     return there

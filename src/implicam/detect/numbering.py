@@ -22,10 +22,10 @@ TOP, RIGHT, BOTTOM, LEFT = range(4)
 
 END, MORE, UNKNOWN = "end", "more", "unknown"
 
-WITHIN, BEYOND = 0.7, 1.3
+WITHIN_SQUARES, BEYOND_SQUARES = 0.7, 1.3
 """Squares outwards from a grid's outermost line where the last square, and what follows it, are looked at."""
 
-CLEARLY = 0.4
+MIN_GREY_HEIGHTS = 0.4
 """How far a grey must be on one side of the middle, as a part of the height, to be called black or white."""
 
 
@@ -95,7 +95,8 @@ def _side(picture: Grey, grid: Grid, side: int) -> str:
     row = i[first] * grid.columns + j[first]
     mean, height = grid.corners.mean[row], np.abs(grid.corners.height[row])
     last, after = (
-        (sample(picture, grid.places(middle + depth * out).uv) - mean) / height for depth in (WITHIN, BEYOND)
+        (sample(picture, grid.places(middle + depth * out).uv) - mean) / height
+        for depth in (WITHIN_SQUARES, BEYOND_SQUARES)
     )
     cell = np.floor(middle + out / 2).sum(axis=1)
     bright = grid.polarity * (1 - 2 * (cell % 2)) > 0
@@ -105,9 +106,9 @@ def _side(picture: Grey, grid: Grid, side: int) -> str:
 def _verdict(last: NDArray[np.float64], after: NDArray[np.float64], bright: NDArray[np.bool_]) -> str:
     """From the greys of the outermost squares and of what follows them, and which of the squares are to be bright."""
     with np.errstate(invalid="ignore"):
-        dark_square = np.sum(~bright & (last < -CLEARLY) & (after > CLEARLY))
-        white_after = np.sum(bright & (last > CLEARLY) & (after > CLEARLY))
-        dark_after = np.sum(bright & (last > CLEARLY) & (after < -CLEARLY))
+        dark_square = np.sum(~bright & (last < -MIN_GREY_HEIGHTS) & (after > MIN_GREY_HEIGHTS))
+        white_after = np.sum(bright & (last > MIN_GREY_HEIGHTS) & (after > MIN_GREY_HEIGHTS))
+        dark_after = np.sum(bright & (last > MIN_GREY_HEIGHTS) & (after < -MIN_GREY_HEIGHTS))
     if dark_square >= 2 and white_after >= 2 and dark_after <= 0.2 * white_after:
         return END
     return MORE if dark_square >= 2 and dark_after >= 2 and white_after == 0 else UNKNOWN

@@ -35,23 +35,23 @@ SKY, GREEN, ORANGE, VERMILLION = (233, 180, 86), (115, 158, 0), (0, 159, 230), (
 DARK, INK, PAPER, WHITE, GREY = (20, 20, 20), (60, 50, 40), (250, 250, 250), (255, 255, 255), (128, 128, 128)
 STATES = {"found": GREEN, "partly found": ORANGE, "nothing found": VERMILLION}
 
-LARGEST, SMALLEST = 1600, 800
+MAX_SIDE_PX, MIN_SIDE_PX = 1600, 800
 """Pixels of an overlay's longer side: larger pictures are reduced, smaller ones enlarged by a whole number."""
 
 COLUMNS, ROWS = 6, 6
-TILE, LETTERS = (320, 240), 62
+TILE_PX, TEXT_PX = (320, 240), 62
 """Thumbnails of a page; the width and height of one, and the height of the text below it."""
 
 DRAWN = "drawn.json"
 """The file that says what is drawn in which state."""
 
-FEW = 12
+MAX_NAMED_POINTS = 12
 """So many points have their names beside them."""
 
-RIMMED = 4.0
+RIMMED_RADIUS_PX = 4.0
 """Pixels: marks of this radius and larger are rings with a dark rim, smaller ones are dots."""
 
-FAR = 2.0**15
+MAX_DRAWN_PX = 2.0**15
 """Pixels: nothing is drawn farther off than this, where OpenCV's whole numbers end."""
 
 SHIFT = 4  # OpenCV takes coordinates in 1/16 pixels
@@ -99,14 +99,14 @@ def overlay(grey: Canvas | None, result: Result) -> Canvas:
 
 
 def _scale(longest: int) -> float:
-    if longest < SMALLEST:
-        return float(min(16, LARGEST // longest))
-    return min(1.0, LARGEST / longest)
+    if longest < MIN_SIDE_PX:
+        return float(min(16, MAX_SIDE_PX // longest))
+    return min(1.0, MAX_SIDE_PX / longest)
 
 
 def thumbnail(grey: Canvas | None, result: Result) -> Canvas:
     """A tile of a sheet: the neighbourhood of what was found, the whole picture small, and a caption below."""
-    width, height = TILE
+    width, height = TILE_PX
     if grey is None:
         inner = _empty(width, height)
     else:
@@ -264,11 +264,11 @@ class _Window:
     @classmethod
     def fitting(cls, left: int, top: int, width: int, height: int) -> _Window:
         """As large as a tile allows."""
-        return cls(left, top, width, height, min(TILE[0] / width, TILE[1] / height))
+        return cls(left, top, width, height, min(TILE_PX[0] / width, TILE_PX[1] / height))
 
     def place(self, uv: Floats) -> Floats:
         """Where pixels (n, 2) of the picture come to lie: a pixel's centre stays the centre of what it becomes."""
-        return np.clip((uv + 0.5 - (self.left, self.top)) * self.scale - 0.5, -FAR, FAR)
+        return np.clip((uv + 0.5 - (self.left, self.top)) * self.scale - 0.5, -MAX_DRAWN_PX, MAX_DRAWN_PX)
 
     def cut(self, grey: Canvas) -> Canvas:
         cv2 = opencv()
@@ -285,8 +285,8 @@ def _neighbourhood(found: Detected, shape: tuple[int, ...]) -> _Window | None:
     spread = _finite(np.concatenate([found.uv, *found.outlines]))
     low, high = spread.min(axis=0), spread.max(axis=0)
     margin = max(12.0, 0.35 * float((high - low).max()))
-    width = max(high[0] - low[0] + 2 * margin, (high[1] - low[1] + 2 * margin) * TILE[0] / TILE[1], 40.0)
-    height = width * TILE[1] / TILE[0]
+    width = max(high[0] - low[0] + 2 * margin, (high[1] - low[1] + 2 * margin) * TILE_PX[0] / TILE_PX[1], 40.0)
+    height = width * TILE_PX[1] / TILE_PX[0]
     if width > 0.7 * shape[1] or height > 0.7 * shape[0]:
         return None
     corner = (low + high) / 2 - (width / 2, height / 2)
@@ -305,7 +305,7 @@ def _drawn(grey: Canvas, found: Detected, window: _Window, *, names: bool = True
             _marks(canvas, window.place(_finite(other.uv)), ORANGE)
         return canvas
     chains = _rows(found.points, uv)
-    _lines(canvas, [uv[chain] for chain in chains if len(chain) > 1], SKY, rim=_radius(uv) >= RIMMED)
+    _lines(canvas, [uv[chain] for chain in chains if len(chain) > 1], SKY, rim=_radius(uv) >= RIMMED_RADIUS_PX)
     _marks(canvas, uv, VERMILLION)
     if chains:
         _numbers(canvas, found.points, uv, chains, few=not names)
@@ -345,21 +345,21 @@ def _to_nearest(uv: Floats) -> Floats:
 def _radius(uv: Floats) -> float:
     """Of the ring around a point: rings of neighbours do not touch."""
     apart = float(np.median(_to_nearest(uv))) if len(uv) > 1 else np.inf
-    return float(np.clip(0.25 * apart, 2.0, 8.0 if len(uv) <= FEW else 6.0))
+    return float(np.clip(0.25 * apart, 2.0, 8.0 if len(uv) <= MAX_NAMED_POINTS else 6.0))
 
 
 def _marks(canvas: Canvas, uv: Floats, colour: Colour) -> None:
     """A ring around each point, with arms where there are few; a dot where points are too close for rings."""
     cv2 = opencv()
     radius = _radius(uv)
-    if radius < RIMMED:
+    if radius < RIMMED_RADIUS_PX:
         for place in uv:
             cv2.circle(canvas, _fixed(place), round(0.75 * radius * 2**SHIFT), colour, cv2.FILLED, cv2.LINE_AA, SHIFT)
         return
     for width, ink in ((3, DARK), (1, colour)):
         for u, v in uv:
             cv2.circle(canvas, _fixed((u, v)), round(radius * 2**SHIFT), ink, width, cv2.LINE_AA, SHIFT)
-            for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)) if len(uv) <= FEW else ():
+            for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)) if len(uv) <= MAX_NAMED_POINTS else ():
                 ends = [_fixed((u + du * part * radius, v + dv * part * radius)) for part in (1.0, 1.9)]
                 cv2.line(canvas, *ends, ink, width, cv2.LINE_AA, SHIFT)
     for place in uv:
@@ -386,8 +386,8 @@ def _numbers(canvas: Canvas, points: Sequence[str], uv: Floats, chains: list[lis
 
 def _names(canvas: Canvas, points: Sequence[str], uv: Floats) -> None:
     """Names beside the points where there is room."""
-    size = 0.36 if len(uv) > FEW else 0.45
-    if len(uv) > FEW and np.median(_to_nearest(uv)) < 14 + max(_width(name, size) for name in points):
+    size = 0.36 if len(uv) > MAX_NAMED_POINTS else 0.45
+    if len(uv) > MAX_NAMED_POINTS and np.median(_to_nearest(uv)) < 14 + max(_width(name, size) for name in points):
         return
     for name, (u, v) in zip(points, uv, strict=True):
         _write(canvas, name, (u + 29 * size, v - 20 * size), WHITE, size, rim=True)
@@ -423,7 +423,7 @@ def _loupe(canvas: Canvas, grey: Canvas, found: Detected, whole: _Window) -> Non
 def _inset(tile: Canvas, grey: Canvas, window: _Window, uv: Floats) -> None:
     """The whole picture in the corner of the tile that hides the fewest points, with a frame where the window is."""
     cv2 = opencv()
-    scale = min(0.28 * TILE[0] / grey.shape[1], 0.34 * TILE[1] / grey.shape[0])
+    scale = min(0.28 * TILE_PX[0] / grey.shape[1], 0.34 * TILE_PX[1] / grey.shape[0])
     whole = _Window(0, 0, grey.shape[1], grey.shape[0], scale)
     small = whole.cut(grey)
     low = whole.place(np.array([[window.left, window.top]], dtype=np.float64))[0]
@@ -459,11 +459,11 @@ def _captioned(canvas: Canvas, result: Result) -> Canvas:
 def _framed(inner: Canvas, result: Result) -> Canvas:
     """A tile: a frame in the colour of its state, and the text below."""
     cv2 = opencv()
-    tile = cv2.copyMakeBorder(inner, 4, LETTERS, 4, 4, cv2.BORDER_CONSTANT, value=WHITE)
+    tile = cv2.copyMakeBorder(inner, 4, TEXT_PX, 4, 4, cv2.BORDER_CONSTANT, value=WHITE)
     height, width = tile.shape[:2]
     colour = STATES[result.state]
     cv2.rectangle(tile, (2, 2), (width - 3, height - 3), colour, 4)
-    top = height - LETTERS
+    top = height - TEXT_PX
     room = width - 30 - _width(result.summary, 0.45)
     _write(tile, _cut(result.view.shot, room, 0.5), (10, top + 17), INK, 0.5)
     _write(tile, result.summary, (width - 10 - _width(result.summary, 0.45), top + 17), INK, 0.45)

@@ -22,22 +22,22 @@ from implicam.dataset import Floats
 from implicam.detect.corners import Bools
 from implicam.images import Grey, eight_bit, opencv
 
-SMALLEST = 4
+MIN_ROWS = 4
 """Rows and columns of the smallest board that OpenCV is asked for; with three it sees boards in anything."""
 
-SADDLES = 800
+MAX_SADDLES = 800
 """Saddle points that are looked at, the strongest first."""
 
-RANK, FAINT = 25, 0.2
+FAINT_RANK, MIN_STRENGTH_RATIO = 25, 0.2
 """A saddle point is weak if it has less than this part of the strength of the one with this rank."""
 
-FLAT = 0.2
+MIN_ANGLE_SINE = 0.2
 """Sine of the angle between rows and columns below which a board is too oblique."""
 
-TRIES = 40
+MAX_SEEDS = 40
 """Seeds from saddle points that are handed on, at most."""
 
-PATIENCE = 60.0
+PATIENCE_SECONDS = 60.0
 """Seconds that the paper's detector may take."""
 
 
@@ -48,7 +48,7 @@ def from_opencv(picture: Grey, scale: float) -> list[Floats]:
     if min(image.shape) < 16:
         return []
     try:
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (SMALLEST, SMALLEST), cv2.CALIB_CB_LARGER)
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (MIN_ROWS, MIN_ROWS), cv2.CALIB_CB_LARGER)
     except cv2.error:  # its own sub-pixel step fails near the picture's rim
         return []
     if not found or meta is None or corners.size != 2 * meta.size:
@@ -83,7 +83,7 @@ def from_libcbdetect(picture: Grey, scale: float) -> list[Floats]:
         np.save(Path(folder) / "picture.npy", np.clip(small, 0, 1).astype(np.float64))
         command = [sys.executable, "-c", _LIBCBDETECT, folder]
         try:
-            subprocess.run(command, check=True, timeout=PATIENCE, capture_output=True, stdin=subprocess.DEVNULL)
+            subprocess.run(command, check=True, timeout=PATIENCE_SECONDS, capture_output=True, stdin=subprocess.DEVNULL)
             grid: Floats = np.load(Path(folder) / "corners.npy")
         except (subprocess.SubprocessError, OSError, ValueError):
             return []
@@ -127,10 +127,10 @@ def saddles(picture: Grey, blur: float = 1.5) -> Saddles:
     peak = (strength >= cv2.dilate(strength, np.ones((5, 5), np.uint8))) & (strength > 0)
     peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = False, False, False, False
     v, u = np.nonzero(peak)
-    strongest = np.argsort(-strength[v, u], kind="stable")[:SADDLES]
+    strongest = np.argsort(-strength[v, u], kind="stable")[:MAX_SADDLES]
     v, u = v[strongest], u[strongest]
     if len(v):
-        clear = strength[v, u] > FAINT * strength[v, u][min(RANK, len(v) - 1)]
+        clear = strength[v, u] > MIN_STRENGTH_RATIO * strength[v, u][min(FAINT_RANK, len(v) - 1)]
         v, u = v[clear], u[clear]
     hessian = np.stack([uu[v, u], uv[v, u], uv[v, u], vv[v, u]], axis=1).reshape(-1, 2, 2).astype(np.float64)
     values, vectors = np.linalg.eigh(hessian)
@@ -153,7 +153,7 @@ def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[F
         if seed is not None:
             yield seed
             given += 1
-            if given == TRIES:
+            if given == MAX_SEEDS:
                 return
 
 
@@ -173,7 +173,7 @@ def _square_about(points: Saddles, k: int) -> Floats | None:
     steps = np.stack([(ap - am) / 2, (bp - bm) / 2])
     lengths = np.linalg.norm(steps, axis=1)
     size = lengths.min()
-    if abs(np.linalg.det(steps)) < FLAT * lengths.prod():
+    if abs(np.linalg.det(steps)) < MIN_ANGLE_SINE * lengths.prod():
         return None
     for i, down in ((0, bm), (2, bp)):
         for j, right in ((0, am), (2, ap)):

@@ -16,13 +16,13 @@ from implicam.dataset import Dataset, Floats, Observations
 from implicam.detect.edge import Ellipse, through
 from implicam.errors import FitError, UsageError
 
-ALLOWED = 0.5
+MAX_OFF_PX = 0.5
 """Pixels that the middle of an outline may be off when a ball is placed for the first time."""
 
-AROUND = 48
+OUTLINE_POINTS = 48
 """Points of an outline."""
 
-ENOUGH = 10
+MIN_POINTS = 10
 """Known points from which a calibration is good enough: the difference follows from where cameras are, roughly."""
 
 
@@ -58,13 +58,13 @@ def centred(data: Dataset, radius: float, calibration: ForwardGPCalibration | No
 def _roughly(observations: Observations) -> Observations:
     """The same, with error bars that allow for what is to be corrected: views must not contradict each other for it."""
     own = np.where(observations.seen[..., None], np.nan_to_num(observations.sd), np.nan)
-    return replace(observations, sd=np.hypot(own, ALLOWED))
+    return replace(observations, sd=np.hypot(own, MAX_OFF_PX))
 
 
 def _own(data: Dataset) -> ForwardGPCalibration:
     if data.known is None:
         raise FitError("there is no calibration yet; give one with --calibration once there is.")
-    if len(data) < ENOUGH:
+    if len(data) < MIN_POINTS:
         raise FitError(f"{len(data)} known positions are too few for a calibration.")
     return ForwardGP().fit(data)
 
@@ -81,7 +81,9 @@ def outline_shift(calibration: ForwardGPCalibration, xyz: Floats, radius: float,
             continue
         c = trained.index(name)
         outline = calibration.predict(_outlines(xyz[there], centres[name], radius).reshape(-1, 3))[:, c]
-        for i, curve, pixel in zip(np.flatnonzero(there), outline.reshape(-1, AROUND, 2), middle[:, c], strict=True):
+        for i, curve, pixel in zip(
+            np.flatnonzero(there), outline.reshape(-1, OUTLINE_POINTS, 2), middle[:, c], strict=True
+        ):
             if np.isfinite(curve).all() and np.isfinite(pixel).all():
                 shift[i, k] = _middle(curve) - pixel
     return shift
@@ -95,7 +97,7 @@ def _middle(curve: Floats) -> Floats:
 
 
 def _outlines(xyz: Floats, centre: Floats, radius: float) -> Floats:
-    """(n, AROUND, 3) where the lines of sight from `centre` (3,) touch balls at xyz (n, 3): circles."""
+    """(n, OUTLINE_POINTS, 3) where the lines of sight from `centre` (3,) touch balls at xyz (n, 3): circles."""
     towards = xyz - centre
     distance = np.linalg.norm(towards, axis=1, keepdims=True)
     axis = towards / distance
@@ -103,7 +105,7 @@ def _outlines(xyz: Floats, centre: Floats, radius: float) -> Floats:
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(axis, first)
     part = np.minimum(radius / distance, 0.99)
-    angle = np.arange(AROUND) * (2 * np.pi / AROUND)
+    angle = np.arange(OUTLINE_POINTS) * (2 * np.pi / OUTLINE_POINTS)
     around = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
     middle = xyz - radius * part * axis
     return np.asarray(middle[:, None] + (radius * np.sqrt(1 - part**2))[:, None] * around, dtype=np.float64)
