@@ -227,9 +227,10 @@ def test_an_arm_that_is_not_there_and_options_that_cannot_be() -> None:
 
 
 SESSION = """
-import sys
+import signal, sys
 import numpy as np
 from implicam.hardware import URRobot
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background of a shell ignores it
 robot = URRobot(sys.argv[1], box=((0, 0, 0), (600, 600, 600)), speed=0.02)
 robot.open()
 print("ready", flush=True)
