@@ -286,7 +286,7 @@ def measure_command(
     show.notes(show.reasons(measured))
     show.notes(show.left_out(measured))
     if measured.alarm:
-        show.alarm(f"{measured.alarm}. Every row says that it is doubtful.")
+        show.alarm(f"{measured.alarm}{'' if measured.alarm.endswith('?') else '.'} Every row says that it is doubtful.")
     raise typer.Exit(int(bool(measured.alarm)))
 
 
