@@ -96,13 +96,20 @@ def order_of(points: Floats, uv: Floats) -> Order | None:
     put_right = {rows: errors for rows, way in ways.items() if len(errors := _errors_seen(points, way))}
     if not put_right:
         return None
-    best = min(put_right, key=lambda rows: float(np.mean(np.minimum(put_right[rows], far))))
-    left = float(np.median(put_right[best]))
-    if not left < TOLERABLE * _half(uv):
-        return None
-    if left < CLEAR * now:
+    misfits = {rows: float(np.mean(np.minimum(errors, far))) for rows, errors in put_right.items()}
+    best = min(misfits, key=lambda rows: misfits[rows])
+    left, tolerable = float(np.median(put_right[best])), TOLERABLE * _half(uv)
+    if left < CLEAR * now and left < tolerable:
         return Order(best, f"they fit to {left:.2g} px, as they are to {now:.2g}")
-    # a lattice that slips along itself fits as it did, but for the ends of its lines
+    # a lattice that slips along itself fits as it did, but for the ends of its lines; one that is turned over fits as
+    # it did in all of them, and there a few wrong views would decide
+    misfits.pop(REVERSED, None)
+    if not misfits:
+        return None
+    best = min(misfits, key=lambda rows: misfits[rows])
+    left = float(np.median(put_right[best]))
+    if not left < tolerable:
+        return None
     before, after = (int(np.sum(errors > FAR * max(left, now))) for errors in (as_is, put_right[best]))
     if before >= max(FEWEST_ENDS, ENDS * len(as_is)) and after <= CLEAR * before:
         return Order(best, f"{f'all but {after}' if after else 'all'} fit, as they are {before} of {len(as_is)} do not")
