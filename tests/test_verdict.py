@@ -243,7 +243,7 @@ def test_not_usable_writes_nothing_unless_forced(
 def test_two_planes_are_doubtful_where_no_lens_restrains_the_cameras(lens: str, levels: int, said: bool) -> None:
     """A tank of the menagerie: 30 points on two levels, errors of 11 times the limit between them, folds as they
     should be."""
-    built = build_rig("bar3", seed=1)
+    built = build_rig("stereo", seed=1)
     grid = ball_grid(built, (6, 6, levels))
     findings = list(_of_surface(ic.ForwardGP(lens).fit(simulate(built, grid, seed=2))))
     assert ["two planes" in finding.reason for finding in findings] == [True] * said

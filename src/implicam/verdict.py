@@ -325,10 +325,11 @@ def _of_data(data: Dataset) -> Iterator[Finding]:
 
 def _of_surface(calibration: Calibration) -> Iterator[Finding]:
     """Known points on two planes, or on another surface of the second degree. What vanishes there may be added to a map
-    that no lens restrains, and no known point tells, held out or not."""
+    that no lens restrains, and no known point tells, held out or not. Three cameras would disagree there, and the
+    alarm of `measure` would say so; two cannot."""
     if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration):
         models = calibration.map.posterior.models
-        if all(model.family in RESTRAINED for model in models):
+        if len(models) > 2 or all(model.family in RESTRAINED for model in models):
             return
     data = calibration.data
     xyz = data.xyz[data.observations.seen.any(axis=1)]
