@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera_model import CameraViews, apply_covariance_root
 from implicam.rig_model.fit_result import FitResult
+from implicam.rig_model.position_errors import Agreement
 from implicam.rig_model.posterior import Posterior
 from implicam.threads import side_by_side
 
@@ -133,20 +134,33 @@ def left_out_views(
     return found
 
 
+def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
+    """What all views say of the position of each of n points, and which points (n,) may be judged by it: seen twice,
+    and not of high leverage."""
+    total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+    high = np.zeros(n, dtype=np.bool_)
+    for view, k in zip(views, inliers, strict=True):
+        rows = view.rows[k]  # a camera sees a point once
+        information, pull = view.information, view.pull
+        total.information[rows] += information[k]
+        total.pull[rows] += pull[k]
+        total.squares[rows] += np.einsum("ni,nij,nj->n", view.residual, view.inverse, view.residual)[k]
+        total.coordinates[rows] += 2
+        high[rows] |= view.high[k]
+    return total, (total.coordinates >= 4) & ~high
+
+
 def left_out_positions(
     posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
 ) -> Floats:
     """(n, 3) how far each known point is measured off its position by views predicted without it; NaN where fewer than
     two cameras see it."""
     n = len(points)
-    information, pull, views = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
-    for view, k in zip(left_out_views(posterior, points, seen, inliers), inliers, strict=True):
-        rows = view.rows[k]  # a camera sees a point once
-        information[rows] += view.information[k]
-        pull[rows] += view.pull[k]
-        views[rows] += 1
+    total, _ = sum_over_cameras(left_out_views(posterior, points, seen, inliers), inliers, n)
+    information, pull = total.information, total.pull
     values = np.linalg.eigvalsh(np.where(np.isfinite(information), information, 0))
-    good = (views >= 2) & (values[:, 0] > MIN_ONE_MINUS_LEVERAGE * values[:, 2]) & np.isfinite(pull).all(axis=1)
+    good = total.coordinates >= 4
+    good &= (values[:, 0] > MIN_ONE_MINUS_LEVERAGE * values[:, 2]) & np.isfinite(pull).all(axis=1)
     error = np.full((n, 3), np.nan)
     error[good] = np.linalg.solve(information[good], pull[good][..., None])[..., 0]
     return error

@@ -14,10 +14,15 @@ from implicam.calibrators.forward_gp.heavy_tail_fit import refit_with_heavy_tail
 from implicam.dataset import Names
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.leave_one_out import MAX_SQUARED_MAHALANOBIS, LeftOutViews, left_out_views
+from implicam.rig_model.leave_one_out import (
+    MAX_SQUARED_MAHALANOBIS,
+    LeftOutViews,
+    left_out_views,
+    sum_over_cameras,
+)
 from implicam.rig_model.level_errors import untold
 from implicam.rig_model.linearise import iterate_linearisation
-from implicam.rig_model.position_errors import Agreement, PositionErrors, estimate_position_errors
+from implicam.rig_model.position_errors import PositionErrors, estimate_position_errors
 from implicam.rig_model.tied import Scatter
 from implicam.rig_model.training_data import TrainingData
 
@@ -68,24 +73,9 @@ def _with_scatter(training: TrainingData, fitted: FitResult) -> FitResult:
     return replace(fitted, posterior=posterior, inliers=inliers, position_errors=errors)
 
 
-def _sums(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
-    """Of all points, and which of them may be used: seen twice, and not of high leverage."""
-    total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
-    high = np.zeros(n, dtype=np.bool_)
-    for view, k in zip(views, inliers, strict=True):
-        rows = view.rows[k]  # a camera sees a point once
-        information, pull = view.information, view.pull
-        total.information[rows] += information[k]
-        total.pull[rows] += pull[k]
-        total.squares[rows] += np.einsum("ni,nij,nj->n", view.residual, view.inverse, view.residual)[k]
-        total.coordinates[rows] += 2
-        high[rows] |= view.high[k]
-    return total, (total.coordinates >= 4) & ~high
-
-
 def _estimated(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[PositionErrors, Floats] | None:
     """The errors, and (n,) how much larger than usual each point's own scale is."""
-    agreement, good = _sums(views, inliers, n)
+    agreement, good = sum_over_cameras(views, inliers, n)
     rows = np.flatnonzero(good).astype(np.int64)
     some = rows if len(rows) <= MAX_POINTS else np.random.default_rng(0).choice(rows, MAX_POINTS, replace=False)
     errors = estimate_position_errors(agreement.select(some))
@@ -98,7 +88,7 @@ def _estimated(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) ->
 
 def _judged(views: list[LeftOutViews], inliers: tuple[Bools, ...], found: PositionErrors, n: int) -> tuple[Bools, ...]:
     """The views to use: those that agree with what the others say of where their point is."""
-    total, _ = _sums(views, inliers, n)
+    total, _ = sum_over_cameras(views, inliers, n)
     noise2 = found.noise**2
     prior = np.linalg.inv(found.covariance)
     judged = []
