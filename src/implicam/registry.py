@@ -1,0 +1,70 @@
+"""The parts that people add: lenses, calibrators, acquisitions, detectors, robots, cameras, each in a registry.
+
+A part is found by its name on the command line, in Python and in files. It is added by one line beside the others of
+its kind, by `REGISTRY.register(name, part)`, or from a package of its own by an entry point. CONTRIBUTING.md has the
+recipes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from importlib.metadata import entry_points
+from typing import TypeVar
+
+from implicam.errors import UsageError, did_you_mean
+
+Part = TypeVar("Part")
+
+
+class Registry(Mapping[str, Part]):
+    """Parts of one kind by name, in the order they were added; entry points of other packages come last.
+
+    Args:
+        kind: what an error calls a part: "lens", "robot".
+        parts: name -> part.
+        group: the group of entry points that other packages add parts under, such as "implicam.lenses". One is
+            imported when it is asked for, not before.
+    """
+
+    def __init__(self, kind: str, parts: Mapping[str, Part], group: str) -> None:
+        self.kind, self.group = kind, group
+        self._parts = dict(parts)
+
+    def register(self, name: str, part: Part) -> None:
+        """Add a part.
+
+        Raises:
+            ValueError: the name is taken, or holds a colon, which separates a name from its variant.
+        """
+        if name in self._parts or ":" in name or not name:
+            raise ValueError(f"{name!r} cannot name a {self.kind}: it is empty, taken, or has a colon")
+        self._parts[name] = part
+
+    def find(self, spec: str) -> tuple[Part, str]:
+        """The part that a spec names, and what the spec says after the first colon: "ur:10.0.0.2" -> (ur, "10.0.0.2").
+
+        Raises:
+            UsageError: there is no part of this name; the error says which there are.
+        """
+        name, _, variant = spec.partition(":")
+        if name not in self:
+            raise UsageError(
+                f"{self.kind} {name!r} is not known{did_you_mean(name, list(self))}.",
+                fix=f"use one of {', '.join(self)}",
+            )
+        return self[name], variant
+
+    def __getitem__(self, name: str) -> Part:
+        if name not in self._parts:
+            for entry in entry_points(group=self.group, name=name):
+                self._parts[name] = entry.load()
+        return self._parts[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._parts or name in entry_points(group=self.group).names
+
+    def __iter__(self) -> Iterator[str]:
+        yield from dict.fromkeys([*self._parts, *sorted(entry_points(group=self.group).names)])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
