@@ -230,7 +230,8 @@ def test_one_more_point_of_a_smooth_outlook_is_kriging_with_one_more_point(rig: 
         np.vstack([old.H, H[4:5]]),
     )  # fmt: skip
     expected = more.predict(X @ calibration.basis, H)[1]
-    assert np.allclose(after._variances[30:, 0], expected, rtol=1e-6, atol=1e-12)
+    (process,) = after.at.processes
+    assert np.allclose(process.variances[30:], expected, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("robot_noise", [0.0, 0.2])

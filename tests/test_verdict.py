@@ -11,6 +11,7 @@ import pytest
 
 import implicam as ic
 from implicam import calibration_file
+from implicam.calibrators.protocol import FitSummary, per_axis
 from implicam.cli import commands, main
 from implicam.dataset import Dataset, Floats
 from implicam.geometry import Pose, rotation_from_vector
@@ -192,6 +193,10 @@ class _Pretends:
 
     def refit(self, data: Dataset) -> _Pretends:
         return _Pretends(data, self.off)
+
+    def summary(self) -> FitSummary:
+        zero = per_axis(np.zeros(3))
+        return FitSummary(points_used=25, points_unused=0, leave_one_out_rms=zero, leave_one_out_mean_sd=zero)
 
     def measure(self, observations: ic.Observations) -> Measurement:
         row = {str(name): xyz for name, xyz in zip(TRUE.points, TRUE.xyz, strict=True)}

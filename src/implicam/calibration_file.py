@@ -72,8 +72,8 @@ class Savable(Protocol):
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Its options as a readable table, and its arrays."""
 
-    def residuals(self) -> dict[str, Any]:
-        """A few readable numbers on how well it fits its own data."""
+    def summary(self) -> Any:
+        """A `FitSummary`: how well it fits its own data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def _description(calibration: Savable) -> dict[str, Any]:
         "pixel_convention": PIXEL_CONVENTION,
         "known_points": len(data),
         "workspace": workspace,
-        "residuals": calibration.residuals(),
+        "residuals": calibration.summary().as_table(),
         "versions": {
             "implicam": package_version(),
             "python": platform.python_version(),

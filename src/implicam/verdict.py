@@ -10,7 +10,7 @@ would be worse than none.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri, fdtrc
 
-from implicam.calibrators import MLP, Calibration, ExplicitCalibration, ForwardGPCalibration, InverseGP
+from implicam.calibrators import Calibration, InverseGP
+from implicam.calibrators.protocol import PredictsPixels
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
@@ -34,9 +35,6 @@ USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
 ON_SURFACE = 0.05
 """Rms of the best quadratic equation at known points, in coordinates of unit variance: with 14 or more points all over
 less was never seen in 2000 draws, two planes good to a hundredth of their distance have 0.03."""
-
-RESTRAINED = ("ordinary", "aspect")
-"""Kinds of cameras that cannot follow anything that lenses do not do."""
 
 FEW_POINTS = 12
 """Fewer known points fix a rig, but leave too little to check it by."""
@@ -153,8 +151,8 @@ def _plan(calibration: Calibration, n: int) -> _Plan:
 
 
 def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | None, list[Finding]]:
-    if calibration.method == MLP.method:
-        return None, list(_of_network(calibration))
+    if calibration.summary().held_out_points is not None:
+        return None, list(_of_kept_back(calibration))
     data = _clean(calibration)
     n = len(data)
     if n < FEWEST_JUDGED:
@@ -283,10 +281,10 @@ _LOOK = (
 _SDS = "The stated sds of the known positions seem too small."
 
 
-def _of_network(calibration: Calibration) -> Iterator[Finding]:
-    """The network keeps points for early stopping; to train it again takes too long."""
-    residuals = calibration.residuals()
-    n, inside = 3 * int(residuals["held_out_points"]), float(residuals["held_out_in_95"])
+def _of_kept_back(calibration: Calibration) -> Iterator[Finding]:
+    """Of a method that keeps points back from training, because to train it again takes too long."""
+    summary = calibration.summary()
+    n, inside = 3 * (summary.held_out_points or 0), summary.held_out_in_95 or 0.0
     if n >= 3 * FEWEST_JUDGED and inside < 0.5:
         yield Finding(
             False,
@@ -327,10 +325,10 @@ def _of_surface(calibration: Calibration) -> Iterator[Finding]:
     """Known points on two planes, or on another surface of the second degree. What vanishes there may be added to a map
     that no lens restrains, and no known point tells, held out or not. Three cameras would disagree there, and the
     alarm of `measure` would say so; two cannot."""
-    if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration):
-        models = calibration.map.posterior.models
-        if len(models) > 2 or all(model.family in RESTRAINED for model in models):
-            return
+    if isinstance(calibration, PredictsPixels) and (
+        len(calibration.camera_names) > 2 or calibration.follows_lenses_only
+    ):
+        return
     data = calibration.data
     xyz = data.xyz[data.observations.seen.any(axis=1)]
     n = len(xyz)
@@ -441,10 +439,11 @@ def _of_stated_sds(calibration: Calibration) -> Iterator[Finding]:
 
 def _seen_and_predicted(calibration: Calibration) -> tuple[Floats, Floats]:
     """(n, cameras, 2) each: pixels of the known points, and where the calibration has them; n = 0 if it cannot say."""
-    predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
     data = calibration.data
     uv = np.where(copies_of(data).cameras[:, None], np.nan, data.observations.uv)
-    predicted = np.zeros((0, *uv.shape[1:])) if predict is None or data.known is None else predict(data.xyz)
+    if not isinstance(calibration, PredictsPixels) or data.known is None:
+        return uv[:0], uv[:0]
+    predicted = calibration.predict(data.xyz)
     return (uv, predicted) if predicted.shape == uv.shape else (uv[:0], predicted[:0])
 
 
@@ -485,9 +484,9 @@ def _moved_at(residual: Floats) -> int | None:
 def _seen_of_labels(calibration: Calibration) -> Floats:
     """(n, cameras) variance in pixels that errors of the known positions, as far as they are estimated, give a view."""
     xyz, covariance = calibration.data.xyz, known_position_covariance(calibration, calibration.data)
-    predict: Callable[[Floats], Floats] | None = getattr(calibration, "predict", None)
-    if predict is None or not covariance.any():
+    if not isinstance(calibration, PredictsPixels) or not covariance.any():
         return np.zeros((len(xyz), 1))
+    predict = calibration.predict
     step = np.sqrt(np.trace(covariance, axis1=1, axis2=2).max() / 3)
     slope = np.stack([(predict(xyz + d) - predict(xyz - d)) / (2 * step) for d in step * np.eye(3)], axis=-1)
     return np.asarray(np.nan_to_num(np.einsum("ncij,njk,ncik->nc", slope, covariance, slope) / 2), dtype=np.float64)

@@ -3,9 +3,9 @@
 A calibration is linear in what it does not know, near what it does: so the covariance after one more point depends on
 where the point is, not on what the cameras will see. Both kinds of methods answer the same questions:
 
-- forward (forward-gp, explicit): pixels depend on the unknowns of the cameras, `FittedRig.sensitivities`;
-- inverse (inverse-gp): each coordinate is a Gaussian process of the pixels, and the pixels of a place are predicted by
-  a forward model that was fitted to the same points, or known because the place was recorded.
+- forward (`PredictsPixels`: forward-gp, explicit): pixels depend on the unknowns of the cameras;
+- inverse (`HasPositionProcesses`: inverse-gp): each coordinate is a Gaussian process of the pixels, and the pixels of a
+  place are predicted by a forward model that was fitted to the same points, or known because the place was recorded.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from implicam.calibrators import Calibration, ExplicitCalibration, ForwardGPCalibration, InverseGPCalibration
-from implicam.calibrators.inverse_maps import Part
+from implicam.calibrators import METHODS, Calibration
+from implicam.calibrators.position_processes import PositionProcesses
+from implicam.calibrators.protocol import HasPositionProcesses, PredictsPixels
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
-from implicam.gp.linalg import solve_lower
-from implicam.rig_model import FittedRig, Sensitivity
+from implicam.rig_model import Sensitivity
 
 Bools = NDArray[np.bool_]
 
@@ -49,10 +49,10 @@ class Places:
         return Places(self.xyz[index], self.uv[index], self.seen[index])
 
     @classmethod
-    def predicted(cls, forward: ForwardGPCalibration | ExplicitCalibration, xyz: Floats) -> Places:
-        """Where a forward model says that the cameras would see positions (n, 3)."""
-        uv = forward.predict(xyz)
-        return cls(xyz, uv, on_image(forward.map.trained, uv))
+    def predicted(cls, rig: PredictsPixels, xyz: Floats) -> Places:
+        """Where a calibration says that the cameras would see positions (n, 3)."""
+        uv = rig.predict(xyz)
+        return cls(xyz, uv, on_image(rig.trained, uv))
 
     @classmethod
     def recorded(cls, data: Dataset) -> Places:
@@ -163,7 +163,7 @@ class ForwardDesignModel:
     place: Floats
 
     @classmethod
-    def of(cls, rig: FittedRig, candidates: Places, judged: Places) -> ForwardDesignModel:
+    def of(cls, rig: PredictsPixels, candidates: Places, judged: Places) -> ForwardDesignModel:
         """What the rig's cameras would see."""
         xyz = np.concatenate([candidates.xyz, judged.xyz])
         seen = np.concatenate([candidates.seen, judged.seen])
@@ -247,16 +247,16 @@ class ForwardDesignModel:
         return replace(self, parts=tuple(parts))
 
 
-def floor_of(rig: FittedRig, xyz: Floats, seen: Bools) -> Floats:
-    """(n, 3, 3) what pixel noise alone would leave at positions (n, 3) with the views seen (n, cameras); NaN for fewer
-    than two."""
-    information = np.zeros((len(xyz), 3, 3))
-    for slope, noise, c in rig.slopes(xyz):
-        there = seen[:, c] & np.isfinite(slope).all(axis=(1, 2))
-        information[there] += slope[there].swapaxes(1, 2) @ slope[there] / noise**2
+def floor_of(rig: PredictsPixels, places: Places) -> Floats:
+    """(n, 3, 3) the covariance that pixel noise alone would leave at each place; NaN with fewer than two views."""
+    information = np.zeros((len(places), 3, 3))
+    views = np.zeros(len(places))
+    for part in rig.sensitivities(places.xyz):
+        part = _masked(part, places.seen[:, part.cameras])
+        information += part.slope.swapaxes(1, 2) @ (part.slope / part.noise[..., None])
+        views += places.seen[:, part.cameras].sum(axis=1)
     floor = np.full_like(information, np.nan)
-    enough = seen[:, rig.cameras].sum(axis=1) >= 2
-    floor[enough] = np.linalg.inv(information[enough])
+    floor[views >= 2] = np.linalg.inv(information[views >= 2])
     return floor
 
 
@@ -287,88 +287,33 @@ def _diagonal(variances: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class InverseDesignModel:
-    """Of Gaussian processes from pixels to positions, over candidates and judged places, in this order.
+    """Of Gaussian processes from pixels to positions.
 
-    X: (places, d) what the processes take. Per process known: V (n, places), and drift: W (p, places), with
-    `covariance of places = K + W^T W - V^T V`. beside: (places, 3, 3) what else is uncertain, whatever is added.
-    widened: (places,) the factor of the covariance away from what was learned, NaN where nothing is measured.
-    forward: knows what pixel noise leaves at each place; None for what the processes take for noise.
+    Attributes:
+        candidates, judged: places; only those that every camera sees count.
+        at: the processes at candidates and judged places, in this order.
+        pilot: knows what pixel noise leaves at each place. Without it that is what the processes take for noise, and
+            with few points they take nearly everything for noise.
     """
 
     candidates: Places
     judged: Places
-    calibration: InverseGPCalibration
-    X: Floats
-    known: tuple[Floats, ...]
-    drift: tuple[Floats, ...]
-    beside: Floats
-    widened: Floats
-    forward: FittedRig | None = None
-
-    @classmethod
-    def of(
-        cls, calibration: InverseGPCalibration, candidates: Places, judged: Places, forward: FittedRig | None
-    ) -> InverseDesignModel:
-        """The three processes of a calibration at the predicted pixels; only places that every camera sees count.
-
-        forward: knows what pixel noise leaves at each place. Without it that is what the processes take for noise, and
-        with few points they take nearly everything for noise.
-        """
-        pixels, learned = _inputs(calibration, candidates, judged), calibration.map
-        X = learned.inputs(pixels)
-        known = tuple(solve_lower(gp.L, gp.kernel(gp.X, X)) for gp, *_ in learned.parts)
-        drift = tuple(learned.drift(pixels, known))
-        far = calibration.farness(pixels * calibration.pixels.scale + calibration.pixels.offset)
-        widened = np.where(far > calibration.farthest, np.nan, far**2)
-        return cls(candidates, judged, calibration, X, known, drift, learned.uncertain(pixels), widened, forward)
+    at: PositionProcesses
+    pilot: PredictsPixels | None = None
 
     @property
     def useful(self) -> Bools:
         """Seen by every camera."""
         return np.asarray(self.candidates.seen.all(axis=1))
 
-    @cached_property
-    def _parts(self) -> tuple[Part, ...]:
-        return self.calibration.map.parts
-
-    def _covariance(self, k: int, a: slice | Bools | NDArray[np.int64], b: slice | Bools | NDArray[np.int64]) -> Floats:
-        """Of process k, between places a and b."""
-        V, W = self.known[k], self.drift[k]
-        return np.asarray(
-            self._parts[k].process.kernel(self.X[a], self.X[b]) + W[:, a].T @ W[:, b] - V[:, a].T @ V[:, b]
-        )
-
-    @cached_property
-    def _variances(self) -> Floats:
-        """(places, processes) of the functions, in their units."""
-        columns = [
-            part.process.kernel.signal_variance + np.einsum("ij,ij->j", W, W) - np.einsum("ij,ij->j", V, V)
-            for part, V, W in zip(self._parts, self.known, self.drift, strict=True)
-        ]
-        return np.asarray(np.maximum(np.stack(columns, axis=1), 0.0), dtype=np.float64)
-
-    @cached_property
-    def _noise(self) -> Floats:
-        return np.array([part.process.noise_variance for part in self._parts])
-
-    @cached_property
-    def _shares(self) -> Floats:
-        """(processes, 3, 3) of the covariance of a position, in the world's unit."""
-        scale = self.calibration.positions.scale
-        return np.stack([part.share * np.outer(scale, scale) for part in self._parts])
-
     def _predicted(self, part: slice, places: Places) -> PredictedCovariance:
-        scale = self.calibration.positions.scale
-        total = np.einsum("nk,kij->nij", self._variances[part] + self._noise, self._shares)
-        total += self.beside[part] * np.outer(scale, scale)
-        total *= self.widened[part, None, None]
-        total[~places.seen.all(axis=1)] = np.nan
+        seen = places.seen.all(axis=1)
+        total = np.where(np.reshape(seen, (-1, 1, 1)), self.at.covariance[part], np.nan)
 
         def floor() -> Floats:
-            if self.forward is not None:
-                return floor_of(self.forward, places.xyz, places.seen)
-            noise = np.einsum("k,kij->ij", self._noise, self._shares)
-            return np.broadcast_to(noise, total.shape)
+            if self.pilot is not None:
+                return floor_of(self.pilot, places)
+            return np.broadcast_to(self.at.noise_covariance, total.shape)
 
         return PredictedCovariance(total, floor)
 
@@ -385,69 +330,75 @@ class InverseDesignModel:
     def gain(self, weights: Floats) -> Floats:
         """(m,) the expected reduction, in closed form: covariance squared over the variance of a new output."""
         m = len(self.candidates)
-        weights = weights * self.widened[m:]
+        weights = weights * self.at.widened[m:]
         good = np.isfinite(weights) & self.judged.seen.all(axis=1)
-        judged = m + np.flatnonzero(good)
         found = np.zeros(m)
-        for k, size in enumerate(np.trace(self._shares, axis1=1, axis2=2)):
-            covariance = self._covariance(k, slice(m), judged)
-            found += size * (covariance**2 @ weights[good]) / (self._variances[:m, k] + self._noise[k])
+        for process in self.at.processes:
+            covariance = process.covariance(slice(m), m + np.flatnonzero(good))
+            variance = process.variances[:m] + process.noise_variance
+            found += np.trace(process.share) * (covariance**2 @ weights[good]) / variance
         return np.where(self.useful, found, 0.0)
 
     def information(self) -> Floats:
         """(m,) half the log of the variance of a new output over that of its noise, all three axes."""
         m = len(self.candidates)
-        outputs = np.array([part.outputs for part in self._parts])
-        found = 0.5 * np.log1p(self._variances[:m] / self._noise) @ outputs
-        return np.where(self.useful, found, 0.0)
+        ratios = [one.outputs * np.log1p(one.variances[:m] / one.noise_variance) for one in self.at.processes]
+        return np.where(self.useful, 0.5 * np.sum(ratios, axis=0), 0.0)
 
     def after(self, i: int) -> InverseDesignModel:
-        """Candidate i known too: V gets one more row."""
-        rows = []
-        for k, V in enumerate(self.known):
-            row = self._covariance(k, slice(i, i + 1), slice(None))
-            rows.append(np.concatenate([V, row / np.sqrt(self._variances[i, k] + self._noise[k])]))
-        return replace(self, known=tuple(rows))
+        """Candidate i known too."""
+        return replace(self, at=self.at.with_known(i))
 
 
-def _inputs(calibration: InverseGPCalibration, candidates: Places, judged: Places) -> Floats:
-    """(places, 2 cameras) standardised pixels; the middle of the data where a place is not seen, which masks it."""
-    uv = np.concatenate([candidates.uv, judged.uv]).reshape(len(candidates) + len(judged), -1)
-    X = calibration.pixels.apply(uv)
-    return np.where(np.isfinite(X), X, 0.0)
+def designs_experiments(calibration: Calibration | type) -> bool:
+    """Whether a calibration, or a class of them, says what one more known point would add."""
+    return any(hasattr(calibration, name) for name in ("sensitivities", "position_processes"))
+
+
+def cannot_design(method: str) -> UsageError:
+    """The error for a method that does not say it."""
+    able = [name for name, (_, calibration) in METHODS.items() if designs_experiments(calibration)]
+    return UsageError(
+        f"{method} cannot say where to measure next.",
+        why="its error bars do not say what one more known point would change",
+        fix=f"use one of {', '.join(able)}",
+    )
 
 
 def design_model_of(
     calibration: Calibration, candidates: Floats | Places, judged: Floats | Places, pilot: Calibration | None = None
 ) -> ForwardDesignModel | InverseDesignModel:
-    """The design of a calibration at positions (m, 3) and (g, 3), or at places whose pixels are known.
+    """The design model of a calibration.
 
-    pilot: a forward calibration of the same rig that predicts pixels; the calibration itself where it is one.
-    UsageError for a method without an design.
+    Args:
+        calibration: that of the rig.
+        candidates: (m, 3) in the world, or places whose pixels are known.
+        judged: (g, 3) in the world, or places whose pixels are known.
+        pilot: another calibration of the same rig, which predicts pixels; needed for a method that does not.
+
+    Raises:
+        UsageError: the method cannot say what one more known point would add, or nothing predicts pixels.
     """
-    forward = calibration if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration) else pilot
+    if not designs_experiments(calibration):
+        raise cannot_design(calibration.method)
+    pilot = calibration if isinstance(calibration, PredictsPixels) else pilot
 
     def places(where: Floats | Places) -> Places:
         if isinstance(where, Places):
             return where
-        if not isinstance(forward, ForwardGPCalibration | ExplicitCalibration):
+        if not isinstance(pilot, PredictsPixels):
             raise UsageError(
                 f"{calibration.method} does not say what the cameras would see of a place.",
                 fix="give a forward-gp calibration of the same points as well, or places whose pixels are known",
             )
-        return Places.predicted(forward, where)
+        return Places.predicted(pilot, where)
 
-    if isinstance(calibration, ForwardGPCalibration | ExplicitCalibration):
-        made = ForwardDesignModel.of(calibration.map, places(candidates), places(judged))
-        return replace(made, place=_place(calibration.data))
-    if isinstance(calibration, InverseGPCalibration):
-        rig = forward.map if isinstance(forward, ForwardGPCalibration | ExplicitCalibration) else None
-        return InverseDesignModel.of(calibration, places(candidates), places(judged), rig)
-    raise UsageError(
-        f"{calibration.method} cannot say where to measure next.",
-        why="its error bars do not say what one more known point would change",
-        fix="use forward-gp, inverse-gp or explicit",
-    )
+    candidates, judged = places(candidates), places(judged)
+    if isinstance(calibration, PredictsPixels):
+        return replace(ForwardDesignModel.of(calibration, candidates, judged), place=_place(calibration.data))
+    assert isinstance(calibration, HasPositionProcesses)
+    at = calibration.position_processes(np.concatenate([candidates.uv, judged.uv]))
+    return InverseDesignModel(candidates, judged, at, pilot if isinstance(pilot, PredictsPixels) else None)
 
 
 def _place(data: Dataset) -> Floats:

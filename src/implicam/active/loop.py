@@ -23,18 +23,14 @@ from implicam.active.design_model import (
     InverseDesignModel,
     Places,
     PredictedCovariance,
+    cannot_design,
     design_model_of,
+    designs_experiments,
 )
 from implicam.active.stopping import Never, Rule, Step
 from implicam.active.workspace import Workspace
-from implicam.calibrators import (
-    Calibration,
-    Calibrator,
-    ForwardGP,
-    ForwardGPCalibration,
-    InverseGP,
-    InverseGPCalibration,
-)
+from implicam.calibrators import Calibration, Calibrator, ForwardGP, ForwardGPCalibration
+from implicam.calibrators.protocol import PredictsPixels, Updatable
 from implicam.dataset import Dataset, Floats, join
 from implicam.errors import FitError, ImplicamError, UsageError
 from implicam.progress import Progress, silent
@@ -217,7 +213,7 @@ class Loop:
         anew = not FEW_POINTS < len(data) < self.growth * self._from_no_guess
         if anew:
             self._from_no_guess = len(data)
-        if isinstance(before, ForwardGPCalibration | InverseGPCalibration) and len(before.data) < len(data):
+        if isinstance(before, Updatable) and len(before.data) < len(data):
             return before.refit_from(data, progress, anew=anew)
         return self.calibrator.fit(data, progress)
 
@@ -289,9 +285,11 @@ class Loop:
         return candidates
 
     def _forward(self) -> Calibration | None:
-        """For inverse-gp a forward model of the same points, which predicts pixels; None where it is not needed."""
-        if not isinstance(self.calibrator, InverseGP) or self.data is None:
+        """For a method that does not predict pixels, a forward model of the same points that does; else None."""
+        if self.calibration is None or self.data is None or isinstance(self.calibration, PredictsPixels):
             return None
+        if not designs_experiments(self.calibration):
+            raise cannot_design(self.calibration.method)
         if self._pilot is None or len(self.data) >= MAX_GROWTH * len(self._pilot.data):
             self._pilot = ForwardGP().fit(self.data)
             self._judged_by_pilot = Places.predicted(self._pilot, self.judged_at)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from implicam.active.acquisitions import DEFAULT, Acquisition, acquisition, choose
-from implicam.active.design_model import design_model_of
+from implicam.active.design_model import cannot_design, design_model_of, designs_experiments
 from implicam.active.loop import Target, step_of, targets_of
 from implicam.active.stopping import Step
 from implicam.active.workspace import Workspace
-from implicam.calibrators import Calibration, ForwardGP, InverseGPCalibration
+from implicam.calibrators import Calibration, ForwardGP
+from implicam.calibrators.protocol import PredictsPixels
 from implicam.dataset import Floats
 from implicam.errors import UsageError
 
@@ -40,7 +41,9 @@ def suggest(
 ) -> Suggestion:
     """The `count` best next targets for a calibration. rule: the default acquisition where None. here, reach: as for
     `choose`. UsageError for a method that cannot say, and for a workspace that the cameras do not see."""
-    pilot = ForwardGP().fit(calibration.data) if isinstance(calibration, InverseGPCalibration) else None
+    if not designs_experiments(calibration):
+        raise cannot_design(calibration.method)
+    pilot = None if isinstance(calibration, PredictsPixels) else ForwardGP().fit(calibration.data)
     places = workspace.candidates(candidates, seed)
     design = design_model_of(calibration, places, workspace.judged(judged, seed), pilot)
     if not design.now.measured.any():

@@ -16,21 +16,28 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam import calibration_file
 from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_principal, learn_smooth
 from implicam.calibrators.pixel_cloud import FAR, FAR_FROM_A_PLANE, PixelCloud
-from implicam.calibrators.protocol import Arrays, finite_column, why_not_all_seen
+from implicam.calibrators.position_processes import PositionProcess, PositionProcesses
+from implicam.calibrators.protocol import (
+    Arrays,
+    CalibrationBase,
+    FitSummary,
+    finite_column,
+    per_axis,
+    why_not_all_seen,
+)
 from implicam.dataset import Dataset, Floats, Names, Observations, copy_notes, without_copies
 from implicam.dataset.requirements import MAX_RELATIVE_THICKNESS, require_points, require_two_values, same_cameras
-from implicam.dataset.unused import Rejected, Unused, copied_points
+from implicam.dataset.unused import Unused, copied_points
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
+from implicam.gp.linalg import solve_lower
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
@@ -182,7 +189,7 @@ def _train(
 
 
 @dataclass(frozen=True, eq=False)
-class InverseGPCalibration:
+class InverseGPCalibration(CalibrationBase):
     """GPs conditioned on the known points that every camera saw.
 
     hyperparameters: of the three of `plain` and `paper`; smoothness and basis: of the one of `smooth`.
@@ -203,11 +210,6 @@ class InverseGPCalibration:
     def used(self) -> Dataset:
         """The data without the points and cameras that are there twice."""
         return without_copies(self.data, cameras_too=True)
-
-    @property
-    def rejected(self) -> tuple[Rejected, ...]:
-        """None: this method uses every view of the points it uses; `notes` names suspects."""
-        return ()
 
     @cached_property
     def processes(self) -> tuple[GaussianProcess, ...]:
@@ -276,15 +278,33 @@ class InverseGPCalibration:
             self.data.length_unit,
         )
 
-    def refit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
-        """The same method with the same options on other data."""
-        return self.calibrator.fit(data, progress)
+    def position_processes(self, uv: Floats) -> PositionProcesses:
+        """What the processes say of n places together, at their pixels uv (n, cameras, 2); for a place that a camera
+        does not see, what they would say at the middle of the data."""
+        pixels = self.pixels.apply(uv.reshape(len(uv), -1))
+        pixels = np.where(np.isfinite(pixels), pixels, 0.0)
+        square = np.outer(self.positions.scale, self.positions.scale)
+        X = self.map.inputs(pixels)
+        known = [solve_lower(part.process.L, part.process.kernel(part.process.X, X)) for part in self.map.parts]
+        processes = tuple(
+            PositionProcess(
+                part.process.kernel, part.process.noise_variance, part.share * square, part.outputs, X, V, W
+            )
+            for part, V, W in zip(self.map.parts, known, self.map.drift(pixels, known), strict=True)
+        )
+        far = self.farness(pixels * self.pixels.scale + self.pixels.offset)
+        widened = np.where(far > self.farthest, np.nan, far**2)
+        return PositionProcesses(processes, self.map.uncertain(pixels) * square, widened)
+
+    def condition_on(self, data: Dataset) -> InverseGPCalibration:
+        """The same hyperparameters, with these known points."""
+        return replace(self, data=data)
 
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> InverseGPCalibration:
         """As `refit`, starting from what is known, for some points more; with `anew` from no guess as well, and the
         more probable of both counts. The paper's preset always starts from its defaults."""
         if self.calibrator.preset == "paper":
-            return self.refit(data, progress)
+            return self.calibrator.fit(data, progress)
         if self.smoothness is not None and self.basis is not None:
             known = self.smoothness, is_principal(self.basis)
             return self.calibrator._fitted_smooth(data, progress, known, anew)
@@ -347,21 +367,16 @@ class InverseGPCalibration:
             f"{', '.join(found[:5])}{more}. Look for a wrong detection or position: nothing is rejected here."
         ]
 
-    def residuals(self) -> dict[str, Any]:
-        """Leave-one-out errors per axis, in the dataset's unit (closed form, hyperparameters kept)."""
+    def summary(self) -> FitSummary:
+        """Leave-one-out errors of the known points: in closed form, hyperparameters kept."""
         errors, variances = self.map.leave_one_out()
-        rms = np.sqrt(np.mean(errors**2, axis=0)) * self.positions.scale
         sds = np.sqrt(variances) * self.positions.scale
-        return {
-            "points_used": len(errors),
-            "points_unused": len(self.unused),
-            "leave_one_out_rms": dict(zip(AXES, map(float, rms), strict=True)),
-            "leave_one_out_mean_sd": dict(zip(AXES, map(float, np.mean(sds, axis=0)), strict=True)),
-        }
-
-    def save(self, path: str | Path) -> None:
-        """Write a `.implicam` file that carries everything, the known points included."""
-        calibration_file.save(self, path)
+        return FitSummary(
+            points_used=len(errors),
+            points_unused=len(self.unused),
+            leave_one_out_rms=per_axis(np.sqrt(np.mean(errors**2, axis=0)) * self.positions.scale),
+            leave_one_out_mean_sd=per_axis(np.mean(sds, axis=0)),
+        )
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Options, and the hyperparameters in standardised units with the scaling."""

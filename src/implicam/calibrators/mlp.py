@@ -13,15 +13,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam import calibration_file
 from implicam.calibrators.inverse_gp import (
-    AXES,
     Scaling,
     blind_reasons,
     flat_note,
@@ -33,10 +30,10 @@ from implicam.calibrators.inverse_gp import (
 )
 from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import Examples, train
-from implicam.calibrators.protocol import Arrays, finite_column
+from implicam.calibrators.protocol import Arrays, CalibrationBase, FitSummary, finite_column, per_axis
 from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_copies
 from implicam.dataset.requirements import same_cameras
-from implicam.dataset.unused import Rejected, Unused
+from implicam.dataset.unused import Unused
 from implicam.errors import FitError, UsageError
 from implicam.formatting import percent
 from implicam.measurement import Measurement
@@ -127,7 +124,7 @@ def _split(n: int, seed: int) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, eq=False)
-class MLPCalibration:
+class MLPCalibration(CalibrationBase):
     """A trained network, and which of the usable known points (n,) were kept for early stopping."""
 
     calibrator: MLP
@@ -144,11 +141,6 @@ class MLPCalibration:
     def used(self) -> Dataset:
         """The data without the points and cameras that are there twice."""
         return without_copies(self.data, cameras_too=True)
-
-    @property
-    def rejected(self) -> tuple[Rejected, ...]:
-        """None: this method uses every view of the points it uses."""
-        return ()
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure the points that every camera saw; the others keep their row, with a reason."""
@@ -204,10 +196,6 @@ class MLPCalibration:
         """Share of the held-out coordinates within their 95 % interval."""
         return float(np.mean(np.abs(self._held_out_errors) <= WITHIN_95 * self._held_out_sds))
 
-    def refit(self, data: Dataset, progress: Progress = silent) -> MLPCalibration:
-        """The same method with the same options on other data."""
-        return self.calibrator.fit(data, progress)
-
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration: always what its error bars are worth."""
         return [
@@ -230,25 +218,20 @@ class MLPCalibration:
             f"kept for early stopping, {percent(self._coverage)} lie inside their 95 % bars."
         )
 
-    def residuals(self) -> dict[str, Any]:
-        """Errors per axis in the dataset's unit, of the points kept for early stopping, not each left out in turn.
+    def summary(self) -> FitSummary:
+        """Errors of the points kept for early stopping, not of each left out in turn.
 
-        held_out_in_95: the share of their coordinates within the stated 95 % intervals. It flatters a little, because
-        the epoch was chosen by them; without dropout more, because then the intervals are made from them.
+        The share inside the 95 % intervals flatters a little, because the epoch was chosen by these points; without
+        dropout more, because then the intervals are made from them.
         """
-        rms = np.sqrt(np.mean(self._held_out_errors**2, axis=0))
-        return {
-            "points_used": len(self.held_out),
-            "points_unused": len(self.unused),
-            "leave_one_out_rms": dict(zip(AXES, map(float, rms), strict=True)),
-            "leave_one_out_mean_sd": dict(zip(AXES, map(float, self._held_out_sds.mean(axis=0)), strict=True)),
-            "held_out_points": int(self.held_out.sum()),
-            "held_out_in_95": self._coverage,
-        }
-
-    def save(self, path: str | Path) -> None:
-        """Write a `.implicam` file that carries everything, the known points included."""
-        calibration_file.save(self, path)
+        return FitSummary(
+            points_used=len(self.held_out),
+            points_unused=len(self.unused),
+            leave_one_out_rms=per_axis(np.sqrt(np.mean(self._held_out_errors**2, axis=0))),
+            leave_one_out_mean_sd=per_axis(self._held_out_sds.mean(axis=0)),
+            held_out_points=int(self.held_out.sum()),
+            held_out_in_95=self._coverage,
+        )
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Options; weights, scalings and which points were kept for early stopping."""

@@ -9,19 +9,70 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from implicam.dataset import Dataset, Observations
+from implicam import calibration_file
+from implicam.calibrators.position_processes import PositionProcesses
+from implicam.dataset import Dataset, Floats, Observations
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import FitError
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
+from implicam.rig_model import FittedRig, Sensitivity
 
 Arrays = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitSummary:
+    """How well a calibration fits its own data, in a few readable numbers; lengths are in the dataset's unit.
+
+    Attributes:
+        points_used: known points that the fit uses.
+        points_unused: known points that it could not use.
+        views_rejected: views that it does not use because they contradict the others; None for a method that
+            rejects none.
+        held_out: what the errors below are of, in words; empty where each known point is left out in turn.
+        leave_one_out_rms: axis -> rms error of a known point that is predicted from the others.
+        leave_one_out_mean_sd: axis -> mean standard deviation that was stated for those errors.
+        noise_px: camera -> noise of a view, in pixels.
+        lens: camera -> name of its lens model.
+        held_out_points: number of known points kept back, for a method that is too slow to be fitted without each;
+            the errors above are of these.
+        held_out_in_95: share of their coordinates inside the stated 95 % intervals.
+    """
+
+    points_used: int
+    points_unused: int
+    views_rejected: int | None = None
+    held_out: str = ""
+    leave_one_out_rms: Mapping[str, float]
+    leave_one_out_mean_sd: Mapping[str, float]
+    noise_px: Mapping[str, float] = field(default_factory=dict)
+    lens: Mapping[str, str] = field(default_factory=dict)
+    held_out_points: int | None = None
+    held_out_in_95: float | None = None
+
+    @property
+    def how(self) -> str:
+        """What the errors are of, in words."""
+        if self.held_out_points is not None:
+            return f"the {self.held_out_points} of them that it was not trained on are predicted"
+        return self.held_out or "each left out in turn is predicted from the rest"
+
+    def as_table(self) -> dict[str, Any]:
+        """Plain values for a calibration file or JSON; what the method does not say is left out."""
+        return {key: value for key, value in asdict(self).items() if value not in (None, "", {})}
+
+
+def per_axis(values: ArrayLike) -> dict[str, float]:
+    """Numbers (3,) by the names of their axes."""
+    return dict(zip("xyz", np.asarray(values, dtype=np.float64).tolist(), strict=True))
 
 
 class Calibration(Protocol):
@@ -60,8 +111,77 @@ class Calibration(Protocol):
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
 
-    def residuals(self) -> dict[str, Any]:
-        """A few readable numbers on how well the calibration fits its own data."""
+    def summary(self) -> FitSummary:
+        """How well the calibration fits its own data."""
+
+
+@runtime_checkable
+class PredictsPixels(Calibration, Protocol):
+    """A calibration that knows each camera: where it sees a position, and how uncertain that is.
+
+    `suggest`, `acquire` with a robot, `export`, the 3D view and the correction of a ball's outline need it.
+    """
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The cameras that are calibrated."""
+
+    @property
+    def trained(self) -> Observations:
+        """What all cameras saw when they were calibrated."""
+
+    @property
+    def follows_lenses_only(self) -> bool:
+        """Whether every camera is restrained to what lenses do, so that it cannot follow wrong known points."""
+
+    def predict(self, xyz: Floats) -> Floats:
+        """Where the cameras see positions.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            (n, cameras, 2) pixels without noise, of all cameras of the dataset; NaN where a camera does not see one.
+        """
+
+    def sensitivities(self, xyz: Floats) -> list[Sensitivity]:
+        """How pixels depend on the position and on what is unknown of the cameras, at positions (n, 3)."""
+
+    def lines_of_sight(self, camera: str, uv: Floats) -> tuple[Floats, Floats]:
+        """The lines that a calibrated camera sees as points.
+
+        Args:
+            camera: its name.
+            uv: (n, 2) pixels.
+
+        Returns:
+            centre (3,) of the camera and directions (n, 3) in the world; NaN for a pixel without a line. A camera
+            that sees a scene and its mirror image alike may give either sign.
+        """
+
+
+@runtime_checkable
+class HasPositionProcesses(Calibration, Protocol):
+    """A calibration that is Gaussian processes from pixels to a position, so that it says what one more would add."""
+
+    def position_processes(self, uv: Floats) -> PositionProcesses:
+        """What the processes say of n places together, at their pixels uv (n, cameras, 2)."""
+
+
+@runtime_checkable
+class Updatable(Calibration, Protocol):
+    """A calibration that can be fitted again from where it is, when there are a few known points more."""
+
+    def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> Calibration:
+        """As `refit`, starting from what is known; with `anew` from no guess as well."""
+
+
+@runtime_checkable
+class TakesPoints(Calibration, Protocol):
+    """A calibration that takes known points at once, with all that was learned of the optics kept."""
+
+    def condition_on(self, data: Dataset) -> Calibration:
+        """The same hyperparameters, with these known points."""
 
 
 class Calibrator(Protocol):
@@ -71,6 +191,78 @@ class Calibrator(Protocol):
 
     def fit(self, data: Dataset, progress: Progress = silent) -> Calibration:
         """Fit to known points; FitError says why it cannot be done."""
+
+
+class CalibrationBase:
+    """What all calibrations do alike; to be inherited, or written anew."""
+
+    calibrator: Calibrator
+    data: Dataset
+
+    @property
+    def rejected(self) -> tuple[Rejected, ...]:
+        """None: the method uses every view of the points it uses."""
+        return ()
+
+    def refit(self, data: Dataset, progress: Progress = silent) -> Any:
+        """The same method with the same options on other data."""
+        return self.calibrator.fit(data, progress)
+
+    def notes(self) -> list[str]:
+        """What the user should know before trusting this calibration; empty where all is well."""
+        return []
+
+    def residuals(self) -> dict[str, Any]:
+        """The summary as plain values, as it stands in the calibration file."""
+        return self.summary().as_table()  # type: ignore[attr-defined,no-any-return]
+
+    def save(self, path: str | Path) -> None:
+        """Write a `.implicam` file that carries everything, the known points included."""
+        calibration_file.save(self, path)  # type: ignore[arg-type]
+
+
+class RigCalibration(CalibrationBase):
+    """A calibration whose cameras are a `FittedRig`: it measures and predicts as that does."""
+
+    @property
+    def map(self) -> FittedRig:
+        """The cameras, and how they measure."""
+        raise NotImplementedError
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The cameras that are calibrated."""
+        return self.map.camera_names
+
+    @property
+    def trained(self) -> Observations:
+        """What all cameras saw when they were calibrated."""
+        return self.map.trained
+
+    @property
+    def follows_lenses_only(self) -> bool:
+        """Whether every camera is restrained to what lenses do."""
+        return self.map.follows_lenses_only
+
+    def measure(self, observations: Observations) -> Measurement:
+        """Measure each point with the views it has, two or more."""
+        return self.map.measure(observations)
+
+    def predict(self, xyz: Floats) -> Floats:
+        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
+        return self.map.predict(xyz)
+
+    def sensitivities(self, xyz: Floats) -> list[Sensitivity]:
+        """How pixels depend on the position and on what is unknown of the cameras, at positions (n, 3)."""
+        return self.map.sensitivities(xyz)
+
+    def lines_of_sight(self, camera: str, uv: Floats) -> tuple[Floats, Floats]:
+        """Centre (3,) and directions (n, 3), in the world, of what a camera sees at pixels (n, 2)."""
+        return self.map.lines_of_sight(camera, uv)
+
+    def centres(self) -> dict[str, Floats]:
+        """Where the calibrated cameras are: name -> (3,) in the world."""
+        return {name: self.lines_of_sight(name, np.zeros((1, 2)))[0] for name in self.camera_names}
 
 
 def why_not_all_seen(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> str:

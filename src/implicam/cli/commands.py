@@ -220,27 +220,21 @@ def calibrate_command(
 
 
 def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path | None, json: bool) -> None:
-    residuals = calibration.residuals()
+    summary = calibration.summary()
     unused = [asdict(unused) for unused in calibration.unused]
     notes = [*calibration.data.notes, *calibration.notes()]
     if json:
         show.emit_json(
             {"calibration": None if output is None else str(output), "verdict": verdict.as_table(),
-             "method": calibration.method, "residuals": residuals, "unused": unused,
+             "method": calibration.method, "residuals": summary.as_table(), "unused": unused,
              "rejected": [asdict(view) for view in calibration.rejected], "notes": notes,
              "length_unit": calibration.data.length_unit}
         )  # fmt: skip
         return
     unit = calibration.data.length_unit
-    rms = residuals["leave_one_out_rms"]
-    show.line(f"{output or 'no file written'}: {calibration.method} from {residuals['points_used']} points")
-    within = ", ".join(f"{axis} {decimal_number(value)}" for axis, value in rms.items())
-    how = "each left out in turn is predicted from the rest"
-    if "held_out" in residuals:
-        how = residuals["held_out"]
-    if "held_out_points" in residuals:  # a method that is not refitted for each
-        how = f"the {residuals['held_out_points']} of them that it was not trained on are predicted"
-    show.line(f"{how} within {within} {unit} rms")
+    show.line(f"{output or 'no file written'}: {calibration.method} from {summary.points_used} points")
+    within = ", ".join(f"{axis} {decimal_number(value)}" for axis, value in summary.leave_one_out_rms.items())
+    show.line(f"{summary.how} within {within} {unit} rms")
     show.notes(show.counted((entry.reason for entry in calibration.unused), "known point", "not used"))
     show.notes([note for note in notes if note not in verdict.reasons])
     show.calibration_verdict(verdict, unit)

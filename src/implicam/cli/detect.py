@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from implicam.calibrators import ForwardGPCalibration, load_calibration
+from implicam.calibrators import load_calibration
+from implicam.calibrators.protocol import PredictsPixels
 from implicam.cli import show
 from implicam.dataset import Dataset
 from implicam.dataset.folder import DESCRIPTION, POINTS, read_description
@@ -54,11 +55,11 @@ class Wanted:
         calibration = None
         if self.calibration is not None:
             loaded = load_calibration(self.calibration)
-            if not isinstance(loaded, ForwardGPCalibration):
+            if not isinstance(loaded, PredictsPixels):
                 raise UsageError(
                     f"{self.calibration} was made by {loaded.method}.",
-                    why="only forward-gp knows what a camera sees of a place",
-                    fix="give a calibration by forward-gp",
+                    why="that method does not know what a camera sees of a place",
+                    fix="give a calibration by forward-gp or explicit",
                 )
             calibration = loaded
         correct = partial(centred, radius=float(radius), calibration=calibration) if radius else _no_radius

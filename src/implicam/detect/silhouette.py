@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from implicam.calibrators import ForwardGP, ForwardGPCalibration
+from implicam.calibrators import ForwardGP
+from implicam.calibrators.protocol import PredictsPixels
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.detect.edge import Ellipse, through
 from implicam.errors import FitError, UsageError
@@ -26,7 +27,7 @@ MIN_POINTS = 10
 """Known points from which a calibration is good enough: the difference follows from where cameras are, roughly."""
 
 
-def centred(data: Dataset, radius: float, calibration: ForwardGPCalibration | None = None) -> tuple[Dataset, list[str]]:
+def centred(data: Dataset, radius: float, calibration: PredictsPixels | None = None) -> tuple[Dataset, list[str]]:
     """The observations moved from the middle of each outline to the ball's middle; and what there is to say of it.
 
     radius: of the ball, in the dataset's unit. calibration: of the rig; without one, one is fitted to the known
@@ -61,7 +62,7 @@ def _roughly(observations: Observations) -> Observations:
     return replace(observations, sd=np.hypot(own, MAX_OFF_PX))
 
 
-def _own(data: Dataset) -> ForwardGPCalibration:
+def _own(data: Dataset) -> PredictsPixels:
     if data.known is None:
         raise FitError("there is no calibration yet; give one with --calibration once there is.")
     if len(data) < MIN_POINTS:
@@ -69,18 +70,18 @@ def _own(data: Dataset) -> ForwardGPCalibration:
     return ForwardGP().fit(data)
 
 
-def outline_shift(calibration: ForwardGPCalibration, xyz: Floats, radius: float, cameras: tuple[str, ...]) -> Floats:
+def outline_shift(calibration: PredictsPixels, xyz: Floats, radius: float, cameras: tuple[str, ...]) -> Floats:
     """(n, cameras, 2) by how much the middle of the outline of a ball at xyz (n, 3) is off its middle, pixels."""
-    trained = calibration.data.observations.camera_names
+    trained = calibration.trained.camera_names
     shift = np.full((len(xyz), len(cameras), 2), np.nan)
-    centres = calibration.centres()
     there = np.isfinite(xyz).all(axis=1)
     middle = calibration.predict(xyz[there])
     for k, name in enumerate(cameras):
-        if name not in centres:
+        if name not in calibration.camera_names:
             continue
         c = trained.index(name)
-        outline = calibration.predict(_outlines(xyz[there], centres[name], radius).reshape(-1, 3))[:, c]
+        centre, _ = calibration.lines_of_sight(name, np.zeros((1, 2)))
+        outline = calibration.predict(_outlines(xyz[there], centre, radius).reshape(-1, 3))[:, c]
         for i, curve, pixel in zip(
             np.flatnonzero(there), outline.reshape(-1, OUTLINE_POINTS, 2), middle[:, c], strict=True
         ):

@@ -7,13 +7,13 @@ standard deviation, averaged over x, y and z, is largest.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators import Calibration, InverseGPCalibration, calibrator_from_name
+from implicam.calibrators import Calibration, calibrator_from_name
+from implicam.calibrators.protocol import TakesPoints
 from implicam.compare import fit_each
 from implicam.dataset import Dataset, Floats
 from implicam.errors import ImplicamError
@@ -97,10 +97,10 @@ def grow(
 def _now(
     fit: Calibration | ImplicamError, data: Dataset, mask: NDArray[np.bool_], new: bool
 ) -> Calibration | ImplicamError | None:
-    """What is known with the points of the mask: a new fit; else a Gaussian process that took them in, or None."""
+    """What is known with the points of the mask: a new fit; else one that took them in at once, or None."""
     if new:
         return fit
-    return replace(fit, data=data.select(mask)) if isinstance(fit, InverseGPCalibration) else None
+    return fit.condition_on(data.select(mask)) if isinstance(fit, TakesPoints) else None
 
 
 def _start(total: int, count: int, repeat: int) -> NDArray[np.int64]:

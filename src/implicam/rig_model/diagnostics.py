@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,20 +86,6 @@ class Diagnosis:
         cov = np.asarray(np.linalg.inv(H[good]), dtype=np.float64)
         error = np.einsum("nij,nj->ni", cov, g[good])
         return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
-
-    def residuals(self) -> dict[str, Any]:
-        """Leave-one-out errors per axis in the dataset's unit, and per camera the noise in pixels."""
-        errors, sds = self.leave_one_out
-        axes, models = "xyz", self.fitted.posterior.models
-        names = (self.data.observations.camera_names[c] for c in self.fitted.cameras)
-        return {
-            "points_used": len(self.data) - len(self.unused),
-            "points_unused": len(self.unused),
-            "views_rejected": len(self.rejected),
-            "leave_one_out_rms": dict(zip(axes, map(float, np.sqrt(np.mean(errors**2, axis=0))), strict=True)),
-            "leave_one_out_mean_sd": dict(zip(axes, map(float, np.mean(sds, axis=0)), strict=True)),
-            "noise_px": dict(zip(names, (float(model.noise) for model in models), strict=True)),
-        }
 
     def notes(self) -> list[str]:
         """Cameras that could not be calibrated, and views that contradict the others."""

@@ -22,6 +22,9 @@ from implicam.rig_model.training_data import Frame, stated_noise, view_noise
 from implicam.rig_model.triangulate import Labels, Located, locate
 from implicam.rig_model.wrong_views import AGREE_P_VALUE
 
+LENS_KINDS = ("ordinary", "aspect")
+"""Kinds of cameras that cannot follow anything that lenses do not do."""
+
 
 class Sensitivity(NamedTuple):
     """How what some cameras see of n places depends on the place and on what is unknown of the cameras.
@@ -58,6 +61,11 @@ class FittedRig:
     def camera_names(self) -> tuple[str, ...]:
         """The cameras that are calibrated."""
         return tuple(self.trained.camera_names[c] for c in self.cameras)
+
+    @property
+    def follows_lenses_only(self) -> bool:
+        """Whether every camera is of a kind that cannot follow anything that lenses do not do."""
+        return all(model.family in LENS_KINDS for model in self.posterior.models)
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure each point with the views it has, two or more."""
@@ -142,14 +150,10 @@ class FittedRig:
         for c, model in zip(self.cameras, self.posterior.models, strict=True):
             yield model.predict(points)[1] / self.frame.scale, model.noise * loss, c
 
-    def centres(self) -> dict[str, Floats]:
-        """Where the calibrated cameras are: name -> (3,) in the world."""
-        nowhere = np.zeros((1, 2))
-        cameras = (model.camera for model in self.posterior.models)
-        return {
-            name: self.frame.to_world(camera.lines(nowhere)[0])
-            for name, camera in zip(self.camera_names, cameras, strict=True)
-        }
+    def lines_of_sight(self, camera: str, uv: Floats) -> tuple[Floats, Floats]:
+        """Centre (3,) and directions (n, 3), in the world, of what a calibrated camera sees at pixels (n, 2)."""
+        centre, rays = self.posterior.models[self.camera_names.index(camera)].camera.lines(uv)
+        return self.frame.to_world(centre), rays
 
     def _noise(self, observations: Observations, c: int, k: int) -> Floats:
         """(n,) of camera c's views, in pixels: as they state it, corrected as the calibration's own views were."""

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 
 from implicam.active import Loop, PredictedCovariance, Step, Target
-from implicam.calibrators import Calibration, ForwardGPCalibration
+from implicam.calibrators import Calibration
+from implicam.calibrators.protocol import PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.detect import Detected, Detector, View, centred
 from implicam.errors import HardwareError, ImplicamError, UsageError
@@ -395,7 +396,7 @@ class SessionController:
         """The pixels of the ball's middle, for those of its outline; by the last calibration, where there is one."""
         assert self.equipment.radius is not None
         last = self.loop.calibration
-        return centred(data, self.equipment.radius, last if isinstance(last, ForwardGPCalibration) else None)[0]
+        return centred(data, self.equipment.radius, last if isinstance(last, PredictsPixels) else None)[0]
 
     def _aim(self, before: str = "") -> None:
         """Name the next target; where there is none left, say so."""
@@ -424,7 +425,7 @@ class SessionController:
     def _uncalibrated(self) -> str:
         """Which cameras have not seen enough of the known points yet, in words."""
         calibration, data = self.loop.calibration, self.loop.data
-        if not isinstance(calibration, ForwardGPCalibration) or data is None:
+        if not isinstance(calibration, PredictsPixels) or data is None:
             return ""
         seen = dict(zip(data.observations.camera_names, data.observations.seen.sum(axis=0), strict=True))
         missing = [name for name in seen if name not in calibration.camera_names]

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from implicam.calibrators import Calibration, ForwardGPCalibration
+from implicam.calibrators import Calibration
+from implicam.calibrators.protocol import PredictsPixels
 from implicam.dataset import Floats
 from implicam.detect import Detected
 from implicam.hardware import Frame
@@ -41,12 +42,12 @@ def reject_implausible(
 
     Of several things that might be the ball, the nearest to that place counts.
     """
-    if not isinstance(calibration, ForwardGPCalibration):
+    if not isinstance(calibration, PredictsPixels):
         return looks
     xyz = where[None]
     uv = calibration.predict(xyz)[0]
     sd = np.full(len(uv), np.nan)
-    for part in calibration.map.sensitivities(xyz):
+    for part in calibration.sensitivities(xyz):
         variance = np.einsum("nij,nij->ni", part.half, part.half)[0] + part.rest[0] + part.noise[0]
         variance += (part.slope[0] ** 2) @ where_sd**2
         sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))

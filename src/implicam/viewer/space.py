@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.active import Workspace
-from implicam.calibrators import Calibration, ExplicitCalibration, ForwardGPCalibration
+from implicam.calibrators import Calibration
+from implicam.calibrators.protocol import PredictsPixels
 from implicam.dataset import Floats
 
 Colours = NDArray[np.uint8]
@@ -70,20 +71,18 @@ class Eye:
 
 def eyes(calibration: Calibration | None) -> list[Eye]:
     """The calibrated cameras; none for a method that has none, and before the first calibration."""
-    if not isinstance(calibration, ForwardGPCalibration | ExplicitCalibration):
+    if not isinstance(calibration, PredictsPixels):
         return []
-    rig = calibration.map
-    found = []
-    for number, name in enumerate(rig.camera_names):
-        camera = rig.trained.cameras[rig.cameras[number]]
-        seen = rig.trained.uv[:, rig.cameras[number]]
+    trained, found = calibration.trained, []
+    for name in calibration.camera_names:
+        c = trained.camera_names.index(name)
+        camera, seen = trained.cameras[c], trained.uv[:, c]
         seen = seen[np.isfinite(seen).all(axis=1)]
         width = camera.width or float(np.ceil(seen[:, 0].max())) + 1
         height = camera.height or float(np.ceil(seen[:, 1].max())) + 1
         pixels = np.array([[0.5, 0.5], [0.4, 0.5], [0.6, 0.5], [0.5, 0.4], [0.5, 0.6], [0.5, 0.0], [0.5, 1.0]])
-        centre, rays = rig.posterior.models[number].camera.lines(pixels * (width, height) - 0.5)
-        ahead = calibration.data.xyz.mean(axis=0) - rig.frame.to_world(centre)
-        eye = _eye(name, rig.frame.to_world(centre), rays, ahead, width / height)
+        centre, rays = calibration.lines_of_sight(name, pixels * (width, height) - 0.5)
+        eye = _eye(name, centre, rays, calibration.data.xyz.mean(axis=0) - centre, width / height)
         if eye is not None:
             found.append(eye)
     return found

@@ -10,13 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam import calibration_file
 from implicam.calibrators.explicit import saved
 from implicam.calibrators.explicit.align import MATCHING
 from implicam.calibrators.explicit.boards import boards_of, has_boards
@@ -24,12 +22,11 @@ from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_b
 from implicam.calibrators.explicit.from_boards import fit_to_boards
 from implicam.calibrators.explicit.lenses import AUTO, FAMILIES
 from implicam.calibrators.explicit.network import Groups, calibrate_groups
-from implicam.calibrators.protocol import Arrays, solvable
-from implicam.dataset import Dataset, Observations
+from implicam.calibrators.protocol import Arrays, FitSummary, RigCalibration, per_axis, solvable
+from implicam.dataset import Dataset
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
-from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig
@@ -99,7 +96,7 @@ class Explicit:
 
 
 @dataclass(frozen=True, eq=False)
-class ExplicitCalibration:
+class ExplicitCalibration(RigCalibration):
     """Cameras with lens models and poses, and the covariance of all of it."""
 
     calibrator: Explicit
@@ -115,18 +112,6 @@ class ExplicitCalibration:
         return FittedRig(
             fitted.trained, self.data.length_unit, fitted.frame, fitted.cameras, fitted.posterior, misfit_adds=True
         )
-
-    def measure(self, observations: Observations) -> Measurement:
-        """Measure each point with the views it has, two or more: maximum likelihood."""
-        return self.map.measure(observations)
-
-    def predict(self, xyz: Floats) -> Floats:
-        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
-        return self.map.predict(xyz)
-
-    def centres(self) -> dict[str, Floats]:
-        """Where the calibrated cameras are: name -> (3,) in the world."""
-        return self.map.centres()
 
     @property
     def unused(self) -> tuple[Unused, ...]:
@@ -154,24 +139,19 @@ class ExplicitCalibration:
         """What the user should know before trusting this calibration; empty where all is well."""
         return list(self.fitted.notes)
 
-    def residuals(self) -> dict[str, Any]:
-        """Leave-one-out errors per axis in the dataset's unit; per camera the lens model and the noise in pixels."""
-        fitted = self.fitted
-        axes, names = "xyz", self.map.camera_names
-        return {
-            "points_used": len(self.data) - len(self.unused),
-            "points_unused": len(self.unused),
-            "views_rejected": len(self.rejected),
-            **({"held_out": "the corners of the boards are measured"} if fitted.alone else {}),
-            "leave_one_out_rms": dict(zip(axes, _columns(fitted.errors, 2), strict=True)),
-            "leave_one_out_mean_sd": dict(zip(axes, _columns(fitted.sds, 1), strict=True)),
-            "noise_px": dict(zip(names, (float(model.noise) for model in fitted.posterior.models), strict=True)),
-            "lens": dict(zip(names, (choice.lens for choice in fitted.choices), strict=True)),
-        }
-
-    def save(self, path: str | Path) -> None:
-        """Write a `.implicam` file that carries everything, the known points and the boards included."""
-        calibration_file.save(self, path)
+    def summary(self) -> FitSummary:
+        """Leave-one-out errors of the known points; of each camera the lens model and the noise."""
+        fitted, names = self.fitted, self.camera_names
+        return FitSummary(
+            points_used=len(self.data) - len(self.unused),
+            points_unused=len(self.unused),
+            views_rejected=len(self.rejected),
+            held_out="the corners of the boards are measured" if fitted.alone else "",
+            leave_one_out_rms=per_axis(_columns(fitted.errors, 2)),
+            leave_one_out_mean_sd=per_axis(_columns(fitted.sds, 1)),
+            noise_px=dict(zip(names, (float(model.noise) for model in fitted.posterior.models), strict=True)),
+            lens=dict(zip(names, (choice.lens for choice in fitted.choices), strict=True)),
+        )
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The options; and per camera lens, pose and covariance, in the working frame."""

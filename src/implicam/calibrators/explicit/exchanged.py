@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from implicam.calibrators.explicit.calibration import Explicit, ExplicitCalibration
 from implicam.calibrators.explicit.fitted import Fitted, posterior_of
 from implicam.calibrators.explicit.lenses import Choice, name_of
-from implicam.calibrators.forward_gp import ForwardGPCalibration
+from implicam.calibrators.protocol import Calibration, RigCalibration
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import UsageError
 from implicam.exchange import UNKNOWN, ExplicitCamera, Rig
 from implicam.geometry import Floats, Pose
 from implicam.rig_model import (
+    CameraModel,
     CentralCamera,
     Frame,
     GeneralCamera,
@@ -29,10 +28,10 @@ DRAWN = 2000
 """Positions in the workspace at which a lens is fitted to what forward-gp predicts."""
 
 
-def rig_of(calibration: Any) -> tuple[Rig, list[str]]:
+def rig_of(calibration: Calibration) -> tuple[Rig, list[str]]:
     """The cameras of a calibration, and what is lost: forward-gp's lenses are fitted to all that it predicts, without
     its field. UsageError for a method that has no cameras."""
-    if not isinstance(calibration, ExplicitCalibration | ForwardGPCalibration):
+    if not isinstance(calibration, RigCalibration):
         raise UsageError(
             f"{calibration.method} has no cameras that could be exported.",
             why="it learns the map from pixels to positions as a whole",
@@ -41,7 +40,8 @@ def rig_of(calibration: Any) -> tuple[Rig, list[str]]:
     fitted_rig, notes, cameras = calibration.map, [], []
     for number, c in enumerate(fitted_rig.cameras):
         described = fitted_rig.trained.cameras[c]
-        camera = fitted_rig.posterior.models[number].camera
+        model = fitted_rig.posterior.models[number]
+        camera = model.camera
         if isinstance(camera, GeneralCamera) and not camera.mirrored:
             camera = camera.as_central()
         if not isinstance(camera, CentralCamera):
@@ -51,8 +51,8 @@ def rig_of(calibration: Any) -> tuple[Rig, list[str]]:
                 why="other programs know lenses that see the world as it is",
                 fix="turn its pictures over, or calibrate the same data with --method explicit",
             )
-        if isinstance(calibration, ForwardGPCalibration):
-            camera, note = _nearest(calibration, number, camera)
+        if len(model.field.inducing):  # forward-gp
+            camera, note = _nearest(model, fitted_rig.frame.to_working(calibration.data.xyz), camera)
             notes += [f"{described.name}: {note}"] if note else []
         cameras.append(
             ExplicitCamera(
@@ -68,12 +68,10 @@ def _world(camera: CentralCamera, frame: Frame) -> Pose:
     return Pose(camera.pose.rotation, camera.pose.translation * frame.scale - turned)
 
 
-def _nearest(calibration: ForwardGPCalibration, number: int, camera: CentralCamera) -> tuple[CentralCamera, str]:
-    """The lens and place that come nearest to what forward-gp predicts in the workspace, and the cost in pixels."""
-    points = calibration.frame.to_working(calibration.data.xyz)
+def _nearest(model: CameraModel, points: Floats, camera: CentralCamera) -> tuple[CentralCamera, str]:
+    """The lens and place that come nearest to what forward-gp predicts around points, and the cost in pixels."""
     low, high = points.min(axis=0), points.max(axis=0)
     drawn = np.random.default_rng(0).uniform(low, high, size=(DRAWN, 3))
-    model = calibration.posterior.models[number]
     uv = model.predict(drawn)[0]
     seen = np.isfinite(uv).all(axis=1) & (np.abs(uv - model.image.centre) <= 1.2 * model.image.half).all(axis=1)
     drawn, uv = drawn[seen], uv[seen]

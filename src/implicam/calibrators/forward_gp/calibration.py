@@ -9,23 +9,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam import calibration_file
 from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
-from implicam.calibrators.protocol import Arrays, finite_column, solvable
-from implicam.dataset import Dataset, Observations, without_copies
+from implicam.calibrators.protocol import Arrays, FitSummary, RigCalibration, finite_column, per_axis, solvable
+from implicam.dataset import Dataset, without_copies
 from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
-from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.rig_model.diagnostics import Diagnosis
@@ -78,7 +75,7 @@ def _copies_named(data: Dataset, fitted: FitResult) -> FitResult:
 
 
 @dataclass(frozen=True, eq=False)
-class ForwardGPCalibration:
+class ForwardGPCalibration(RigCalibration):
     """A fitted rig."""
 
     calibrator: ForwardGP
@@ -112,23 +109,6 @@ class ForwardGPCalibration:
             degrees=None if tails is None else tails.degrees,
         )
 
-    @property
-    def camera_names(self) -> tuple[str, ...]:
-        """The cameras that are calibrated."""
-        return self.map.camera_names
-
-    def measure(self, observations: Observations) -> Measurement:
-        """Measure each point with the views it has, two or more."""
-        return self.map.measure(observations)
-
-    def predict(self, xyz: Floats) -> Floats:
-        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
-        return self.map.predict(xyz)
-
-    def centres(self) -> dict[str, Floats]:
-        """Where the calibrated cameras are: name -> (3,) in the world."""
-        return self.map.centres()
-
     @cached_property
     def _labels(self) -> Labels | None:
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
@@ -156,17 +136,13 @@ class ForwardGPCalibration:
         """The known points of which no view is used."""
         return (*self.diagnosis.unused, *copied_points(self.data))
 
-    def refit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
-        """The same method with the same options on other data."""
-        return self.calibrator.fit(data, progress)
-
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> ForwardGPCalibration:
         """As `refit`, starting from what is known: for a few points more, in half of the time.
 
         What is found is the nearest optimum and not the best of many, so begin `anew` where the points have grown much.
         """
         if anew:
-            return self.refit(data, progress)
+            return self.calibrator.fit(data, progress)
         with solvable(), blas_threads(1):
             used = without_copies(data)
             training = training_data_of(self.calibrator.lens, used, self.frame)
@@ -232,13 +208,18 @@ class ForwardGPCalibration:
             out += self._labels.own(self.frame.to_working(xyz))
         return out * self.frame.scale**2
 
-    def residuals(self) -> dict[str, Any]:
-        """Leave-one-out errors per axis in the dataset's unit, and per camera the noise and the field in pixels."""
-        return self.diagnosis.residuals()
-
-    def save(self, path: str | Path) -> None:
-        """Write a `.implicam` file that carries everything, the known points included."""
-        calibration_file.save(self, path)
+    def summary(self) -> FitSummary:
+        """Leave-one-out errors of the known points, and the noise of each camera."""
+        errors, sds = self.diagnosis.leave_one_out
+        noise = (model.noise for model in self.posterior.models)
+        return FitSummary(
+            points_used=len(self.used) - len(self.diagnosis.unused),
+            points_unused=len(self.diagnosis.unused),
+            views_rejected=len(self.rejected),
+            leave_one_out_rms=per_axis(np.sqrt(np.mean(errors**2, axis=0))),
+            leave_one_out_mean_sd=per_axis(np.mean(sds, axis=0)),
+            noise_px=dict(zip(self.camera_names, map(float, noise), strict=True)),
+        )
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The options; and per camera lens, field, weights and covariance, in the working frame."""
