@@ -19,7 +19,10 @@ from implicam.calibrators import (
     InverseGPCalibration,
     calibrator,
     calibrator_from_name,
+    every_option,
     load_calibration,
+    method_for,
+    options_of,
 )
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import DatasetError, FitError, MissingExtraError, UsageError
@@ -418,6 +421,38 @@ def test_a_name_is_a_method_with_one_option(
         with pytest.raises(MissingExtraError, match=f"{name} needs the library '{library}'") as caught:
             calibrator_from_name(name)
         assert f"implicam[{extra}]" in caught.value.fix
+
+
+def test_options_win_over_the_variant_and_those_that_are_none_are_left_at_their_default() -> None:
+    assert calibrator("inverse-gp:plain", kernel="matern-5/2", preset=None) == InverseGP("matern-5/2", "plain")
+    assert calibrator("mlp:no-dropout", seed=3, dropout=0.1).dropout == 0.1
+
+
+def test_the_options_of_the_command_line_are_fields_with_a_help_text() -> None:
+    offered = {method: set(options_of(method)) for method in METHODS}
+    assert offered["explicit"] == {"lens", "align", "boards"}
+    assert offered["inverse-gp"] == {"kernel", "preset"}
+    assert set(every_option()["lens"]) == {"forward-gp", "explicit"}
+    for fields in every_option().values():
+        for field in fields.values():
+            assert field.metadata["help"]
+            assert field.metadata["metavar"].isupper()
+    assert every_option()["boards"]["explicit"].metadata["is_dataset"]
+
+
+@pytest.mark.parametrize(("options", "method"), [
+    ({}, "forward-gp"),
+    ({"lens": "none"}, "forward-gp"),
+    ({"lens": "auto"}, "forward-gp"),
+    ({"lens": "kannala-brandt"}, "explicit"),
+    ({"align": "icp"}, "explicit"),
+    ({"kernel": "matern-5/2"}, "inverse-gp"),
+    ({"preset": "no such preset"}, "inverse-gp"),
+    ({"kernel": "matern-5/2", "lens": "none"}, "forward-gp"),
+    ({"kernel": None, "lens": None}, "forward-gp"),
+])  # fmt: skip
+def test_options_alone_say_which_method_is_meant(options: dict[str, Any], method: str) -> None:
+    assert method_for(**options) == method
 
 
 # inverse-gp

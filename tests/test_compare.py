@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from implicam.calibrators import METHODS, NEEDED, Calibration, ForwardGP, InverseGP, calibrator_from_name
+from implicam.calibrators import METHODS, NEEDED, Calibration, ForwardGP, InverseGP, Method, calibrator_from_name
 from implicam.cli import main
 from implicam.cli.compare import _available_methods
 from implicam.cli.compare_table import compare_failures, compare_table
@@ -722,7 +722,7 @@ def test_a_lattice_from_the_command_line(run: Callable[..., Ran]) -> None:
     ("lattice --lattice --check random", "exclude each other"),
     ("board --leave-out shot --train 61", "choose numbers up to 60"),
     ("lattice --lattice --train 141", "choose numbers up to 140"),
-    ("board --methods inverse-gp:matern", "inverse-gp has no kernel 'matern'"),
+    ("board --methods inverse-gp:matern", "inverse-gp has no variant 'matern' (did you mean 'matern-5/2'?)"),
     ("board --methods explicit:fisheye", "explicit has no"),
 ])  # fmt: skip
 def test_what_the_command_refuses(words: str, says: str, run: Callable[..., Ran]) -> None:
@@ -738,13 +738,13 @@ def test_all_methods_are_those_that_are_there(
 ) -> None:
     class Other(InverseGP):
         method = "other"
+        library = ("no_such_library", "other-extra")
 
-    monkeypatch.setitem(METHODS, "other", (Other, Other))
-    monkeypatch.setitem(NEEDED, "other", ("no_such_library", "other-extra"))
+    monkeypatch.setitem(METHODS._parts, "other", Method(Other, Other))
     names = _available_methods()
     assert "other" not in names
     assert 'left out other: pip install "implicam[other-extra]"' in capsys.readouterr().err
-    monkeypatch.delitem(NEEDED, "other")
+    Other.library = None
     names = _available_methods()
     assert {"forward-gp", "forward-gp:none", "inverse-gp", "other"} <= set(names)
     assert set(METHODS) - set(NEEDED) <= set(names)

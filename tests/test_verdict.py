@@ -11,7 +11,7 @@ import pytest
 
 import implicam as ic
 from implicam import calibration_file
-from implicam.calibrators.protocol import FitSummary, per_axis
+from implicam.calibrators.protocol import CalibrationBase, FitSummary, per_axis
 from implicam.cli import commands, main
 from implicam.dataset import Dataset, Floats
 from implicam.geometry import Pose, rotation_from_vector
@@ -183,10 +183,10 @@ def test_points_nearly_on_a_plane_are_doubtful() -> None:
     assert not finding.grave
 
 
-class _Pretends:
+class _Pretends(CalibrationBase):
     """A calibration that is off by `off` in each axis and believes in 0.02."""
 
-    method, unused, rejected = "pretends", (), ()
+    method, unused = "pretends", ()
 
     def __init__(self, data: Dataset, off: float) -> None:
         self.data, self.off = data, off

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri, fdtrc
 
-from implicam.calibrators import Calibration, InverseGP
-from implicam.calibrators.protocol import PredictsPixels
+from implicam.calibrators import Calibration, PredictsPixels
+from implicam.calibrators.protocol import CheckPlan
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
 from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
@@ -135,21 +135,6 @@ def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
 # --- held out ------------------------------------------------------------------------------------------------------
 
 
-class _Plan(NamedTuple):
-    """How many folds, how many of them are done, and the most points that a fit gets."""
-
-    folds: int
-    done: int
-    train: int
-
-
-def _plan(calibration: Calibration, n: int) -> _Plan:
-    """What is affordable: the slow methods get fewer points, or fewer folds."""
-    if calibration.method == InverseGP.method:
-        return _Plan(3, 1 if getattr(calibration, "calibrator", InverseGP()).preset == "paper" else 3, 120)
-    return _Plan(5, 5, 300) if n <= FEW_FOR_FOLDS else _Plan(3, 3, 300)
-
-
 def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | None, list[Finding]]:
     if calibration.summary().held_out_points is not None:
         return None, list(_of_kept_back(calibration))
@@ -157,30 +142,30 @@ def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | N
     n = len(data)
     if n < FEWEST_JUDGED:
         return None, []
-    plan = _plan(calibration, n)
+    plan = calibration.check_plan or (CheckPlan(5, 5, 300) if n <= FEW_FOR_FOLDS else CheckPlan(3, 3, 300))
     places = calibration.data.places
     fold = np.random.default_rng(0).permutation(np.arange(n) % plan.folds)[data.places]
     found: list[_Measured] = []
     failures: list[ImplicamError] = []
-    for i in range(plan.done):
-        progress("checking", i, plan.done)
+    for i in range(plan.fits):
+        progress("checking", i, plan.fits)
         if not (fold == i).any():  # all at a few places
             continue
         held = np.isin(calibration.data.points, data.points[fold == i])
         others = calibration.data.select(~np.isin(places, places[held]))
         try:
-            again = calibration.refit(_at_most(others, plan.train))
+            again = calibration.refit(_at_most(others, plan.max_points))
         except UsageError:  # made without known points: nothing can be held out
             return None, []
         except ImplicamError as error:
             failures.append(error)
             continue
         found.append(_measured(again, data.select(fold == i)))
-    progress("checking", plan.done, plan.done)
-    if not found or len(failures) > plan.done / 2 or (failures and n < ENOUGH_POINTS):
+    progress("checking", plan.fits, plan.fits)
+    if not found or len(failures) > plan.fits / 2 or (failures and n < ENOUGH_POINTS):
         return None, _not_repeatable(n, failures[0]) if failures else []
     how = f"{len(found)} fits from nothing without {'a fifth' if plan.folds == 5 else 'a third'} of the known points"
-    return _summary(found, how + (f", at most {plan.train} points each" if n > plan.train else "")), []
+    return _summary(found, how + (f", at most {plan.max_points} points each" if n > plan.max_points else "")), []
 
 
 def _not_repeatable(n: int, error: ImplicamError) -> list[Finding]:

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from implicam.calibrators import METHODS, Calibration
+from implicam.calibrators import METHODS, Calibration, HasPositionProcesses, PredictsPixels
 from implicam.calibrators.position_processes import PositionProcesses
-from implicam.calibrators.protocol import HasPositionProcesses, PredictsPixels
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
 from implicam.rig_model import Sensitivity

@@ -29,8 +29,7 @@ from implicam.active.design_model import (
 )
 from implicam.active.stopping import Never, Rule, Step
 from implicam.active.workspace import Workspace
-from implicam.calibrators import Calibration, Calibrator, ForwardGP, ForwardGPCalibration
-from implicam.calibrators.protocol import PredictsPixels, Updatable
+from implicam.calibrators import Calibration, Calibrator, ForwardGP, ForwardGPCalibration, PredictsPixels, Updatable
 from implicam.dataset import Dataset, Floats, join
 from implicam.errors import FitError, ImplicamError, UsageError
 from implicam.progress import Progress, silent

@@ -11,8 +11,7 @@ from implicam.active.design_model import cannot_design, design_model_of, designs
 from implicam.active.loop import Target, step_of, targets_of
 from implicam.active.stopping import Step
 from implicam.active.workspace import Workspace
-from implicam.calibrators import Calibration, ForwardGP
-from implicam.calibrators.protocol import PredictsPixels
+from implicam.calibrators import Calibration, ForwardGP, PredictsPixels
 from implicam.dataset import Floats
 from implicam.errors import UsageError
 

@@ -27,8 +27,11 @@ from implicam.calibrators.position_processes import PositionProcess, PositionPro
 from implicam.calibrators.protocol import (
     Arrays,
     CalibrationBase,
+    CalibratorBase,
+    CheckPlan,
     FitSummary,
     finite_column,
+    option,
     per_axis,
     why_not_all_seen,
 )
@@ -81,15 +84,17 @@ class Hyperparameters:
 
 
 @dataclass(frozen=True)
-class InverseGP:
+class InverseGP(CalibratorBase):
     """kernel: `squared-exponential` or `matern-5/2`; preset: `smooth`, `plain` or `paper`.
 
     shortest_lengthscale: bound of every lengthscale, in standard deviations of the pixels. Optics are smooth across
     the image, so by default it is the extent of the pixels themselves (docs/decisions/0004-lattices.md).
     """
 
-    kernel: str = "squared-exponential"
-    preset: str = "smooth"
+    kernel: str = field(default="squared-exponential", metadata=option(" or ".join(SHAPES)))
+    preset: str = field(
+        default="smooth", metadata=option('smooth; "plain", the paper\'s model; "paper", its own software')
+    )
     seed: int = 0
     shortest_lengthscale: float = EXTENT
 
@@ -107,6 +112,16 @@ class InverseGP:
             raise UsageError(f"shortest_lengthscale is {self.shortest_lengthscale!r}; it must be positive and finite.")
         if self.preset == "paper" and self.kernel != "squared-exponential":
             raise UsageError("the paper preset has the squared-exponential kernel only.", fix="leave out --kernel")
+
+    @classmethod
+    def variants(cls) -> dict[str, dict[str, Any]]:
+        """The presets and the kernels."""
+        return {preset: {"preset": preset} for preset in PRESETS} | {shape: {"kernel": shape} for shape in SHAPES}
+
+    @property
+    def library(self) -> tuple[str, str] | None:
+        """The paper's preset is trained with the paper's software."""
+        return ("gpytorch", "paper") if self.preset == "paper" else None
 
     def fit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
         """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
@@ -210,6 +225,11 @@ class InverseGPCalibration(CalibrationBase):
     def used(self) -> Dataset:
         """The data without the points and cameras that are there twice."""
         return without_copies(self.data, cameras_too=True)
+
+    @property
+    def check_plan(self) -> CheckPlan:
+        """A few fits to a hundred points: they take seconds."""
+        return CheckPlan(folds=3, fits=1 if self.calibrator.preset == "paper" else 3, max_points=120)
 
     @cached_property
     def processes(self) -> tuple[GaussianProcess, ...]:

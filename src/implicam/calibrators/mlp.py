@@ -30,7 +30,7 @@ from implicam.calibrators.inverse_gp import (
 )
 from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import Examples, train
-from implicam.calibrators.protocol import Arrays, CalibrationBase, FitSummary, finite_column, per_axis
+from implicam.calibrators.protocol import Arrays, CalibrationBase, CalibratorBase, FitSummary, finite_column, per_axis
 from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_copies
 from implicam.dataset.requirements import same_cameras
 from implicam.dataset.unused import Unused
@@ -50,7 +50,7 @@ SPLIT, SPREAD = 0, 3  # streams of random numbers of one seed; mlp_training.py h
 
 
 @dataclass(frozen=True)
-class MLP:
+class MLP(CalibratorBase):
     """The paper's network. dropout: probability that a hidden unit is switched off, 0 to 0.9.
 
     With dropout = 0 there is no spread, and the error bars are the rms errors of the points kept for early stopping.
@@ -68,6 +68,16 @@ class MLP:
                 why="it is the probability that a hidden unit is switched off",
                 fix="the paper has 0.2",
             )
+
+    @classmethod
+    def variants(cls) -> dict[str, dict[str, Any]]:
+        """Without dropout."""
+        return {"no-dropout": {"dropout": 0.0}}
+
+    @property
+    def library(self) -> tuple[str, str]:
+        """The network is trained with PyTorch."""
+        return "torch", "mlp"
 
     def fit(self, data: Dataset, progress: Progress = silent) -> MLPCalibration:
         """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""

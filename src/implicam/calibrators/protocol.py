@@ -1,8 +1,9 @@
 """What every method offers, so that everything above works with each of them.
 
 A *calibrator* is a method with its options, a frozen value; `fit` returns a *calibration*, the fitted map of the rig.
-To add a method: 1. write `calibrators/<method>.py` with the two classes; 2. add it to `METHODS` in
-`calibrators/__init__.py`; 3. run the tests: one contract test runs over every entry of METHODS.
+`Calibrator` and `Calibration` are what all of them offer, `CalibratorBase` and `CalibrationBase` what most do alike.
+The other protocols are what some can do besides; a command that needs one refuses the others by name. To add a method,
+follow "A calibrator" in CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -75,6 +76,20 @@ def per_axis(values: ArrayLike) -> dict[str, float]:
     return dict(zip("xyz", np.asarray(values, dtype=np.float64).tolist(), strict=True))
 
 
+class CheckPlan(NamedTuple):
+    """How `judge` fits a method again without a part of the known points: what is affordable.
+
+    Attributes:
+        folds: parts of the known points, each of which can be held out.
+        fits: how many of them are.
+        max_points: a fit gets no more.
+    """
+
+    folds: int
+    fits: int
+    max_points: int
+
+
 class Calibration(Protocol):
     """A fitted map of a rig, and the data it was fitted from."""
 
@@ -113,6 +128,10 @@ class Calibration(Protocol):
 
     def summary(self) -> FitSummary:
         """How well the calibration fits its own data."""
+
+    @property
+    def check_plan(self) -> CheckPlan | None:
+        """How `judge` fits it again; None for the usual way, of a method that is fast."""
 
 
 @runtime_checkable
@@ -184,17 +203,50 @@ class TakesPoints(Calibration, Protocol):
         """The same hyperparameters, with these known points."""
 
 
+def option(help: str, metavar: str = "NAME", *, is_dataset: bool = False) -> dict[str, Any]:  # noqa: A002
+    """The metadata of a calibrator's field that is an option of the command line.
+
+    Args:
+        help: what it may be, for `--help`.
+        metavar: what stands for its value there.
+        is_dataset: the command line takes a path, and the value is the dataset that is read from it.
+    """
+    return {"help": help, "metavar": metavar, "is_dataset": is_dataset}
+
+
 class Calibrator(Protocol):
-    """A method and its options, not fitted yet."""
+    """A method and its options, not fitted yet: a frozen dataclass, whose fields are the options."""
 
     method: ClassVar[str]
+
+    @classmethod
+    def variants(cls) -> Mapping[str, Mapping[str, Any]]:
+        """Name after the colon, as in `inverse-gp:plain` -> the options that it stands for."""
+
+    @property
+    def library(self) -> tuple[str, str] | None:
+        """The optional library that a fit needs, and the extra that brings it."""
 
     def fit(self, data: Dataset, progress: Progress = silent) -> Calibration:
         """Fit to known points; FitError says why it cannot be done."""
 
 
+class CalibratorBase:
+    """What most calibrators do alike; to be inherited, or written anew."""
+
+    @classmethod
+    def variants(cls) -> Mapping[str, Mapping[str, Any]]:
+        """None."""
+        return {}
+
+    @property
+    def library(self) -> tuple[str, str] | None:
+        """None: what is always installed is enough."""
+        return None
+
+
 class CalibrationBase:
-    """What all calibrations do alike; to be inherited, or written anew."""
+    """What most calibrations do alike; to be inherited, or written anew."""
 
     calibrator: Calibrator
     data: Dataset
@@ -203,6 +255,11 @@ class CalibrationBase:
     def rejected(self) -> tuple[Rejected, ...]:
         """None: the method uses every view of the points it uses."""
         return ()
+
+    @property
+    def check_plan(self) -> CheckPlan | None:
+        """The usual one."""
+        return None
 
     def refit(self, data: Dataset, progress: Progress = silent) -> Any:
         """The same method with the same options on other data."""

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from implicam.calibrators import METHODS, MLP, NEEDED, ForwardGP, InverseGP, calibrator_from_name
+from implicam.calibrators import METHODS, MLP, ForwardGP, InverseGP, calibrator_from_name, library_of
 from implicam.cli import show
 from implicam.cli.app import Cameras, Json, LeaveOut, Unit, Without, check_figure, command, must_be_shot, read
 from implicam.cli.compare_table import compare_failures, compare_table
@@ -76,10 +76,14 @@ SHOWN_VARIANTS = {ForwardGP.method: ("none",), InverseGP.method: ("paper",), MLP
 def _available_methods() -> list[str]:
     """All methods and the variants worth showing, as far as their libraries are installed."""
     names = [name for method in METHODS for name in (method, *_variants(method))]
-    absent = [name for name in names if name in NEEDED and find_spec(NEEDED[name][0]) is None]
-    for name in absent:
-        show.note(f'left out {name}: pip install "implicam[{NEEDED[name][1]}]" to add it')
-    return [name for name in names if name not in absent]
+    available = []
+    for name in names:
+        library = library_of(name)
+        if library is None or find_spec(library[0]) is not None:
+            available.append(name)
+        else:
+            show.note(f'left out {name}: pip install "implicam[{library[1]}]" to add it')
+    return available
 
 
 def _variants(method: str) -> list[str]:

@@ -7,8 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from implicam.calibrators import load_calibration
-from implicam.calibrators.protocol import PredictsPixels
+from implicam.calibrators import PredictsPixels, load_calibration
 from implicam.cli import show
 from implicam.dataset import Dataset
 from implicam.dataset.folder import DESCRIPTION, POINTS, read_description

@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from implicam.calibrators import ForwardGP
-from implicam.calibrators.protocol import PredictsPixels
+from implicam.calibrators import ForwardGP, PredictsPixels
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.detect.edge import Ellipse, through
 from implicam.errors import FitError, UsageError

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators import Calibration, calibrator_from_name
-from implicam.calibrators.protocol import TakesPoints
+from implicam.calibrators import Calibration, TakesPoints, calibrator_from_name
 from implicam.compare import fit_each
 from implicam.dataset import Dataset, Floats
 from implicam.errors import ImplicamError

@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 
 from implicam.active import Loop, PredictedCovariance, Step, Target
-from implicam.calibrators import Calibration
-from implicam.calibrators.protocol import PredictsPixels
+from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.detect import Detected, Detector, View, centred
 from implicam.errors import HardwareError, ImplicamError, UsageError

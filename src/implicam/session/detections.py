@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from implicam.calibrators import Calibration
-from implicam.calibrators.protocol import PredictsPixels
+from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Floats
 from implicam.detect import Detected
 from implicam.hardware import Frame

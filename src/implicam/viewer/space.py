@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.active import Workspace
-from implicam.calibrators import Calibration
-from implicam.calibrators.protocol import PredictsPixels
+from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Floats
 
 Colours = NDArray[np.uint8]

@@ -8,7 +8,7 @@ from the normal equations and go into every position that is measured.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -22,7 +22,15 @@ from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_b
 from implicam.calibrators.explicit.from_boards import fit_to_boards
 from implicam.calibrators.explicit.lenses import AUTO, FAMILIES
 from implicam.calibrators.explicit.network import Groups, calibrate_groups
-from implicam.calibrators.protocol import Arrays, FitSummary, RigCalibration, per_axis, solvable
+from implicam.calibrators.protocol import (
+    Arrays,
+    CalibratorBase,
+    FitSummary,
+    RigCalibration,
+    option,
+    per_axis,
+    solvable,
+)
 from implicam.dataset import Dataset
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import UsageError, did_you_mean
@@ -34,19 +42,21 @@ from implicam.threads import blas_threads
 
 
 @dataclass(frozen=True)
-class Explicit:
+class Explicit(CalibratorBase):
     """The classical method. lens: `auto`, the model that predicts held-out views best, or `brown-conrady`, or
     `kannala-brandt`, for all cameras.
 
     boards: pictures of a board, the corners found in them; without, the known points are what it is fitted to. align:
     how a calibration from boards is brought into the world: `points`, by the names of the known points, or `icp`, by
-    the closest ones as in the paper. seed is there because every method has one; nothing is left to chance.
+    the closest ones as in the paper. seed changes nothing: no part of this method is left to chance.
     """
 
-    lens: str = AUTO
-    align: str = MATCHING[0]
+    lens: str = field(default=AUTO, metadata=option(f"auto, {', '.join(FAMILIES)}"))
+    align: str = field(default=MATCHING[0], metadata=option("known points match boards by name (points), or icp"))
     seed: int = 0
-    boards: Dataset | None = None
+    boards: Dataset | None = field(
+        default=None, metadata=option("learn the cameras from these pictures of a board", "DATASET", is_dataset=True)
+    )
 
     method: ClassVar[str] = "explicit"
 
@@ -57,6 +67,11 @@ class Explicit:
                     f"explicit has no {what} {value!r}{did_you_mean(value, known)}.",
                     fix=f"choose one of {', '.join(known)}",
                 )
+
+    @classmethod
+    def variants(cls) -> dict[str, dict[str, Any]]:
+        """The lenses."""
+        return {lens: {"lens": lens} for lens in (AUTO, *FAMILIES)}
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
         """Fit to the known points; or to the boards, and then to the known points.

@@ -7,7 +7,7 @@ parameters integrated out. The mathematics, with the numbered equations the code
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -18,7 +18,16 @@ from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
-from implicam.calibrators.protocol import Arrays, FitSummary, RigCalibration, finite_column, per_axis, solvable
+from implicam.calibrators.protocol import (
+    Arrays,
+    CalibratorBase,
+    FitSummary,
+    RigCalibration,
+    finite_column,
+    option,
+    per_axis,
+    solvable,
+)
 from implicam.dataset import Dataset, without_copies
 from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
 from implicam.errors import UsageError, did_you_mean
@@ -40,14 +49,14 @@ LENS_OPTIONS = (AUTO, "central", "none")
 
 
 @dataclass(frozen=True)
-class ForwardGP:
+class ForwardGP(CalibratorBase):
     """Our method. lens: `auto`, the camera model that the data choose for each camera; `central`, an ordinary camera
     with one model for all lenses; or `none`, a linear projection and the GP for the rest.
 
-    seed is there because every method has one; nothing in this method is left to chance.
+    seed changes nothing: no part of this method is left to chance.
     """
 
-    lens: str = AUTO
+    lens: str = field(default=AUTO, metadata=option("auto, central or none"))
     seed: int = 0
 
     method: ClassVar[str] = "forward-gp"
@@ -58,6 +67,11 @@ class ForwardGP:
                 f"forward-gp has no lens {self.lens!r}{did_you_mean(self.lens, LENS_OPTIONS)}.",
                 fix=f"choose one of {', '.join(LENS_OPTIONS)}",
             )
+
+    @classmethod
+    def variants(cls) -> dict[str, dict[str, Any]]:
+        """The lenses."""
+        return {lens: {"lens": lens} for lens in LENS_OPTIONS}
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """Fit to all known points that any camera saw."""

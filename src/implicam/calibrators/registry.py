@@ -1,0 +1,144 @@
+"""The methods by name: from a name, with a variant and options, to a calibrator; from a file to a calibration.
+
+CONTRIBUTING.md has the recipe for one more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import Field, fields
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from implicam import calibration_file
+from implicam.calibrators.explicit import Explicit, ExplicitCalibration
+from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
+from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
+from implicam.calibrators.mlp import MLP, MLPCalibration
+from implicam.calibrators.protocol import Calibration, Calibrator
+from implicam.errors import CalibrationFileError, UsageError, did_you_mean, import_extra
+from implicam.registry import Registry
+
+
+class Method(NamedTuple):
+    """A calibrator, and the calibration that it returns, which restores itself from a file."""
+
+    calibrator: type[Any]
+    calibration: type[Any]
+
+
+CALIBRATORS = Registry(
+    "method",
+    {
+        ForwardGP.method: Method(ForwardGP, ForwardGPCalibration),
+        InverseGP.method: Method(InverseGP, InverseGPCalibration),
+        MLP.method: Method(MLP, MLPCalibration),
+        Explicit.method: Method(Explicit, ExplicitCalibration),
+    },
+    "implicam.calibrators",
+)
+"""Method name -> (calibrator, calibration)."""
+
+METHODS = CALIBRATORS
+
+DEFAULT_METHOD = ForwardGP.method
+
+
+def calibrator(name: str, **options: Any) -> Calibrator:
+    """The calibrator of a method.
+
+    Args:
+        name: `method`, or `method:variant`, where the variant stands for options: `inverse-gp:plain`,
+            `forward-gp:none`, `explicit:kannala-brandt`, `mlp:no-dropout`.
+        **options: fields of the calibrator, which win over those of the variant; those that are None are left at
+            their default, and so is `seed` for a method that leaves nothing to chance.
+
+    Raises:
+        UsageError: the method, the variant or an option is not known.
+    """
+    (made, _), variant = CALIBRATORS.find(name)
+    known = [field.name for field in fields(made)]
+    given = {key: value for key, value in options.items() if value is not None and (key in known or key != "seed")}
+    for key in given:
+        if key not in known:
+            raise UsageError(
+                f"{made.method} has no option {key!r}{did_you_mean(key, known)}.",
+                fix=f"leave it out; {made.method} has {', '.join(known) or 'none'}",
+            )
+    if not variant:
+        return made(**given)  # type: ignore[no-any-return]
+    variants = made.variants()
+    if variant not in variants:
+        raise UsageError(
+            f"{made.method} has no variant {variant!r}{did_you_mean(variant, variants)}.",
+            fix=f"use one of {', '.join(variants)}" if variants else f"write {made.method}, without a colon",
+        )
+    return made(**{**variants[variant], **given})  # type: ignore[no-any-return]
+
+
+def calibrator_from_name(name: str) -> Calibrator:
+    """The calibrator of `method` or `method:variant`, as tables and sweeps name them, everything else at its default.
+
+    Raises:
+        UsageError: the method or the variant is not known.
+        MissingExtraError: the library that it needs to be fitted is not installed.
+    """
+    made = calibrator(name)
+    if made.library is not None:
+        import_extra(*made.library, name)  # now, so that no fit is charged for it
+    return made
+
+
+def library_of(name: str) -> tuple[str, str] | None:
+    """The library that a method or variant needs to be fitted, and the extra that brings it."""
+    return calibrator(name).library
+
+
+NEEDED = {name: library for name in ("inverse-gp:paper", "mlp", "mlp:no-dropout") if (library := library_of(name))}
+"""`library_of` the methods and variants here that need one."""
+
+
+def options_of(method: str) -> dict[str, Field[Any]]:
+    """The options that a method has on the command line: its calibrator's fields with an `option`, by name."""
+    return {field.name: field for field in fields(CALIBRATORS[method].calibrator) if "help" in field.metadata}
+
+
+def every_option() -> dict[str, dict[str, Field[Any]]]:
+    """Option -> method -> field, over all methods."""
+    found: dict[str, dict[str, Field[Any]]] = {}
+    for method in CALIBRATORS:
+        for name, field in options_of(method).items():
+            found.setdefault(name, {})[method] = field
+    return found
+
+
+def method_for(**options: Any) -> str:
+    """The method that is meant where only options are given: the first that takes them all, the default one before.
+
+    Where none takes them, the first that has options of these names, whose error says the most.
+    """
+    given = {key: value for key, value in options.items() if value is not None}
+    methods = dict.fromkeys([DEFAULT_METHOD, *CALIBRATORS])
+    able = [method for method in methods if set(given) <= set(options_of(method))]
+    for method in able:
+        try:
+            calibrator(method, **given)
+        except UsageError:
+            continue
+        return method
+    return able[0] if able else DEFAULT_METHOD
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Read a `.implicam` file; CalibrationFileError says what is wrong with one that cannot be used."""
+    contents = calibration_file.read(path)
+    if contents.method not in CALIBRATORS:
+        raise CalibrationFileError(
+            f"{path} was made by the method {contents.method!r}, which this version does not have.",
+            why=f"the methods here are {', '.join(CALIBRATORS)}",
+            fix="pip install --upgrade implicam",
+        )
+    with calibration_file.refusing(contents.path):
+        restored: Calibration = CALIBRATORS[contents.method].calibration.from_state(
+            contents.data, contents.options, contents.arrays
+        )
+    return restored
