@@ -1,7 +1,4 @@
-"""Where to measure next: a score for every candidate, the largest wins.
-
-To add one: write a frozen class with `scores`, add it to ACQUISITIONS, run the tests: one contract runs over all.
-"""
+"""Where to measure next: a score for every candidate, the largest wins. CONTRIBUTING.md has the recipe for one more."""
 
 from __future__ import annotations
 
@@ -13,20 +10,28 @@ import numpy as np
 
 from implicam.active.design_model import DesignModel
 from implicam.dataset import Floats
-from implicam.errors import UsageError, did_you_mean
+from implicam.errors import UsageError
+from implicam.registry import Registry
 
 
 class Acquisition(Protocol):
-    """A rule, without any state: the same design and random numbers give the same scores."""
+    """A rule, without any state: the same design and random numbers give the same scores.
+
+    Attributes:
+        name: on the command line and in files.
+        same_candidates: whether the loop offers it the same candidates in the same order each time, without as many
+            as there are known points, and not new ones.
+    """
 
     name: ClassVar[str]
+    same_candidates: ClassVar[bool] = False
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """(m,) how much is to be expected of a known point at each candidate, never negative; NaN for nothing."""
 
 
 @dataclass(frozen=True)
-class Random:
+class Random(Acquisition):
     """Anywhere, all candidates alike."""
 
     name: ClassVar[str] = "random"
@@ -37,10 +42,11 @@ class Random:
 
 
 @dataclass(frozen=True)
-class Sobol:
+class Sobol(Acquisition):
     """Evenly spread, whatever the cameras: the candidates in their own order, which is that of a Sobol sequence."""
 
     name: ClassVar[str] = "sobol"
+    same_candidates: ClassVar[bool] = True
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
         """The first one first."""
@@ -48,7 +54,7 @@ class Sobol:
 
 
 @dataclass(frozen=True)
-class MaximumVariance:
+class MaximumVariance(Acquisition):
     """The paper's rule, uncertainty sampling: the largest standard deviation, averaged over x, y and z."""
 
     name: ClassVar[str] = "variance"
@@ -60,7 +66,7 @@ class MaximumVariance:
 
 
 @dataclass(frozen=True)
-class RelativeExcess:
+class RelativeExcess(Acquisition):
     """What more points can still remove: total variance over the variance that pixel noise alone would leave."""
 
     name: ClassVar[str] = "excess"
@@ -71,7 +77,7 @@ class RelativeExcess:
 
 
 @dataclass(frozen=True)
-class IntegratedVariance:
+class IntegratedVariance(Acquisition):
     """By how much a point would reduce the variance of the whole workspace (Cohn, Ghahramani & Jordan 1996).
 
     relative: in units of what pixel noise alone would leave, or else in length units, where the far end, with its large
@@ -95,7 +101,7 @@ class IntegratedVariance:
 
 
 @dataclass(frozen=True)
-class DOptimal:
+class DOptimal(Acquisition):
     """The view that tells most of the unknowns, wherever it matters: the largest information, in nats."""
 
     name: ClassVar[str] = "d-optimal"
@@ -105,10 +111,14 @@ class DOptimal:
         return design.information()
 
 
-ACQUISITIONS: dict[str, Acquisition] = {
-    rule.name: rule
-    for rule in (Random(), Sobol(), MaximumVariance(), RelativeExcess(), IntegratedVariance(), DOptimal())
-}
+ACQUISITIONS: Registry[Acquisition] = Registry(
+    "acquisition",
+    {
+        rule.name: rule
+        for rule in (Random(), Sobol(), MaximumVariance(), RelativeExcess(), IntegratedVariance(), DOptimal())
+    },
+    "implicam.acquisitions",
+)
 """Name -> rule."""
 
 DEFAULT = IntegratedVariance.name
@@ -116,12 +126,10 @@ DEFAULT = IntegratedVariance.name
 
 def acquisition(name: str) -> Acquisition:
     """The rule with this name; UsageError for another."""
-    if name not in ACQUISITIONS:
-        raise UsageError(
-            f"there is no acquisition {name!r}{did_you_mean(name, ACQUISITIONS)}.",
-            fix=f"use one of {', '.join(ACQUISITIONS)}",
-        )
-    return ACQUISITIONS[name]
+    rule, variant = ACQUISITIONS.find(name)
+    if variant:
+        raise UsageError(f"the acquisition {rule.name} has no variants.", fix=f"write {rule.name}")
+    return rule
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from implicam.calibrators import METHODS, Calibration, HasPositionProcesses, PredictsPixels
+from implicam.calibrators import CALIBRATORS, Calibration, HasPositionProcesses, PredictsPixels
 from implicam.calibrators.position_processes import PositionProcesses
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.errors import UsageError
@@ -356,7 +356,7 @@ def designs_experiments(calibration: Calibration | type) -> bool:
 
 def cannot_design(method: str) -> UsageError:
     """The error for a method that does not say it."""
-    able = [name for name, (_, calibration) in METHODS.items() if designs_experiments(calibration)]
+    able = [name for name, (_, calibration) in CALIBRATORS.items() if designs_experiments(calibration)]
     return UsageError(
         f"{method} cannot say where to measure next.",
         why="its error bars do not say what one more known point would change",

@@ -253,7 +253,7 @@ class Loop:
         else:
             # Others each time, or what is between the candidates would never be measured.
             candidates = self.workspace.candidates(self.candidates, 1000 * self.seed + self._asked)
-            if self.acquisition.name == "sobol":
+            if self.acquisition.same_candidates:
                 candidates = self.workspace.candidates(self.candidates, self.seed)[self.points :]
             candidates = self._not_refused(candidates)
         return design_model_of(self.calibration, candidates, self._judged(), self._forward())

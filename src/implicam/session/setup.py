@@ -13,7 +13,8 @@ import numpy as np
 
 from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition, workspace_from
 from implicam.active.acquisitions import DEFAULT
-from implicam.calibrators import DEFAULT_METHOD, METHODS, calibrator_from_name
+from implicam.active.design_model import cannot_design, designs_experiments
+from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES
 from implicam.detect import Ball
@@ -31,9 +32,6 @@ SIMULATED_SPEED = 0.4
 
 PATIENCE = 60.0
 """Seconds for the next picture of a camera that has none to spare: somebody, or another program, has to take it."""
-
-CANNOT = "mlp"
-"""The method that cannot say where to measure next."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +76,9 @@ class Setup:
                 f"there is no length unit {self.unit!r}{did_you_mean(self.unit, METRES)}.",
                 fix=f"use {', '.join(METRES)}",
             )
-        if self.method.partition(":")[0] == CANNOT:
-            raise UsageError(
-                f"{CANNOT} cannot say where to measure next.",
-                fix=f"use one of {', '.join(name for name in METHODS if name != CANNOT)}",
-            )
+        method, _ = CALIBRATORS.find(self.method)
+        if not designs_experiments(method.calibration):
+            raise cannot_design(method.calibration.method)
         acquisition(self.acquisition)
         _ = self.rule
         for what in ("reach", "speed", "sd", "radius"):
