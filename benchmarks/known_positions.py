@@ -18,11 +18,12 @@ import numpy as np
 
 from implicam.calibrators import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.forward_gp.fit import fit_rig
+from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, Training
 from implicam.dataset import KnownPositions, read_dataset
 from implicam.errors import FitError
 from implicam.evaluation import evaluate
 from implicam.progress import silent
-from implicam.rig_model.training_data import Frame, training_data_of
+from implicam.rig_model.training_data import Frame
 from implicam.simulate import build_rig, moving_board, random_positions, simulate
 
 REAL = {
@@ -45,7 +46,8 @@ RIGS = {
 def exact(lens, data):
     """As `ForwardGP.fit`, the known positions taken as they are."""
     frame = Frame.of(data, "forward-gp")
-    return ForwardGPCalibration(ForwardGP(lens), data, frame, fit_rig(training_data_of(lens, data, frame), silent))
+    training = Training.of(lens, data, frame, DEFAULT_SETTINGS)
+    return ForwardGPCalibration(ForwardGP(lens), data, frame, fit_rig(training, silent))
 
 
 def after(lens, data):

@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 
 from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.settings import DEFAULT_SETTINGS
 from implicam.rig_model.triangulate import _Seen
-from implicam.rig_model.wrong_views import AGREE_P_VALUE, CLEARLY_BETTER_RATIO, DISAGREE_P_VALUE
 
 
 def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most: int = 2) -> tuple[np.ndarray, ...]:
@@ -18,7 +18,7 @@ def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most:
     xyz, _, p = points.solved(np.arange(len(uv)), seen)
     left_out = np.zeros_like(seen)
     for count in range(1, most + 1):
-        rows = np.flatnonzero((seen.sum(axis=1) >= 2 * count + 1) & ~(p >= DISAGREE_P_VALUE))
+        rows = np.flatnonzero((seen.sum(axis=1) >= 2 * count + 1) & ~(p >= DEFAULT_SETTINGS.disagree_p_value))
         groups = list(combinations(range(seen.shape[1]), count))
         if not len(rows):
             continue
@@ -32,7 +32,8 @@ def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most:
             tried.append(x)
         best, ordered = np.argmax(ps, axis=1), np.sort(ps, axis=1)
         for i in np.flatnonzero(
-            (ordered[:, -1] > AGREE_P_VALUE) & (ordered[:, -1] > CLEARLY_BETTER_RATIO * ordered[:, -2])
+            (ordered[:, -1] > DEFAULT_SETTINGS.agree_p_value)
+            & (ordered[:, -1] > DEFAULT_SETTINGS.clearly_better_ratio * ordered[:, -2])
         ):
             xyz[rows[i]], p[rows[i]] = tried[best[i]][i], ps[i, best[i]]
             left_out[rows[i], groups[best[i]]] = True

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from implicam.calibrators import ForwardGP, load_calibration
-from implicam.calibrators.forward_gp.families import FAMILIES, family_prior
+from implicam.calibrators.forward_gp.families import family_prior
+from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, KINDS
 from implicam.dataset import Dataset, Observations, read_dataset
 from implicam.evaluation import cross_validate, evaluate
 from implicam.geometry import camera_from_linear, resect_affine, resect_robustly, rotation_from_vector
@@ -156,13 +157,13 @@ def test_a_camera_that_saw_nonsense_does_not_take_the_rig_down() -> None:
     assert evaluate(calibration, new, regions=False).coverage.overall.nees.value < 5
 
 
-@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("family", KINDS)
 def test_every_kind_has_a_proper_prior_on_all_but_focal_length_and_pose(family: str) -> None:
     known, _ = odd_rig(Unusual())
     calibration = ForwardGP().fit(known)
     model = calibration.posterior.models[0]
     assert isinstance(model.camera, GeneralCamera)
-    prior = family_prior(model.camera, family, model.image, 0.5)
+    prior = family_prior(model.camera, family, model.image, 0.5, DEFAULT_SETTINGS)
     flat = [0, 12, 13, 14, 15, 16]
     assert not prior.precision[flat].any()
     assert (

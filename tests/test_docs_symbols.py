@@ -26,6 +26,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "implicam"
 METHOD = ROOT / "docs" / "method.md"
@@ -225,7 +227,7 @@ class Looked(NamedTuple):
 
 @pytest.mark.parametrize("constant", constants(), ids=lambda constant: constant.expression)
 def test_constants_have_the_values_of_the_method(constant: Constant) -> None:
-    names: dict[str, Any] = {"exp": np.exp, "inf": np.inf}
+    names: dict[str, Any] = {"exp": np.exp, "inf": np.inf, "settings": DEFAULT_SETTINGS}
     names |= {name: Looked(name) for name in re.findall(r"\b([a-z]\w*)\.[A-Z]", constant.expression)}
     in_code = np.asarray(eval(constant.expression, names), dtype=float)
     in_text = np.asarray(eval(constant.value, names), dtype=float)

@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal
 
 from forward_gp_cases import LENGTHSCALE, numeric, se
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
+from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS
 from implicam.rig_model.camera import Prior
 
 
@@ -71,11 +72,11 @@ def test_sizes_and_lengthscales_are_found_again() -> None:
     true = (0.4, 0.2)
     cameras = [camera_evidence(150, seed=10 + c, sizes=true) for c in range(3)]
     half, stated = np.full(3, 640.0), np.full(3, np.nan)
-    found = RigEvidence(cameras, half, stated, "central", 1e-6).maximise()
+    found = RigEvidence(cameras, half, stated, True, 1e-6, DEFAULT_SETTINGS).maximise()
     np.testing.assert_allclose(found.noise, true[1], rtol=0.15)
     np.testing.assert_allclose(found.signal, true[0], rtol=0.4)
     np.testing.assert_allclose(found.lengthscale, np.tile(LENGTHSCALE, (3, 1)), rtol=0.35)
-    again = RigEvidence(cameras, half, stated, "central", 1e-6).maximise(found)
+    again = RigEvidence(cameras, half, stated, True, 1e-6, DEFAULT_SETTINGS).maximise(found)
     np.testing.assert_allclose(again.noise, found.noise, rtol=0.03)
     np.testing.assert_allclose(again.lengthscale, found.lengthscale, rtol=0.2)
 
@@ -83,5 +84,5 @@ def test_sizes_and_lengthscales_are_found_again() -> None:
 def test_with_little_data_the_stated_noise_decides() -> None:
     few = [camera_evidence(9, seed=30 + c, sizes=(0.3, 0.2)) for c in range(2)]
     for stated in (0.1, 0.4):
-        found = RigEvidence(few, np.full(2, 640.0), np.full(2, stated), "central", 1e-6).maximise()
+        found = RigEvidence(few, np.full(2, 640.0), np.full(2, stated), True, 1e-6, DEFAULT_SETTINGS).maximise()
         assert np.abs(np.log(found.noise / stated)).max() < 0.5

@@ -27,6 +27,7 @@ from implicam.rig_model.heavy_tails import (
     refine_positions,
     student_t_weights,
 )
+from implicam.rig_model.settings import DEFAULT_SETTINGS
 from implicam.rig_model.wrong_views import LinearisedViews
 from implicam.simulate import build_rig, random_positions, simulate
 
@@ -111,7 +112,7 @@ def linear_views(n: int, C: int, degrees: float, seed: int) -> LinearisedViews:
 @pytest.mark.parametrize("C", [2, 3, 6])
 def test_error_bars_are_those_of_the_t(C: int) -> None:
     views = linear_views(3000, C, 3.0, C)
-    found = refine_positions(views, 3.0)
+    found = refine_positions(views, 3.0, DEFAULT_SETTINGS)
     ok = np.isfinite(found.step).all(axis=1)
     assert ok.mean() > 0.99
     distance = np.einsum("ni,nij,nj->n", found.step[ok], np.linalg.inv(found.cov[ok]), found.step[ok])
@@ -121,7 +122,7 @@ def test_error_bars_are_those_of_the_t(C: int) -> None:
     assert np.mean(p < 1e-4) < 0.004
     if C > 2:
         assert kstest(p, "uniform").statistic < 0.12
-        normal = refine_positions(views, 1e6)
+        normal = refine_positions(views, 1e6, DEFAULT_SETTINGS)
         assert np.mean(np.sum(found.step[ok] ** 2, axis=1)) < 0.9 * np.mean(np.sum(normal.step[ok] ** 2, axis=1))
 
 
@@ -133,15 +134,15 @@ def test_two_places_are_none() -> None:
     left = np.linalg.svd(D[0].reshape(6, 3))[0][:, 3:]  # what no position explains
     r[0] = (left @ [60.0, 0.0, 0.0]).reshape(3, 2)
     each = np.broadcast_to(np.eye(2), (1, 3, 2, 2)).copy()
-    found = refine_positions(LinearisedViews(r, D, each, None), 3.0)
+    found = refine_positions(LinearisedViews(r, D, each, None), 3.0, DEFAULT_SETTINGS)
     assert np.isnan(found.step).all()
-    assert np.isfinite(refine_positions(LinearisedViews(0 * r, D, each, None), 3.0).step).all()
+    assert np.isfinite(refine_positions(LinearisedViews(0 * r, D, each, None), 3.0, DEFAULT_SETTINGS).step).all()
 
 
 def test_the_posterior_of_a_position_is_integrated_rightly() -> None:
     """Against a fine grid, for three views of a point."""
     views = linear_views(4, 3, 3.0, 8)
-    found = refine_positions(views, 3.0)
+    found = refine_positions(views, 3.0, DEFAULT_SETTINGS)
     for i in range(4):
         half = 12 * np.sqrt(np.diagonal(found.cov[i]))
         axes = [np.linspace(m - h, m + h, 81) for m, h in zip(found.step[i], half, strict=True)]
@@ -164,7 +165,7 @@ def test_the_posterior_of_a_position_is_integrated_rightly() -> None:
 
 def test_nearly_normal_noise_is_measured_as_normal_noise() -> None:
     views = linear_views(20, 4, np.inf, 3)
-    found = refine_positions(views, 1e6)
+    found = refine_positions(views, 1e6, DEFAULT_SETTINGS)
     D, r = views.D.reshape(20, 8, 3), views.r.reshape(20, 8)
     cov = np.linalg.inv(D.swapaxes(1, 2) @ D)
     step = np.einsum("nij,nj->ni", cov, np.einsum("nki,nk->ni", D, r))
@@ -184,12 +185,12 @@ def test_two_views_are_taken_as_they_are() -> None:
 def test_degrees_are_found_from_agreement_alone() -> None:
     for degrees, low, high in ((3.0, 2.2, 5.0), (6.0, 3.5, 20.0)):
         views = linear_views(150, 5, degrees, 4)
-        found = degrees_of_agreement(views.D, views.r, np.ones((150, 5), dtype=bool))
+        found = degrees_of_agreement(views.D, views.r, np.ones((150, 5), dtype=bool), DEFAULT_SETTINGS)
         assert found is not None
         assert low <= found <= high
     for seed in range(3):
         views = linear_views(150, 5, np.inf, seed)
-        assert degrees_of_agreement(views.D, views.r, np.ones((150, 5), dtype=bool)) is None
+        assert degrees_of_agreement(views.D, views.r, np.ones((150, 5), dtype=bool), DEFAULT_SETTINGS) is None
 
 
 def test_wrong_detections_anywhere_are_no_tails() -> None:
@@ -197,10 +198,10 @@ def test_wrong_detections_anywhere_are_no_tails() -> None:
     q = draw.chisquare(2, 1000)
     q[:150] = draw.uniform(0, 1000, (150, 2)).max(axis=1) ** 2 / 0.04
     background = np.full(1000, 2 * np.pi * 0.04 / 1280**2)
-    assert not looks_heavy(q, background)
+    assert not looks_heavy(q, background, DEFAULT_SETTINGS)
     heavy_ones = 2 * draw.f(2, 3, 1000)
-    assert looks_heavy(heavy_ones, background)
-    assert not looks_heavy(heavy_ones[:20], background[:20])
+    assert looks_heavy(heavy_ones, background, DEFAULT_SETTINGS)
+    assert not looks_heavy(heavy_ones[:20], background[:20], DEFAULT_SETTINGS)
 
 
 # the whole method

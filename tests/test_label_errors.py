@@ -15,7 +15,7 @@ from implicam.dataset import Dataset, KnownPositions
 from implicam.evaluation import cross_validate, evaluate
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.leave_one_out import left_out_points
-from implicam.rig_model.level_errors import LEVEL_SD, SHOT_SD, levels, untold
+from implicam.rig_model.level_errors import levels, untold
 from implicam.rig_model.position_errors import (
     Agreement,
     PositionErrors,
@@ -27,10 +27,14 @@ from implicam.rig_model.position_errors import (
     _symmetric,
     estimate_position_errors,
 )
+from implicam.rig_model.settings import DEFAULT_SETTINGS
 from implicam.rig_model.shot_errors import Shots
 from implicam.rig_model.tied import Scatter, condition_scattered
 from implicam.rig_model.training_data import camera_views_of, stated_noise
 from implicam.simulate import Rig, Target, build_rig, moving_board, random_positions, simulate
+
+SHOT_SD = DEFAULT_SETTINGS.shot_sd_prior_median_wf * float(np.exp(DEFAULT_SETTINGS.shot_sd_prior_log_sd))
+LEVEL_SD = DEFAULT_SETTINGS.level_sd_ratio * SHOT_SD
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -105,7 +109,7 @@ def test_the_estimate_turns_with_the_world() -> None:
     agreement, _ = views(40, np.diag([1e-3, 1e-3, 4e-3]) ** 2, 0.7)
     turn = rotation(3)
     turned = agreement._replace(information=turn @ agreement.information @ turn.T, pull=agreement.pull @ turn.T)
-    a, b = estimate_position_errors(agreement), estimate_position_errors(turned)
+    a, b = estimate_position_errors(agreement, DEFAULT_SETTINGS), estimate_position_errors(turned, DEFAULT_SETTINGS)
     assert a is not None
     assert b is not None
     np.testing.assert_allclose(turn.T @ b.scale @ turn, a.scale, atol=0.03 * np.trace(a.scale))
@@ -116,7 +120,7 @@ def test_the_estimate_turns_with_the_world() -> None:
 def test_a_known_covariance_is_found_again() -> None:
     scale = covariance(5, 2e-3)
     agreement, _ = views(300, scale, 0.6)
-    found = estimate_position_errors(agreement)
+    found = estimate_position_errors(agreement, DEFAULT_SETTINGS)
     assert found is not None
     assert np.isinf(found.freedom)
     assert found.noise == pytest.approx(0.6, rel=0.05)
@@ -129,15 +133,17 @@ def test_positions_that_are_exact_are_left_so() -> None:
     gains = []
     for seed in range(20):
         agreement, _ = views(40, np.zeros((3, 3)), 1.0, seed=seed)
-        assert estimate_position_errors(agreement) is None
+        assert estimate_position_errors(agreement, DEFAULT_SETTINGS) is None
         gains.append(_evidence(agreement, _most_probable(agreement, np.inf, None)))
     assert np.mean(gains) < 0
-    assert estimate_position_errors(agreement.select(np.arange(3))) is None
+    assert estimate_position_errors(agreement.select(np.arange(3)), DEFAULT_SETTINGS) is None
 
 
 def test_a_few_points_far_off_are_a_tail() -> None:
     scale = np.eye(3) * 1e-6
-    normal, heavy = (estimate_position_errors(views(300, scale, 0.6, freedom=f, seed=1)[0]) for f in (np.inf, 3.0))
+    normal, heavy = (
+        estimate_position_errors(views(300, scale, 0.6, freedom=f, seed=1)[0], DEFAULT_SETTINGS) for f in (np.inf, 3.0)
+    )
     assert normal is not None
     assert heavy is not None
     assert np.isinf(normal.freedom)
@@ -178,11 +184,11 @@ STEPS = {
 @pytest.mark.parametrize("name", STEPS)
 def test_a_stepped_target_has_levels(name: str) -> None:
     z = STEPS[name]
-    found = levels(stepped(z))
+    found = levels(stepped(z), DEFAULT_SETTINGS)
     assert found is not None
     np.testing.assert_allclose(np.abs(found.normal), [0, 0, 1], atol=1e-9)
     assert len(np.unique(found.number)) == len(np.unique(z))
-    planes = untold(stepped(z) / 20, np.full(len(z) * 10, "target"))
+    planes = untold(stepped(z) / 20, np.full(len(z) * 10, "target"), DEFAULT_SETTINGS)
     assert planes is not None
     assert planes.sd[0] == pytest.approx(LEVEL_SD)
     assert planes.shots.pattern.shape[1] == max(len(np.unique(z)) - 3, 0)
@@ -191,7 +197,7 @@ def test_a_stepped_target_has_levels(name: str) -> None:
 
 def test_a_stepped_target_may_be_turned() -> None:
     turn = rotation(1)
-    found = levels(stepped(STEPS["pyramid"]) @ turn.T + 100)
+    found = levels(stepped(STEPS["pyramid"]) @ turn.T + 100, DEFAULT_SETTINGS)
     assert found is not None
     assert abs(found.normal @ turn[:, 2]) == pytest.approx(1)
     assert len(np.unique(found.number)) == 3
@@ -199,15 +205,15 @@ def test_a_stepped_target_may_be_turned() -> None:
 
 def test_what_has_no_levels() -> None:
     rng = np.random.default_rng(0)
-    assert levels(rng.uniform(-1, 1, (100, 3))) is None
-    assert levels(stepped(STEPS["two"])[:9]) is None
+    assert levels(rng.uniform(-1, 1, (100, 3)), DEFAULT_SETTINGS) is None
+    assert levels(stepped(STEPS["two"])[:9], DEFAULT_SETTINGS) is None
     points = stepped(STEPS["pyramid"])
     assert untold(points, np.array([f"p{i}" for i in range(len(points))])) is None  # a ball that stood on a lattice
 
 
 def test_a_level_of_a_few_points_is_none() -> None:
     points = np.concatenate([stepped(STEPS["pyramid"]), [[12.0, 3.0, -30.0], [13.0, 8.0, -30.0]]])
-    found = levels(points)
+    found = levels(points, DEFAULT_SETTINGS)
     assert found is not None
     assert (found.number[-2:] == -1).all()
     assert len(np.unique(found.number)) == 4
@@ -227,7 +233,7 @@ def test_the_world_is_the_parabola_or_the_line_through_its_shots() -> None:
     assert two is not None
     at = two.centre.mean(axis=0) + np.array([[0, 0, 1.5], [0, 0, 0]])
     np.testing.assert_allclose(two.drawn_along(at), [5, 0.5], rtol=1e-9)
-    planes = untold(three, np.repeat(["a", "b", "c"], 20))
+    planes = untold(three, np.repeat(["a", "b", "c"], 20), DEFAULT_SETTINGS)
     assert planes is not None
     assert planes.sd[0] == pytest.approx(SHOT_SD)
 
@@ -392,8 +398,8 @@ def test_levels_of_one_target_widen_the_bars_between_them() -> None:
 
 def test_label_errors_with_no_tail_have_their_scale_as_covariance() -> None:
     scale = covariance(1, 1e-3)
-    np.testing.assert_array_equal(PositionErrors(scale, np.inf, 0.5, 10).covariance, scale)
-    root = PositionErrors(scale, 3.0, 0.5, 10).root
+    np.testing.assert_array_equal(PositionErrors(scale, np.inf, 0.5, 10, 0.95).covariance, scale)
+    root = PositionErrors(scale, 3.0, 0.5, 10, 0.95).root
     np.testing.assert_allclose(root @ root.T, scale)
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from forward_gp_cases import rotation
-from implicam.rig_model.shot_errors import SHOT_SD_PRIOR, WORLD_POLYNOMIAL_TERMS, ShotErrors, Shots
+from implicam.rig_model.settings import DEFAULT_SETTINGS
+from implicam.rig_model.shot_errors import WORLD_POLYNOMIAL_TERMS, ShotErrors, Shots
 
 
 @pytest.mark.parametrize("size", [1e-2, 1.0, 30.0])
@@ -16,7 +17,8 @@ def test_the_update_of_the_shots_sds_maximises_their_posterior(size: float) -> N
     sd = np.column_stack([rng.uniform(1e-3, 3e-3, (5, 2)), rng.uniform(1e-4, 1e-3, (5, 1)), np.full((5, 1), 0.7)])
     errors = ShotErrors(np.zeros(3, dtype=np.int64), np.zeros((3, 3, 4)), sd, np.array([0, 0, 1, -1]))
     mean, variance = size * rng.normal(size=(5, 4)), rng.uniform(0.01, 1, (5, 4))
-    updated, label = errors.updated(mean, variance)
+    median, log_sd = np.log(DEFAULT_SETTINGS.shot_sd_prior_median_wf), DEFAULT_SETTINGS.shot_sd_prior_log_sd
+    updated, label = errors.updated(mean, variance, DEFAULT_SETTINGS)
     np.testing.assert_array_equal(updated.sd[:, 3], 0.7)  # declared sds stay
     np.testing.assert_array_equal(label[:, 3], 0.7)
     for columns in ([0, 1], [2]):
@@ -24,14 +26,10 @@ def test_the_update_of_the_shots_sds_maximises_their_posterior(size: float) -> N
         assert np.ptp(new) == 0
         second = ((mean**2 + variance) * sd**2)[:, columns]
         u = np.log(new[0, 0]) + np.linspace(-2, 2, 400001)
-        objective = (
-            -second.size * u
-            - 0.5 * second.sum() * np.exp(-2 * u)
-            - 0.5 * ((u - SHOT_SD_PRIOR[0]) / SHOT_SD_PRIOR[1]) ** 2
-        )
+        objective = -second.size * u - 0.5 * second.sum() * np.exp(-2 * u) - 0.5 * ((u - median) / log_sd) ** 2
         assert np.exp(u[np.argmax(objective)]) == pytest.approx(new[0, 0], rel=2e-5)
         told = np.sum(1 - variance[:, columns])
-        np.testing.assert_allclose(label[:, columns], new * np.exp(1 / (2 * told + 1 / SHOT_SD_PRIOR[1] ** 2)))
+        np.testing.assert_allclose(label[:, columns], new * np.exp(1 / (2 * told + 1 / log_sd**2)))
 
 
 def plates(

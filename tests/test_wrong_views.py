@@ -13,9 +13,9 @@ from exhaustive_views import by_trying_all
 from implicam.calibrators import ForwardGP
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
 from implicam.dataset import Dataset, Observations
+from implicam.rig_model.settings import RigModelSettings
 from implicam.rig_model.triangulate import Located, _Seen, locate
 from implicam.rig_model.wrong_views import (
-    DISAGREE_P_VALUE,
     LinearisedViews,
     _Choices,
     exclude_wrong_views,
@@ -220,5 +220,5 @@ def test_three_against_two_are_believed() -> None:
 def test_good_points_are_left_alone() -> None:
     uv, noise = fitted("dome8").map.views(seen_by_all("dome8").observations)
     found: Located = locate(fitted("dome8").posterior, uv, noise)
-    assert (found.p > DISAGREE_P_VALUE).mean() > 0.95
+    assert (found.p > RigModelSettings.disagree_p_value).mean() > 0.95
     assert found.left_out.any(axis=1).mean() < 0.05

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.calibrators import ExplicitCalibration as ExplicitCalibration
     from implicam.calibrators import ForwardGP as ForwardGP
     from implicam.calibrators import ForwardGPCalibration as ForwardGPCalibration
+    from implicam.calibrators import ForwardGPSettings as ForwardGPSettings
     from implicam.calibrators import InverseGP as InverseGP
     from implicam.calibrators import InverseGPCalibration as InverseGPCalibration
     from implicam.calibrators import MLPCalibration as MLPCalibration
@@ -60,7 +61,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
 _NAMES = {
     "implicam.calibrators": (
         "METHODS", "MLP", "Calibration", "Explicit", "ExplicitCalibration", "ForwardGP", "ForwardGPCalibration",
-        "InverseGP", "InverseGPCalibration", "MLPCalibration", "calibrator", "load_calibration",
+        "ForwardGPSettings", "InverseGP", "InverseGPCalibration", "MLPCalibration", "calibrator", "load_calibration",
     ),
     "implicam.coverage": ("Coverage", "assess"),
     "implicam.dataset": (

@@ -1,7 +1,7 @@
 """The methods: known points in, a map from pixels to position with its uncertainty out."""
 
 from implicam.calibrators.explicit import Explicit, ExplicitCalibration
-from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
+from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration, ForwardGPSettings
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
 from implicam.calibrators.mlp import MLP, MLPCalibration
 from implicam.calibrators.protocol import (
@@ -47,6 +47,7 @@ __all__ = [
     "FitSummary",
     "ForwardGP",
     "ForwardGPCalibration",
+    "ForwardGPSettings",
     "HasPositionProcesses",
     "InverseGP",
     "InverseGPCalibration",

@@ -4,8 +4,8 @@ From data to a fitted rig, in the order of the modules: `training_data` (known p
 `initialise` (a camera from no guess), `camera`, `general_camera`, `field` and `camera_model` (what a camera is),
 `normal_equations`, `schur`, `tied`, `posterior` and `linearise` (what is known of all cameras), `leave_one_out` and
 `diagnostics` (views that contradict the others), `shot_errors`, `level_errors`, `position_errors` and `heavy_tails`
-(how positions and pixels are off), `fit_result`; then `rig`, `triangulate`, `wrong_views` and `alarm` (measuring). The
-mathematics: docs/method.md.
+(how positions and pixels are off), `fit_result`; then `rig`, `triangulate`, `wrong_views` and `alarm` (measuring). All
+of it by what `settings` take for usual and for clear. The mathematics: docs/method.md.
 """
 
 from implicam.rig_model.camera import (
@@ -25,7 +25,6 @@ from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.general_camera import AnyCamera, GeneralCamera
 from implicam.rig_model.heavy_tails import HeavyTails
 from implicam.rig_model.initialise import (
-    MAX_ERROR_MEDIANS,
     InitialCamera,
     lens_only_model,
     levenberg_marquardt,
@@ -37,6 +36,7 @@ from implicam.rig_model.normal_equations import solve_normal
 from implicam.rig_model.position_errors import PositionErrors
 from implicam.rig_model.posterior import Posterior, condition
 from implicam.rig_model.rig import FittedRig, Sensitivity
+from implicam.rig_model.settings import RigModelSettings
 from implicam.rig_model.shot_errors import ShotErrors, Shots
 from implicam.rig_model.tied import Scatter, condition_scattered
 from implicam.rig_model.training_data import (
@@ -46,14 +46,12 @@ from implicam.rig_model.training_data import (
     image_of,
     relative_noise,
     stated_noise,
-    training_data_of,
 )
 from implicam.rig_model.triangulate import Labels, Located, locate
 
 __all__ = [
     "CENTRE_PRIOR_SD",
     "LOG_ASPECT_PRIOR_SD",
-    "MAX_ERROR_MEDIANS",
     "MAX_NAMED_IN_NOTE",
     "MIN_POINTS_PER_CAMERA",
     "PERSPECTIVE_K",
@@ -76,6 +74,7 @@ __all__ = [
     "Posterior",
     "Prior",
     "ProjectiveCamera",
+    "RigModelSettings",
     "Scatter",
     "Sensitivity",
     "ShotErrors",
@@ -94,6 +93,5 @@ __all__ = [
     "solve_normal",
     "start_rig",
     "stated_noise",
-    "training_data_of",
     "update_inliers",
 ]

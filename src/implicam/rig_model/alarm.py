@@ -1,20 +1,22 @@
 """Look at a measured table as a whole: does the rig still stand as it was calibrated?
 
-Each point is tested alone: do its views agree? Of honest views one point in ten thousand fails (`DISAGREE`). Wrong
+Each point is tested alone: do its views agree? Of honest views one point in ten thousand fails
+(`disagree_p_value`). Wrong
 detections make single points fail, and the rest stays as good as ever. A camera that was moved, or two that were
 exchanged, make most of them fail, and what is left does not look honest either: that is the alarm.
 
-Three signs, each a binomial tail beyond what chance shows (`FALSE_ALARM`) in a table with one wrong view in five
-(`USUAL_WRONG`) and error bars that are somewhat too small (`TOO_SMALL`):
+Three signs, each a binomial tail beyond what chance shows (`false_alarm_probability`) in a table with one wrong view in
+five (`usual_wrong_share`) and error bars that are somewhat too small (`tolerated_error_bar_ratio`):
 
-1. more than MANY contradict, and they are points that no wrong view or two explain: more of them than MANY;
+1. more than `max_contradicting_share` contradict, and they are points that no wrong view or two explain;
 2. of the points that are not plainly wrong, too many have a small p-value. A wrong detection is off by far; a camera
    that was moved a little makes many points disagree a little. It needs no single point to fail;
-3. more than MANY contradict, and they are views of one camera.
+3. more than `max_contradicting_share` contradict, and they are views of one camera.
 
 The first and third hold whatever the points have in common, as the errors of a calibration: where each fails with
-probability `DISAGREE` at most, more than MANY of them do with DISAGREE / MANY at most (Markov), 3 in 10 000. The second
-counts points as independent, but at most INDEPENDENT of them: 285 points of a rig with 16 known ones shared its errors.
+probability `disagree_p_value` at most, more than that share of them do with the ratio of the two at most (Markov), 3 in
+10 000. The second counts points as independent, but at most `max_independent_points`: 285 points of a rig with 16 known
+ones shared its errors.
 What moves every view along the lines on which two cameras would see it nobody can find in the pixels of two cameras.
 
 Then the likeliest causes are tried on some of the points, and the one that makes them agree is named.
@@ -33,34 +35,8 @@ from scipy.special import bdtrc, chdtrc, chdtri
 from implicam.dataset import Camera
 from implicam.formatting import percent
 from implicam.geometry import Bools, Floats
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.row_order import late_or_early, moved_up
-
-FEWEST_POINTS = 10
-"""Of fewer points that can be tested nothing is said."""
-
-MANY = 0.3
-"""Share of the points that contradict, beyond which it is no longer them."""
-
-USUAL_WRONG = 0.2
-"""Share of wrong views in a table whose detection is bad, and whose rig is as it was."""
-
-FALSE_ALARM = 5e-4
-"""Probability that a sign is there where nothing is wrong."""
-
-DISAGREE = 1e-4
-"""Below this p-value the views of a point disagree."""
-
-SMALL = (0.05, 0.01, 0.001)
-"""p-values below each of these are few."""
-
-TOO_SMALL = 1.3
-"""By how much error bars may be too small without an alarm."""
-
-INDEPENDENT = 50
-"""Points of a table that count as independent at most: all share what is not known of the cameras."""
-
-WRONG = 1e-10
-"""A point with a p-value below has a wrong view, and says nothing of small errors."""
 
 TRIED = 24
 """Points on which the causes are tried."""
@@ -102,6 +78,7 @@ class Table:
     checked: bool = True
     """Whether the calibration was held against known points. Of cameras from elsewhere nobody knows how good they are,
     and that their views agree badly is no news."""
+    settings: RigModelSettings = DEFAULT_SETTINGS
 
     @property
     def seen(self) -> Bools:
@@ -116,27 +93,29 @@ class Table:
 
 def alarm_of(table: Table) -> str:
     """What is wrong with the table as a whole, in a sentence; empty where nothing is."""
-    views = table.seen.sum(axis=1)
-    tested = views >= 2
+    settings, views = table.settings, table.seen.sum(axis=1)
+    many, tested = settings.max_contradicting_share, views >= 2
     n = int(tested.sum())
-    if n < FEWEST_POINTS:
+    if n < settings.min_alarm_points:
         return ""
     explained = tested & table.left_out.any(axis=1)
-    contradict = tested & (explained | ~(table.p >= DISAGREE))
+    contradict = tested & (explained | ~(table.p >= settings.disagree_p_value))
     share = contradict.sum() / n
-    if share > MANY:
+    if share > many:
         alone = int((contradict & ~explained).sum())
-        usual = max(USUAL_WRONG, float(np.mean([_inexplicable(int(k)) for k in views[tested]])))
+        wrong = settings.usual_wrong_share
+        usual = max(wrong, float(np.mean([_inexplicable(int(k), wrong) for k in views[tested]])))
         moved = _contradicted(table, views)
-        if moved or (alone > MANY * n and _surprising(alone, n, usual)):
-            return _said(f"{percent(share)} of {n} points contradict the calibration", DISAGREE, table, tested, moved)
-    near = tested & ~explained & (table.p >= WRONG)
-    uneven = _uneven(table.p[near], views[near]) if table.checked else None
+        if moved or (alone > many * n and _tail(alone, n, usual) < settings.false_alarm_probability):
+            what = f"{percent(share)} of {n} points contradict the calibration"
+            return _said(what, settings.disagree_p_value, table, tested, moved)
+    near = tested & ~explained & (table.p >= settings.min_p_value)
+    uneven = _uneven(table.p[near], views[near], settings) if table.checked else None
     if uneven is None:
         return ""
     level, count = uneven
     words = f"the views of {count} of {near.sum()} points agree badly"
-    if share > MANY:
+    if share > many:
         return _said(words, level, table, tested, [])
     return (
         f"{words}; {100 * level:g} % would be chance: has a camera been moved or refocused a little, or are the pixels "
@@ -148,30 +127,25 @@ def _said(what: str, chance: float, table: Table, tested: Bools, moved: Sequence
     return f"{what}; {100 * chance:g} % would be chance: {_cause(table, tested, moved)}"
 
 
-def _uneven(p: Floats, views: NDArray[np.int64]) -> tuple[float, int] | None:
-    """The level of SMALL below which the most surprising number of p-values (n,) lies, and it; None where none does."""
+def _uneven(p: Floats, views: NDArray[np.int64], settings: RigModelSettings) -> tuple[float, int] | None:
+    """The level below which the most surprising number of p-values (n,) lies, and it; None where none does."""
     if not len(p):
         return None
     degrees = 2 * views - 3
     found = []
-    for level in SMALL:
-        usual = float(np.mean(chdtrc(degrees, chdtri(degrees, level) / TOO_SMALL**2)))
+    for level in settings.alarm_p_values:
+        usual = float(np.mean(chdtrc(degrees, chdtri(degrees, level) / settings.tolerated_error_bar_ratio**2)))
         count = int((p < level).sum())
-        some = min(len(p), INDEPENDENT)
+        some = min(len(p), settings.max_independent_points)
         found.append((_tail(count * some // len(p), some, usual), level, count))
     tail, level, count = min(found)
-    return (level, count) if tail < FALSE_ALARM else None
+    return (level, count) if tail < settings.false_alarm_probability else None
 
 
-def _inexplicable(views: int) -> float:
+def _inexplicable(views: int, wrong_share: float) -> float:
     """Probability that more of a point's views are wrong than leaving one or two out can mend."""
     mended = 2 if views >= 5 else 1 if views >= 3 else 0
-    return float(bdtrc(mended, views, USUAL_WRONG))
-
-
-def _surprising(count: int, n: int, share: float) -> bool:
-    """Whether so many of n are too many for chance, where each has the probability `share`."""
-    return _tail(count, n, share) < FALSE_ALARM
+    return float(bdtrc(mended, views, wrong_share))
 
 
 def _tail(count: int, n: int, share: float) -> float:
@@ -181,12 +155,14 @@ def _tail(count: int, n: int, share: float) -> float:
 
 def _contradicted(table: Table, views: NDArray[np.int64]) -> list[str]:
     """Cameras whose views are left out far more often than wrong detections would be."""
-    can_tell = views >= 3
+    can_tell, settings = views >= 3, table.settings
     seen, away = table.seen[can_tell].sum(axis=0), table.left_out[can_tell].sum(axis=0)
     return [
         name
         for name, n, k in zip(table.names, seen.tolist(), away.tolist(), strict=True)
-        if n >= FEWEST_POINTS and k > MANY * n and _surprising(k, n, USUAL_WRONG)
+        if n >= settings.min_alarm_points
+        and k > settings.max_contradicting_share * n
+        and _tail(k, n, settings.usual_wrong_share) < settings.false_alarm_probability
     ]
 
 
@@ -195,7 +171,7 @@ def _cause(table: Table, tested: Bools, moved: Sequence[str]) -> str:
     rows = np.flatnonzero(tested)
     if len(rows) > TRIED:
         rows = np.sort(np.random.default_rng(0).choice(rows, TRIED, replace=False))
-    now = (table.p[rows] >= DISAGREE) & ~table.left_out[rows].any(axis=1)
+    now = (table.p[rows] >= table.settings.disagree_p_value) & ~table.left_out[rows].any(axis=1)
     least = max(EXPLAINS, BETTER + float(now.mean()))
     guesses = [(_misfit(table, rows, uv, noise), words, uv) for words, uv, noise in _guesses(table)]
     without = [(_misfit(table, rows, uv, table.noise), words, uv) for words, uv in _without_one(table)]

@@ -11,10 +11,6 @@ from implicam.gp import Kernel
 from implicam.gp.low_rank import LowRank
 from implicam.rig_model.camera import Image, View
 
-TYPICAL_LOG_DISTANCE_SD = 0.12
-"""Standard deviation of the log distance of the known points in an ordinary rig. Where the volume is thinner, depth
-counts in its own spread: what a window or water does varies over the volume, however far that is."""
-
 
 class Hyperparameters(NamedTuple):
     """lengthscale (C, 2): across the image, in half its longer side, and in log distance, the same for cameras of one
@@ -37,22 +33,19 @@ class DepthScale(NamedTuple):
     unit: float = 1.0
 
     @classmethod
-    def of(cls, view: View) -> DepthScale:
-        """Of the known points that a camera sees."""
+    def of(cls, view: View, typical_sd: float) -> DepthScale:
+        """Of the known points that a camera sees; typical_sd: of their log distance in an ordinary rig."""
         spread = float(np.std(view.log_distance))
-        return cls(float(np.mean(view.log_distance)), min(max(spread / TYPICAL_LOG_DISTANCE_SD, 1e-6), 1.0))
+        return cls(float(np.mean(view.log_distance)), min(max(spread / typical_sd, 1e-6), 1.0))
 
 
 UNSCALED_DEPTH = DepthScale()
 """Log distance itself is the coordinate."""
 
 
-def field_coordinates(view: View, image: Image, depth: DepthScale | None = None) -> Floats:
-    """(n, 3) where a field is looked up: pixel about the centre in half the longer side, scaled log distance, eq. (8).
-
-    depth: as of these very points where it is not given."""
-    mean, unit = DepthScale.of(view) if depth is None else depth
-    return np.column_stack([(view.uv - image.centre) / image.half, (view.log_distance - mean) / unit])
+def field_coordinates(view: View, image: Image, depth: DepthScale) -> Floats:
+    """(n, 3) where a field is looked up: pixel about the centre in half sides, scaled log distance, eq. (8)."""
+    return np.column_stack([(view.uv - image.centre) / image.half, (view.log_distance - depth.mean) / depth.unit])
 
 
 def empty_field(lengthscale: Floats, q: Floats, tolerance: float) -> LowRank:

@@ -17,14 +17,8 @@ from scipy.special import chdtrc, gammaln, logsumexp, ndtri
 
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera_model import CameraViews
+from implicam.rig_model.settings import RigModelSettings
 from implicam.rig_model.wrong_views import Ints, LinearisedViews
-
-DEGREES_OF_FREEDOM = (2.2, 2.6, 3.0, 3.5, 4.2, 5.0, 7.0, 10.0, 20.0)
-"""Degrees of freedom tried. With two or fewer the noise has no variance, with more than 20 it is as good as normal."""
-
-MIN_GAIN_NATS = 5.0
-"""Nats by which a t must be more likely than normal noise, or noise is normal: chance gains so much once in a
-thousand times."""
 
 MAX_EM_STEPS = 40
 """Of EM for scale and share of wrong detections, at each number of degrees ..."""
@@ -32,31 +26,8 @@ MAX_EM_STEPS = 40
 EM_RELATIVE_TOLERANCE = 1e-6
 """... or fewer, where no scale squared changes by this part any more."""
 
-MIN_CONFIRMING_GAIN_NATS = 2.0
-"""The same of what cameras say among themselves, which is less, and only has to confirm it."""
-
-MIN_DISAGREEMENT_VARIANCE_RATIO = 0.5
-"""Scale squared of what cameras disagree on, over that of what they miss the known positions by, below which the errors
-are those of the known positions."""
-
-MAX_WRONG_SHARE = 0.3
-"""Share of wrong detections, anywhere in the image, beyond which nothing is concluded."""
-
-MAX_VIEWS_PER_CAMERA = 1000
-"""Views of a camera that the degrees are found from; more cost time and tell little more."""
-
-MIN_VIEWS = 60
-"""Views from which tails can be told."""
-
 POSTERIOR_DRAWS = 512
 """Places at which the posterior of a position is looked up: its sds are then good to a few per cent."""
-
-MAX_VIEWS_WITH_SECOND_MODE = 4
-"""Up to so many, the posterior may have a second mode, without one of them."""
-
-MAX_SD_RATIO = 8.0
-"""How many times larger an error bar may be than that of views that agree: beyond, there are two places, and nothing
-says which."""
 
 REWEIGHTINGS_TO_MODE = 10
 """Times that views are weighted to find a mode."""
@@ -64,8 +35,8 @@ REWEIGHTINGS_TO_MODE = 10
 VIEWS_PER_BATCH = 256
 """Views whose positions are integrated at once, so that all fits in the processor's cache."""
 
-EVIDENCE_DRAWS, MAX_EVIDENCE_POINTS = 64, 200
-"""The same for the evidence of the degrees, and points that it is taken from."""
+EVIDENCE_DRAWS = 64
+"""The same for the evidence of the degrees."""
 
 MAX_CONDITION = 1e10
 """Condition of a point's normal matrix beyond which its views do not fix it."""
@@ -108,7 +79,7 @@ def student_t_weights(distance: Floats, degrees: float) -> Floats:
     return np.asarray((degrees + 2) / (degrees + distance), dtype=np.float64)
 
 
-def looks_heavy(distance: Floats, background: Floats) -> bool:
+def looks_heavy(distance: Floats, background: Floats, settings: RigModelSettings) -> bool:
     """Whether the noise of single cameras looks as if it had heavy tails, from squared distances (n,) of views to what
     all others predict: that is quickly seen, and seldom so.
 
@@ -116,12 +87,13 @@ def looks_heavy(distance: Floats, background: Floats) -> bool:
     """
     good = np.isfinite(distance) & (distance >= 0)
     q, b = distance[good], background[good]
-    if len(q) < MIN_VIEWS:
+    if len(q) < settings.min_tail_views:
         return False
     normal = _likelihoods(q, b, np.array([np.inf]))[0]
-    found = _likelihoods(q, b, np.array(DEGREES_OF_FREEDOM))
+    found = _likelihoods(q, b, np.array(settings.tail_degrees_of_freedom))
     best = found[np.argmax(found[:, 0])]
-    return bool(best[0] > normal[0] + MIN_GAIN_NATS and best[2] < MAX_WRONG_SHARE)
+    clearly = best[0] > normal[0] + settings.min_tail_gain_nats
+    return bool(clearly and best[2] < settings.max_wrong_detection_share)
 
 
 def _likelihoods(q: Floats, background: Floats, degrees: Floats) -> Floats:
@@ -175,7 +147,7 @@ class RefinedPositions(NamedTuple):
     distance: Floats
 
 
-def refine_positions(linear: LinearisedViews, degrees: float) -> RefinedPositions:
+def refine_positions(linear: LinearisedViews, degrees: float, settings: RigModelSettings) -> RefinedPositions:
     """Mean and covariance of the position under t noise, from views linearised near it, eq. (T4)."""
     A, b = whiten(linear)
     n, C = b.shape[:2]
@@ -188,17 +160,17 @@ def refine_positions(linear: LinearisedViews, degrees: float) -> RefinedPosition
         size = max(1, VIEWS_PER_BATCH // int(V))
         for some in np.split(alike, range(size, len(alike), size)):
             chosen = order[some, :V]
-            found = _integrated(A[some[:, None], chosen], b[some[:, None], chosen], degrees)
+            found = _integrated(A[some[:, None], chosen], b[some[:, None], chosen], degrees, settings)
             out.step[some], out.cov[some] = found.step, found.cov
             out.distance[some[:, None], chosen] = found.distance
     return out
 
 
-def _integrated(A: Floats, b: Floats, degrees: float) -> RefinedPositions:
+def _integrated(A: Floats, b: Floats, degrees: float, settings: RigModelSettings) -> RefinedPositions:
     """By importance sampling, from a mixture of spherical t about every place that may be a mode: with few views, each
     of them may be the wrong one."""
     n = len(b)
-    modes = [_about_mode(A, b, degrees, start) for start in _starts(A, b)]
+    modes = [_about_mode(A, b, degrees, start) for start in _starts(A, b, settings.max_views_with_second_mode)]
     z, log_density = _draws(POSTERIOR_DRAWS)
     centre = np.stack([mode.step for mode in modes], axis=1)  # (n, K, 3)
     spread = np.stack([mode.spread for mode in modes], axis=1)
@@ -220,21 +192,22 @@ def _integrated(A: Floats, b: Floats, degrees: float) -> RefinedPositions:
     cov = np.einsum("nk,nki,nkj->nij", weight, about, about)
     agreeing = information_loss(degrees) * np.linalg.inv(np.einsum("ncij,ncik->njk", A, A))
     larger = np.linalg.eigvals(np.linalg.solve(agreeing, cov)).real.max(axis=1)
-    mean[larger > MAX_SD_RATIO**2], cov[larger > MAX_SD_RATIO**2] = np.nan, np.nan
+    two_places = larger > settings.max_error_bar_ratio**2
+    mean[two_places], cov[two_places] = np.nan, np.nan
     left = np.stack([mode.left for mode in modes], axis=1)
     distance = np.sum(left**2, axis=3)  # (n, K, V)
     best = np.argmin(np.sum(np.log1p(distance / degrees), axis=2), axis=1)
     return RefinedPositions(mean, cov, distance[np.arange(n), best])
 
 
-def _starts(A: Floats, b: Floats) -> list[Floats]:
+def _starts(A: Floats, b: Floats, few: int) -> list[Floats]:
     """Least squares (n, 3), and with few views, without each of them."""
     N = A.swapaxes(2, 3) @ A
     g = (A.swapaxes(2, 3) @ b[..., None])[..., 0]
     H, pull = N.sum(axis=1), g.sum(axis=1)
     starts = [np.linalg.solve(H, pull[..., None])[..., 0]]
     V = b.shape[1]
-    if 3 <= V <= MAX_VIEWS_WITH_SECOND_MODE:
+    if 3 <= V <= few:
         held = 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         starts += [np.linalg.solve(H - N[:, c] + held, (pull - g[:, c])[..., None])[..., 0] for c in range(V)]
     return starts
@@ -246,7 +219,7 @@ def whiten(linear: LinearisedViews) -> tuple[Floats, Floats]:
     return np.asarray(root @ linear.D), np.asarray((root @ linear.r[..., None])[..., 0])
 
 
-def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
+def degrees_of_agreement(A: Floats, b: Floats, seen: Bools, settings: RigModelSettings) -> float | None:
     """Degrees of freedom of the noise from what cameras say of the same points, wherever these are: from views (n, C)
     whitened as above, the position of each point integrated out, eq. (T2). None where the noise is normal.
 
@@ -255,13 +228,13 @@ def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
     what cameras share is not their noise, and noise is taken for normal.
     """
     views = seen.sum(axis=1)
-    some = np.flatnonzero(views >= 2)[:MAX_EVIDENCE_POINTS]
+    some = np.flatnonzero(views >= 2)[: settings.max_confirming_points]
     A, b, views = np.where(seen[..., None, None], A, 0)[some], np.where(seen[..., None], b, 0)[some], views[some]
     H = np.einsum("ncij,ncik->njk", A, A)
     good = np.linalg.cond(H) < MAX_CONDITION
     A, b, views, H, seen = A[good], b[good], views[good], H[good], seen[some][good]
     free = float(np.sum(2 * views - 3))
-    if free < MIN_VIEWS:
+    if free < settings.min_tail_views:
         return None
     g = np.einsum("ncij,nci->nj", A, b)
     squares = np.sum(b**2, axis=(1, 2)) - np.einsum("ni,ni->n", g, np.linalg.solve(H, g[..., None])[..., 0])
@@ -271,17 +244,11 @@ def degrees_of_agreement(A: Floats, b: Floats, seen: Bools) -> float | None:
     usual = max(float(squares.sum()) / free, 1e-300)
     normal = log_sizes - 0.5 * free * (1 + np.log(usual))
 
-    found = [_most_likely(A, b, views, degrees, usual) for degrees in DEGREES_OF_FREEDOM]
-    k = int(np.argmax([value for value, _ in found]))
-    value, scale = found[k]
-    alone = _likelihoods(
-        np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), np.array(DEGREES_OF_FREEDOM[k : k + 1])
-    )[0, 1]
-    return (
-        DEGREES_OF_FREEDOM[k]
-        if value > normal + MIN_CONFIRMING_GAIN_NATS and scale > MIN_DISAGREEMENT_VARIANCE_RATIO * alone
-        else None
-    )
+    found = [(*_most_likely(A, b, views, degrees, usual), degrees) for degrees in settings.tail_degrees_of_freedom]
+    value, scale, degrees = max(found, key=lambda one: one[0])
+    alone = _likelihoods(np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), np.array([degrees]))[0, 1]
+    confirmed = value > normal + settings.min_confirming_tail_gain_nats
+    return degrees if confirmed and scale > settings.min_disagreement_variance_ratio * alone else None
 
 
 def _most_likely(A: Floats, b: Floats, views: Ints, degrees: float, usual: float) -> tuple[float, float]:

@@ -18,18 +18,13 @@ from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, Image, Prior
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.field import empty_field
 from implicam.rig_model.general_camera import AnyCamera
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA, TrainingData, pixel_extent
 from implicam.row_order import what_is_wrong
 from implicam.threads import side_by_side
 
-MAX_ERROR_MEDIANS = 8.0
-"""Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
-
 ENOUGH_VIEWS = 12
 """Views of a camera that are too many to call too few the reason why nothing fits them."""
-
-MAX_START_ERROR_HALF_EXTENTS = {"central": 0.05, "general": 0.05, "none": 0.3}
-"""Median error of a start, in half the extent of the pixels, beyond which it is none."""
 
 
 class InitialCamera(NamedTuple):
@@ -43,43 +38,49 @@ class InitialCamera(NamedTuple):
     ordinary_px: float = float("nan")
 
 
-def start_camera(points: Floats, uv: Floats, image: Image, lens: str) -> InitialCamera:
+def start_camera(
+    points: Floats, uv: Floats, image: Image, lens: str, settings: RigModelSettings = DEFAULT_SETTINGS
+) -> InitialCamera:
     """A camera of the kind `lens` from points (n, 3), all seen at uv (n, 2); FitError where they do not fix one."""
     if len(points) < MIN_POINTS_PER_CAMERA:
         raise FitError(f"{len(points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
     if lens == "none":
-        return _start_projective(points, uv, image)
+        return _start_projective(points, uv, image, settings)
     found = resect_any_lens(points, uv, middle=image.centre)
     k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
     camera = CentralCamera(
         KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist()), found.camera_from_world
     )
-    return _with_prior(camera, points, uv, image, found.inliers)
+    return _with_prior(camera, points, uv, image, found.inliers, settings)
 
 
-def start_again(camera: AnyCamera, points: Floats, uv: Floats, image: Image, lens: str) -> InitialCamera:
+def start_again(
+    camera: AnyCamera, points: Floats, uv: Floats, image: Image, lens: str, settings: RigModelSettings
+) -> InitialCamera:
     """The same from a camera that fitted most of these points a moment ago; from no guess where it does not."""
     error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    inliers = error <= max(MAX_ERROR_MEDIANS * float(np.nanmedian(error)), 1e-4 * image.half)
+    inliers = error <= max(settings.max_start_error_medians * float(np.nanmedian(error)), 1e-4 * image.half)
     if not isinstance(camera, CentralCamera) or inliers.sum() < max(MIN_POINTS_PER_CAMERA, len(points) / 2):
-        return start_camera(points, uv, image, lens)
-    return _with_prior(camera, points, uv, image, inliers)
+        return start_camera(points, uv, image, lens, settings)
+    return _with_prior(camera, points, uv, image, inliers, settings)
 
 
-def _with_prior(camera: CentralCamera, points: Floats, uv: Floats, image: Image, inliers: Bools) -> InitialCamera:
+def _with_prior(
+    camera: CentralCamera, points: Floats, uv: Floats, image: Image, inliers: Bools, settings: RigModelSettings
+) -> InitialCamera:
     there = camera.pose.apply(points[inliers])
     widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
-    return _refined(camera, camera.prior(image, widest), points, uv, image, inliers)
+    return _refined(camera, camera.prior(image, widest), points, uv, image, inliers, settings.max_start_error_medians)
 
 
-def _start_projective(points: Floats, uv: Floats, image: Image) -> InitialCamera:
+def _start_projective(points: Floats, uv: Floats, image: Image, settings: RigModelSettings) -> InitialCamera:
     inliers = resect_any_lens(
         points, uv, middle=image.centre
     ).inliers  # any lens at all tells the wrong views from the right
     for _ in range(5):
         camera = ProjectiveCamera(resect(points[inliers], uv[inliers]))
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        inside = ~(error > MAX_ERROR_MEDIANS * np.nanmedian(error))
+        inside = ~(error > settings.max_start_error_medians * np.nanmedian(error))
         if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
         inliers = inside
@@ -88,7 +89,7 @@ def _start_projective(points: Floats, uv: Floats, image: Image) -> InitialCamera
 
 
 def _refined(
-    camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, inliers: Bools
+    camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, inliers: Bools, max_medians: float
 ) -> InitialCamera:
     """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong."""
     sd = 1e-3 * image.half
@@ -96,7 +97,7 @@ def _refined(
         camera = levenberg_marquardt(camera, prior, points[inliers], uv[inliers], sd)
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         sd = max(float(np.median(error[inliers])), 1e-5 * image.half)
-        inside = error <= max(MAX_ERROR_MEDIANS * float(np.median(error[inliers])), 1e-4 * image.half)
+        inside = error <= max(max_medians * float(np.median(error[inliers])), 1e-4 * image.half)
         if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
         inliers = inside
@@ -218,6 +219,7 @@ def _cure(training: TrainingData, uncalibrated: list[tuple[int, str]]) -> str:
 
 def check_start(started: InitialCamera, points: Floats, uv: Floats, training: TrainingData) -> None:
     """FitError for a start that too few views agree on, or that leaves too much."""
+    settings = training.settings
     error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.inliers]
     low, high = pixel_extent(uv)
     half = float((high - low).max()) / 2
@@ -226,7 +228,9 @@ def check_start(started: InitialCamera, points: Floats, uv: Floats, training: Tr
             f"{len(error)} of its {len(uv)} views agree on one camera, and it takes {MIN_POINTS_PER_CAMERA}.",
             fix="add known points, or look for wrong detections",
         )
-    if not np.median(error) < MAX_START_ERROR_HALF_EXTENTS[started.camera.kind] * half:
+    without_lens = started.camera.kind == ProjectiveCamera.kind
+    most = settings.max_start_error_half_extents_without_lens if without_lens else settings.max_start_error_half_extents
+    if not np.median(error) < most * half:
         raise FitError(
             f"no camera sees the known points at these pixels: the best of all fits leaves {np.median(error):.3g} px."
         )

@@ -12,17 +12,11 @@ from implicam.rig_model.camera_model import CameraViews, apply_covariance_root
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.position_errors import Agreement
 from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.threads import side_by_side
-
-MAX_SQUARED_MAHALANOBIS = 25.0
-"""Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
 
 MIN_ONE_MINUS_LEVERAGE = 1e-9
 """One minus the leverage of a view, at least: below, rounding decides."""
-
-MAX_LEVERAGE = 3.0
-"""Variance of a view predicted without its own point over that of the noise: beyond it the point says how a camera is,
-and not how it is off itself."""
 
 
 def squared_distances(posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools) -> Floats:
@@ -80,17 +74,21 @@ def left_out_residuals_from(at: Residuals, inliers: Bools) -> tuple[Floats, Floa
 
 
 def update_inliers(
-    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
+    posterior: Posterior,
+    points: Floats,
+    seen: tuple[CameraViews, ...],
+    inliers: tuple[Bools, ...],
+    limit: float = DEFAULT_SETTINGS.max_squared_mahalanobis,
 ) -> tuple[Bools, ...]:
     """Per camera, the views to use next: not those that contradict the others."""
 
     def one(c: int) -> Bools:
-        return next_inliers(squared_distances(posterior, c, points, seen[c], inliers[c]), inliers[c])
+        return next_inliers(squared_distances(posterior, c, points, seen[c], inliers[c]), inliers[c], limit)
 
     return tuple(side_by_side(one, range(len(seen))))
 
 
-def next_inliers(distance: Floats, inliers: Bools, limit: float = MAX_SQUARED_MAHALANOBIS) -> Bools:
+def next_inliers(distance: Floats, inliers: Bools, limit: float) -> Bools:
     """The views to use next: the far ones go, the worst tenth at a time, those that agree come back."""
     worst = np.quantile(distance[inliers], 0.9) if inliers.any() else 0.0
     return np.asarray(np.where(inliers, distance <= max(limit, worst), distance <= limit), dtype=np.bool_)
@@ -118,7 +116,11 @@ class LeftOutViews(NamedTuple):
 
 
 def left_out_views(
-    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
+    posterior: Posterior,
+    points: Floats,
+    seen: tuple[CameraViews, ...],
+    inliers: tuple[Bools, ...],
+    settings: RigModelSettings,
 ) -> list[LeftOutViews]:
     """Per camera."""
     found = []
@@ -128,7 +130,8 @@ def left_out_views(
         slope = posterior.models[c].predict(where[one.rows])[1]
         noise2 = (posterior.models[c].noise * one.relative) ** 2
         values = np.linalg.eigvalsh(covariance) / noise2[:, None]
-        high = ~((values > 0) & (values < MAX_LEVERAGE)).all(axis=1)  # negative: rounding, at a leverage of one
+        limit = settings.max_left_out_variance_ratio
+        high = ~((values > 0) & (values < limit)).all(axis=1)  # negative: rounding, at a leverage of one
         inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         found.append(LeftOutViews(one.rows, residual, inverse, slope, np.asarray(high, dtype=np.bool_)))
     return found
@@ -151,12 +154,16 @@ def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: i
 
 
 def left_out_positions(
-    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
+    posterior: Posterior,
+    points: Floats,
+    seen: tuple[CameraViews, ...],
+    inliers: tuple[Bools, ...],
+    settings: RigModelSettings,
 ) -> Floats:
     """(n, 3) how far each known point is measured off its position by views predicted without it; NaN where fewer than
     two cameras see it."""
     n = len(points)
-    total, _ = sum_over_cameras(left_out_views(posterior, points, seen, inliers), inliers, n)
+    total, _ = sum_over_cameras(left_out_views(posterior, points, seen, inliers, settings), inliers, n)
     information, pull = total.information, total.pull
     values = np.linalg.eigvalsh(np.where(np.isfinite(information), information, 0))
     good = total.coordinates >= 4

@@ -12,28 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.geometry import Floats
-from implicam.rig_model.shot_errors import SHOT_SD_PRIOR, WORLD_POLYNOMIAL_TERMS, Shots
-
-SHOT_SD = float(np.exp(sum(SHOT_SD_PRIOR)))
-"""Sd of the error of one of two or three shots, in the working frame: eq. (17) where nothing is told."""
-
-LEVEL_SD = 0.3 * SHOT_SD
-"""The same of a level of one target: machined in one piece, not moved and stopped again."""
-
-ACROSS_SD_RATIO = 0.7
-"""Across the traverse a shot is off by this part of what it is along it."""
-
-TILT_SD_RATIO = 0.33
-"""A tilt moves the rim of a shot by this part of its shift."""
-
-MIN_LEVELS, MAX_LEVELS = 2, 12
-"""Of a stepped target; more are a lattice."""
-
-MIN_POINTS_PER_LEVEL = 6
-"""Points that a level has on average; a plane takes three."""
-
-MAX_RELATIVE_THICKNESS = 1e-3
-"""Thickness of a level and a tenth of the gap to the next, as a part of the target's extent."""
+from implicam.rig_model.settings import RigModelSettings
+from implicam.rig_model.shot_errors import WORLD_POLYNOMIAL_TERMS, Shots
 
 TRIPLES_TRIED, MAX_POINTS_LOOKED_AT = 600, 200
 """Levels are looked for along the normals of so many random triples of points, among so many points."""
@@ -46,24 +26,26 @@ class Planes(NamedTuple):
     sd: Floats
 
 
-def untold(points: Floats, labels: NDArray[np.str_]) -> Planes | None:
+def untold(points: Floats, labels: NDArray[np.str_], settings: RigModelSettings) -> Planes | None:
     """The planes of known points (n, 3) of which nothing can be told; None where there are none, or enough shots."""
     names = np.unique(labels)
     if len(names) == 1:
-        found = levels(points)
+        found = levels(points, settings)
         if found is None:
             return None
         there, number = found.number >= 0, found.number.astype(np.str_)
-        shots = Shots.of(points[there], number[there], fewest=2, direction=found.normal)
-        return None if shots is None else Planes(shots, _sd(LEVEL_SD))
+        shots = Shots.of(points[there], number[there], settings, fewest=2, direction=found.normal)
+        return None if shots is None else Planes(shots, settings.level_sd_ratio * _shot_sd(settings))
     if len(names) > WORLD_POLYNOMIAL_TERMS:
         return None
-    shots = Shots.of(points, labels, fewest=2)
-    return None if shots is None else Planes(shots, _sd(SHOT_SD))
+    shots = Shots.of(points, labels, settings, fewest=2)
+    return None if shots is None else Planes(shots, _shot_sd(settings))
 
 
-def _sd(size: float) -> Floats:
-    return size * np.array([1, ACROSS_SD_RATIO, ACROSS_SD_RATIO, TILT_SD_RATIO, TILT_SD_RATIO, TILT_SD_RATIO])
+def _shot_sd(settings: RigModelSettings) -> Floats:
+    """(6,) sds of one of two or three shots: eq. (17) where nothing is told."""
+    along = settings.shot_sd_prior_median_wf * float(np.exp(settings.shot_sd_prior_log_sd))
+    return along * np.array([1, *2 * [settings.across_sd_ratio], *3 * [settings.tilt_sd_ratio]])
 
 
 class Levels(NamedTuple):
@@ -73,7 +55,7 @@ class Levels(NamedTuple):
     normal: Floats
 
 
-def levels(points: Floats) -> Levels | None:
+def levels(points: Floats, settings: RigModelSettings) -> Levels | None:
     """Of the points (n, 3) of one target; None if it has none.
 
     Of the axes along which the points stand on a few planes, that with the fewest, and then the one along which the
@@ -83,15 +65,16 @@ def levels(points: Floats) -> Levels | None:
     some = points[np.linspace(0, len(points) - 1, min(MAX_POINTS_LOOKED_AT, len(points))).astype(int)]
     normals = np.concatenate([np.eye(3), _normals(some)])
     along = some @ normals.T
-    apart, clear = _steps(np.sort(along, axis=0))
+    thickness, fewest = settings.max_level_thickness_ratio, settings.min_points_per_level
+    apart, clear = _steps(np.sort(along, axis=0), thickness)
     counts = apart.sum(axis=0) + 1
     slanted = np.arange(len(normals)) >= 3
     for k in np.lexsort((np.ptp(along, axis=0), counts, slanted)):
-        if not clear[k] or not MIN_LEVELS <= counts[k] <= min(MAX_LEVELS, len(points) / MIN_POINTS_PER_LEVEL):
+        if not clear[k] or not settings.min_levels <= counts[k] <= min(settings.max_levels, len(points) / fewest):
             continue
-        number = _numbers(points @ normals[k])
-        large = np.bincount(number) >= MIN_POINTS_PER_LEVEL
-        if large.sum() >= MIN_LEVELS and len(large) <= MAX_LEVELS:
+        number = _numbers(points @ normals[k], thickness)
+        large = np.bincount(number) >= fewest
+        if large.sum() >= settings.min_levels and len(large) <= settings.max_levels:
             return Levels(np.where(large[number], number, -1), normals[k])
     return None
 
@@ -107,21 +90,19 @@ def _normals(points: Floats) -> Floats:
     return np.asarray(normal[good] / size[good, None], dtype=np.float64)
 
 
-def _steps(t: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _steps(t: Floats, thickness: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Of sorted values t (n, k): (n - 1, k) where a level ends; and (k,) whether the levels are thin and well apart."""
     step = np.diff(t, axis=0)
     extent = np.ptp(t, axis=0)
-    apart = step >= 10 * MAX_RELATIVE_THICKNESS * extent
+    apart = step >= 10 * thickness * extent
     within = np.where(apart, 0, step)
-    thin = within.max(axis=0) <= MAX_RELATIVE_THICKNESS * extent
-    return apart, thin & (within.sum(axis=0) <= MAX_RELATIVE_THICKNESS * extent * (apart.sum(axis=0) + 1)) & (
-        extent > 0
-    )
+    thin = within.max(axis=0) <= thickness * extent
+    return apart, thin & (within.sum(axis=0) <= thickness * extent * (apart.sum(axis=0) + 1)) & (extent > 0)
 
 
-def _numbers(t: Floats) -> NDArray[np.int64]:
+def _numbers(t: Floats, thickness: float) -> NDArray[np.int64]:
     """(n,) numbers of the levels."""
     order = np.argsort(t)
     number = np.zeros(len(t), dtype=np.int64)
-    number[order[1:]] = np.cumsum(_steps(t[order, None])[0][:, 0])
+    number[order[1:]] = np.cumsum(_steps(t[order, None], thickness)[0][:, 0])
     return number

@@ -19,33 +19,10 @@ from scipy.optimize import minimize
 from scipy.special import chdtri, fdtri, gammainccinv
 
 from implicam.geometry import Floats
-
-POSITION_SD_PRIOR = (np.log(5e-4), 1.5)
-"""Prior of the sd of a known position, median and log sd, in the working frame: machined, printed or driven there."""
-
-ANISOTROPY_PRIOR_SD = 0.7
-"""Prior sd of how the log sds of the directions differ from each other."""
-
-LOG_NOISE_PRIOR_SD = 0.7
-"""Prior sd of the log of how much of the noise is left; the fit took the errors of positions for noise."""
-
-MIN_GAIN_NATS = 3.0
-"""Nats of evidence by which errors of known positions must explain the views better than noise alone: 20 to 1."""
-
-DEGREES_OF_FREEDOM = (np.inf, 8.0, 4.0, 3.0)
-"""Degrees of freedom to choose from, the fewest with a variance; and that of the normal distribution."""
-
-MIN_TAIL_GAIN_NATS = 3.0
-"""Nats by which a tail must do better than the normal distribution."""
-
-ERROR_BAR_LEVEL = 0.95
-"""What error bars are judged by. The variance of a t would do for all levels together and too little for this one."""
+from implicam.rig_model.settings import RigModelSettings
 
 QUADRATURE_NODES = 7
 """Of the quadrature over a point's own scale."""
-
-MAX_LOG_NOISE_VARIANCE, MAX_LOG_SD_VARIANCE = 0.25, 1.0
-"""At most these variances of the log noise and of a log sd enter a mean variance: their tails are not normal."""
 
 MIN_CURVATURE = 0.05
 """Of minus the log posterior: the prior alone is more curved; what is less is rounding, or not yet the optimum."""
@@ -77,21 +54,22 @@ class PositionErrors:
 
     noise: what is left of the noise that the fit without them has found, at most 1. gain: nats of evidence by which
     they explain the views better than noise alone. scale and noise are of the mean variance, as eq. (12) has it. size:
-    (n,) of each known point, by how much it seems to be farther off than usual.
+    (n,) of each known point, by how much it seems to be farther off than usual. level: what error bars are judged by.
     """
 
     scale: Floats
     freedom: float
     noise: float
     gain: float
+    level: float
     size: Floats | None = None
 
     @property
     def covariance(self) -> Floats:
-        """(3, 3) of the normal distribution whose 95 % ellipsoid holds 95 % of the errors: more than theirs."""
+        """(3, 3) of the normal distribution whose ellipsoid at the level holds as many of the errors: it is larger."""
         if np.isinf(self.freedom):
             return self.scale
-        ratio = 3 * fdtri(3, self.freedom, ERROR_BAR_LEVEL) / chdtri(3, 1 - ERROR_BAR_LEVEL)
+        ratio = 3 * fdtri(3, self.freedom, self.level) / chdtri(3, 1 - self.level)
         return np.asarray(self.scale * ratio, dtype=np.float64)
 
     @property
@@ -106,20 +84,20 @@ class PositionErrors:
         return np.asarray(1 / np.sum(found.share / _nodes(self.freedom)[0][:, None], axis=0), dtype=np.float64)
 
 
-def estimate_position_errors(agreement: Agreement) -> PositionErrors | None:
+def estimate_position_errors(agreement: Agreement, settings: RigModelSettings) -> PositionErrors | None:
     """The most probable errors of known positions; None where noise alone explains the views as well."""
     if len(agreement.coordinates) < 4:
         return None
-    found = _most_probable(agreement, np.inf, None)
-    gain = _evidence(agreement, found)
-    if gain < MIN_GAIN_NATS:
+    found = _most_probable(agreement, np.inf, None, settings)
+    gain = _evidence(agreement, found, settings)
+    if gain < settings.min_position_gain_nats:
         return None
     normal = found.value
-    for freedom in DEGREES_OF_FREEDOM[1:]:
-        other = _most_probable(agreement, freedom, found.at)
-        if other.value < min(found.value, normal - MIN_TAIL_GAIN_NATS):
+    for freedom in settings.position_degrees_of_freedom:
+        other = _most_probable(agreement, freedom, found.at, settings)
+        if other.value < min(found.value, normal - settings.min_position_tail_gain_nats):
             found = other
-    return _mean_variances(agreement, found, gain + normal - found.value)
+    return _mean_variances(agreement, found, gain + normal - found.value, settings)
 
 
 class _Found(NamedTuple):
@@ -130,31 +108,32 @@ class _Found(NamedTuple):
     value: float
 
 
-def _evidence(agreement: Agreement, found: _Found) -> float:
+def _evidence(agreement: Agreement, found: _Found, settings: RigModelSettings) -> float:
     """Log of how much more probable the views are with errors of any size than with none: Laplace, the noise at its
     most probable either way, eq. (25)."""
-    alone = float(_noise_alone(agreement, np.linspace(*LOG_NOISE_BOUNDS, 121)).min())
-    prior = np.array([_prior(z)[1] - _prior(0 * z)[1] for z in np.eye(7)])
-    shrunk = np.linalg.slogdet(prior[:6, :6])[1] - np.linalg.slogdet(_curvature(agreement, found)[:6, :6])[1]
+    alone = float(_noise_alone(agreement, np.linspace(*LOG_NOISE_BOUNDS, 121), settings).min())
+    prior = np.array([_prior(z, settings)[1] - _prior(0 * z, settings)[1] for z in np.eye(7)])
+    curvature = _curvature(agreement, found, settings)
+    shrunk = np.linalg.slogdet(prior[:6, :6])[1] - np.linalg.slogdet(curvature[:6, :6])[1]
     return float(alone - found.value + 0.5 * shrunk)
 
 
-def _curvature(agreement: Agreement, found: _Found) -> Floats:
+def _curvature(agreement: Agreement, found: _Found, settings: RigModelSettings) -> Floats:
     """(7, 7) second derivatives of minus the log posterior."""
-    objective, h = _objective(agreement, found.freedom), 1e-3
+    objective, h = _objective(agreement, found.freedom, settings), 1e-3
     hessian = np.array([(objective(found.at + d)[1] - objective(found.at - d)[1]) / (2 * h) for d in h * np.eye(7)])
     values, turned = np.linalg.eigh(0.5 * (hessian + hessian.T))
     return np.asarray(turned * np.maximum(values, MIN_CURVATURE) @ turned.T, dtype=np.float64)
 
 
-def _noise_alone(agreement: Agreement, log_noise: Floats) -> Floats:
+def _noise_alone(agreement: Agreement, log_noise: Floats, settings: RigModelSettings) -> Floats:
     squares, coordinates = float(agreement.squares.sum()), float(agreement.coordinates.sum())
-    terms = squares * np.exp(-2 * log_noise) + 2 * coordinates * log_noise + (log_noise / LOG_NOISE_PRIOR_SD) ** 2
-    return np.asarray(0.5 * terms, dtype=np.float64)
+    prior = (log_noise / settings.position_noise_prior_log_sd) ** 2
+    return 0.5 * (squares * np.exp(-2 * log_noise) + 2 * coordinates * log_noise + prior)
 
 
-def _most_probable(agreement: Agreement, freedom: float, start: Floats | None) -> _Found:
-    objective = _objective(agreement, freedom)
+def _most_probable(agreement: Agreement, freedom: float, start: Floats | None, settings: RigModelSettings) -> _Found:
+    objective = _objective(agreement, freedom, settings)
     if start is None:
         sizes = [(size, noise) for size in (5e-4, 2e-3, 8e-3) for noise in (-0.1, -0.7)]
         trials = [np.array([*np.full(3, 2 * np.log(size)), 0, 0, 0, noise]) for size, noise in sizes]
@@ -164,7 +143,9 @@ def _most_probable(agreement: Agreement, freedom: float, start: Floats | None) -
     return _Found(z, freedom, objective(z)[0])
 
 
-def _objective(agreement: Agreement, freedom: float) -> Callable[[Floats], tuple[float, Floats]]:
+def _objective(
+    agreement: Agreement, freedom: float, settings: RigModelSettings
+) -> Callable[[Floats], tuple[float, Floats]]:
     """Minus the log posterior of z: the matrix logarithm of the scale (xx, yy, zz, xy, xz, yz), and the log noise."""
 
     def objective(z: Floats) -> tuple[float, Floats]:
@@ -173,7 +154,7 @@ def _objective(agreement: Agreement, freedom: float) -> Callable[[Floats], tuple
         found = _Scales.of(agreement, scale).likelihood(z[6], freedom)
         chain = vectors @ ((vectors.T @ found.by_scale @ vectors) * _divided(values)) @ vectors.T
         gradient = np.array([*np.diag(chain), *(2 * chain[_OFF]), found.by_noise])
-        prior, by_prior = _prior(z)
+        prior, by_prior = _prior(z, settings)
         return found.value + prior, gradient + by_prior
 
     return objective
@@ -197,19 +178,18 @@ def _divided(values: Floats) -> Floats:
     return np.asarray(np.where(near, middle, (size[:, None] - size) / np.where(near, 1, difference)), dtype=np.float64)
 
 
-def _prior(z: Floats) -> tuple[float, Floats]:
+def _prior(z: Floats, settings: RigModelSettings) -> tuple[float, Floats]:
     """Minus the log prior, the same in every world frame, and its slope."""
+    median, sd = np.log(settings.position_sd_prior_median_wf), settings.position_sd_prior_log_sd
+    unlike_sd, noise_sd = settings.position_anisotropy_prior_sd, settings.position_noise_prior_log_sd
     usual = z[:3].sum() / 6  # log sd, mean over the directions
     unlike = np.array([*(0.5 * z[:3] - usual), *(0.5 * z[3:6])])
     twice = np.array([1.0, 1, 1, 2, 2, 2])
-    value = (
-        0.5 * ((usual - POSITION_SD_PRIOR[0]) / POSITION_SD_PRIOR[1]) ** 2
-        + 0.5 * np.sum(twice * unlike**2) / ANISOTROPY_PRIOR_SD**2
-    )
-    value += 0.5 * (z[6] / LOG_NOISE_PRIOR_SD) ** 2
-    slope = 0.5 * twice * unlike / ANISOTROPY_PRIOR_SD**2  # the mean of `unlike` is zero
-    slope[:3] += (usual - POSITION_SD_PRIOR[0]) / POSITION_SD_PRIOR[1] ** 2 / 6
-    return float(value), np.append(slope, z[6] / LOG_NOISE_PRIOR_SD**2)
+    value = 0.5 * ((usual - median) / sd) ** 2 + 0.5 * np.sum(twice * unlike**2) / unlike_sd**2
+    value += 0.5 * (z[6] / noise_sd) ** 2
+    slope = 0.5 * twice * unlike / unlike_sd**2  # the mean of `unlike` is zero
+    slope[:3] += (usual - median) / sd**2 / 6
+    return float(value), np.append(slope, z[6] / noise_sd**2)
 
 
 class _Likelihood(NamedTuple):
@@ -277,12 +257,13 @@ def _nodes(freedom: float) -> tuple[Floats, Floats]:
     return np.asarray(own, dtype=np.float64), np.asarray(weight / 2, dtype=np.float64)
 
 
-def _mean_variances(agreement: Agreement, found: _Found, gain: float) -> PositionErrors:
+def _mean_variances(agreement: Agreement, found: _Found, gain: float, settings: RigModelSettings) -> PositionErrors:
     """With mean variances, larger than the most probable ones where there are few points: as eq. (12)."""
-    spread = np.linalg.inv(_curvature(agreement, found))
+    spread = np.linalg.inv(_curvature(agreement, found, settings))
     logs, axes = np.linalg.eigh(_symmetric(found.at))
     along = 0.5 * np.array([[*(q**2), 2 * q[0] * q[1], 2 * q[0] * q[2], 2 * q[1] * q[2]] for q in axes.T])
-    variance = np.minimum(np.einsum("ai,ij,aj->a", along, spread[:6, :6], along), MAX_LOG_SD_VARIANCE)
-    noise = float(np.exp(found.at[6] + min(spread[6, 6], MAX_LOG_NOISE_VARIANCE)))
+    variance = np.einsum("ai,ij,aj->a", along, spread[:6, :6], along)
+    variance = np.minimum(variance, settings.max_position_log_sd_variance)
+    noise = float(np.exp(found.at[6] + min(spread[6, 6], settings.max_position_log_noise_variance)))
     scale = (axes * np.exp(logs + 2 * variance)) @ axes.T
-    return PositionErrors(scale, found.freedom, min(noise, 1.0), gain)
+    return PositionErrors(scale, found.freedom, min(noise, 1.0), gain, settings.error_bar_level)

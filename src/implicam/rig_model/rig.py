@@ -18,9 +18,9 @@ from implicam.rig_model.alarm import Table, alarm_of
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
 from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
 from implicam.rig_model.triangulate import Labels, Located, locate
-from implicam.rig_model.wrong_views import AGREE_P_VALUE
 
 LENS_KINDS = ("ordinary", "aspect")
 """Kinds of cameras that cannot follow anything that lenses do not do."""
@@ -46,7 +46,7 @@ class FittedRig:
     """trained: what the cameras saw when they were fitted, all cameras; cameras: numbers of those that could be, in
     the order of posterior.models; posterior: in the working frame; labels: how known positions are off, if they are.
     misfit_adds: residuals that are larger than the views state come from the lens models, and not from the views.
-    degrees: of freedom of the noise, None where it is normal."""
+    degrees: of freedom of the noise, None where it is normal. settings: which views disagree, and when that alarms."""
 
     trained: Observations
     length_unit: str
@@ -56,6 +56,7 @@ class FittedRig:
     labels: Labels | None = None
     misfit_adds: bool = False
     degrees: float | None = None
+    settings: RigModelSettings = DEFAULT_SETTINGS
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -73,7 +74,7 @@ class FittedRig:
         trained = self.trained.with_cameras(known) if known else self.trained
         observations = same_cameras(trained, observations)
         uv, noise = self.views(observations)
-        found = locate(self.posterior, uv, noise, self.labels, self.degrees)
+        found = locate(self.posterior, uv, noise, self.labels, self.degrees, self.settings)
         seen = np.asarray(np.isfinite(uv).all(axis=2))
         measured = Measurement(
             observations.points,
@@ -85,15 +86,25 @@ class FittedRig:
             self.length_unit,
         )
         cameras = tuple(self.trained.cameras[c] for c in self.cameras)
-        checked = len(self.trained) > 0
-        table = Table(cameras, uv, noise, found.p, found.left_out, self._agree, self._lines, self._pixels, checked)
+        table = Table(
+            cameras,
+            uv,
+            noise,
+            found.p,
+            found.left_out,
+            self._agree,
+            self._lines,
+            self._pixels,
+            checked=len(self.trained) > 0,
+            settings=self.settings,
+        )
         return measured.with_alarm(alarm_of(table))
 
     def _agree(self, uv: Floats) -> NDArray[np.bool_]:
         """(n,) whether all views (n, C, 2) of each point agree, with the usual noise."""
         noise = np.broadcast_to([model.noise for model in self.posterior.models], uv.shape[:2])
-        found = locate(self.posterior, uv, noise, self.labels)
-        return np.asarray((found.p >= AGREE_P_VALUE) & ~found.left_out.any(axis=1))
+        found = locate(self.posterior, uv, noise, self.labels, settings=self.settings)
+        return np.asarray((found.p >= self.settings.agree_p_value) & ~found.left_out.any(axis=1))
 
     def _lines(self, uv: Floats) -> Iterator[tuple[Floats, Floats]]:
         """Per calibrated camera the centre (3,) and directions (n, 3) of the lines of sight of pixels (n, C, 2)."""

@@ -17,32 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.geometry import Floats
-
-MIN_POINTS_PER_SHOT = 6
-"""A shot's position is judged by its own points: so many at least."""
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 
 WORLD_POLYNOMIAL_TERMS = 3
 """Constant, linear, quadratic: what of the shots' errors is the world."""
-
-INITIAL_SHOT_SD = 2e-3
-"""Sd of a shot's error to begin with, in the working frame."""
-
-MAX_TILT_RADII = 2.0
-"""Plate radii off its centre beyond which a tilt says no more: it is small, and not a matter of the whole world."""
-
-MAX_WORLD_HALF_LENGTHS, MAX_WORLD_VARIANCE_RATIO = 3.0, 100.0
-"""Half lengths of the traverse off its middle, and times the variance of a shot's error, to which the parabola through
-the shots is followed: beyond, nobody believes it."""
-
-MAX_RELATIVE_THICKNESS, MAX_ONE_MINUS_COSINE = 0.01, 1e-4
-"""Thickness over width of a plate, and one less the cosine between two (0.8 degrees), up to which they are parallel
-plates."""
-
-LABEL_REACH_GAPS = 0.25
-"""How far the label of a shot holds around it, as a part of the distance to the next one."""
-
-SHOT_SD_PRIOR = (np.log(3e-3), 1.0)
-"""Prior of how far a shot is off, median and log sd, in the working frame: a thousandth of the volume's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +37,14 @@ class Shots:
     radius: Floats
     along: Floats
     pattern: Floats
+    settings: RigModelSettings
 
     @classmethod
     def of(
         cls,
         points: Floats,
         labels: NDArray[np.str_],
+        settings: RigModelSettings = DEFAULT_SETTINGS,
         *,
         fewest: int = WORLD_POLYNOMIAL_TERMS + 1,
         direction: Floats | None = None,
@@ -77,7 +57,7 @@ class Shots:
         """
         _, shot, count = np.unique(labels, return_inverse=True, return_counts=True)
         S = len(count)
-        if fewest > S or count.min() < MIN_POINTS_PER_SHOT:
+        if fewest > S or count.min() < settings.min_points_per_shot:
             return None
         members = [points[shot == s] for s in range(S)]
         centre = np.array([m.mean(axis=0) for m in members])
@@ -85,14 +65,14 @@ class Shots:
         spans = [np.abs((m - c) @ a.T) for m, c, a in zip(members, centre, axes, strict=True)]
         extent = np.array([span.max(axis=0) for span in spans])
         radius = np.array([np.sqrt(np.mean(np.sum(span**2, axis=1))) for span in spans])
-        direction = _common_normal(axes, extent) if direction is None else direction
+        direction = _common_normal(axes, extent, settings) if direction is None else direction
         along = np.linalg.svd(centre - centre.mean(axis=0) if direction is None else direction[None])[2]
         t = (centre - centre.mean(axis=0)) @ along[0]
         if np.ptp(t) < 1e-9 or len(np.unique(np.round(t / np.ptp(t), 6))) < min(fewest, S):
             return None
         smooth = np.vander(t / np.abs(t).max(), WORLD_POLYNOMIAL_TERMS)
         pattern = np.linalg.qr(smooth, mode="complete")[0][:, WORLD_POLYNOMIAL_TERMS:]
-        return cls(shot.astype(np.int64), centre, axes, extent, radius, along, pattern)
+        return cls(shot.astype(np.int64), centre, axes, extent, radius, along, pattern, settings)
 
     def errors(self, points: Floats) -> ShotErrors:
         """All shots as one: shift along, across (2), and three tilts, each with every pattern."""
@@ -100,9 +80,8 @@ class Shots:
         basis = own[:, :, :, None] * self.pattern[self.shot][:, None, None, :]
         group = np.repeat([0, 1, 1, 2, 2, 2], self.pattern.shape[1])
         basis = basis.reshape(len(points), 3, -1)
-        return ShotErrors(
-            np.zeros(len(points), dtype=np.int64), basis, np.full((1, basis.shape[2]), INITIAL_SHOT_SD), group
-        )
+        sd = np.full((1, basis.shape[2]), self.settings.initial_shot_sd_wf)
+        return ShotErrors(np.zeros(len(points), dtype=np.int64), basis, sd, group)
 
     def _rigid(self, points: Floats, shot: NDArray[np.int64]) -> Floats:
         """(n, 3, 6) displacement of points with their shot: by a unit along, across and by a tilt of a unit at rms."""
@@ -118,7 +97,7 @@ class Shots:
             np.min(self._outside(self.centre[[s]])[0, np.arange(len(self.centre)) != s])
             for s in range(len(self.centre))
         ]
-        return LABEL_REACH_GAPS * float(np.median(nearest))
+        return self.settings.label_reach_gaps * float(np.median(nearest))
 
     def _outside(self, points: Floats) -> Floats:
         """(n, S) how far points are outside the box of each shot's points."""
@@ -146,7 +125,7 @@ class Shots:
             return np.zeros((len(points), 3, 3))
         holds = np.exp(-0.5 * (outside[np.arange(len(points)), nearest] / self._reach) ** 2)
         lengths = np.linalg.norm(points - self.centre[nearest], axis=1) / self.radius[nearest]
-        within = np.minimum(1, MAX_TILT_RADII / np.maximum(lengths, 1e-12))
+        within = np.minimum(1, self.settings.max_tilt_radii / np.maximum(lengths, 1e-12))
         lever = self._rigid(points, nearest) * sd
         lever[:, :, 3:] *= within[:, None, None]
         return np.asarray((1 - holds**2)[:, None, None] * (lever @ lever.swapaxes(1, 2)), dtype=np.float64)
@@ -157,17 +136,19 @@ class Shots:
         t = (self.centre - (middle := self.centre.mean(axis=0))) @ self.along[0]
         half = np.abs(t).max()
         terms = min(WORLD_POLYNOMIAL_TERMS, len(t))
-        at = np.clip((points - middle) @ self.along[0] / half, -MAX_WORLD_HALF_LENGTHS, MAX_WORLD_HALF_LENGTHS)
+        farthest = self.settings.max_world_half_lengths
+        at = np.clip((points - middle) @ self.along[0] / half, -farthest, farthest)
         weights = np.vander(at, terms) @ np.linalg.pinv(np.vander(t / half, terms))
-        return np.asarray(np.minimum(np.sum(weights**2, axis=1), MAX_WORLD_VARIANCE_RATIO), dtype=np.float64)
+        most = self.settings.max_world_variance_ratio
+        return np.asarray(np.minimum(np.sum(weights**2, axis=1), most), dtype=np.float64)
 
 
-def _common_normal(axes: Floats, extent: Floats) -> Floats | None:
+def _common_normal(axes: Floats, extent: Floats, settings: RigModelSettings) -> Floats | None:
     """(3,) of parallel plates, None of other shots. Where some of a plate's points are missing, its centre lies beside
     the others', so that the centres say poorly where thin slabs follow each other."""
     normals = axes[:, 2]
-    flat = extent[:, 2] <= MAX_RELATIVE_THICKNESS * extent[:, 1]
-    parallel = np.abs(normals @ normals[0]) >= 1 - MAX_ONE_MINUS_COSINE
+    flat = extent[:, 2] <= settings.max_plate_thickness_ratio * extent[:, 1]
+    parallel = np.abs(normals @ normals[0]) >= 1 - settings.max_plate_one_minus_cosine
     return np.asarray(normals[0], dtype=np.float64) if (flat & parallel).all() else None
 
 
@@ -199,7 +180,7 @@ class ShotErrors:
         """Whether any sd is estimated."""
         return bool((self.group >= 0).any())
 
-    def updated(self, mean: Floats, variance: Floats) -> tuple[ShotErrors, Floats]:
+    def updated(self, mean: Floats, variance: Floats, settings: RigModelSettings) -> tuple[ShotErrors, Floats]:
         """With more probable sds, from the posterior of the unknowns (shots, k) in sds: one step of EM, eq. (17); and
         (shots, k) the sds for error bars.
 
@@ -208,16 +189,15 @@ class ShotErrors:
         """
         second = (mean**2 + variance) * self.sd**2
         sd, mean_sd = self.sd.copy(), self.sd.copy()
+        usual, precision = np.log(settings.shot_sd_prior_median_wf), 1 / settings.shot_sd_prior_log_sd**2
         for number in np.unique(self.group[self.group >= 0]):
             members = self.group == number
             n, total = second[:, members].size, float(second[:, members].sum())
             u = 0.5 * np.log(total / n)
             for _ in range(30):  # Newton; the log posterior is concave in u = log sd
                 pull = total * np.exp(-2 * u)
-                u -= (n - pull + (u - SHOT_SD_PRIOR[0]) / SHOT_SD_PRIOR[1] ** 2) / (
-                    2 * pull + 1 / SHOT_SD_PRIOR[1] ** 2
-                )
+                u -= (n - pull + (u - usual) * precision) / (2 * pull + precision)
             told = float(np.sum(1 - np.minimum(variance[:, members], 1)))  # of n, how many the data tell
             sd[:, members] = np.exp(u)
-            mean_sd[:, members] = np.exp(u + 1 / (2 * told + 1 / SHOT_SD_PRIOR[1] ** 2))
+            mean_sd[:, members] = np.exp(u + 1 / (2 * told + precision))
         return replace(self, sd=sd), mean_sd

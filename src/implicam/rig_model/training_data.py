@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from implicam.dataset.requirements import require_points, require_volume
 from implicam.geometry import FAR_OUT, Floats
 from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraViews
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.shot_errors import ShotErrors, Shots
 
 MIN_POINTS_PER_CAMERA = 8
@@ -60,17 +62,6 @@ class Frame:
         return points * self.scale + self.offset
 
 
-def training_data_of(lens: str, data: Dataset, frame: Frame, *, shots_off: bool = True) -> TrainingData:
-    """What known points say, in the working frame; shots_off: estimate how shots are off as a whole."""
-    observations, points = data.observations, frame.to_working(data.xyz)
-    stated = stated_noise(observations)
-    images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
-    shots = _shots(data, points) if shots_off else None
-    errors = shots.errors(points) if shots is not None else _declared(data, frame)
-    camera_views = camera_views_of(observations, stated)
-    return TrainingData(points, observations.camera_names, camera_views, images, stated, errors, lens)
-
-
 def camera_views_of(observations: Observations, stated: Floats) -> tuple[CameraViews, ...]:
     """What each camera saw, all of it."""
     relative = relative_noise(observations, stated)
@@ -112,11 +103,6 @@ def _declares(data: Dataset) -> bool:
     return bool((data.positions.sd > 0).any())
 
 
-def _shots(data: Dataset, points: Floats) -> Shots | None:
-    """Shots whose errors are to be estimated: many points each, and nothing declared."""
-    return None if _declares(data) else Shots.of(points, data.shots)
-
-
 def _declared(data: Dataset, frame: Frame) -> ShotErrors | None:
     """A shot is off as a whole by its declared sd: a robot or a slide puts all its points there together."""
     if not _declares(data):
@@ -139,7 +125,7 @@ def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
 @dataclass(frozen=True, eq=False)
 class TrainingData:
     """Known points (n, 3) in the working frame; per camera what it saw (all of it), its image, and its stated noise in
-    pixels or NaN; how the points may be off; lens: "auto", "central" or "none"."""
+    pixels or NaN; how the points may be off; lens: "auto", "central" or "none"; what the fit takes for usual."""
 
     points: Floats
     names: tuple[str, ...]
@@ -148,3 +134,24 @@ class TrainingData:
     stated: Floats
     errors: ShotErrors | None
     lens: str
+    settings: RigModelSettings
+
+    @classmethod
+    def of(
+        cls,
+        lens: str,
+        data: Dataset,
+        frame: Frame,
+        settings: RigModelSettings = DEFAULT_SETTINGS,
+        *,
+        shots_off: bool = True,
+    ) -> Self:
+        """What known points say, in the working frame; shots_off: estimate how shots are off as a whole."""
+        observations, points = data.observations, frame.to_working(data.xyz)
+        stated = stated_noise(observations)
+        images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
+        estimated = shots_off and not _declares(data)  # many points each, and nothing declared
+        shots = Shots.of(points, data.shots, settings) if estimated else None
+        errors = shots.errors(points) if shots is not None else _declared(data, frame)
+        camera_views = camera_views_of(observations, stated)
+        return cls(points, observations.camera_names, camera_views, images, stated, errors, lens, settings)

@@ -17,8 +17,9 @@ from implicam.rig_model.heavy_tails import consistency, equivalent_normal_noise,
 from implicam.rig_model.normal_equations import POINTS_PER_CHUNK
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.schur import Unknowns
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.shot_errors import Shots
-from implicam.rig_model.wrong_views import DISAGREE_P_VALUE, LinearisedViews, apply_weights, exclude_wrong_views
+from implicam.rig_model.wrong_views import LinearisedViews, apply_weights, exclude_wrong_views
 from implicam.threads import side_by_side
 
 MAX_GAUSS_NEWTON_STEPS = 12
@@ -28,14 +29,8 @@ CONVERGED_STEP_SDS = 1e-3
 MIN_INFORMATION_RATIO = 1e-14
 """Of a position, in its worst direction over that in its best: what is less is rounding, and may be negative."""
 
-REWEIGHTINGS = 3
-"""Times that the views of tied cameras are weighted, where their noise has heavy tails."""
-
 STEPS_TO_MEND, HOPELESS_CHI_SQUARED = 3, 1e4
 """Steps after which chi-squared beyond this, at the end of the next step, will not come down to what is possible."""
-
-MIN_P_VALUE = 1e-10
-"""Below this p-value there is no position, but a wrong match: a number would be worse than none."""
 
 
 class Located(NamedTuple):
@@ -73,14 +68,23 @@ class Labels(NamedTuple):
 
 
 def locate(
-    posterior: Posterior, uv: Floats, noise: Floats, labels: Labels | None = None, degrees: float | None = None
+    posterior: Posterior,
+    uv: Floats,
+    noise: Floats,
+    labels: Labels | None = None,
+    degrees: float | None = None,
+    settings: RigModelSettings = DEFAULT_SETTINGS,
 ) -> Located:
     """Points from pixels uv (n, C, 2), NaN where not seen, with noise (n, C) in pixels: normal, or the scale of a t
     with so many degrees of freedom."""
     if len(uv) == 0:
         return Located(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(uv.shape[:2], dtype=np.bool_))
     parts = [slice(i, i + POINTS_PER_CHUNK) for i in range(0, len(uv), POINTS_PER_CHUNK)]
-    found = side_by_side(lambda part: _locate(_Seen(posterior, uv[part], noise[part], labels, degrees)), parts)
+
+    def one(part: slice) -> Located:
+        return _locate(_Seen(posterior, uv[part], noise[part], labels, degrees, settings))
+
+    found = side_by_side(one, parts)
     return Located(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
@@ -88,12 +92,12 @@ def _locate(points: _Seen) -> Located:
     seen = np.asarray(np.isfinite(points.uv).all(axis=2))
     xyz, cov, p = points.solved(np.arange(len(seen)), seen)
     left_out = np.zeros_like(seen)
-    bad = np.flatnonzero((seen.sum(axis=1) >= 3) & ~(p >= DISAGREE_P_VALUE))
+    bad = np.flatnonzero((seen.sum(axis=1) >= 3) & ~(p >= points.settings.disagree_p_value))
     for some in np.split(bad, range(POINTS_PER_CHUNK // 16, len(bad), POINTS_PER_CHUNK // 16)):
         for better in exclude_wrong_views(points, some, seen[some]):
             rows = better.rows
             xyz[rows], cov[rows], p[rows], left_out[rows] = better.xyz, better.cov, better.p, better.left_out
-    impossible = p < MIN_P_VALUE
+    impossible = p < points.settings.min_p_value
     xyz[impossible], cov[impossible] = np.nan, np.nan
     return Located(xyz, cov, p, left_out)
 
@@ -107,6 +111,7 @@ class _Seen:
     noise: Floats
     labels: Labels | None = None
     degrees: float | None = None
+    settings: RigModelSettings = DEFAULT_SETTINGS
 
     def solved(self, rows: NDArray[np.int64], seen: Bools) -> tuple[Floats, Floats, Floats]:
         """Positions, covariances and p-values of points from the views `seen` alone."""
@@ -127,11 +132,11 @@ class _Seen:
         rows, seen = rows[good], seen[good]
         linear = self.linear(rows, found.x[good], seen)
         if linear.joint is None:
-            better = refine_positions(linear, degrees)
+            better = refine_positions(linear, degrees, self.settings)
             xyz[good], cov[good] = found.x[good] + better.step, better.cov
             p[good] = consistency(better.distance, seen, degrees)
             return xyz, cov, p
-        for _ in range(REWEIGHTINGS):
+        for _ in range(self.settings.reweightings):
             distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
             noise = equivalent_normal_noise(self.noise[rows], distance, seen, degrees)
             again = _solve(self.posterior, found.x[good], self.uv[rows], noise, seen, self.labels)

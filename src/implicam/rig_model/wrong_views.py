@@ -17,25 +17,13 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from implicam.geometry import Bools, Floats
+from implicam.rig_model.settings import RigModelSettings
 
 Ints = NDArray[np.int64]
-
-DISAGREE_P_VALUE = 1e-4
-"""Below this p-value the views disagree, and those are looked for that the others would do better without."""
-
-AGREE_P_VALUE = 1e-3
-"""The p-value that the others must have among themselves then."""
-
-CLEARLY_BETTER_RATIO = 100.0
-"""How many times better they must agree than without any other choice of as many views."""
 
 MAX_PAIRS_TRIED = 40
 """Pairs of lines of sight that a place is tried from: all of up to nine views. Of more, with 45 % of them wrong, one in
 a million points has no good pair among so many."""
-
-MAX_SUSPECTS_OF_TWO = 8
-"""Views of a point that are combined to pairs; MAX_SUSPECTS_OF_THREE of them to triples."""
-MAX_SUSPECTS_OF_THREE = 4
 
 FAR_STEP_PX = 10.0
 """Pixels: a step from a robust place beyond which the cameras are linearised once more."""
@@ -66,6 +54,10 @@ class LinearisedViews(NamedTuple):
 
 class Points(Protocol):
     """Points whose views are asked about, by their rows."""
+
+    @property
+    def settings(self) -> RigModelSettings:
+        """Which views disagree, and which choice is clearly better."""
 
     @property
     def degrees(self) -> float | None:
@@ -154,7 +146,8 @@ def _clearly_better(points: Points, rows: Ints, seen: Bools, groups: tuple[Ints,
     order = np.argsort(-ps, axis=0)
     best, index = order[0], np.arange(n)
     second = ps[order[1], index] if len(groups) > 1 else np.zeros(n)
-    good = np.flatnonzero((ps[best, index] > AGREE_P_VALUE) & (ps[best, index] > CLEARLY_BETTER_RATIO * second))
+    least, ratio = points.settings.agree_p_value, points.settings.clearly_better_ratio
+    good = np.flatnonzero((ps[best, index] > least) & (ps[best, index] > ratio * second))
     where = best[good] * n + good
     return BetterChoice(rows[good], x[where], cov[where], p[where], out[best[good], good])
 
@@ -185,6 +178,7 @@ class _Choices(NamedTuple):
     squares: Floats
     distance: Floats
     degrees: float | None
+    settings: RigModelSettings
 
     @classmethod
     def about(cls, points: Points, rows: Ints, seen: Bools) -> _Choices:
@@ -200,12 +194,12 @@ class _Choices(NamedTuple):
         u = Wr - np.einsum("ncij,nj->nci", B, step)
         squares = np.sum(r * Wr, axis=(1, 2)) - np.einsum("ni,ni->n", g, step)
         distance = np.where(seen, np.einsum("nci,ncij,ncj->nc", r, linear.each, r), -1.0)
-        return cls(seen, linear, u, B, inverse, squares, distance, points.degrees)
+        return cls(seen, linear, u, B, inverse, squares, distance, points.degrees, points.settings)
 
     @property
     def clearly_off(self) -> Ints:
         """(n,) how many views are far from the place."""
-        return np.asarray((chdtrc(2, self._as_normal) < DISAGREE_P_VALUE).sum(axis=1), dtype=np.int64)
+        return np.asarray((chdtrc(2, self._as_normal) < self.settings.disagree_p_value).sum(axis=1), dtype=np.int64)
 
     @property
     def _as_normal(self) -> Floats:
@@ -218,7 +212,7 @@ class _Choices(NamedTuple):
         worst = np.argsort(-self.distance[some], axis=1, kind="stable")
         n, C = len(some), self.seen.shape[1]
         best = [_Groups(np.full((n, size), -1), np.full(n, np.inf)) for _ in range(2)]
-        for places in _all_but_one(size, C):
+        for places in _all_but_one(size, C, self.settings):
             others = worst[:, list(places)]
             chi2 = self._without(some, others)  # (n, C): without these and each other view
             for _ in range(2):
@@ -235,7 +229,9 @@ class _Choices(NamedTuple):
         p = [np.where(np.isfinite(g.chi2), chdtrc(free, self._misfit(some, g)), 0) for g in (best, second)]
         known = (best.group >= 0).all(axis=1) & (second.group >= 0).all(axis=1)
         return np.asarray(
-            known & (p[0] * P_VALUE_SLACK > AGREE_P_VALUE) & (p[0] * P_VALUE_SLACK > CLEARLY_BETTER_RATIO * p[1])
+            known
+            & (p[0] * P_VALUE_SLACK > self.settings.agree_p_value)
+            & (p[0] * P_VALUE_SLACK > self.settings.clearly_better_ratio * p[1])
         )
 
     def _misfit(self, some: Ints, without: _Groups) -> Floats:
@@ -294,14 +290,14 @@ class _Choices(NamedTuple):
         return np.asarray(columns, dtype=np.float64)
 
 
-def _all_but_one(size: int, C: int) -> list[tuple[int, ...]]:
+def _all_but_one(size: int, C: int, settings: RigModelSettings) -> list[tuple[int, ...]]:
     """Groups, but for one view each: places in the list of views, the farthest first."""
     if size == 1:
         return [()]
     if size == 2:
-        return [(place,) for place in range(min(MAX_SUSPECTS_OF_TWO, C))]
+        return [(place,) for place in range(min(settings.max_suspects_of_two, C))]
     if size == 3:
-        return list(combinations(range(min(MAX_SUSPECTS_OF_THREE, C)), 2))
+        return list(combinations(range(min(settings.max_suspects_of_three, C)), 2))
     return [tuple(k for k in range(size) if k != without) for without in range(size - 3, size)]
 
 

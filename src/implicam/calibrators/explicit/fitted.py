@@ -28,9 +28,9 @@ from implicam.rig_model import (
     Frame,
     InitialCamera,
     Posterior,
+    TrainingData,
     lens_only_model,
     stated_noise,
-    training_data_of,
 )
 
 METHOD = "explicit"
@@ -59,7 +59,7 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
     """Every camera from the known points; FitError where fewer than two can be calibrated."""
     used = without_copies(data)
     frame = Frame.of(used, METHOD)
-    fitted, choices = fit_points(training_data_of("central", used, frame, shots_off=False), family, progress)
+    fitted, choices = fit_points(TrainingData.of("central", used, frame, shots_off=False), family, progress)
     fitted = replace(fitted, uncalibrated=uncalibrated_with_copies(data, fitted.uncalibrated))
     diagnosis = Diagnosis(used, frame, fitted)
     return Fitted(

@@ -31,7 +31,7 @@ from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
-from implicam.rig_model import CameraModel, Diagnosis, FittedRig, Frame, locate, training_data_of
+from implicam.rig_model import CameraModel, Diagnosis, FittedRig, Frame, TrainingData, locate
 
 
 class Part(NamedTuple):
@@ -157,7 +157,7 @@ def _placed(
 ) -> tuple[Part, list[tuple[int, str]]]:
     """Cameras that saw their boards alone, by the known points; and why not the others."""
     mine = data.with_cameras(trained.camera_names)
-    training = training_data_of("central", mine, frame, shots_off=False)
+    training = TrainingData.of("central", mine, frame, shots_off=False)
     fitted = place(training, {network.cameras[0]: network for network in networks}, progress)
     uncalibrated = list(fitted.uncalibrated)
     by_camera = {network.cameras[0]: network for network in networks}

@@ -10,7 +10,7 @@ import numpy as np
 from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Floats
-from implicam.rig_model import MAX_ERROR_MEDIANS, CentralCamera
+from implicam.rig_model import CentralCamera, RigModelSettings
 
 FAMILIES: dict[str, type[BrownConrady] | type[KannalaBrandt]] = {
     "brown-conrady": BrownConrady,
@@ -113,10 +113,10 @@ def chosen(
 
 def _with_far(squares: Floats) -> Floats:
     """(n,) squared errors, with NaN replaced by what `clipped` makes of an error that is far off."""
-    return np.where(np.isnan(squares), MAX_ERROR_MEDIANS**2 * np.nanmedian(squares), squares)
+    return np.where(np.isnan(squares), RigModelSettings.max_start_error_medians**2 * np.nanmedian(squares), squares)
 
 
 def clipped(errors: Floats) -> Floats:
     """Errors, none of them so far off that it decides alone."""
     errors = np.where(np.isfinite(errors), errors, np.inf)
-    return np.minimum(errors, MAX_ERROR_MEDIANS * float(np.median(errors)))
+    return np.minimum(errors, RigModelSettings.max_start_error_medians * float(np.median(errors)))

@@ -17,13 +17,13 @@ from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, poses_from_rays
 from implicam.progress import Progress
 from implicam.rig_model import (
-    MAX_ERROR_MEDIANS,
     CentralCamera,
     FitResult,
     Hyperparameters,
     InitialCamera,
     Posterior,
     Prior,
+    RigModelSettings,
     TrainingData,
     levenberg_marquardt,
 )
@@ -76,7 +76,7 @@ def _placed(network: Network, points: Floats, uv: Floats) -> InitialCamera:
     prior = _prior(network)
     found = _best(known, prior, points, uv, rays, valid, sd)
     left = _median(found[0][0], points, uv) if found else np.inf
-    if left > max(MAX_ERROR_MEDIANS * sd, MIRROR_FROM_HALF_SIDES * half):
+    if left > max(RigModelSettings.max_start_error_medians * sd, MIRROR_FROM_HALF_SIDES * half):
         _check_mirror(known, prior, points, uv, rays, valid, sd, left)
     if not found:
         raise FitError("from no place does its lens see the known points at these pixels.")
@@ -141,7 +141,7 @@ def _best(
     found = [_refined(replace(known, pose=pose), prior, points, uv, valid, sd) for pose in _poses(points, rays, valid)]
     off = min((_median(camera, points, uv) for camera, _ in found), default=np.inf)
     good = np.flatnonzero(valid)
-    if off > MAX_ERROR_MEDIANS * sd and len(good) > MIN_POINTS + 1:
+    if off > RigModelSettings.max_start_error_medians * sd and len(good) > MIN_POINTS + 1:
         rng = np.random.default_rng(0)
         some = np.zeros(len(points), dtype=np.bool_)
         for _ in range(RANDOM_SUBSETS):
@@ -177,7 +177,8 @@ def _refined(
         assert isinstance(fitted, CentralCamera)
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-        inside = np.asarray(error <= MAX_ERROR_MEDIANS * max(float(np.median(error[inliers])), sd))
+        typical = max(float(np.median(error[inliers])), sd)
+        inside = np.asarray(error <= RigModelSettings.max_start_error_medians * typical)
         if inside.sum() < MIN_POINTS or (inside == inliers).all():
             break
         inliers = inside

@@ -27,12 +27,12 @@ from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, resect_any_pixels
 from implicam.rig_model import (
     CENTRE_PRIOR_SD,
-    MAX_ERROR_MEDIANS,
     MIN_POINTS_PER_CAMERA,
     PERSPECTIVE_K,
     CentralCamera,
     Image,
     InitialCamera,
+    RigModelSettings,
     levenberg_marquardt,
 )
 
@@ -139,7 +139,8 @@ def _refined(
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         sd = max(float(np.median(error[inliers])), 1e-5 * image.half)
-        inside = np.asarray(error <= max(MAX_ERROR_MEDIANS * float(np.median(error[inliers])), 1e-4 * image.half))
+        limit = RigModelSettings.max_start_error_medians * float(np.median(error[inliers]))
+        inside = np.asarray(error <= max(limit, 1e-4 * image.half))
         if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
         inliers = inside

@@ -7,7 +7,7 @@ parameters integrated out. The mathematics, with the numbered equations the code
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -18,6 +18,7 @@ from implicam.calibrators.forward_gp import saved
 from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
+from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings, Training
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -40,7 +41,7 @@ from implicam.rig_model.level_errors import untold
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.rig import FittedRig
 from implicam.rig_model.shot_errors import Shots
-from implicam.rig_model.training_data import Frame, training_data_of
+from implicam.rig_model.training_data import Frame
 from implicam.rig_model.triangulate import Labels
 from implicam.threads import blas_threads
 
@@ -53,11 +54,13 @@ class ForwardGP(CalibratorBase):
     """Our method. lens: `auto`, the camera model that the data choose for each camera; `central`, an ordinary camera
     with one model for all lenses; or `none`, a linear projection and the GP for the rest.
 
-    seed changes nothing: no part of this method is left to chance.
+    seed changes nothing: no part of this method is left to chance. settings: all priors and thresholds; a calibration
+    file carries them, so that a refit years later is the same fit.
     """
 
     lens: str = field(default=AUTO, metadata=option("auto, central or none"))
     seed: int = 0
+    settings: ForwardGPSettings = DEFAULT_SETTINGS
 
     method: ClassVar[str] = "forward-gp"
 
@@ -66,6 +69,11 @@ class ForwardGP(CalibratorBase):
             raise UsageError(
                 f"forward-gp has no lens {self.lens!r}{did_you_mean(self.lens, LENS_OPTIONS)}.",
                 fix=f"choose one of {', '.join(LENS_OPTIONS)}",
+            )
+        if not isinstance(self.settings, ForwardGPSettings):
+            raise UsageError(
+                f"the settings of forward-gp are a ForwardGPSettings, and not a {type(self.settings).__name__}.",
+                fix="ForwardGP(settings=ForwardGPSettings(max_squared_mahalanobis=30.0))",
             )
 
     @classmethod
@@ -79,7 +87,7 @@ class ForwardGP(CalibratorBase):
         # many small matrices, one after the other: two threads would wait
         with mistakes_named(data), solvable(), blas_threads(1):
             frame = Frame.of(used, self.method)
-            training = training_data_of(self.lens, used, frame)
+            training = Training.of(self.lens, used, frame, self.settings)
             fitted = separate_position_errors(training, fit_rig(training, progress), used.shots)
         return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
 
@@ -121,17 +129,18 @@ class ForwardGPCalibration(RigCalibration):
             self.posterior,
             self._labels,
             degrees=None if tails is None else tails.degrees,
+            settings=self.calibrator.settings,
         )
 
     @cached_property
     def _labels(self) -> Labels | None:
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
-        points = self.frame.to_working(self.used.xyz)
+        points, settings = self.frame.to_working(self.used.xyz), self.calibrator.settings
         if errors is None or unknowns is None or self.fitted.label_sd is None:
             untold_sd = self.fitted.untold_sd
-            planes = None if untold_sd is None else untold(points, self.used.shots)
+            planes = None if untold_sd is None else untold(points, self.used.shots, settings)
             return None if planes is None or untold_sd is None else Labels(planes.shots, np.zeros(0), None, untold_sd)
-        shots = Shots.of(points, self.used.shots)
+        shots = Shots.of(points, self.used.shots, settings)
         bars = self.fitted.label_sd.reshape(6, -1)[:, 0]
         return None if shots is None else Labels(shots, errors.sd[0], unknowns, bars)
 
@@ -159,7 +168,7 @@ class ForwardGPCalibration(RigCalibration):
             return self.calibrator.fit(data, progress)
         with solvable(), blas_threads(1):
             used = without_copies(data)
-            training = training_data_of(self.calibrator.lens, used, self.frame)
+            training = Training.of(self.calibrator.lens, used, self.frame, self.calibrator.settings)
             fitted = separate_position_errors(training, fit_rig(training, progress, self.fitted), used.shots)
         return ForwardGPCalibration(self.calibrator, data, self.frame, _copies_named(data, fitted))
 
@@ -236,15 +245,18 @@ class ForwardGPCalibration(RigCalibration):
         )
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """The options; and per camera lens, field, weights and covariance, in the working frame."""
+        """The options with all settings; and per camera lens, field, weights and covariance, in the working frame."""
         table, arrays = saved.state(self.fitted, self.data.observations.camera_names)
-        return {**asdict(self.calibrator), **table}, {**arrays, "frame": self.frame.as_array()}
+        options = {"lens": self.calibrator.lens, "seed": self.calibrator.seed}
+        settings = {"settings": self.calibrator.settings.as_table()}
+        return options | table | settings, arrays | {"frame": self.frame.as_array()}
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ForwardGPCalibration:
         """Restore a calibration; nothing is computed again."""
-        calibrator = ForwardGP(str(table["lens"]), int(table["seed"]))
+        settings = ForwardGPSettings.from_table(table.get("settings", {}))  # files had none before there were settings
+        calibrator = ForwardGP(str(table["lens"]), int(table["seed"]), settings)
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = without_copies(data)
-        fitted = saved.restored(used, working.to_working(used.xyz), table, arrays)
+        fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, settings)
         return cls(calibrator, data, working, fitted)

@@ -12,17 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.evidence import LOG_NOISE_PRIOR
 from implicam.calibrators.forward_gp.families import (
-    FAMILIES,
-    MAX_CHOICE_VIEWS,
-    MIRRORED_PRIOR_ODDS,
-    Views,
+    Scene,
     family_prior,
     log_evidences,
     near_prior,
     widest_angle,
 )
+from implicam.calibrators.forward_gp.settings import KINDS, ForwardGPSettings
 from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import (
@@ -35,23 +32,10 @@ from implicam.geometry import (
     resect_any_lens,
     resect_robustly,
 )
-from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, Image
+from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera
 from implicam.rig_model.general_camera import MIN_RHO, RHO, AnyCamera, GeneralCamera
-from implicam.rig_model.initialise import MAX_ERROR_MEDIANS, InitialCamera, levenberg_marquardt
+from implicam.rig_model.initialise import InitialCamera, levenberg_marquardt
 from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA
-
-QUICK_MEDIAN = 2e-3
-"""Median error of an ordinary camera, in half the longer side; more needs a look at everything else."""
-
-QUICK_GAIN = 0.6
-"""A freer camera that brings the median error below this part asks for the whole choice."""
-
-QUICK_NATS = 3.0
-"""So does one whose evidence, odds aside, is better by this less."""
-
-QUICK_NOISES, QUICK_LEFT = 2.0, 0.4
-"""Where a camera's evidence is better than a freer one's by as much from where it stands, its median error is below so
-many noises, and one step towards the freer camera leaves so much of the squares, no look from farther on is needed."""
 
 MAX_START_VIEWS = 80
 """Views that starts are refined with."""
@@ -62,27 +46,8 @@ SHORT_STEPS, PROBE_STEPS, LONG_STEPS, FINAL_STEPS = 8, 10, 25, 60
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-7
 """The part of its misfit that a step must gain for another to follow, while starts are compared and in the end."""
 
-MAX_MEDIAN = 0.05
-"""Median error, in half the longer side, beyond which a camera explains nothing."""
-
-MAX_ERROR_RATIO = 10.0
-"""A start whose errors are so many times the best camera's is no start for the kinds."""
-
 BEST_STARTS = 3
 """Starts of each sign that go on."""
-
-CLEARLY_WRONG_RATIO = 0.3
-"""The sign whose best camera leaves the other's median times this is the right one without further question."""
-
-MIN_TOLERATED_NOISES = 10.0
-"""Stated or usual noises that a view may be off and still start the fit, which judges it better."""
-
-FEW_VIEWS = 18
-"""Views fewer than which a camera of 17 numbers may go through most of them, whatever the others say."""
-
-WANDERING_NOISES = 5.0
-"""Median error of a free camera, in stated or usual noises, from which its field is so large that it would wander.
-Where it is small, a prior about the camera found would make error bars too small."""
 
 AFFINE_RHOS = (0.02, 0.2)
 """Inverse distances that an affine start tries."""
@@ -112,32 +77,6 @@ class Start(NamedTuple):
     doubtful: bool = False
 
 
-class Scene(NamedTuple):
-    """What one camera saw: points (n, 3), pixels (n, 2), relative noise (n,), image, stated noise or NaN."""
-
-    points: Floats
-    uv: Floats
-    relative: Floats
-    image: Image
-    stated: float
-
-    def error(self, camera: GeneralCamera) -> Floats:
-        """(n,) px, infinite where the camera sees nothing."""
-        away = np.linalg.norm(camera.pixel(self.points) - self.uv, axis=1)
-        return np.asarray(np.where(np.isnan(away), np.inf, away), dtype=np.float64)
-
-    def near(self, error: Floats, inliers: Bools) -> Bools:
-        """The views that a camera explains, judged by the median of those kept; of few views, which a camera of
-        seventeen numbers may nearly go through, by the noise."""
-        limit = max(MAX_ERROR_MEDIANS * float(np.median(error[inliers])), MIN_TOLERATED_NOISES * self.noise)
-        return np.asarray(error <= limit, dtype=np.bool_)
-
-    @property
-    def noise(self) -> float:
-        """Px, as stated or usual."""
-        return float(self.stated) if np.isfinite(self.stated) else float(np.exp(LOG_NOISE_PRIOR[0])) * self.image.half
-
-
 def candidates(whole: Scene) -> list[Candidate]:
     """The kinds of camera that explain the views; one where it is ordinary. FitError where there is none."""
     if len(whole.points) < MIN_POINTS_PER_CAMERA:
@@ -150,7 +89,8 @@ def candidates(whole: Scene) -> list[Candidate]:
     linear = _from_dlt(whole)
     if ladder is None or ladder.doubtful:
         # subsets are for wrong views; where a linear projection does well without them, it is the camera that is odd
-        if ladder is None or linear is None or _score(whole, linear.camera) > QUICK_GAIN * _score(whole, ladder.camera):
+        ratio = whole.settings.max_freer_error_ratio
+        if ladder is None or linear is None or _score(whole, linear.camera) > ratio * _score(whole, ladder.camera):
             ladder = _from_ladder(whole, mirrored=False)
         quick = _quick(whole, ladder) if ladder is not None else None
         if quick is not None:
@@ -158,14 +98,14 @@ def candidates(whole: Scene) -> list[Candidate]:
     return _thorough(whole, ladder, linear)
 
 
-def choose(rig: Sequence[list[Candidate]]) -> list[Candidate]:
+def choose(rig: Sequence[list[Candidate]], settings: ForwardGPSettings) -> list[Candidate]:
     """One candidate of each camera: evidence, prior odds, and what the rig's other cameras are."""
-    chosen = [max(some, key=lambda one: one.evidence + np.log(_weight(one, []))) for some in rig]
+    chosen = [max(some, key=lambda one: one.evidence + np.log(_weight(one, [], settings))) for some in rig]
     for _ in range(ROUNDS_OF_CHOICE):
         before = [one.kind for one in chosen]
         for c, some in enumerate(rig):
             others = [one.kind for k, one in enumerate(chosen) if k != c]
-            chosen[c] = max(some, key=lambda one: one.evidence + np.log(_weight(one, others)))
+            chosen[c] = max(some, key=lambda one: one.evidence + np.log(_weight(one, others, settings)))
         if [one.kind for one in chosen] == before:
             break
     return chosen
@@ -173,7 +113,7 @@ def choose(rig: Sequence[list[Candidate]]) -> list[Candidate]:
 
 def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate | None:
     """A camera that fitted most of these points a moment ago, refined; None where it no longer does."""
-    if not isinstance(camera, GeneralCamera) or family not in FAMILIES:
+    if not isinstance(camera, GeneralCamera) or family not in KINDS:
         return None
     error = whole.error(camera)
     inliers = whole.near(error, np.isfinite(error))
@@ -185,26 +125,24 @@ def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate |
 
 def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> InitialCamera:
     """What the fit starts from; some: all candidates of the camera."""
-    prior = family_prior(one.camera, one.family, whole.image, _widest(one.camera, whole.points[one.inliers]))
+    settings, widest = whole.settings, _widest(one.camera, whole.points[one.inliers])
+    prior = family_prior(one.camera, one.family, whole.image, widest, settings)
     left = float(np.median(whole.error(one.camera)[one.inliers]))
-    if one.family == "free" and left > WANDERING_NOISES * whole.noise:
-        prior = near_prior(one.camera, prior, whole.image)
+    if one.family == "free" and left > settings.wandering_error_noises * whole.noise:
+        prior = near_prior(one.camera, prior, whole.image, settings)
     inliers = one.inliers & np.isfinite(whole.error(one.camera))
     ordinary = [float(np.median(whole.error(other.camera))) for other in some if other.kind == ("ordinary", False)]
     left = ordinary[0] if ordinary and one.kind != ("ordinary", False) else float("nan")
     return InitialCamera(one.camera, prior, inliers, one.family, left)
 
 
-def _weight(one: Candidate, others: list[tuple[str, bool]]) -> float:
+def _weight(one: Candidate, others: list[tuple[str, bool]], settings: ForwardGPSettings) -> float:
     families = sum(family == one.family for family, _ in others)
     signs = sum(mirrored == one.camera.mirrored for _, mirrored in others)
-    total = sum(kind.weight for kind in FAMILIES.values())
-    of_sign = MIRRORED_PRIOR_ODDS if one.camera.mirrored else 1.0
-    return (
-        (FAMILIES[one.family].weight + families)
-        / (total + len(others))
-        * ((of_sign + signs) / (1 + MIRRORED_PRIOR_ODDS + len(others)))
-    )
+    total = sum(kind.odds for kind in settings.kinds.values())
+    of_sign = settings.mirrored_odds if one.camera.mirrored else 1.0
+    of_kind = (settings.kinds[one.family].odds + families) / (total + len(others))
+    return of_kind * ((of_sign + signs) / (1 + settings.mirrored_odds + len(others)))
 
 
 def _widest(camera: GeneralCamera, points: Floats) -> float:
@@ -226,7 +164,7 @@ def _refined(
         if len(rows) > MAX_START_VIEWS:
             rows = rows[np.random.default_rng(0).choice(len(rows), MAX_START_VIEWS, replace=False)]
         points, uv = scene.points[rows], scene.uv[rows]
-        prior = family_prior(camera, family, scene.image, _widest(camera, points))
+        prior = family_prior(camera, family, scene.image, _widest(camera, points), scene.settings)
         error = scene.error(camera)
         usual = float(np.median(error[rows]))
         sd = max(usual if np.isfinite(usual) else scene.image.half, 1e-5 * scene.image.half)
@@ -271,27 +209,31 @@ def _ladder(scene: Scene, *, mirrored: bool, subsets: bool) -> Start | None:
 def _quick(scene: Scene, ladder: Start) -> Candidate | None:
     """The ordinary camera, if nothing freer is clearly better."""
     camera, inliers = _refined(ladder.camera, "ordinary", scene, ladder.inliers, FINAL_STEPS * 5, rounds=4)
-    error = scene.error(camera)
+    settings, error = scene.settings, scene.error(camera)
     median = float(np.median(error[inliers]))
     if (
         inliers.sum() < MIN_POINTS_PER_CAMERA
-        or not median < QUICK_MEDIAN * scene.image.half
+        or not median < settings.max_ordinary_error_half_sides * scene.image.half
         or camera.rho < 4 * MIN_RHO
     ):
         return None
     views = _common_views(scene, inliers)
     tight, free_from_here = _evidences(camera, ("ordinary", "free"), views)
-    if tight > free_from_here + QUICK_NATS and median < QUICK_NOISES * scene.noise:
+    clear = median < settings.max_clear_error_noises * scene.noise
+    if clear and tight > free_from_here + settings.min_freer_gain_nats:
         free, free_kept = _refined(camera, "free", scene, inliers, 1, gain=ROUGH_GAIN)
         left = np.sum(scene.error(free)[inliers] ** 2) / np.sum(error[inliers] ** 2)
-        if left > QUICK_LEFT and free_kept.sum() <= inliers.sum():
+        if left > settings.min_squares_left_share and free_kept.sum() <= inliers.sum():
             return Candidate(camera, "ordinary", inliers, tight)
     free, free_kept = _refined(camera, "free", scene, inliers, PROBE_STEPS, gain=ROUGH_GAIN)
     free_error = scene.error(free)
     # what seventeen free numbers gain over eleven by chance is no reason; of few views the evidence must do
     by_chance = np.sqrt(max(2 * inliers.sum() - 17, 0) / (2 * inliers.sum() - 11))
-    better = inliers.sum() >= FEW_VIEWS and np.median(free_error[inliers]) < QUICK_GAIN * by_chance * median
-    if better or free_kept.sum() > inliers.sum() or tight < _evidences(free, ("free",), views)[0] - QUICK_NATS:
+    ratio = settings.max_freer_error_ratio * by_chance
+    better = inliers.sum() >= settings.few_views and np.median(free_error[inliers]) < ratio * median
+    if better or free_kept.sum() > inliers.sum():
+        return None
+    if _evidences(free, ("free",), views)[0] > tight + settings.min_freer_gain_nats:
         return None
     return Candidate(camera, "ordinary", inliers, tight)
 
@@ -312,7 +254,8 @@ def _thorough(scene: Scene, ladder: Start | None, linear: Start | None) -> list[
         ]
         best[sign] = sorted(((_score(scene, c), c, k) for c, k in again), key=lambda one: one[0])
     leading = {sign: some[0][0] if some else np.inf for sign, some in best.items()}
-    signs = [sign for sign in best if best[sign] and not leading[sign] * CLEARLY_WRONG_RATIO > leading[not sign]]
+    ratio = scene.settings.clearly_wrong_sign_ratio
+    signs = [sign for sign in best if best[sign] and not leading[sign] * ratio > leading[not sign]]
     common = min((best[sign][0] for sign in signs), key=lambda one: one[0])[2]
     views = _common_views(scene, common)
     found_all = [one for sign in signs for one in _kinds(scene, views, best[sign][0], sign)]
@@ -324,23 +267,25 @@ def _thorough(scene: Scene, ladder: Start | None, linear: Start | None) -> list[
 
 def _kinds(
     scene: Scene,
-    views: Views,
+    views: Scene,
     best: tuple[float, GeneralCamera, Bools],
     sign: bool,
 ) -> Iterator[Candidate]:
     """Each kind, from the best free camera and from the ladder of what that one explains."""
     _, free, inliers = best
-    right = Scene(scene.points[inliers], scene.uv[inliers], scene.relative[inliers], scene.image, scene.stated)
-    ladder = _from_ladder(right, mirrored=sign, subsets=False)
+    settings = scene.settings
+    ladder = _from_ladder(scene.select(inliers), mirrored=sign, subsets=False)
     others = [] if ladder is None else [ladder.camera]
-    for family, kind in FAMILIES.items():
+    for family, kind in settings.kinds.items():
         shape = free.shape if kind.p > 0.01 else np.zeros(2)
         tilt = free.tilt if kind.tilt > 0.01 else np.zeros(2)
         some = []
-        near = [one for one in others if family == "ordinary" or _score(scene, one) < MAX_ERROR_RATIO * best[0]]
+        limit = np.inf if family == "ordinary" else settings.max_kind_error_ratio * best[0]
+        near = [one for one in others if _score(scene, one) < limit]
         for camera in (free.with_shape(shape, tilt), *near):
             found, explained = _refined(camera, family, scene, inliers, FINAL_STEPS, rounds=2)
-            plausible = np.median(scene.error(found)[explained]) < MAX_MEDIAN * scene.image.half
+            limit = settings.max_kind_error_half_sides * scene.image.half
+            plausible = np.median(scene.error(found)[explained]) < limit
             evidence = _evidences(found, (family,), views)[0] if plausible else -np.inf
             some.append(Candidate(found, family, explained, evidence))
         yield max(some, key=lambda one: one.evidence)
@@ -353,16 +298,16 @@ def _score(scene: Scene, camera: GeneralCamera) -> float:
     return scene.noise * float(np.exp(0.5 * np.mean(np.log1p((error / scene.noise) ** 2))))
 
 
-def _common_views(scene: Scene, inliers: Bools) -> Views:
-    rows = np.flatnonzero(inliers)
-    if len(rows) > MAX_CHOICE_VIEWS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_CHOICE_VIEWS, replace=False))
-    return Views(scene.points[rows], scene.uv[rows], scene.relative[rows], scene.image, scene.stated)
+def _common_views(scene: Scene, inliers: Bools) -> Scene:
+    rows, most = np.flatnonzero(inliers), scene.settings.max_choice_views
+    if len(rows) > most:
+        rows = np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
+    return scene.select(rows)
 
 
-def _evidences(camera: GeneralCamera, families: Sequence[str], views: Views) -> list[float]:
+def _evidences(camera: GeneralCamera, families: Sequence[str], views: Scene) -> list[float]:
     widest = _widest(camera, views.points)
-    priors = [family_prior(camera, family, views.image, widest) for family in families]
+    priors = [family_prior(camera, family, views.image, widest, views.settings) for family in families]
     return log_evidences(camera, priors, views)
 
 
@@ -378,7 +323,8 @@ def _from_dlt(scene: Scene) -> Start | None:
 def _starts(scene: Scene, ladder: Start | None, linear: Start | None) -> Iterator[Start]:
     if ladder is not None:
         yield ladder
-        if not ladder.inliers.all() and len(scene.points) < FEW_VIEWS:  # too few to say by themselves which are wrong
+        few = len(scene.points) < scene.settings.few_views  # too few to say by themselves which are wrong
+        if few and not ladder.inliers.all():
             yield Start(ladder.camera, np.ones(len(scene.points), dtype=np.bool_))
     mirrored = _from_ladder(scene, mirrored=True, subsets=linear is None or not linear.camera.mirrored)
     if mirrored is not None:

@@ -14,36 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
+from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.geometry import Floats
 from implicam.gp.low_rank import pivoted_cholesky
 from implicam.rig_model.camera import Prior
 from implicam.rig_model.field import Hyperparameters, field_kernel
 from implicam.rig_model.normal_equations import stable_cholesky
 
-LOG_LENGTHSCALE_MEDIAN = np.log([1.0, 2.0])
-"""Prior medians: across the image in half its longer side, and in log distance. Optics vary smoothly across the image;
-refraction and the entrance pupil vary with the distance as 1 / distance does."""
-
-LOG_LENGTHSCALE_SD = np.array([0.7, 1.0])
-
-MIN_LOG_LENGTHSCALE = np.log([0.5, 0.1])
-
-MAX_LOG_LENGTHSCALE = np.log([30.0, 100.0])
-
 LENGTHSCALE_GRID = ((0.6, 1.5, 4.0), (0.15, 0.5, 2.0))
 """Where the search looks first."""
-
-LOG_SIGNAL_PRIOR = {"central": (np.log(5e-4), 1.0), "general": (np.log(5e-4), 1.0), "none": (np.log(2e-2), 2.0)}
-"""Prior of the field's sd, median and log sd, in half the longer side: what good lens models leave, 0.3 px in 1280."""
-
-LOG_NOISE_PRIOR = (np.log(3e-4), 1.0)
-"""The same for the noise: 0.2 px in 1280."""
-
-STATED_NOISE_LOG_SD = 0.2
-"""Log sd of the noise about what the observations state, where they do."""
-
-CAMERA_SIGNAL_LOG_SD, CAMERA_NOISE_LOG_SD = 0.3, 0.15
-"""Log sd of one camera's field and noise about the rig's."""
 
 FTOL = 1e-4
 """Change of the log posterior at which the search for the sizes ends, as a part of what it has gained: hundredths of a
@@ -181,13 +160,15 @@ class BatchedEvidence(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RigEvidence:
-    """All cameras together. half: (C,) half the longer side in pixels; stated: (C,) stated noise in pixels or NaN."""
+    """All cameras together. half: (C,) half the longer side in pixels; stated: (C,) stated noise in pixels or NaN;
+    lens: whether they have a lens model, and are no linear projections."""
 
     cameras: list[CameraEvidence]
     half: Floats
     stated: Floats
-    lens: str
+    lens: bool
     tolerance: float
+    settings: ForwardGPSettings
 
     def maximise(self, start: Hyperparameters | None = None, *, search: bool = True) -> Hyperparameters:
         """The most probable hyperparameters; `start` is a good guess, from a moment ago, of which the lengthscales
@@ -198,14 +179,16 @@ class RigEvidence:
             shared = np.clip(np.mean(logs, axis=1), -6.0, 6.0)
         known: dict[tuple[float, ...], tuple[float, Floats]] = {}
         spectra: dict[tuple[float, ...], list[Spectrum]] = {}
+        median, log_sd = np.log(self.settings.lengthscale_prior_median), self.settings.lengthscale_prior_log_sd
+        least, most = np.log(self.settings.min_lengthscale), np.log(self.settings.max_lengthscale)
 
         def at(log_lengthscale: Floats) -> float:
             nonlocal shared
-            inside = np.clip(log_lengthscale, MIN_LOG_LENGTHSCALE, MAX_LOG_LENGTHSCALE)
+            inside = np.clip(log_lengthscale, least, most)
             spectra[tuple(inside)] = self._spectra(inside)
             found = self._minimum(self._sizes_objective(spectra[tuple(inside)], own=False)[0], shared, GTOL)
             shared = found.x
-            penalty = 0.5 * np.sum(((inside - LOG_LENGTHSCALE_MEDIAN) / LOG_LENGTHSCALE_SD) ** 2)
+            penalty = 0.5 * np.sum(((inside - median) / log_sd) ** 2)
             known[tuple(inside)] = float(found.fun + penalty), shared
             return known[tuple(inside)][0] + float(np.sum((log_lengthscale - inside) ** 2))
 
@@ -266,9 +249,9 @@ class RigEvidence:
         return [camera.spectrum(np.exp(log_lengthscale), self.tolerance) for camera in self.cameras]
 
     def _medians(self) -> tuple[Floats, Floats]:
-        known = np.isfinite(self.stated)
-        noise = np.where(known, self.stated, np.exp(LOG_NOISE_PRIOR[0]) * self.half)
-        return np.exp(LOG_SIGNAL_PRIOR[self.lens][0]) * self.half, noise
+        usual = np.exp(self.settings.log_noise_prior[0]) * self.half
+        noise = np.where(np.isfinite(self.stated), self.stated, usual)
+        return np.exp(self.settings.log_signal_prior(lens=self.lens)[0]) * self.half, noise
 
     def penalty(self, signal: Floats, noise: Floats) -> float:
         """Minus the log prior of sizes (C,) in pixels, as far as the rig shares them."""
@@ -279,12 +262,9 @@ class RigEvidence:
         return 0.5 * float(np.sum((np.array(shared) / self._shared_sds()) ** 2))
 
     def _shared_sds(self) -> Floats:
-        return np.array(
-            [
-                LOG_SIGNAL_PRIOR[self.lens][1],
-                STATED_NOISE_LOG_SD if np.isfinite(self.stated).all() else LOG_NOISE_PRIOR[1],
-            ]
-        )
+        stated, settings = np.isfinite(self.stated).all(), self.settings
+        noise = settings.stated_noise_log_sd if stated else settings.noise_prior_log_sd
+        return np.array([settings.log_signal_prior(lens=self.lens)[1], noise])
 
     def _sizes(self, z: Floats) -> tuple[Floats, Floats]:
         """Signal and noise (C,) from (shared signal, shared noise, own signals, own noises)."""
@@ -300,7 +280,7 @@ class RigEvidence:
         C = len(self.cameras)
         sds = self._shared_sds()
         if own:
-            sds = np.concatenate([sds, np.full(C, CAMERA_SIGNAL_LOG_SD), np.full(C, CAMERA_NOISE_LOG_SD)])
+            sds = np.append(sds, np.repeat([self.settings.camera_signal_log_sd, self.settings.camera_noise_log_sd], C))
 
         alike: dict[int, list[int]] = {}
         for c, camera in enumerate(self.cameras):

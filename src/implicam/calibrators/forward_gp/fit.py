@@ -11,19 +11,19 @@ import numpy as np
 
 from implicam.calibrators.forward_gp.choose_camera import (
     Candidate,
-    Scene,
     as_started,
     candidate_again,
     candidates,
     choose,
 )
+from implicam.calibrators.forward_gp.families import Scene
 from implicam.calibrators.forward_gp.linear_projections import (
-    LARGE_FIELD_HALF_SIDES,
     measures_better,
     predicts_better,
     start_without_lens,
 )
 from implicam.calibrators.forward_gp.rounds import Round, check_fitted, next_round
+from implicam.calibrators.forward_gp.settings import Training
 from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.progress import Progress, silent
@@ -39,20 +39,13 @@ from implicam.rig_model.initialise import (
 )
 from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.normal_equations import CameraFailedError
-from implicam.rig_model.training_data import TrainingData
 from implicam.threads import side_by_side
 
 AUTO = "auto"
 """The kind of each camera is chosen by the data."""
 
-MAX_ROUNDS, MAX_ROUNDS_WITH_SHOTS = 6, 18
 
-MIN_SEARCH_ROUNDS, MAX_SHARE_CHANGED = 2, 0.01
-"""Of these, those that look for lengthscales in any case, where known positions are exact; and the part of the views
-which, when they change later, tell nothing new of how smooth a field is."""
-
-
-def fit_rig(training: TrainingData, progress: Progress, before: FitResult | None = None) -> FitResult:
+def fit_rig(training: Training, progress: Progress, before: FitResult | None = None) -> FitResult:
     """Fit every camera that can be fitted. before: a fit in the same working frame to most of these points, from a
     moment ago: its cameras and hyperparameters are the guess. Where known positions have declared errors, which make
     hyperparameters costly, they are kept."""
@@ -63,7 +56,7 @@ def fit_rig(training: TrainingData, progress: Progress, before: FitResult | None
 
 
 def _fit_without_failing_cameras(
-    training: TrainingData,
+    training: Training,
     progress: Progress,
     before: FitResult | None,
     started: dict[int, InitialCamera],
@@ -87,12 +80,13 @@ def _fit_without_failing_cameras(
             require_two_cameras(training, started, uncalibrated)
 
 
-def _try_linear_projections(training: TrainingData, fitted: FitResult, started: dict[int, InitialCamera]) -> FitResult:
+def _try_linear_projections(training: Training, fitted: FitResult, started: dict[int, InitialCamera]) -> FitResult:
     """The rig with those cameras as linear projections that clearly predict left-out views better so."""
     tried = {}
     for number, c in enumerate(fitted.cameras):
         model = fitted.posterior.models[number]
-        odd = model.family in ("free", "crop") or model.signal > LARGE_FIELD_HALF_SIDES * model.image.half
+        large = training.settings.large_field_half_sides * model.image.half
+        odd = model.family in ("free", "crop") or model.signal > large
         if odd and model.family != "none" and c in started:
             found = start_without_lens(training, c)
             if found is not None:
@@ -121,7 +115,7 @@ def _try_linear_projections(training: TrainingData, fitted: FitResult, started: 
 
 
 def _start_cameras(
-    training: TrainingData, before: FitResult | None
+    training: Training, before: FitResult | None
 ) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
     guess = {} if before is None else dict(zip(before.cameras, before.posterior.models, strict=True))
     if training.lens == AUTO:
@@ -129,20 +123,21 @@ def _start_cameras(
 
     def start(c: int, points: Floats, uv: Floats) -> InitialCamera:
         if c in guess:
-            return start_again(guess[c].camera, points, uv, training.images[c], training.lens)
-        return start_camera(points, uv, training.images[c], training.lens)
+            return start_again(guess[c].camera, points, uv, training.images[c], training.lens, training.settings)
+        return start_camera(points, uv, training.images[c], training.lens, training.settings)
 
     return start_rig(training, start)
 
 
 def choose_cameras(
-    training: TrainingData, guess: Mapping[int, CameraModel]
+    training: Training, guess: Mapping[int, CameraModel]
 ) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
     """The kind of each camera, and where it starts; guess: cameras that fitted most of the points a moment ago."""
 
     def scene(c: int) -> Scene:
         seen = training.camera_views[c]
-        return Scene(training.points[seen.rows], seen.uv, seen.relative, training.images[c], float(training.stated[c]))
+        stated = float(training.stated[c])
+        return Scene(training.points[seen.rows], seen.uv, seen.relative, training.images[c], stated, training.settings)
 
     def look(c: int) -> list[Candidate] | FitError:
         try:
@@ -154,8 +149,8 @@ def choose_cameras(
             return FitError(f"its equations have no solution: {error}.")
 
     found = side_by_side(look, range(len(training.camera_views)))
-    seeing = [c for c, some in enumerate(found) if not isinstance(some, FitError)]
-    chosen = dict(zip(seeing, choose([some for some in found if not isinstance(some, FitError)]), strict=True))
+    seeing = {c: some for c, some in enumerate(found) if not isinstance(some, FitError)}
+    chosen = dict(zip(seeing, choose(list(seeing.values()), training.settings), strict=True))
 
     def start(c: int, points: Floats, uv: Floats) -> InitialCamera:
         some = found[c]
@@ -167,7 +162,7 @@ def choose_cameras(
 
 
 def _fit_from_start(
-    training: TrainingData,
+    training: Training,
     progress: Progress,
     before: FitResult | None,
     started: dict[int, InitialCamera],
@@ -180,17 +175,19 @@ def _fit_from_start(
     models = tuple(lens_only_model(started[c], image) for c, image in zip(cameras, images, strict=True))
     progress("fitting", 1, 3)
     stated = training.stated[list(cameras)]
-    rounds = MAX_ROUNDS_WITH_SHOTS if training.errors is not None and training.errors.estimated else MAX_ROUNDS
+    settings, shots = training.settings, training.errors is not None and training.errors.estimated
+    rounds = settings.max_rounds_with_shots if shots else settings.max_rounds
     hyper = before.hyperparameters if before is not None and before.cameras == cameras else None
     tied = training.errors is not None and not training.errors.estimated
     state = Round(hyper, models, None, inliers, training.errors, None, settled=False, fixed=hyper if tied else None)
     changed = 1.0  # part of the views
     for number in range(rounds):
-        search = number < MIN_SEARCH_ROUNDS or changed > MAX_SHARE_CHANGED
+        search = number < settings.min_search_rounds or changed > settings.max_changed_share
         state = next_round(training, state, seen, images, stated, search=search)
         judged = state.inliers
         if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
-            judged = update_inliers(state.posterior, training.points, seen, state.inliers)
+            limit = settings.max_squared_mahalanobis
+            judged = update_inliers(state.posterior, training.points, seen, state.inliers, limit)
         changed = float(np.mean(np.concatenate(judged) != np.concatenate(state.inliers)))
         if state.settled and not changed:
             break

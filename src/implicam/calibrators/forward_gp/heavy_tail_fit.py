@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.rounds import Round, check_fitted, next_round
+from implicam.calibrators.forward_gp.settings import Training
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraViews, random_subset
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.heavy_tails import (
-    DEGREES_OF_FREEDOM,
-    MAX_VIEWS_PER_CAMERA,
     HeavyTails,
     degrees_of_agreement,
     looks_heavy,
@@ -24,20 +23,15 @@ from implicam.rig_model.heavy_tails import (
     whiten,
 )
 from implicam.rig_model.leave_one_out import (
-    MAX_SQUARED_MAHALANOBIS,
     left_out_residuals_from,
     next_inliers,
     posterior_residuals,
 )
 from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.training_data import TrainingData
 from implicam.rig_model.wrong_views import LinearisedViews
 
-REWEIGHTING_ROUNDS = 3
-"""Rounds more where the noise has heavy tails."""
 
-
-def refit_with_heavy_tails(training: TrainingData, fitted: FitResult) -> FitResult:
+def refit_with_heavy_tails(training: Training, fitted: FitResult) -> FitResult:
     """After a few rounds more with views weighted by a t, where the noise of the fit clearly is one; else the same."""
     cameras = fitted.cameras
     seen, images = tuple(training.camera_views[c] for c in cameras), tuple(training.images[c] for c in cameras)
@@ -55,7 +49,7 @@ def refit_with_heavy_tails(training: TrainingData, fitted: FitResult) -> FitResu
         fixed=fixed,
     )
     try:
-        for number in range(REWEIGHTING_ROUNDS):
+        for number in range(training.settings.tail_rounds):
             found = _tails(training, state, seen, images)
             if found is None:
                 break
@@ -80,11 +74,11 @@ def refit_with_heavy_tails(training: TrainingData, fitted: FitResult) -> FitResu
 
 
 def _tails(
-    training: TrainingData, state: Round, seen: tuple[CameraViews, ...], images: tuple[Image, ...]
+    training: Training, state: Round, seen: tuple[CameraViews, ...], images: tuple[Image, ...]
 ) -> tuple[HeavyTails, tuple[Bools, ...]] | None:
     """Degrees of freedom of the noise, from how far all views are from what the others predict; the weight of each view
     by how far it is from what all say; and the views to use. None where the noise is normal."""
-    weighted = state.weighted(seen, told=True)
+    weighted, settings = state.weighted(seen, told=True), training.settings
 
     def one(c: int, most: int) -> _Predicted:
         some = random_subset(len(seen[c].rows), most)
@@ -93,13 +87,13 @@ def _tails(
         )
 
     if state.tails is None:
-        few = [one(c, MAX_VIEWS_PER_CAMERA) for c in range(len(seen))]
+        few = [one(c, settings.max_tail_views_per_camera) for c in range(len(seen))]
         areas = [(2 * image.half) ** 2 for image in images]
         background = [2 * np.pi * f.variance / area for f, area in zip(few, areas, strict=True)]
-        if not looks_heavy(np.concatenate([f.distance for f in few]), np.concatenate(background)):
+        if not looks_heavy(np.concatenate([f.distance for f in few]), np.concatenate(background), settings):
             return None
         try:
-            degrees = degrees_of_agreement(*_agreement(state.posterior, training.points, few))
+            degrees = degrees_of_agreement(*_agreement(state.posterior, training, few), settings)
         except np.linalg.LinAlgError:  # the cameras among themselves say nothing of the noise
             return None
     else:
@@ -107,7 +101,7 @@ def _tails(
     if degrees is None:
         return None
     every = [one(c, len(training.points)) for c in range(len(seen))]
-    limit = outlier_distance(degrees, MAX_SQUARED_MAHALANOBIS)
+    limit = outlier_distance(degrees, settings.max_squared_mahalanobis)
     judged = tuple(next_inliers(p.distance, k, limit) for p, k in zip(every, state.inliers, strict=True))
     return HeavyTails(degrees, tuple(student_t_weights(p.own, degrees) for p in every)), judged
 
@@ -139,11 +133,12 @@ class _Predicted(NamedTuple):
         return cls(seen.rows, residual, covariance, distance, np.where(inliers, expected, distance), variance)
 
 
-def _agreement(posterior: Posterior, points: Floats, predicted: list[_Predicted]) -> tuple[Floats, Floats, Bools]:
+def _agreement(posterior: Posterior, training: Training, predicted: list[_Predicted]) -> tuple[Floats, Floats, Bools]:
     """Of points, slopes and residuals of their views in the scale of the noise, and which there are: not those that are
     wrong even with heavy tails."""
-    limit = outlier_distance(min(DEGREES_OF_FREEDOM), MAX_SQUARED_MAHALANOBIS)
-    n, C = len(points), len(predicted)
+    settings = training.settings
+    limit = outlier_distance(min(settings.tail_degrees_of_freedom), settings.max_squared_mahalanobis)
+    n, C = len(training.points), len(predicted)
     each = np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy()
     r, D, there = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3)), np.zeros((n, C), dtype=np.bool_)
     for c, view in enumerate(predicted):
@@ -151,5 +146,5 @@ def _agreement(posterior: Posterior, points: Floats, predicted: list[_Predicted]
         rows = view.rows[good]
         each[rows, c] = np.linalg.inv(view.covariance[good])
         r[rows, c], there[rows, c] = view.residual[good], True
-        D[rows, c] = posterior.models[c].predict(points[rows])[1]
+        D[rows, c] = posterior.models[c].predict(training.points[rows])[1]
     return *whiten(LinearisedViews(r, D, each, None)), there

@@ -8,25 +8,19 @@ import numpy as np
 from scipy.optimize import minimize
 
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
+from implicam.calibrators.forward_gp.settings import Training
 from implicam.geometry import Floats
 from implicam.rig_model.camera import Image, ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel, CameraViews, thin_views
 from implicam.rig_model.field import DepthScale, Hyperparameters, empty_field, field_coordinates
 from implicam.rig_model.posterior import condition
-from implicam.rig_model.training_data import TrainingData
-
-MAX_POINTS = 300
-"""Points of one camera that the hyperparameters are found from; more cost time and tell little more."""
-
-MAX_UNCERTAIN_POINTS = 50
-"""The same where every point has an error of its own: three unknowns each."""
 
 FIELD_VARIANCE_TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
 
 
 def estimate_hyperparameters(
-    training: TrainingData,
+    training: Training,
     models: tuple[CameraModel, ...],
     used: tuple[CameraViews, ...],
     images: tuple[Image, ...],
@@ -43,7 +37,8 @@ def estimate_hyperparameters(
         evidence = [_evidence(training, models[c], used[c], moved) for c in numbers]
         half = np.array([images[c].half for c in numbers])
         kind = models[numbers[0]].camera.kind
-        rig = RigEvidence(evidence, half, stated[numbers], kind, FIELD_VARIANCE_TOLERANCE[kind])
+        lens = kind != ProjectiveCamera.kind
+        rig = RigEvidence(evidence, half, stated[numbers], lens, FIELD_VARIANCE_TOLERANCE[kind], training.settings)
         guess = None if before is None else Hyperparameters(*(values[numbers] for values in before))
         for values, part in zip(found, rig.maximise(guess, search=search or moved is not None), strict=True):
             values[numbers] = part
@@ -59,13 +54,12 @@ def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
     return [group for group in ([c for c in range(len(models)) if c not in none], none) if group]
 
 
-def _evidence(training: TrainingData, model: CameraModel, seen: CameraViews, moved: Floats | None) -> CameraEvidence:
+def _evidence(training: Training, model: CameraModel, seen: CameraViews, moved: Floats | None) -> CameraEvidence:
     """One camera's evidence. The error of a shot of many points is known well, so the points are where it says
     (`moved`); that of a single point is not, and is one more unknown of the camera."""
     errors = training.errors if training.errors is not None and not training.errors.estimated else None
-    seen = thin_views(
-        seen, MAX_POINTS if errors is None or errors.count <= MAX_UNCERTAIN_POINTS else MAX_UNCERTAIN_POINTS
-    )
+    most, few = training.settings.max_points_for_sizes, training.settings.max_uncertain_points_for_sizes
+    seen = thin_views(seen, most if errors is None or errors.count <= few else few)
     points = training.points if moved is None else training.points + moved
     view = model.camera.view(points[seen.rows])
     X, off, prior = view.by_parameters, model.prior.mean - model.camera.parameters, model.prior
@@ -81,11 +75,12 @@ def _evidence(training: TrainingData, model: CameraModel, seen: CameraViews, mov
         precision = np.eye(len(off))
         precision[:-extra, :-extra] = prior.precision
         prior = prior._replace(mean=off, precision=precision)
-    return CameraEvidence(seen.uv - view.uv, X, off, prior, field_coordinates(view, model.image), seen.relative)
+    q = field_coordinates(view, model.image, DepthScale.of(view, training.settings.typical_log_distance_sd))
+    return CameraEvidence(seen.uv - view.uv, X, off, prior, q, seen.relative)
 
 
 def size_fields(
-    training: TrainingData, models: tuple[CameraModel, ...], used: tuple[CameraViews, ...], hyper: Hyperparameters
+    training: Training, models: tuple[CameraModel, ...], used: tuple[CameraViews, ...], hyper: Hyperparameters
 ) -> tuple[CameraModel, ...]:
     """The cameras with fields laid out anew."""
 
@@ -93,7 +88,7 @@ def size_fields(
         model = models[c]
         points = training.points[used[c].rows]
         view = model.camera.view(points[:: max(1, len(points) // 4000)])
-        depth = DepthScale.of(view)
+        depth = DepthScale.of(view, training.settings.typical_log_distance_sd)
         tolerance = FIELD_VARIANCE_TOLERANCE[model.camera.kind]
         field = empty_field(hyper.lengthscale[c], field_coordinates(view, model.image, depth), tolerance)
         return replace(
@@ -110,7 +105,7 @@ def size_fields(
 
 
 def _joint_sizes(
-    training: TrainingData,
+    training: Training,
     models: tuple[CameraModel, ...],
     used: tuple[CameraViews, ...],
     hyper: Hyperparameters,
@@ -121,8 +116,9 @@ def _joint_sizes(
     One camera cannot tell the error of a position from its own noise; together they can, for all see the same error.
     """
     points = np.unique(np.concatenate([seen.rows for seen in used]))
-    if len(points) > MAX_POINTS:
-        points = np.random.default_rng(0).choice(points, MAX_POINTS, replace=False)
+    most = training.settings.max_points_for_sizes
+    if len(points) > most:
+        points = np.random.default_rng(0).choice(points, most, replace=False)
     some = tuple(seen.select(np.isin(seen.rows, points)) for seen in used)
     laid_out = size_fields(training, models, some, hyper)
 

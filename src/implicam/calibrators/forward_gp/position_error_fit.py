@@ -11,26 +11,18 @@ from dataclasses import replace
 import numpy as np
 
 from implicam.calibrators.forward_gp.heavy_tail_fit import refit_with_heavy_tails
+from implicam.calibrators.forward_gp.settings import ForwardGPSettings, Training
 from implicam.dataset import Names
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.leave_one_out import (
-    MAX_SQUARED_MAHALANOBIS,
-    LeftOutViews,
-    left_out_views,
-    sum_over_cameras,
-)
+from implicam.rig_model.leave_one_out import LeftOutViews, left_out_views, sum_over_cameras
 from implicam.rig_model.level_errors import untold
 from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.position_errors import PositionErrors, estimate_position_errors
 from implicam.rig_model.tied import Scatter
-from implicam.rig_model.training_data import TrainingData
-
-MAX_POINTS = 400
-"""Points that the errors are estimated from; more cost time and tell little more."""
 
 
-def separate_position_errors(training: TrainingData, fitted: FitResult, shots: Names) -> FitResult:
+def separate_position_errors(training: Training, fitted: FitResult, shots: Names) -> FitResult:
     """The rig where what the fit took for normal pixel noise is something else: errors of known positions if all
     cameras agree on them, else heavy tails; else the same. shots: (n,) of the points.
 
@@ -40,7 +32,7 @@ def separate_position_errors(training: TrainingData, fitted: FitResult, shots: N
     """
     if training.errors is not None and not training.errors.estimated:
         return refit_with_heavy_tails(training, fitted)
-    planes = untold(training.points, shots) if training.errors is None else None
+    planes = untold(training.points, shots, training.settings) if training.errors is None else None
     if planes is not None:
         fitted = replace(fitted, untold_sd=planes.sd)
     scattered = _with_scatter(training, fitted)
@@ -50,18 +42,19 @@ def separate_position_errors(training: TrainingData, fitted: FitResult, shots: N
     return fitted if heavy.tails is None else _with_scatter(training, heavy)
 
 
-def _with_scatter(training: TrainingData, fitted: FitResult) -> FitResult:
+def _with_scatter(training: Training, fitted: FitResult) -> FitResult:
     seen = tuple(training.camera_views[c] for c in fitted.cameras)
     if fitted.tails is not None:
         seen = fitted.tails.weighted(seen, told=True)
-    views = left_out_views(fitted.posterior, training.points, seen, fitted.inliers)
+    settings = training.settings
+    views = left_out_views(fitted.posterior, training.points, seen, fitted.inliers, settings)
     inliers, n = fitted.inliers, len(training.points)
-    found = _estimated(views, inliers, n)
+    found = _estimated(views, inliers, n, settings)
     if found is None:
         return fitted
-    inliers = _judged(views, inliers, found[0], n)
+    inliers = _judged(views, inliers, found[0], n, settings.max_squared_mahalanobis)
     if any((a != b).any() for a, b in zip(inliers, fitted.inliers, strict=True)):
-        found = _estimated(views, inliers, n) or found
+        found = _estimated(views, inliers, n, settings) or found
     errors, size = found
     errors = replace(errors, size=size)
     models = tuple(replace(model, noise=model.noise * errors.noise) for model in fitted.posterior.models)
@@ -73,12 +66,15 @@ def _with_scatter(training: TrainingData, fitted: FitResult) -> FitResult:
     return replace(fitted, posterior=posterior, inliers=inliers, position_errors=errors)
 
 
-def _estimated(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[PositionErrors, Floats] | None:
+def _estimated(
+    views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int, settings: ForwardGPSettings
+) -> tuple[PositionErrors, Floats] | None:
     """The errors, and (n,) how much larger than usual each point's own scale is."""
     agreement, good = sum_over_cameras(views, inliers, n)
     rows = np.flatnonzero(good).astype(np.int64)
-    some = rows if len(rows) <= MAX_POINTS else np.random.default_rng(0).choice(rows, MAX_POINTS, replace=False)
-    errors = estimate_position_errors(agreement.select(some))
+    most = settings.max_points_for_position_errors
+    some = rows if len(rows) <= most else np.random.default_rng(0).choice(rows, most, replace=False)
+    errors = estimate_position_errors(agreement.select(some), settings)
     if errors is None:
         return None
     size = np.ones(len(good))
@@ -86,7 +82,9 @@ def _estimated(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) ->
     return errors, size
 
 
-def _judged(views: list[LeftOutViews], inliers: tuple[Bools, ...], found: PositionErrors, n: int) -> tuple[Bools, ...]:
+def _judged(
+    views: list[LeftOutViews], inliers: tuple[Bools, ...], found: PositionErrors, n: int, limit: float
+) -> tuple[Bools, ...]:
     """The views to use: those that agree with what the others say of where their point is."""
     total, _ = sum_over_cameras(views, inliers, n)
     noise2 = found.noise**2
@@ -100,5 +98,5 @@ def _judged(views: list[LeftOutViews], inliers: tuple[Bools, ...], found: Positi
         residual = view.residual - np.einsum("nij,njk,nk->ni", view.slope, where, drawn)
         covariance = noise2 * np.linalg.inv(view.inverse) + view.slope @ where @ view.slope.swapaxes(1, 2)
         distance = np.einsum("ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0])
-        judged.append(np.asarray(distance <= MAX_SQUARED_MAHALANOBIS, dtype=np.bool_))
+        judged.append(np.asarray(distance <= limit, dtype=np.bool_))
     return tuple(judged)

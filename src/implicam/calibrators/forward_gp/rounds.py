@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.calibrators.forward_gp.hyperparameters import estimate_hyperparameters, size_fields
+from implicam.calibrators.forward_gp.settings import Training
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraModel, CameraViews
@@ -16,16 +17,10 @@ from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.normal_equations import CameraFailedError
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.shot_errors import ShotErrors
-from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA, TrainingData
-
-MAX_MEDIAN_ERROR_NOISES = 4.0
-"""Median error of a fitted camera at its own views, in its noise, beyond which the fit has failed."""
-
-SHOT_SD_TOLERANCE = 0.1
-"""Relative change of the shots' errors between two rounds below which they are found."""
+from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA
 
 
-def check_fitted(training: TrainingData, state: Round, seen: tuple[CameraViews, ...]) -> None:
+def check_fitted(training: Training, state: Round, seen: tuple[CameraViews, ...]) -> None:
     """A camera that ends far off its own known points is no camera, whatever its covariance says."""
     points = training.points
     if state.posterior.displacement is not None:
@@ -33,7 +28,8 @@ def check_fitted(training: TrainingData, state: Round, seen: tuple[CameraViews, 
     for number, (model, views, inliers) in enumerate(zip(state.posterior.models, seen, state.inliers, strict=True)):
         rows = views.rows[inliers]
         error = np.linalg.norm(model.predict(points[rows])[0] - views.uv[inliers], axis=1) / views.relative[inliers]
-        if len(rows) < MIN_POINTS_PER_CAMERA or not np.median(error) < MAX_MEDIAN_ERROR_NOISES * model.noise:
+        limit = training.settings.max_median_error_noises * model.noise
+        if len(rows) < MIN_POINTS_PER_CAMERA or not np.median(error) < limit:
             off = float(np.median(error)) if len(rows) else np.nan
             raise CameraFailedError(number, f"it ends {off:.3g} px off its own known points")
 
@@ -65,7 +61,7 @@ class Round(NamedTuple):
 
 
 def next_round(
-    training: TrainingData,
+    training: Training,
     last: Round,
     seen: tuple[CameraViews, ...],
     images: tuple[Image, ...],
@@ -92,15 +88,16 @@ def next_round(
     following, label_sd, settled = errors, None, True
     if errors is not None and posterior.unknowns is not None:
         mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
-        following, label_sd = errors.updated(mean.reshape(errors.sd.shape), variance.reshape(errors.sd.shape))
-        settled = bool(np.allclose(following.sd, errors.sd, rtol=SHOT_SD_TOLERANCE))
+        shape, settings = errors.sd.shape, training.settings
+        following, label_sd = errors.updated(mean.reshape(shape), variance.reshape(shape), settings)
+        settled = bool(np.allclose(following.sd, errors.sd, rtol=settings.shot_sd_tolerance))
     return Round(
         hyper, posterior.models, posterior, inliers, following, label_sd, settled, errors, last.fixed, last.tails
     )
 
 
 def condition_with_new_fields(
-    training: TrainingData,
+    training: Training,
     models: tuple[CameraModel, ...],
     used: tuple[CameraViews, ...],
     hyper: Hyperparameters,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.forward_gp.families import FAMILIES
+from implicam.calibrators.forward_gp.settings import KINDS, ForwardGPSettings
 from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset
 from implicam.geometry import Floats
@@ -85,7 +85,9 @@ def _described(fitted: FitResult, number: int, name: str) -> dict[str, Any]:
     return table | ({"ordinary_would_leave_px": left} if np.isfinite(left) else {})
 
 
-def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays) -> FitResult:
+def restored(
+    data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays, settings: ForwardGPSettings
+) -> FitResult:
     """The inverse of `state`; points: (n, 3) the known positions in the working frame.
 
     KeyError, ValueError or TypeError for anything that does not fit.
@@ -110,10 +112,10 @@ def restored(data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Ar
             raise ValueError(f"{number}/kept must say of each view whether it is used")
         inliers.append(used)
     posterior = _posterior(data, arrays, tuple(models), tuple(alone))
-    errors, label_sd = _shot_errors(data, points, arrays, posterior)
+    errors, label_sd = _shot_errors(data, points, arrays, posterior, settings)
     hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
     ordinary = tuple(float(one.get("ordinary_would_leave_px", np.nan)) for one in described)
-    position_errors, untold_sd = _position_errors(data, arrays, posterior), None
+    position_errors, untold_sd = _position_errors(data, arrays, posterior, settings), None
     if "untold_sd" in arrays:
         untold_sd = finite_column(arrays, "untold_sd", (6,), positive=True)
     tails = _tails(arrays, inliers)
@@ -146,7 +148,9 @@ def _tails(arrays: Arrays, inliers: Sequence[NDArray[np.bool_]]) -> HeavyTails |
     return HeavyTails(degrees, tuple(weights))
 
 
-def _position_errors(data: Dataset, arrays: Arrays, posterior: Posterior) -> PositionErrors | None:
+def _position_errors(
+    data: Dataset, arrays: Arrays, posterior: Posterior, settings: ForwardGPSettings
+) -> PositionErrors | None:
     if posterior.ties is None:
         if any(name.startswith("labels/") for name in arrays):
             raise ValueError("errors of known positions tie the cameras: ties is missing")
@@ -160,15 +164,16 @@ def _position_errors(data: Dataset, arrays: Arrays, posterior: Posterior) -> Pos
     if not np.allclose(scale, scale.T) or np.linalg.eigvalsh(scale)[0] <= 0:
         raise ValueError("labels/scale must be a covariance")
     size = finite_column(arrays, "labels/size", (len(data),), positive=True)
-    return PositionErrors(scale, 1 / thickness if thickness else np.inf, noise, gain, size)
+    freedom = 1 / thickness if thickness else np.inf
+    return PositionErrors(scale, freedom, noise, gain, settings.error_bar_level, size)
 
 
 def _shot_errors(
-    data: Dataset, points: Floats, arrays: Arrays, posterior: Posterior
+    data: Dataset, points: Floats, arrays: Arrays, posterior: Posterior, settings: ForwardGPSettings
 ) -> tuple[ShotErrors | None, Floats | None]:
     if posterior.unknowns is None:
         return None, None
-    shots = Shots.of(points, data.shots)
+    shots = Shots.of(points, data.shots, settings)
     if shots is None:
         raise ValueError("the data have no shots of which errors were estimated")
     errors = shots.errors(points)
@@ -184,7 +189,7 @@ def _model(
     described: Mapping[str, Any], arrays: Arrays, number: int, sizes: Floats, lengthscale: Floats
 ) -> tuple[CameraModel, Floats]:
     kind, family = CAMERAS[str(described["model"])], str(described["kind"])
-    if family not in (*FAMILIES, "none"):
+    if family not in (*KINDS, "none"):
         raise ValueError(f"{family!r} is no kind of camera")
     numbers = {"central": (20,), "general": (24,), "none": (12,)}[kind.kind]
     camera, field_camera = (

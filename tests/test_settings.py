@@ -1,0 +1,209 @@
+"""Settings of forward-gp: each at its default changes nothing, each is in the file, a changed one changes something."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import implicam
+from forward_gp_cases import fitted, known, rig, with_positions
+from implicam.calibration_file import describe
+from implicam.calibrators import ForwardGP, ForwardGPCalibration, ForwardGPSettings, load_calibration
+from implicam.dataset import Dataset
+from implicam.errors import UsageError
+from implicam.rig_model.settings import BELOW_ONE, RigModelSettings
+from implicam.simulate import moving_board, random_positions, simulate
+
+ROOT = Path(implicam.__file__).parent
+FIELDS = {field.name: field for field in fields(ForwardGPSettings)}
+
+
+def other(name: str) -> Any:
+    """Another value of a setting."""
+    default = FIELDS[name].default
+    if isinstance(default, tuple):
+        return tuple(1.1 * value if not name.endswith(BELOW_ONE) else 0.9 * value for value in default)
+    return default + 1 if isinstance(default, int) else 0.9 * default
+
+
+every_field = pytest.mark.parametrize("name", FIELDS)
+
+
+@every_field
+def test_each_setting_is_in_the_file(name: str, tmp_path: Path) -> None:
+    settings = ForwardGPSettings(**{name: other(name)})
+    assert ForwardGPSettings.from_table(settings.as_table()) == settings
+    assert settings != ForwardGPSettings()
+    calibration = replace(fitted(), calibrator=ForwardGP(settings=settings))
+    calibration.save(tmp_path / "rig.implicam")
+    loaded = load_calibration(tmp_path / "rig.implicam")
+    assert isinstance(loaded, ForwardGPCalibration)
+    assert loaded.calibrator.settings == settings
+    assert describe(tmp_path / "rig.implicam")["options"]["settings"] == settings.as_table()
+
+
+@every_field
+def test_each_setting_is_used_and_documented(name: str) -> None:
+    """By the code beside the settings; one line of documentation follows it."""
+    sources = {path: path.read_text() for path in ROOT.rglob("*.py")}
+    own = [text for path, text in sources.items() if path.name == "settings.py"]
+    assert sum(len(re.findall(rf'^    {name}: .*\n    """', text, re.M)) for text in own) == 1
+    uses = sum(len(re.findall(rf"\.{name}\b", text)) for text in sources.values())
+    assert uses or name.endswith("_kind")
+
+
+def test_settings_at_their_defaults_change_nothing() -> None:
+    stated = ForwardGPSettings(**{name: field.default for name, field in FIELDS.items()})
+    again = ForwardGP(settings=stated).fit(known())
+    np.testing.assert_array_equal(again.posterior.root(0), fitted().posterior.root(0))
+    assert again.calibrator == fitted().calibrator
+
+
+def test_a_file_from_before_there_were_settings_has_the_defaults() -> None:
+    table, arrays = fitted().state()
+    del table["settings"]
+    assert ForwardGPCalibration.from_state(fitted().data, table, arrays).calibrator == ForwardGP()
+
+
+def test_a_refit_after_loading_is_the_same_fit(tmp_path: Path) -> None:
+    calibration = ForwardGP(settings=ForwardGPSettings(camera_noise_log_sd=1.0)).fit(known())
+    calibration.save(tmp_path / "rig.implicam")
+    again = load_calibration(tmp_path / "rig.implicam").refit(known())
+    assert isinstance(again, ForwardGPCalibration)
+    np.testing.assert_array_equal(again.posterior.root(0), calibration.posterior.root(0))
+    assert (again.posterior.root(0) != fitted().posterior.root(0)).any()
+
+
+@cache
+def with_wrong_views() -> Dataset:
+    return simulate(rig(), random_positions(rig(), 60, np.random.default_rng(5)), seed=6, outliers=0.05)
+
+
+@cache
+def plates() -> Dataset:
+    """A moving board whose fourth position is labelled 1 mm too far along the slide."""
+    data = simulate(rig("2R"), moving_board(rig("2R"), corners=(4, 5), positions=7, step=30.0, square=25.0), seed=71)
+    xyz = data.xyz.copy()
+    xyz[data.shots == "board04"] += rig("2R").volume.world_from_box.rotation[:, 2]
+    return with_positions(data, xyz)
+
+
+@cache
+def two_plates() -> Dataset:
+    return simulate(rig("2R"), moving_board(rig("2R"), corners=(4, 5), positions=2, step=90.0, square=25.0), seed=71)
+
+
+@cache
+def dots() -> Dataset:
+    data = known(120)
+    return with_positions(data, data.xyz + np.random.default_rng(3).standard_t(3, size=data.xyz.shape) * 0.3)
+
+
+@cache
+def default_fit(data: str) -> ForwardGPCalibration:
+    return ForwardGP().fit(DATA[data]())
+
+
+DATA = {
+    "points": known,
+    "wrong views": with_wrong_views,
+    "plates": plates,
+    "two plates": two_plates,
+    "dots": dots,
+}
+CHANGES: list[tuple[str, dict[str, Any]]] = [
+    ("wrong views", {"max_squared_mahalanobis": 6.0}),
+    ("points", {"typical_log_distance_sd": 1.0}),
+    ("points", {"ordinary_kind": (0.05, 0.01, 0.01, 0.2, 1.0)}),
+    ("points", {"rho_prior_sd_per_wf": 0.1}),
+    ("points", {"lengthscale_prior_median": (3.0, 6.0)}),
+    ("points", {"min_lengthscale": (5.0, 5.0)}),
+    ("points", {"signal_prior_median_half_sides": 5e-3}),
+    ("points", {"camera_noise_log_sd": 1.0}),
+    ("points", {"max_points_for_sizes": 20}),
+    ("plates", {"max_rounds_with_shots": 2}),
+    ("plates", {"shot_sd_prior_median_wf": 3e-2}),
+    ("plates", {"initial_shot_sd_wf": 2e-2, "max_rounds_with_shots": 1}),
+    ("plates", {"label_reach_gaps": 0.02}),
+    ("plates", {"min_points_per_shot": 50}),
+    ("two plates", {"across_sd_ratio": 0.1}),
+    ("dots", {"position_sd_prior_median_wf": 5e-2}),
+    ("dots", {"min_position_gain_nats": 1e6}),
+    ("dots", {"error_bar_level": 0.5, "position_degrees_of_freedom": (3.0,), "min_position_tail_gain_nats": 1e-9}),
+]
+
+
+@pytest.mark.parametrize(("data", "changed"), CHANGES, ids=[" ".join([of, *changed]) for of, changed in CHANGES])
+def test_a_changed_setting_changes_the_fit_or_its_error_bars(data: str, changed: dict[str, Any]) -> None:
+    usual = default_fit(data)
+    calibration = ForwardGP(settings=ForwardGPSettings(**changed)).fit(DATA[data]())
+    between = usual.data.xyz + 5.0
+    assert not np.array_equal(
+        calibration.measure(usual.data.observations).cov + calibration.known_position_covariance(between),
+        usual.measure(usual.data.observations).cov + usual.known_position_covariance(between),
+        equal_nan=True,
+    )
+
+
+def test_settings_of_measuring_are_those_of_the_calibration() -> None:
+    """Which views disagree, when there is no position, and when that is an alarm."""
+    data = with_wrong_views()
+    usual = fitted().measure(data.observations)
+
+    def measured(**changed: Any) -> Any:
+        calibration = replace(fitted(), calibrator=ForwardGP(settings=ForwardGPSettings(**changed)))
+        return calibration.measure(data.observations)
+
+    left_out = [sum("measured without" in why for why in m.reason) for m in (usual, measured(agree_p_value=1 - 1e-9))]
+    assert left_out[0] > 3
+    assert left_out[1] == 0
+    strict = measured(min_p_value=0.9)
+    assert np.isnan(strict.xyz[:, 0]).sum() > 30
+    assert not usual.alarm
+    assert measured(max_contradicting_share=0.01, usual_wrong_share=1e-6, false_alarm_probability=0.99).alarm
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("max_squared_mahalanobis", -1.0, "above 0"),
+        ("max_squared_mahalanobis", float("nan"), "above 0"),
+        ("max_squared_mahalanobis", float("inf"), "above 0"),
+        ("max_squared_mahalanobis", "25", "a number"),
+        ("max_squared_mahalanobis", True, "a number"),
+        ("max_rounds", 2.5, "a whole number"),
+        ("max_rounds", 0, "above 0"),
+        ("agree_p_value", 1.5, "below 1"),
+        ("max_contradicting_share", 1.0, "below 1"),
+        ("alarm_p_values", (0.05, 2.0), "below 1"),
+        ("alarm_p_values", 0.05, "a tuple of numbers"),
+        ("tail_degrees_of_freedom", (2.0, 3.0), "above 2"),
+        ("tail_degrees_of_freedom", (), "at least one"),
+        ("lengthscale_prior_median", (1.0, 2.0, 3.0), "2 numbers"),
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_refused(name: str, value: Any, words: str) -> None:
+    with pytest.raises(UsageError, match=rf"the setting {name} must be .*{words}"):
+        ForwardGPSettings(**{name: value})
+
+
+def test_a_setting_that_is_not_there_is_refused_with_the_nearest() -> None:
+    with pytest.raises(UsageError, match=r"there is no setting 'max_round'.*max_rounds"):
+        ForwardGPSettings.from_table({"max_round": 3})
+    with pytest.raises(UsageError, match="no setting 'max_rounds'"):
+        RigModelSettings.from_table({"max_rounds": 3})
+    with pytest.raises(UsageError, match="settings of forward-gp"):
+        ForwardGP(settings=RigModelSettings())  # type: ignore[arg-type]
+
+
+def test_a_file_whose_settings_make_no_sense_is_refused() -> None:
+    table, arrays = fitted().state()
+    for wrong in ({"max_rounds": -3}, {"max_rounds": [3]}, {"nothing": 3}):
+        with pytest.raises(UsageError):
+            ForwardGPCalibration.from_state(fitted().data, table | {"settings": wrong}, arrays)
