@@ -122,6 +122,7 @@ CHANGES: list[tuple[str, dict[str, Any]]] = [
     ("points", {"typical_log_distance_sd": 1.0}),
     ("points", {"ordinary_kind": (0.05, 0.01, 0.01, 0.2, 1.0)}),
     ("points", {"rho_prior_sd_per_wf": 0.1}),
+    ("points", {"distortion_prior_sd": (1e-3, 1e-3, 1e-3, 1e-3)}),
     ("points", {"lengthscale_prior_median": (3.0, 6.0)}),
     ("points", {"min_lengthscale": (5.0, 5.0)}),
     ("points", {"signal_prior_median_half_sides": 5e-3}),

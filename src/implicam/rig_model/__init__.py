@@ -9,8 +9,6 @@ of it by what `settings` take for usual and for clear. The mathematics: docs/met
 """
 
 from implicam.rig_model.camera import (
-    CENTRE_PRIOR_SD,
-    LOG_ASPECT_PRIOR_SD,
     PERSPECTIVE_K,
     CentralCamera,
     Image,
@@ -50,8 +48,6 @@ from implicam.rig_model.training_data import (
 from implicam.rig_model.triangulate import Labels, Located, locate
 
 __all__ = [
-    "CENTRE_PRIOR_SD",
-    "LOG_ASPECT_PRIOR_SD",
     "MAX_NAMED_IN_NOTE",
     "MIN_POINTS_PER_CAMERA",
     "PERSPECTIVE_K",

@@ -13,31 +13,16 @@ import numpy as np
 
 from implicam.cameras import BrownConrady, KannalaBrandt, Lens
 from implicam.geometry import Floats, Pose, camera_centre, rotation_from_vector
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 
 PERSPECTIVE_K = np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
 """k1 ... k4 of a perspective lens: tan(t) = t + t^3/3 + 2 t^5/15 + ..."""
 
-DISTORTION_PRIOR_SD = np.array([0.15, 0.1, 0.05, 0.02])
-"""Prior sd of k1 ... k4 about the line from an equidistant to a perspective lens ..."""
-
-DISTORTION_AT_EDGE_PRIOR_SD = np.array([0.15, 0.1, 0.07, 0.05])
-"""... and of what each term may do at the edge of the image, as a part of the radius: it tames fisheyes."""
-
 BROWN_PRIOR_SD, BROWN_AT_EDGE_PRIOR_SD = np.array([0.5, 0.5, 0.3]), np.array([0.4, 0.3, 0.15])
-"""The same of k1, k2, k3 of a Brown-Conrady lens, about none, and of each term at the edge of the image."""
+"""Prior sd of k1, k2, k3 of a Brown-Conrady lens, about none, and of what each term may do at the edge of the image."""
 
 DECENTRING_PRIOR_SD = 0.005
 """Prior sd of p1 and p2."""
-
-LOG_ASPECT_PRIOR_SD = 0.002
-"""Prior sd of log(fy / fx): pixels are square."""
-
-CENTRE_PRIOR_SD = 0.02
-"""Prior sd of the principal point about the image's centre, as a part of the longer side."""
-
-
-PROJECTION_PRIOR_RELATIVE_SD = 0.3
-"""Prior sd of the numbers of a linear projection about those of its start, as a part of them."""
 
 
 class Image(NamedTuple):
@@ -125,15 +110,16 @@ class CentralCamera:
         turn = rotation_from_vector(step[-6:-3])
         return CentralCamera(lens, Pose(turn @ self.pose.rotation, self.pose.translation + step[-3:]))
 
-    def prior(self, image: Image, widest: float) -> Prior:
+    def prior(self, image: Image, widest: float, settings: RigModelSettings = DEFAULT_SETTINGS) -> Prior:
         """Eq. (3), for a lens that is used up to `widest` radians off its axis."""
         mean, precision = np.zeros(self.size), np.zeros((self.size, self.size))
-        aspect = 1 / (LOG_ASPECT_PRIOR_SD * self.lens.fx) ** 2
+        aspect = 1 / (settings.log_aspect_prior_sd * self.lens.fx) ** 2
         precision[:2, :2] = aspect * np.array([[1, -1], [-1, 1]])
         mean[2:4] = image.centre
-        precision[2, 2] = precision[3, 3] = 1 / (CENTRE_PRIOR_SD * 2 * image.half) ** 2
+        precision[2, 2] = precision[3, 3] = 1 / (settings.centre_prior_sd_sides * 2 * image.half) ** 2
         if isinstance(self.lens, KannalaBrandt):
-            own = np.minimum(DISTORTION_PRIOR_SD, DISTORTION_AT_EDGE_PRIOR_SD / widest ** np.array([2, 4, 6, 8]))
+            at_edge = settings.distortion_at_edge_prior_sd / widest ** np.array([2, 4, 6, 8])
+            own = np.minimum(settings.distortion_prior_sd, at_edge)
             mean[4:8] = 0.5 * PERSPECTIVE_K
             precision[4:8, 4:8] = np.linalg.inv(np.diag(own**2) + 0.25 * np.outer(PERSPECTIVE_K, PERSPECTIVE_K))
         else:
@@ -218,14 +204,12 @@ class ProjectiveCamera:
         """The camera with its matrix changed by (12,)."""
         return ProjectiveCamera(self.P + step.reshape(3, 4))
 
-    def prior(self, image: Image, widest: float) -> Prior:
+    def prior(self, image: Image, widest: float, settings: RigModelSettings = DEFAULT_SETTINGS) -> Prior:
         """Roughly what the linear resection found; and the scale of P, which no pixel shows, stays what it is."""
         scale = np.maximum(np.abs(self.P), 1e-3 * np.abs(self.P).max(axis=1, keepdims=True))
         along = (self.P / scale**2).ravel()
-        return Prior(
-            self.P.ravel(),
-            np.diag(1 / (PROJECTION_PRIOR_RELATIVE_SD * scale.ravel()) ** 2) + 1e4 * np.outer(along, along),
-        )
+        own = np.diag(1 / (settings.projection_prior_relative_sd * scale.ravel()) ** 2)
+        return Prior(self.P.ravel(), own + 1e4 * np.outer(along, along))
 
     def as_array(self) -> Floats:
         """(12,)."""

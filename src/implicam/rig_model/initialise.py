@@ -70,7 +70,8 @@ def _with_prior(
 ) -> InitialCamera:
     there = camera.pose.apply(points[inliers])
     widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
-    return _refined(camera, camera.prior(image, widest), points, uv, image, inliers, settings.max_start_error_medians)
+    prior = camera.prior(image, widest, settings)
+    return _refined(camera, prior, points, uv, image, inliers, settings.max_start_error_medians)
 
 
 def _start_projective(points: Floats, uv: Floats, image: Image, settings: RigModelSettings) -> InitialCamera:
@@ -85,7 +86,7 @@ def _start_projective(points: Floats, uv: Floats, image: Image, settings: RigMod
             break
         inliers = inside
     front = ~np.isnan(camera.pixel(points)[:, 0])  # no linear projection sees what is behind it
-    return InitialCamera(camera, camera.prior(image, 1.0), inliers & front, "none")
+    return InitialCamera(camera, camera.prior(image, 1.0, settings), inliers & front, "none")
 
 
 def _refined(

@@ -32,6 +32,18 @@ class RigModelSettings:
     max_start_error_half_extents_without_lens: float = 0.3
     """The same of a linear projection, which leaves the lens to its field."""
 
+    # priors of cameras, eqs. (3) and (4); those of single lens families are with the lenses
+    distortion_prior_sd: tuple[float, float, float, float] = (0.15, 0.1, 0.05, 0.02)
+    """Prior sd of k1 ... k4 of a Kannala-Brandt lens, about the line from an equidistant to a perspective one."""
+    distortion_at_edge_prior_sd: tuple[float, float, float, float] = (0.15, 0.1, 0.07, 0.05)
+    """Prior sd of what each term may do at the edge of the image, as a part of the radius: it tames fisheyes."""
+    log_aspect_prior_sd: float = 0.002
+    """Prior sd of log(fy / fx) of an ordinary camera: pixels are square."""
+    centre_prior_sd_sides: float = 0.02
+    """Prior sd of the principal point about the image's centre, in the longer side."""
+    projection_prior_relative_sd: float = 0.3
+    """Prior sd of the numbers of a linear projection about those of its start, as a part of them."""
+
     # the field, eq. (8)
     typical_log_distance_sd: float = 0.12
     """Sd of the log distance of the known points in an ordinary rig. Where the volume is thinner, depth counts in its

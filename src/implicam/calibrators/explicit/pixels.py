@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.calibrators.explicit.lenses import USUAL_PIXELS
-from implicam.rig_model import CENTRE_PRIOR_SD, LOG_ASPECT_PRIOR_SD, CentralCamera, Image, Prior
+from implicam.rig_model import CentralCamera, Image, Prior, RigModelSettings
 
 ASPECTS = (1.0, 0.5, 0.63, 0.79, 1.26, 1.59, 2.0)
 """Ratios fy / fx that a start tries: the steps of 26 % are close enough for what follows."""
@@ -41,9 +41,9 @@ class Pixels(NamedTuple):
     odds: float
 
 
-def square(centre: float = CENTRE_PRIOR_SD) -> Pixels:
+def square(centre: float = RigModelSettings.centre_prior_sd_sides) -> Pixels:
     """Square pixels and a lens over the middle of the picture: the usual."""
-    return Pixels(USUAL_PIXELS, LOG_ASPECT_PRIOR_SD, centre, 1.0)
+    return Pixels(USUAL_PIXELS, RigModelSettings.log_aspect_prior_sd, centre, 1.0)
 
 
 def kinds(usual: Pixels) -> tuple[Pixels, ...]:
@@ -51,7 +51,7 @@ def kinds(usual: Pixels) -> tuple[Pixels, ...]:
     return (
         usual,
         Pixels("stretched", FREE_LOG_ASPECT_SD, usual.centre, 20.0),
-        Pixels("cropped", LOG_ASPECT_PRIOR_SD, FREE_CENTRE_SD, 20.0),
+        Pixels("cropped", RigModelSettings.log_aspect_prior_sd, FREE_CENTRE_SD, 20.0),
         Pixels("any", FREE_LOG_ASPECT_SD, FREE_CENTRE_SD, 50.0),
     )
 
@@ -62,7 +62,7 @@ def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels)
     mean, precision = usual.mean.copy(), usual.precision.copy()
     lens = camera.lens
     # log(fy / fx) about 0, made linear where the lens is: (fy - fx) over their mean has the same slope
-    typical = lens.fx if pixels.aspect == LOG_ASPECT_PRIOR_SD else 0.5 * (lens.fx + lens.fy)
+    typical = lens.fx if pixels.aspect == RigModelSettings.log_aspect_prior_sd else 0.5 * (lens.fx + lens.fy)
     precision[:2, :2] = np.array([[1, -1], [-1, 1]]) / (pixels.aspect * typical) ** 2
     precision[2, 2] = precision[3, 3] = 1 / (pixels.centre * 2 * image.half) ** 2
     return Prior(mean, precision)

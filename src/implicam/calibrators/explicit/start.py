@@ -26,7 +26,6 @@ from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, resect_any_pixels
 from implicam.rig_model import (
-    CENTRE_PRIOR_SD,
     MIN_POINTS_PER_CAMERA,
     PERSPECTIVE_K,
     CentralCamera,
@@ -91,14 +90,14 @@ def _resected(points: Floats, uv: Floats, image: Image) -> _Candidate:
     found, aspect = resect_any_pixels(points, uv, middle=image.centre, aspects=ASPECTS)
     k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
     lens = KannalaBrandt(found.focal, found.focal * aspect, *image.centre.tolist(), *k.tolist())
-    pixels = square(CENTRE_PRIOR_SD) if aspect == 1 else kinds(square(CENTRE_PRIOR_SD))[1]
+    pixels = square() if aspect == 1 else kinds(square())[1]
     return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.inliers, points, uv, image, 1e-3)
 
 
 def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image: Image) -> list[_Candidate]:
     """The cameras refined with each prior of their pixels that may be right, the most probable one first; one alone
     where the usual one is clearly right."""
-    usual, *between, widest = kinds(square(CENTRE_PRIOR_WIDENING * CENTRE_PRIOR_SD))
+    usual, *between, widest = kinds(square(CENTRE_PRIOR_WIDENING * RigModelSettings.centre_prior_sd_sides))
 
     def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
         return _refined(start.camera, pixels, start.inliers, points, uv, image)

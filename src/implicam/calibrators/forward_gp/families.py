@@ -19,7 +19,7 @@ from implicam.calibrators.forward_gp.evidence import (
 )
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.camera import DISTORTION_AT_EDGE_PRIOR_SD, DISTORTION_PRIOR_SD, PERSPECTIVE_K, Image, Prior
+from implicam.rig_model.camera import PERSPECTIVE_K, Image, Prior
 from implicam.rig_model.field import DepthScale, field_coordinates
 from implicam.rig_model.general_camera import CENTRE, KAPPA, MIN_RHO, RHO, GeneralCamera
 
@@ -67,9 +67,9 @@ def family_prior(camera: GeneralCamera, family: str, image: Image, widest: float
     sd = np.array([kind.p, kind.q, kind.tilt, kind.tilt, *2 * [kind.centre * 2 * image.half]])
     precision[range(1, 7), range(1, 7)] = 1 / sd**2
     powers = np.array([2, 4, 6, 8])
-    own = DISTORTION_PRIOR_SD.copy()
+    own = np.array(settings.distortion_prior_sd)
     own[:2] = np.maximum(own[:2], settings.telephoto_edge_sd / widest ** powers[:2])
-    own = np.minimum(own, DISTORTION_AT_EDGE_PRIOR_SD / widest**powers)
+    own = np.minimum(own, settings.distortion_at_edge_prior_sd / widest**powers)
     unit = camera.rho**powers
     covariance = np.diag(own**2) + 0.25 * np.outer(PERSPECTIVE_K, PERSPECTIVE_K)
     precision[KAPPA, KAPPA] = np.linalg.inv(covariance) / np.outer(unit, unit)
