@@ -31,7 +31,7 @@ from odd_rigs import draw
 STAGES = {
     "kinds": (fit, "_start_cameras"),
     "sizes": (rounds, "estimate_hyperparameters"),
-    "posterior": (rounds, "condition_with_new_fields"),
+    "posterior": (rounds, "iterate_linearisation"),
     "wrong views": (fit, "update_inliers"),
     "tails": (position_error_fit, "refit_with_heavy_tails"),
     "projections": (fit, "_try_linear_projections"),

@@ -18,7 +18,7 @@ from implicam.dataset import Floats, Observations
 from implicam.errors import DatasetError
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.measurement import DOUBTFUL
-from implicam.rig_model.alarm import Table, _inexplicable, _misfit, _uneven
+from implicam.rig_model.alarm import Table, _inexplicable_probability, _misfit, _surprising_level
 from implicam.rig_model.settings import DEFAULT_SETTINGS
 from implicam.simulate import Rig, build_rig, random_positions, simulate
 
@@ -177,10 +177,10 @@ def test_error_bars_somewhat_too_small_are_no_alarm(views: int) -> None:
     alarms = 0
     for n in (10, 30, 100, 300) * 250:
         p = chdtrc(2 * views - 3, 1.25**2 * rng.chisquare(2 * views - 3, size=n))
-        alarms += _uneven(p, np.full(n, views), DEFAULT_SETTINGS) is not None
+        alarms += _surprising_level(p, np.full(n, views), DEFAULT_SETTINGS) is not None
     assert alarms <= 3  # of 1000
     wide = chdtrc(2 * views - 3, 2.5**2 * rng.chisquare(2 * views - 3, size=60))
-    assert _uneven(wide, np.full(60, views), DEFAULT_SETTINGS) is not None
+    assert _surprising_level(wide, np.full(60, views), DEFAULT_SETTINGS) is not None
 
 
 def test_a_few_points_are_not_a_table() -> None:
@@ -191,7 +191,7 @@ def test_a_few_points_are_not_a_table() -> None:
 
 @pytest.mark.parametrize(("views", "share"), [(2, 0.36), (3, 0.104), (5, 0.05792)])
 def test_how_many_points_no_wrong_view_explains(views: int, share: float) -> None:
-    assert _inexplicable(views, DEFAULT_SETTINGS.usual_wrong_share) == pytest.approx(share)
+    assert _inexplicable_probability(views, DEFAULT_SETTINGS.usual_wrong_share) == pytest.approx(share)
 
 
 @pytest.mark.filterwarnings("error")

@@ -95,7 +95,7 @@ def test_the_likelihood_is_the_density_of_the_residuals(freedom: float) -> None:
 @pytest.mark.parametrize("freedom", [np.inf, 8.0, 3.0])
 def test_the_estimate_knows_its_gradient(freedom: float) -> None:
     agreement, _ = views(12, covariance(1, 1e-3), 0.7)
-    objective = _objective(agreement, freedom)
+    objective = _objective(agreement, freedom, DEFAULT_SETTINGS)
     for seed in range(3):
         z = np.array([-14.0, -13, -15, 0, 0, 0, -0.4]) + 0.4 * np.random.default_rng(seed).normal(size=7)
         numeric = [(objective(z + d)[0] - objective(z - d)[0]) / 2e-5 for d in 1e-5 * np.eye(7)]
@@ -134,7 +134,8 @@ def test_positions_that_are_exact_are_left_so() -> None:
     for seed in range(20):
         agreement, _ = views(40, np.zeros((3, 3)), 1.0, seed=seed)
         assert estimate_position_errors(agreement, DEFAULT_SETTINGS) is None
-        gains.append(_evidence(agreement, _most_probable(agreement, np.inf, None)))
+        found = _most_probable(agreement, np.inf, None, DEFAULT_SETTINGS)
+        gains.append(_evidence(agreement, found, DEFAULT_SETTINGS))
     assert np.mean(gains) < 0
     assert estimate_position_errors(agreement.select(np.arange(3)), DEFAULT_SETTINGS) is None
 
@@ -208,7 +209,8 @@ def test_what_has_no_levels() -> None:
     assert levels(rng.uniform(-1, 1, (100, 3)), DEFAULT_SETTINGS) is None
     assert levels(stepped(STEPS["two"])[:9], DEFAULT_SETTINGS) is None
     points = stepped(STEPS["pyramid"])
-    assert untold(points, np.array([f"p{i}" for i in range(len(points))])) is None  # a ball that stood on a lattice
+    each = np.array([f"p{i}" for i in range(len(points))])  # a ball that stood on a lattice
+    assert untold(points, each, DEFAULT_SETTINGS) is None
 
 
 def test_a_level_of_a_few_points_is_none() -> None:

@@ -13,7 +13,7 @@ from exhaustive_views import by_trying_all
 from implicam.calibrators import ForwardGP
 from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
 from implicam.dataset import Dataset, Observations
-from implicam.rig_model.settings import RigModelSettings
+from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.triangulate import Located, _Seen, locate
 from implicam.rig_model.wrong_views import (
     LinearisedViews,
@@ -101,6 +101,7 @@ class Counted:
     solved_rows: list[np.ndarray] = field(default_factory=list)
     linear_rows: list[np.ndarray] = field(default_factory=list)
     degrees: float | None = None
+    settings: RigModelSettings = DEFAULT_SETTINGS
 
     def lines(self, rows):
         return self.points.lines(rows)
@@ -148,6 +149,7 @@ class Given:
     """Points that are linear."""
 
     degrees = None
+    settings = DEFAULT_SETTINGS
 
     def __init__(self, linear: LinearisedViews) -> None:
         self.given = linear

@@ -13,15 +13,12 @@ from implicam.rig_model.camera import (
     CentralCamera,
     Image,
     Prior,
-    ProjectiveCamera,
-    View,
 )
 from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
 from implicam.rig_model.diagnostics import MAX_NAMED_IN_NOTE, Diagnosis
 from implicam.rig_model.field import Hyperparameters
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.general_camera import AnyCamera, GeneralCamera
-from implicam.rig_model.heavy_tails import HeavyTails
+from implicam.rig_model.general_camera import GeneralCamera
 from implicam.rig_model.initialise import (
     InitialCamera,
     lens_only_model,
@@ -31,12 +28,9 @@ from implicam.rig_model.initialise import (
 from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.normal_equations import solve_normal
-from implicam.rig_model.position_errors import PositionErrors
 from implicam.rig_model.posterior import Posterior, condition
 from implicam.rig_model.rig import FittedRig, Sensitivity
 from implicam.rig_model.settings import RigModelSettings
-from implicam.rig_model.shot_errors import ShotErrors, Shots
-from implicam.rig_model.tied import Scatter, condition_scattered
 from implicam.rig_model.training_data import (
     MIN_POINTS_PER_CAMERA,
     Frame,
@@ -45,13 +39,12 @@ from implicam.rig_model.training_data import (
     relative_noise,
     stated_noise,
 )
-from implicam.rig_model.triangulate import Labels, Located, locate
+from implicam.rig_model.triangulate import locate
 
 __all__ = [
     "MAX_NAMED_IN_NOTE",
     "MIN_POINTS_PER_CAMERA",
     "PERSPECTIVE_K",
-    "AnyCamera",
     "CameraModel",
     "CameraViews",
     "CentralCamera",
@@ -60,26 +53,16 @@ __all__ = [
     "FittedRig",
     "Frame",
     "GeneralCamera",
-    "HeavyTails",
     "Hyperparameters",
     "Image",
     "InitialCamera",
-    "Labels",
-    "Located",
-    "PositionErrors",
     "Posterior",
     "Prior",
-    "ProjectiveCamera",
     "RigModelSettings",
-    "Scatter",
     "Sensitivity",
-    "ShotErrors",
-    "Shots",
     "TrainingData",
-    "View",
     "apply_covariance_root",
     "condition",
-    "condition_scattered",
     "image_of",
     "iterate_linearisation",
     "lens_only_model",

@@ -38,25 +38,25 @@ from implicam.geometry import Bools, Floats
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.row_order import late_or_early, moved_up
 
-TRIED = 24
+MAX_POINTS_TRIED = 24
 """Points on which the causes are tried."""
 
-EXPLAINS, BETTER = 0.6, 0.3
+MIN_SHARE_EXPLAINED, MIN_SHARE_GAINED = 0.6, 0.3
 """A cause makes so many of the points agree, and so many more than agree without it."""
 
-MOST_PAIRS = 2000
+MAX_PAIRS = 2000
 """Pairs of cameras that are tried; of more, the neighbours."""
 
-SIZES = (
+RESIZE_FACTORS = (
     (2.0, "half"), (0.5, "twice"), (1.5, "two thirds"), (2 / 3, "one and a half times"), (3.0, "a third"),
     (1 / 3, "three times"), (4 / 3, "three quarters"), (0.75, "four thirds"), (2.25, "four ninths"), (4 / 9, "9/4"),
 )  # fmt: skip
 """Factors from one usual height of a video (480, 720, 1080, 1440, 2160 rows) to another, and the words for it."""
 
-CONFIRMED = 3
+MAX_CAUSES_CONFIRMED = 3
 """The likeliest causes, which are put to the full test."""
 
-PLAUSIBLE = 50.0
+MAX_MISFIT_NOISES = 50.0
 """Misfit beyond which a cause is not put to it."""
 
 
@@ -104,30 +104,30 @@ def alarm_of(table: Table) -> str:
     if share > many:
         alone = int((contradict & ~explained).sum())
         wrong = settings.usual_wrong_share
-        usual = max(wrong, float(np.mean([_inexplicable(int(k), wrong) for k in views[tested]])))
-        moved = _contradicted(table, views)
+        usual = max(wrong, float(np.mean([_inexplicable_probability(int(k), wrong) for k in views[tested]])))
+        moved = _contradicted_cameras(table, views)
         if moved or (alone > many * n and _tail(alone, n, usual) < settings.false_alarm_probability):
             what = f"{percent(share)} of {n} points contradict the calibration"
-            return _said(what, settings.disagree_p_value, table, tested, moved)
+            return _sentence(what, settings.disagree_p_value, table, tested, moved)
     near = tested & ~explained & (table.p >= settings.min_p_value)
-    uneven = _uneven(table.p[near], views[near], settings) if table.checked else None
+    uneven = _surprising_level(table.p[near], views[near], settings) if table.checked else None
     if uneven is None:
         return ""
     level, count = uneven
     words = f"the views of {count} of {near.sum()} points agree badly"
     if share > many:
-        return _said(words, level, table, tested, [])
+        return _sentence(words, level, table, tested, [])
     return (
         f"{words}; {100 * level:g} % would be chance: has a camera been moved or refocused a little, or are the pixels "
         "noisier than they were when the rig was calibrated?"
     )
 
 
-def _said(what: str, chance: float, table: Table, tested: Bools, moved: Sequence[str]) -> str:
+def _sentence(what: str, chance: float, table: Table, tested: Bools, moved: Sequence[str]) -> str:
     return f"{what}; {100 * chance:g} % would be chance: {_cause(table, tested, moved)}"
 
 
-def _uneven(p: Floats, views: NDArray[np.int64], settings: RigModelSettings) -> tuple[float, int] | None:
+def _surprising_level(p: Floats, views: NDArray[np.int64], settings: RigModelSettings) -> tuple[float, int] | None:
     """The level below which the most surprising number of p-values (n,) lies, and it; None where none does."""
     if not len(p):
         return None
@@ -142,7 +142,7 @@ def _uneven(p: Floats, views: NDArray[np.int64], settings: RigModelSettings) -> 
     return (level, count) if tail < settings.false_alarm_probability else None
 
 
-def _inexplicable(views: int, wrong_share: float) -> float:
+def _inexplicable_probability(views: int, wrong_share: float) -> float:
     """Probability that more of a point's views are wrong than leaving one or two out can mend."""
     mended = 2 if views >= 5 else 1 if views >= 3 else 0
     return float(bdtrc(mended, views, wrong_share))
@@ -153,7 +153,7 @@ def _tail(count: int, n: int, share: float) -> float:
     return float(bdtrc(count - 1, n, share)) if count > 0 else 1.0
 
 
-def _contradicted(table: Table, views: NDArray[np.int64]) -> list[str]:
+def _contradicted_cameras(table: Table, views: NDArray[np.int64]) -> list[str]:
     """Cameras whose views are left out far more often than wrong detections would be."""
     can_tell, settings = views >= 3, table.settings
     seen, away = table.seen[can_tell].sum(axis=0), table.left_out[can_tell].sum(axis=0)
@@ -169,15 +169,15 @@ def _contradicted(table: Table, views: NDArray[np.int64]) -> list[str]:
 def _cause(table: Table, tested: Bools, moved: Sequence[str]) -> str:
     """The likeliest cause as a question: what makes most of some points agree."""
     rows = np.flatnonzero(tested)
-    if len(rows) > TRIED:
-        rows = np.sort(np.random.default_rng(0).choice(rows, TRIED, replace=False))
+    if len(rows) > MAX_POINTS_TRIED:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_POINTS_TRIED, replace=False))
     now = (table.p[rows] >= table.settings.disagree_p_value) & ~table.left_out[rows].any(axis=1)
-    least = max(EXPLAINS, BETTER + float(now.mean()))
+    least = max(MIN_SHARE_EXPLAINED, MIN_SHARE_GAINED + float(now.mean()))
     guesses = [(_misfit(table, rows, uv, noise), words, uv) for words, uv, noise in _guesses(table)]
     without = [(_misfit(table, rows, uv, table.noise), words, uv) for words, uv in _without_one(table)]
     for likely in (guesses, without):  # without the one at fault the others agree whatever its fault is
-        plausible = sorted((guess for guess in likely if guess[0] < PLAUSIBLE), key=lambda guess: guess[0])
-        for _, words, uv in plausible[:CONFIRMED]:
+        plausible = sorted((guess for guess in likely if guess[0] < MAX_MISFIT_NOISES), key=lambda guess: guess[0])
+        for _, words, uv in plausible[:MAX_CAUSES_CONFIRMED]:
             testable = rows[_views(uv[rows]) >= 2]
             agree = table.agree(uv[testable])
             if len(testable) and agree.mean() >= least:
@@ -208,7 +208,7 @@ def _misfit(table: Table, rows: NDArray[np.int64], uv: Floats, noise: Floats) ->
     x = np.asarray(np.linalg.solve(A + 1e-9 * np.eye(3), b[..., None])[..., 0], dtype=np.float64)
     off = np.asarray(np.linalg.norm(table.pixels(x) - uv[rows], axis=2) / noise[rows], dtype=np.float64)
     worst = np.where(np.isnan(uv[rows, :, 0]), 0.0, np.nan_to_num(off, nan=np.inf)).max(axis=1)
-    return float(np.sort(worst)[int(EXPLAINS * len(worst))])  # some are infinite, so nothing is interpolated
+    return float(np.sort(worst)[int(MIN_SHARE_EXPLAINED * len(worst))])  # some are infinite, so nothing is interpolated
 
 
 def _without_one(table: Table) -> Iterator[tuple[str, Floats]]:
@@ -226,11 +226,12 @@ def _guesses(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
     names = table.names
     for c, name in enumerate(names):
         for rows in (1, -1):
-            uv = table.uv.copy()
-            uv[:, c] = moved_up(uv[:, c], rows)
-            yield f"are the pictures of {name} {late_or_early(rows)}? Put right {{share}}", uv, table.noise
+            words = f"are the pictures of {name} {late_or_early(rows)}? Put right {{share}}"
+            yield words, *_changed(table, c, moved_up(table.uv[:, c], rows))
     pairs = list(combinations(range(len(names)), 2))
-    for a, b in pairs if len(pairs) <= MOST_PAIRS else pairs[: len(names) - 1] + _neighbours(len(names)):
+    if len(pairs) > MAX_PAIRS:  # those that follow each other are exchanged most easily
+        pairs = [*pairs[: len(names) - 1], *((c, c + 1) for c in range(1, len(names) - 1))]
+    for a, b in pairs:
         order = np.arange(len(names))
         order[[a, b]] = b, a
         words = f"are {names[a]} and {names[b]} exchanged? With the two the other way round {{share}}"
@@ -238,38 +239,27 @@ def _guesses(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
     yield from _other_pixels(table)
 
 
-def _neighbours(cameras: int) -> list[tuple[int, int]]:
-    """Of very many cameras: those that follow each other, which are exchanged most easily."""
-    return [(c, c + 1) for c in range(1, cameras - 1)]
+def _changed(table: Table, cameras: slice | int, uv: Floats, factor: float = 1.0) -> tuple[Floats, Floats]:
+    """Pixels and noise of the table, those of some cameras changed."""
+    every, noise = table.uv.copy(), table.noise.copy()
+    every[:, cameras] = uv
+    noise[:, cameras] *= factor
+    return every, noise
 
 
 def _other_pixels(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
     """The ways in which other programs count pixels: of all cameras, or of one."""
-    every = slice(None)
-    for cameras, whose in [(every, ""), *((slice(c, c + 1), f" of {name}") for c, name in enumerate(table.names))]:
-        heights = [camera.height for camera in table.cameras[cameras]]
-        if None not in heights:
-            uv = table.uv.copy()
-            uv[:, cameras, 1] = np.array(heights, dtype=np.float64) - 1 - uv[:, cameras, 1]
-            yield (
-                f"is v{whose} counted from below here, and was not when the rig was calibrated? So {{share}}",
-                uv,
-                table.noise,
-            )
-            ends = np.array([[camera.width, camera.height] for camera in table.cameras[cameras]], dtype=np.float64) - 1
-            uv = table.uv.copy()
-            uv[:, cameras] = ends - uv[:, cameras]
-            yield (
-                f"are the pictures{whose} upside down here, and were not when the rig was calibrated? Turned by 180° "
-                "{share}",
-                uv,
-                table.noise,
-            )
-        uv = table.uv.copy()
-        uv[:, cameras] = uv[:, cameras, ::-1]
-        yield f"are u and v{whose} exchanged? The other way round {{share}}", uv, table.noise
-        for factor, words in SIZES:
-            uv, noise = table.uv.copy(), table.noise.copy()
-            uv[:, cameras] = factor * (uv[:, cameras] + 0.5) - 0.5
-            noise[:, cameras] *= factor
-            yield f"are the pictures{whose} {words} the size they were? Resized {{share}}", uv, noise
+    one_by_one = ((slice(c, c + 1), f" of {name}") for c, name in enumerate(table.names))
+    for cameras, whose in [(slice(None), ""), *one_by_one]:
+        uv = table.uv[:, cameras]
+        ends = np.array([[camera.width, camera.height] for camera in table.cameras[cameras]], dtype=np.float64) - 1
+        if np.isfinite(ends).all():  # all sizes are known
+            from_below = np.stack([uv[..., 0], ends[:, 1] - uv[..., 1]], axis=-1)
+            words = f"is v{whose} counted from below here, and was not when the rig was calibrated? So {{share}}"
+            yield words, *_changed(table, cameras, from_below)
+            words = f"are the pictures{whose} upside down here, and were not when the rig was calibrated? "
+            yield words + "Turned by 180° {share}", *_changed(table, cameras, ends - uv)
+        yield f"are u and v{whose} exchanged? The other way round {{share}}", *_changed(table, cameras, uv[..., ::-1])
+        for factor, size in RESIZE_FACTORS:
+            words = f"are the pictures{whose} {size} the size they were? Resized {{share}}"
+            yield words, *_changed(table, cameras, factor * (uv + 0.5) - 0.5, factor)

@@ -13,7 +13,7 @@ from implicam.dataset.unused import Rejected, Unused
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.leave_one_out import left_out_points, left_out_residuals
+from implicam.rig_model.leave_one_out import left_out_points, left_out_positions, left_out_residuals
 from implicam.rig_model.training_data import Frame, camera_views_of, stated_noise
 
 MAX_NAMED_IN_NOTE = 5
@@ -58,33 +58,15 @@ class Diagnosis:
 
     @cached_property
     def leave_one_out(self) -> tuple[Floats, Floats]:
-        """Errors and sds (n, 3) of the known points, each measured without its own views, to first order; the errors of
-        the known positions themselves are part of both, where they are estimated."""
-        n = len(self.data)
-        posterior = self.fitted.posterior
-        if self.fitted.position_errors is not None:
-            all_seen = tuple(self._camera_views[c] for c in self.fitted.cameras)
-            error, cov = left_out_points(self.fitted, self._points, all_seen)
-            return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
-        H, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        views = np.zeros(n)
-        for number, c in enumerate(self.fitted.cameras):
-            seen, inliers = self._camera_views[c], self.fitted.inliers[number]
-            residual, spread = left_out_residuals(posterior, number, self._points, seen, inliers)
-            rows = seen.rows[inliers]
-            where = self._points[rows]
-            if posterior.displacement is not None:
-                where = where + posterior.displacement[rows]
-            _, D = posterior.models[number].predict(where)
-            WD = np.linalg.inv(spread[inliers]) @ D
-            H[rows] += D.swapaxes(1, 2) @ WD
-            g[rows] += np.einsum("nij,ni->nj", WD, residual[inliers])
-            views[rows] += 1
-        H[~np.isfinite(H).all(axis=(1, 2))] = 0.0
-        size = np.linalg.eigvalsh(H)
-        good = (views >= 2) & (size[:, 0] > 1e-12 * size[:, -1])
-        cov = np.asarray(np.linalg.inv(H[good]), dtype=np.float64)
-        error = np.einsum("nij,nj->ni", cov, g[good])
+        """Errors and sds (m, 3) of the known points that two cameras see, in the world's unit, each measured without
+        its own views, to first order; where errors of known positions are estimated, they are part of both."""
+        fitted, seen = self.fitted, tuple(self._camera_views[c] for c in self.fitted.cameras)
+        if fitted.position_errors is not None:
+            error, cov = left_out_points(fitted, self._points, seen)
+        else:
+            error, cov = left_out_positions(fitted.posterior, self._points, seen, fitted.inliers)
+            measured = np.isfinite(error[:, 0])
+            error, cov = error[measured], cov[measured]
         return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale
 
     def notes(self) -> list[str]:

@@ -12,11 +12,14 @@ from implicam.rig_model.camera_model import CameraViews, apply_covariance_root
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.position_errors import Agreement
 from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
+from implicam.rig_model.settings import DEFAULT_SETTINGS
 from implicam.threads import side_by_side
 
 MIN_ONE_MINUS_LEVERAGE = 1e-9
 """One minus the leverage of a view, at least: below, rounding decides."""
+
+MIN_INFORMATION_RATIO = 1e-12
+"""Of a position, in its worst direction over that in its best: what is less is rounding."""
 
 
 def squared_distances(posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools) -> Floats:
@@ -96,13 +99,14 @@ def next_inliers(distance: Floats, inliers: Bools, limit: float) -> Bools:
 
 class LeftOutViews(NamedTuple):
     """Per view of one camera, predicted without it: rows (n,) of the points; residual (n, 2) and covariance inverse
-    (n, 2, 2); slope (n, 2, 3) by the position; high (n,) whether its point says how the camera is."""
+    (n, 2, 2); slope (n, 2, 3) by the position; variance_ratio (n,) of the prediction, in its worst direction, over the
+    noise: where it is large, the point says how the camera is."""
 
     rows: NDArray[np.int64]
     residual: Floats
     inverse: Floats
     slope: Floats
-    high: Bools
+    variance_ratio: Floats
 
     @property
     def information(self) -> Floats:
@@ -116,11 +120,7 @@ class LeftOutViews(NamedTuple):
 
 
 def left_out_views(
-    posterior: Posterior,
-    points: Floats,
-    seen: tuple[CameraViews, ...],
-    inliers: tuple[Bools, ...],
-    settings: RigModelSettings,
+    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
 ) -> list[LeftOutViews]:
     """Per camera."""
     found = []
@@ -130,18 +130,16 @@ def left_out_views(
         slope = posterior.models[c].predict(where[one.rows])[1]
         noise2 = (posterior.models[c].noise * one.relative) ** 2
         values = np.linalg.eigvalsh(covariance) / noise2[:, None]
-        limit = settings.max_left_out_variance_ratio
-        high = ~((values > 0) & (values < limit)).all(axis=1)  # negative: rounding, at a leverage of one
+        ratio = np.where((values > 0).all(axis=1), values[:, 1], np.inf)  # negative: rounding, at a leverage of one
         inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        found.append(LeftOutViews(one.rows, residual, inverse, slope, np.asarray(high, dtype=np.bool_)))
+        found.append(LeftOutViews(one.rows, residual, inverse, slope, ratio))
     return found
 
 
-def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Bools]:
-    """What all views say of the position of each of n points, and which points (n,) may be judged by it: seen twice,
-    and not of high leverage."""
+def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Floats]:
+    """What all views say of the position of each of n points, and the largest variance ratio (n,) of these views."""
     total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
-    high = np.zeros(n, dtype=np.bool_)
+    largest = np.zeros(n)
     for view, k in zip(views, inliers, strict=True):
         rows = view.rows[k]  # a camera sees a point once
         information, pull = view.information, view.pull
@@ -149,28 +147,34 @@ def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: i
         total.pull[rows] += pull[k]
         total.squares[rows] += np.einsum("ni,nij,nj->n", view.residual, view.inverse, view.residual)[k]
         total.coordinates[rows] += 2
-        high[rows] |= view.high[k]
-    return total, (total.coordinates >= 4) & ~high
+        largest[rows] = np.maximum(largest[rows], view.variance_ratio[k])
+    return total, largest
 
 
 def left_out_positions(
-    posterior: Posterior,
-    points: Floats,
-    seen: tuple[CameraViews, ...],
-    inliers: tuple[Bools, ...],
-    settings: RigModelSettings,
-) -> Floats:
-    """(n, 3) how far each known point is measured off its position by views predicted without it; NaN where fewer than
-    two cameras see it."""
+    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
+) -> tuple[Floats, Floats]:
+    """How far each known point is measured off its position by views predicted without it, eq. (18).
+
+    Args:
+        posterior: What is known of the cameras.
+        points: Known positions (n, 3) in the working frame.
+        seen: Per camera, what it saw.
+        inliers: Per camera (n seen,), the views in use.
+
+    Returns:
+        Errors (n, 3) and their covariances (n, 3, 3) in the working frame; NaN where fewer than two cameras see it.
+    """
     n = len(points)
-    total, _ = sum_over_cameras(left_out_views(posterior, points, seen, inliers, settings), inliers, n)
-    information, pull = total.information, total.pull
-    values = np.linalg.eigvalsh(np.where(np.isfinite(information), information, 0))
-    good = total.coordinates >= 4
-    good &= (values[:, 0] > MIN_ONE_MINUS_LEVERAGE * values[:, 2]) & np.isfinite(pull).all(axis=1)
-    error = np.full((n, 3), np.nan)
-    error[good] = np.linalg.solve(information[good], pull[good][..., None])[..., 0]
-    return error
+    total, _ = sum_over_cameras(left_out_views(posterior, points, seen, inliers), inliers, n)
+    information = np.where(np.isfinite(total.information), total.information, 0.0)
+    values = np.linalg.eigvalsh(information)
+    good = (total.coordinates >= 4) & (values[:, 0] > MIN_INFORMATION_RATIO * values[:, 2])
+    good &= np.isfinite(total.pull).all(axis=1)
+    error, covariance = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+    covariance[good] = np.linalg.inv(information[good])
+    error[good] = np.einsum("nij,nj->ni", covariance[good], total.pull[good])
+    return error, covariance
 
 
 def left_out_points(fitted: FitResult, points: Floats, seen: tuple[CameraViews, ...]) -> tuple[Floats, Floats]:
@@ -202,7 +206,7 @@ def left_out_points(fitted: FitResult, points: Floats, seen: tuple[CameraViews, 
     measured = without[:, :, :-1] - own @ own.swapaxes(1, 2)  # a measurement does not know of the label's error
     weighted = np.linalg.solve(measured, slope)
     information = slope.swapaxes(1, 2) @ weighted
-    good = (np.linalg.eigvalsh(information)[:, 0] > 1e-12 * np.trace(information, axis1=1, axis2=2)) & (
+    good = (np.linalg.eigvalsh(information)[:, 0] > MIN_INFORMATION_RATIO * np.trace(information, axis1=1, axis2=2)) & (
         np.sum(slope.any(axis=2), axis=1) >= 4
     )
     covariance = np.linalg.inv(information[good])

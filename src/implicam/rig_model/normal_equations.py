@@ -30,6 +30,19 @@ def stable_cholesky(A: Floats) -> Floats:
     raise np.linalg.LinAlgError("the views do not fix the camera")
 
 
+def invert_stack(A: Floats) -> Floats:
+    """Inverses of symmetric matrices (n, k, k), NaN where there is none."""
+    good = np.asarray(np.isfinite(A).all(axis=(1, 2)))
+    out = np.full(A.shape, np.nan)
+    try:
+        inverse = np.linalg.inv(A[good])
+    except np.linalg.LinAlgError:  # some are singular to the last bit: find out which
+        good[good] = np.linalg.matrix_rank(A[good], hermitian=True) == A.shape[1]
+        inverse = np.linalg.inv(A[good])
+    out[good] = 0.5 * (inverse + inverse.swapaxes(1, 2))
+    return out
+
+
 def camera_normals(
     models: tuple[CameraModel, ...], points: Floats, camera_views: tuple[CameraViews, ...]
 ) -> list[NormalEquations]:

@@ -41,6 +41,11 @@ class Posterior:
     displacement: Floats | None = None
     ties: Floats | None = None
 
+    @classmethod
+    def unknown(cls, models: tuple[CameraModel, ...]) -> Posterior:
+        """Cameras before they have seen anything."""
+        return cls(models, (), None, (), 0.0)
+
     @property
     def tied(self) -> bool:
         """Whether errors of known positions tie the cameras."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -155,3 +156,13 @@ class TrainingData:
         errors = shots.errors(points) if shots is not None else _declared(data, frame)
         camera_views = camera_views_of(observations, stated)
         return cls(points, observations.camera_names, camera_views, images, stated, errors, lens, settings)
+
+    def of_cameras(self, cameras: Sequence[int]) -> Self:
+        """The same of some cameras, by their numbers."""
+        return replace(
+            self,
+            names=tuple(self.names[c] for c in cameras),
+            camera_views=tuple(self.camera_views[c] for c in cameras),
+            images=tuple(self.images[c] for c in cameras),
+            stated=self.stated[list(cameras)],
+        )

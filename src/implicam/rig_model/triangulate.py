@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import consistency, equivalent_normal_noise, refine_positions
-from implicam.rig_model.normal_equations import POINTS_PER_CHUNK
+from implicam.rig_model.normal_equations import POINTS_PER_CHUNK, invert_stack
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.schur import Unknowns
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
@@ -201,7 +201,7 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
     found = done & np.isfinite(H).all(axis=(1, 2)) & np.isfinite(step).all(axis=1)
     information = np.linalg.eigvalsh(np.where(found[:, None, None], H, np.eye(3)))
     found &= information[:, 0] > MIN_INFORMATION_RATIO * information[:, 2]
-    covariance = _inverted(H)
+    covariance = invert_stack(H)
     found &= np.isfinite(covariance).all(axis=(1, 2))
     x = x + step
     before[rows[found]] = x[found]
@@ -275,16 +275,16 @@ class _Weights:
             own = [own[c] + _square(self.halves[c]) for c in range(C)]
         if not posterior.tied:
             for c in range(C):
-                self.each[:, c] = _inverted(np.where(seen[:, c, None, None], own[c], np.eye(2)))
+                self.each[:, c] = invert_stack(np.where(seen[:, c, None, None], own[c], np.eye(2)))
             return
         self.half = np.concatenate([apply_covariance_root(rows[c], posterior.shared_root(c)) for c in range(C)], axis=1)
         S = _square(self.half).reshape(len(x), C, 2, C, 2)  # half is (n, 2C, sum P), of ties (n, 2C, q)
         for c in range(C):
             S[:, c, :, c] += own[c]
-            self.each[:, c] = _inverted(np.where(seen[:, c, None, None], S[:, c, :, c], np.eye(2)))
+            self.each[:, c] = invert_stack(np.where(seen[:, c, None, None], S[:, c, :, c], np.eye(2)))
         both = seen[:, :, None, None, None] & seen[:, None, None, :, None]
         masked = np.where(both, S, np.eye(2 * C).reshape(C, 2, C, 2))
-        self.joint = _inverted(masked.reshape(len(x), 2 * C, 2 * C))
+        self.joint = invert_stack(masked.reshape(len(x), 2 * C, 2 * C))
 
     def select(self, keep: Bools) -> _Weights:
         """Those of some points."""
@@ -329,17 +329,4 @@ def _square(half: Floats) -> Floats:
 
 def _solved(A: Floats, b: Floats) -> Floats:
     """A^-1 b of stacks, NaN where A is singular or not finite."""
-    return np.asarray(np.einsum("nij,nj->ni", _inverted(A), b), dtype=np.float64)
-
-
-def _inverted(A: Floats) -> Floats:
-    """Inverses of a stack of symmetric matrices, NaN where there is none."""
-    good = np.asarray(np.isfinite(A).all(axis=(1, 2)))
-    out = np.full(A.shape, np.nan)
-    try:
-        inverse = np.linalg.inv(A[good])
-    except np.linalg.LinAlgError:  # some are singular to the last bit: find out which
-        good[good] = np.linalg.matrix_rank(A[good], hermitian=True) == A.shape[1]
-        inverse = np.linalg.inv(A[good])
-    out[good] = 0.5 * (inverse + inverse.swapaxes(1, 2))
-    return out
+    return np.asarray(np.einsum("nij,nj->ni", invert_stack(A), b), dtype=np.float64)

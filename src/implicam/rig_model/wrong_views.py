@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from implicam.geometry import Bools, Floats
+from implicam.rig_model.normal_equations import invert_stack
 from implicam.rig_model.settings import RigModelSettings
 
 Ints = NDArray[np.int64]
@@ -188,7 +189,7 @@ class _Choices(NamedTuple):
         D, r = linear.D, linear.r
         B, Wr = apply_weights(linear, D), apply_weights(linear, r[..., None])[..., 0]
         Dt = D.reshape(n, 2 * C, 3).swapaxes(1, 2)
-        inverse = _inverse(Dt @ B.reshape(n, 2 * C, 3))
+        inverse = invert_stack(Dt @ B.reshape(n, 2 * C, 3))
         g = (Dt @ Wr.reshape(n, 2 * C, 1))[..., 0]
         step = np.einsum("nij,nj->ni", inverse, g)
         u = Wr - np.einsum("ncij,nj->nci", B, step)
@@ -251,9 +252,9 @@ class _Choices(NamedTuple):
             k = others.shape[1]
             column = self._columns(some, others)  # (n, C, 2, 2k)
             inside = np.take_along_axis(column, others[:, :, None, None], axis=1).reshape(n, 2 * k, 2 * k)
-            T = column @ _inverse(inside)[:, None]
+            T = column @ invert_stack(inside)[:, None]
             u_inside = np.take_along_axis(u, others[:, :, None], axis=1).reshape(n, 2 * k)
-            squares = squares - np.einsum("ni,nij,nj->n", u_inside, _inverse(inside), u_inside)
+            squares = squares - np.einsum("ni,nij,nj->n", u_inside, invert_stack(inside), u_inside)
             u = u - np.einsum("ncij,nj->nci", T, u_inside)
             M = M - T @ column.swapaxes(2, 3)
         chi2 = squares[:, None] - _quadratic(M, u)
@@ -444,17 +445,6 @@ def _least_squares(N: Floats, g: Floats) -> Floats:
     ridge = 1e-12 * np.trace(N, axis1=-2, axis2=-1) + 1e-300
     held = N + ridge[..., None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(held, g[..., None])[..., 0], dtype=np.float64)
-
-
-def _inverse(A: Floats) -> Floats:
-    """Inverses of a stack, NaN where there is none."""
-    try:
-        return np.asarray(np.linalg.inv(A), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        out = np.full(A.shape, np.nan)
-        good = np.isfinite(A).all(axis=(1, 2)) & (np.abs(np.linalg.det(np.nan_to_num(A))) > 0)
-        out[good] = np.linalg.inv(A[good])
-        return out
 
 
 def apply_weights(linear: LinearisedViews, what: Floats) -> Floats:

@@ -83,17 +83,21 @@ class ForwardGP(CalibratorBase):
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """Fit to all known points that any camera saw."""
+        with mistakes_named(data):
+            return self._fit(data, progress)
+
+    def _fit(
+        self, data: Dataset, progress: Progress, before: ForwardGPCalibration | None = None
+    ) -> ForwardGPCalibration:
+        """From no guess, or from a fit to most of the points, in its working frame."""
         used = without_copies(data)
-        # many small matrices, one after the other: two threads would wait
-        with mistakes_named(data), solvable(), blas_threads(1):
-            frame = Frame.of(used, self.method)
+        with solvable(), blas_threads(1):  # many small matrices, one after the other: two threads would wait
+            frame = Frame.of(used, self.method) if before is None else before.frame
             training = Training.of(self.lens, used, frame, self.settings)
-            fitted = separate_position_errors(training, fit_rig(training, progress), used.shots)
-        return ForwardGPCalibration(self, data, frame, _copies_named(data, fitted))
-
-
-def _copies_named(data: Dataset, fitted: FitResult) -> FitResult:
-    return replace(fitted, uncalibrated=uncalibrated_with_copies(data, fitted.uncalibrated))
+            fitted = fit_rig(training, progress, None if before is None else before.fitted)
+            fitted = separate_position_errors(training, fitted, used.shots)
+        uncalibrated = uncalibrated_with_copies(data, fitted.uncalibrated)
+        return ForwardGPCalibration(self, data, frame, replace(fitted, uncalibrated=uncalibrated))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,11 +170,7 @@ class ForwardGPCalibration(RigCalibration):
         """
         if anew:
             return self.calibrator.fit(data, progress)
-        with solvable(), blas_threads(1):
-            used = without_copies(data)
-            training = Training.of(self.calibrator.lens, used, self.frame, self.calibrator.settings)
-            fitted = separate_position_errors(training, fit_rig(training, progress, self.fitted), used.shots)
-        return ForwardGPCalibration(self.calibrator, data, self.frame, _copies_named(data, fitted))
+        return self.calibrator._fit(data, progress, self)
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""

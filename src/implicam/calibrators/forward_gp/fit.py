@@ -39,6 +39,7 @@ from implicam.rig_model.initialise import (
 )
 from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.normal_equations import CameraFailedError
+from implicam.rig_model.posterior import Posterior
 from implicam.threads import side_by_side
 
 AUTO = "auto"
@@ -169,25 +170,23 @@ def _fit_from_start(
     uncalibrated: list[tuple[int, str]],
 ) -> FitResult:
     cameras = tuple(started)
-    seen = tuple(training.camera_views[c] for c in cameras)
-    images = tuple(training.images[c] for c in cameras)
-    inliers = tuple(started[c].inliers for c in cameras)
-    models = tuple(lens_only_model(started[c], image) for c, image in zip(cameras, images, strict=True))
+    mine, settings = training.of_cameras(cameras), training.settings
+    models = tuple(lens_only_model(start, image) for start, image in zip(started.values(), mine.images, strict=True))
     progress("fitting", 1, 3)
-    stated = training.stated[list(cameras)]
-    settings, shots = training.settings, training.errors is not None and training.errors.estimated
+    guess = before.hyperparameters if before is not None and before.cameras == cameras else None
+    inliers = tuple(start.inliers for start in started.values())
+    state = Round(Posterior.unknown(models), inliers, guess, training.errors)
+    shots = training.errors is not None and training.errors.estimated
+    keep_sizes = guess is not None and training.errors is not None and not shots
     rounds = settings.max_rounds_with_shots if shots else settings.max_rounds
-    hyper = before.hyperparameters if before is not None and before.cameras == cameras else None
-    tied = training.errors is not None and not training.errors.estimated
-    state = Round(hyper, models, None, inliers, training.errors, None, settled=False, fixed=hyper if tied else None)
     changed = 1.0  # part of the views
     for number in range(rounds):
         search = number < settings.min_search_rounds or changed > settings.max_changed_share
-        state = next_round(training, state, seen, images, stated, search=search)
+        state = next_round(mine, state, search=search, keep_sizes=keep_sizes)
         judged = state.inliers
         if state.settled or number >= rounds // 2:  # earlier it is too soon to say what contradicts the others
             limit = settings.max_squared_mahalanobis
-            judged = update_inliers(state.posterior, training.points, seen, state.inliers, limit)
+            judged = update_inliers(state.posterior, mine.points, mine.camera_views, state.inliers, limit)
         changed = float(np.mean(np.concatenate(judged) != np.concatenate(state.inliers)))
         if state.settled and not changed:
             break
@@ -196,8 +195,7 @@ def _fit_from_start(
             state = state._replace(inliers=judged)
     progress("fitting", 3, 3)
     assert state.hyper is not None
-    check_fitted(training, state, seen)
-    ordinary_px = tuple(one.ordinary_px for one in started.values())
+    check_fitted(mine, state)
     return FitResult(
         state.posterior,
         cameras,
@@ -206,5 +204,5 @@ def _fit_from_start(
         state.hyper,
         state.errors,
         state.label_sd,
-        ordinary_px=ordinary_px,
+        ordinary_px=tuple(start.ordinary_px for start in started.values()),
     )

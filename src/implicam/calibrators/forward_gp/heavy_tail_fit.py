@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from implicam.calibrators.forward_gp.rounds import Round, check_fitted, next_round
 from implicam.calibrators.forward_gp.settings import Training
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraViews, random_subset
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.heavy_tails import (
@@ -33,32 +32,22 @@ from implicam.rig_model.wrong_views import LinearisedViews
 
 def refit_with_heavy_tails(training: Training, fitted: FitResult) -> FitResult:
     """After a few rounds more with views weighted by a t, where the noise of the fit clearly is one; else the same."""
-    cameras = fitted.cameras
-    seen, images = tuple(training.camera_views[c] for c in cameras), tuple(training.images[c] for c in cameras)
-    stated, hyper, errors = training.stated[list(cameras)], fitted.hyperparameters, fitted.errors
-    fixed = hyper if errors is not None and not errors.estimated else None
+    mine, errors = training.of_cameras(fitted.cameras), fitted.errors
     state = Round(
-        hyper,
-        fitted.posterior.models,
-        fitted.posterior,
-        fitted.inliers,
-        errors,
-        fitted.label_sd,
-        settled=True,
-        errors=errors,
-        fixed=fixed,
+        fitted.posterior, fitted.inliers, fitted.hyperparameters, errors, errors, fitted.label_sd, settled=True
     )
+    keep_sizes = errors is not None and not errors.estimated
     try:
         for number in range(training.settings.tail_rounds):
-            found = _tails(training, state, seen, images)
+            found = _tails(mine, state)
             if found is None:
                 break
             tails, inliers = found
             again = state._replace(tails=tails, inliers=inliers)
-            state = next_round(training, again, seen, images, stated, search=number == 0)
+            state = next_round(mine, again, search=number == 0, keep_sizes=keep_sizes)
         if state.tails is None:
             return fitted
-        check_fitted(training, state, seen)
+        check_fitted(mine, state)
     except np.linalg.LinAlgError:
         return fitted
     assert state.hyper is not None
@@ -73,12 +62,11 @@ def refit_with_heavy_tails(training: Training, fitted: FitResult) -> FitResult:
     )
 
 
-def _tails(
-    training: Training, state: Round, seen: tuple[CameraViews, ...], images: tuple[Image, ...]
-) -> tuple[HeavyTails, tuple[Bools, ...]] | None:
+def _tails(training: Training, state: Round) -> tuple[HeavyTails, tuple[Bools, ...]] | None:
     """Degrees of freedom of the noise, from how far all views are from what the others predict; the weight of each view
     by how far it is from what all say; and the views to use. None where the noise is normal."""
-    weighted, settings = state.weighted(seen, told=True), training.settings
+    seen, settings = training.camera_views, training.settings
+    weighted = seen if state.tails is None else state.tails.weighted(seen, told=True)
 
     def one(c: int, most: int) -> _Predicted:
         some = random_subset(len(seen[c].rows), most)
@@ -88,7 +76,7 @@ def _tails(
 
     if state.tails is None:
         few = [one(c, settings.max_tail_views_per_camera) for c in range(len(seen))]
-        areas = [(2 * image.half) ** 2 for image in images]
+        areas = [(2 * image.half) ** 2 for image in training.images]
         background = [2 * np.pi * f.variance / area for f, area in zip(few, areas, strict=True)]
         if not looks_heavy(np.concatenate([f.distance for f in few]), np.concatenate(background), settings):
             return None

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
 from implicam.calibrators.forward_gp.settings import Training
 from implicam.geometry import Floats
-from implicam.rig_model.camera import Image, ProjectiveCamera
+from implicam.rig_model.camera import ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel, CameraViews, thin_views
 from implicam.rig_model.field import DepthScale, Hyperparameters, empty_field, field_coordinates
 from implicam.rig_model.posterior import condition
@@ -23,10 +23,9 @@ def estimate_hyperparameters(
     training: Training,
     models: tuple[CameraModel, ...],
     used: tuple[CameraViews, ...],
-    images: tuple[Image, ...],
-    stated: Floats,
     before: Hyperparameters | None,
     moved: Floats | None,
+    *,
     search: bool,
 ) -> Hyperparameters:
     """Most probable for all cameras, from the views in use. before: a guess; moved (n, 3): how far the known points are
@@ -35,10 +34,12 @@ def estimate_hyperparameters(
     groups = []
     for numbers in _alike(models):
         evidence = [_evidence(training, models[c], used[c], moved) for c in numbers]
-        half = np.array([images[c].half for c in numbers])
+        half = np.array([models[c].image.half for c in numbers])
         kind = models[numbers[0]].camera.kind
         lens = kind != ProjectiveCamera.kind
-        rig = RigEvidence(evidence, half, stated[numbers], lens, FIELD_VARIANCE_TOLERANCE[kind], training.settings)
+        rig = RigEvidence(
+            evidence, half, training.stated[numbers], lens, FIELD_VARIANCE_TOLERANCE[kind], training.settings
+        )
         guess = None if before is None else Hyperparameters(*(values[numbers] for values in before))
         for values, part in zip(found, rig.maximise(guess, search=search or moved is not None), strict=True):
             values[numbers] = part

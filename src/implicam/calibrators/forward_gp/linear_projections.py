@@ -37,8 +37,8 @@ def measures_better(training: Training, one: FitResult, other: FitResult) -> boo
     another. A view of a steep camera says little of depth, so its density is not all that counts."""
     squares = []
     for fitted in (one, other):
-        seen = tuple(training.camera_views[c] for c in fitted.cameras)
-        error = left_out_positions(fitted.posterior, training.points, seen, fitted.inliers, training.settings)
+        seen = training.of_cameras(fitted.cameras).camera_views
+        error, _ = left_out_positions(fitted.posterior, training.points, seen, fitted.inliers)
         squares.append(np.sum(error**2, axis=1))
     one_squares, other_squares = np.array(squares)[:, np.isfinite(squares).all(axis=0)]
     if len(one_squares) < training.settings.min_views_without_lens:

@@ -18,7 +18,7 @@ from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.leave_one_out import LeftOutViews, left_out_views, sum_over_cameras
 from implicam.rig_model.level_errors import untold
 from implicam.rig_model.linearise import iterate_linearisation
-from implicam.rig_model.position_errors import PositionErrors, estimate_position_errors
+from implicam.rig_model.position_errors import Agreement, PositionErrors, estimate_position_errors
 from implicam.rig_model.tied import Scatter
 
 
@@ -43,50 +43,45 @@ def separate_position_errors(training: Training, fitted: FitResult, shots: Names
 
 
 def _with_scatter(training: Training, fitted: FitResult) -> FitResult:
-    seen = tuple(training.camera_views[c] for c in fitted.cameras)
+    seen, settings = training.of_cameras(fitted.cameras).camera_views, training.settings
     if fitted.tails is not None:
         seen = fitted.tails.weighted(seen, told=True)
-    settings = training.settings
-    views = left_out_views(fitted.posterior, training.points, seen, fitted.inliers, settings)
-    inliers, n = fitted.inliers, len(training.points)
-    found = _estimated(views, inliers, n, settings)
-    if found is None:
+    inliers, points = fitted.inliers, training.points
+    views = left_out_views(fitted.posterior, points, seen, inliers)
+    total, ratio = sum_over_cameras(views, inliers, len(points))
+    errors = _estimated(total, ratio, settings)
+    if errors is None:
         return fitted
-    inliers = _judged(views, inliers, found[0], n, settings.max_squared_mahalanobis)
+    inliers = _judged(views, inliers, errors, total, settings.max_squared_mahalanobis)
     if any((a != b).any() for a, b in zip(inliers, fitted.inliers, strict=True)):
-        found = _estimated(views, inliers, n, settings) or found
-    errors, size = found
-    errors = replace(errors, size=size)
+        errors = _estimated(*sum_over_cameras(views, inliers, len(points)), settings) or errors
     models = tuple(replace(model, noise=model.noise * errors.noise) for model in fitted.posterior.models)
     used = tuple(one.select(k) for one, k in zip(seen, inliers, strict=True))
+    assert errors.size is not None
     try:
-        posterior = iterate_linearisation(models, training.points, used, fitted.errors, Scatter(errors.root, size))
+        posterior = iterate_linearisation(models, points, used, fitted.errors, Scatter(errors.root, errors.size))
     except np.linalg.LinAlgError:  # then the cameras stay as they were, with more noise than there is
         return fitted
     return replace(fitted, posterior=posterior, inliers=inliers, position_errors=errors)
 
 
-def _estimated(
-    views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int, settings: ForwardGPSettings
-) -> tuple[PositionErrors, Floats] | None:
-    """The errors, and (n,) how much larger than usual each point's own scale is."""
-    agreement, good = sum_over_cameras(views, inliers, n)
-    rows = np.flatnonzero(good).astype(np.int64)
-    most = settings.max_points_for_position_errors
+def _estimated(total: Agreement, variance_ratio: Floats, settings: ForwardGPSettings) -> PositionErrors | None:
+    """The errors, with how much larger than usual each point's own scale is."""
+    limit, most = settings.max_left_out_variance_ratio, settings.max_points_for_position_errors
+    rows = np.flatnonzero((total.coordinates >= 4) & (variance_ratio < limit)).astype(np.int64)
     some = rows if len(rows) <= most else np.random.default_rng(0).choice(rows, most, replace=False)
-    errors = estimate_position_errors(agreement.select(some), settings)
+    errors = estimate_position_errors(total.select(some), settings)
     if errors is None:
         return None
-    size = np.ones(len(good))
-    size[rows] = np.sqrt(errors.weights(agreement.select(rows)))
-    return errors, size
+    size = np.ones(len(variance_ratio))
+    size[rows] = np.sqrt(errors.weights(total.select(rows)))
+    return replace(errors, size=size)
 
 
 def _judged(
-    views: list[LeftOutViews], inliers: tuple[Bools, ...], found: PositionErrors, n: int, limit: float
+    views: list[LeftOutViews], inliers: tuple[Bools, ...], found: PositionErrors, total: Agreement, limit: float
 ) -> tuple[Bools, ...]:
     """The views to use: those that agree with what the others say of where their point is."""
-    total, _ = sum_over_cameras(views, inliers, n)
     noise2 = found.noise**2
     prior = np.linalg.inv(found.covariance)
     judged = []

@@ -9,8 +9,7 @@ import numpy as np
 from implicam.calibrators.forward_gp.hyperparameters import estimate_hyperparameters, size_fields
 from implicam.calibrators.forward_gp.settings import Training
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.camera import Image
-from implicam.rig_model.camera_model import CameraModel, CameraViews
+from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.field import Hyperparameters
 from implicam.rig_model.heavy_tails import HeavyTails
 from implicam.rig_model.linearise import iterate_linearisation
@@ -20,88 +19,76 @@ from implicam.rig_model.shot_errors import ShotErrors
 from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA
 
 
-def check_fitted(training: Training, state: Round, seen: tuple[CameraViews, ...]) -> None:
-    """A camera that ends far off its own known points is no camera, whatever its covariance says."""
-    points = training.points
-    if state.posterior.displacement is not None:
-        points = points + state.posterior.displacement
-    for number, (model, views, inliers) in enumerate(zip(state.posterior.models, seen, state.inliers, strict=True)):
-        rows = views.rows[inliers]
-        error = np.linalg.norm(model.predict(points[rows])[0] - views.uv[inliers], axis=1) / views.relative[inliers]
-        limit = training.settings.max_median_error_noises * model.noise
-        if len(rows) < MIN_POINTS_PER_CAMERA or not np.median(error) < limit:
-            off = float(np.median(error)) if len(rows) else np.nan
-            raise CameraFailedError(number, f"it ends {off:.3g} px off its own known points")
-
-
 class Round(NamedTuple):
-    """What a round of the fit hands to the next; errors: those of its posterior, next_errors: more probable ones;
-    fixed: hyperparameters that are kept."""
+    """What a round of the fit hands to the next.
 
-    hyper: Hyperparameters | None
-    models: tuple[CameraModel, ...]
-    found: Posterior | None
+    posterior: before the first round, the cameras as they were started. inliers: per camera the views (n,) to use.
+    hyper: a guess before the first round, or None. next_errors: of the known points, more probable than `errors`, those
+    of the posterior; label_sd: their sds for error bars. settled: the two are about the same. tails: of the noise.
+    """
+
+    posterior: Posterior
     inliers: tuple[Bools, ...]
+    hyper: Hyperparameters | None
     next_errors: ShotErrors | None
-    label_sd: Floats | None
-    settled: bool
     errors: ShotErrors | None = None
-    fixed: Hyperparameters | None = None
+    label_sd: Floats | None = None
+    settled: bool = False
     tails: HeavyTails | None = None
 
-    def weighted(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
-        """The views with their weights as noise; told: as much as they tell, for what is known of the cameras."""
-        return seen if self.tails is None else self.tails.weighted(seen, told=told)
-
-    @property
-    def posterior(self) -> Posterior:
-        """That of a round that has been."""
-        assert self.found is not None
-        return self.found
+    def used(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
+        """The views to use, with their weights as noise; told: as much as they tell, for what is known of cameras."""
+        weighted = seen if self.tails is None else self.tails.weighted(seen, told=told)
+        return tuple(views.select(k) for views, k in zip(weighted, self.inliers, strict=True))
 
 
-def next_round(
-    training: Training,
-    last: Round,
-    seen: tuple[CameraViews, ...],
-    images: tuple[Image, ...],
-    stated: Floats,
-    *,
-    search: bool,
-) -> Round:
-    """Sizes, posterior, and how far the shots are off. search: for other lengthscales too."""
+def next_round(training: Training, last: Round, *, search: bool, keep_sizes: bool) -> Round:
+    """Sizes, posterior, and how far the shots are off.
+
+    Args:
+        training: What the cameras of the round saw, and no others.
+        last: The round before.
+        search: Look for other lengthscales, too.
+        keep_sizes: Keep the hyperparameters of the last round, if it has any.
+
+    Raises:
+        CameraFailedError: Too few views of a camera agree with the others.
+    """
+    models, seen, errors = last.posterior.models, training.camera_views, last.next_errors
     inliers = tuple(
         k & np.isfinite(m.camera.pixel(training.points[s.rows])).all(axis=1)  # a camera can turn its back on a point
-        for k, m, s in zip(last.inliers, last.models, seen, strict=True)
+        for k, m, s in zip(last.inliers, models, seen, strict=True)
     )
     for number, k in enumerate(inliers):
         if k.sum() < MIN_POINTS_PER_CAMERA:
             raise CameraFailedError(number, f"{k.sum()} of its {len(k)} views agree with the others")
-    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=False), inliers, strict=True))
-    moved = None if last.found is None or last.found.unknowns is None else last.found.displacement
-    hyper = last.fixed or estimate_hyperparameters(
-        training, last.models, used, images, stated, last.hyper, moved, search
-    )
-    errors = last.next_errors
-    used = tuple(s.select(k) for s, k in zip(last.weighted(seen, told=True), inliers, strict=True))
-    posterior = condition_with_new_fields(training, last.models, used, hyper, errors)
-    following, label_sd, settled = errors, None, True
-    if errors is not None and posterior.unknowns is not None:
-        mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
-        shape, settings = errors.sd.shape, training.settings
-        following, label_sd = errors.updated(mean.reshape(shape), variance.reshape(shape), settings)
-        settled = bool(np.allclose(following.sd, errors.sd, rtol=settings.shot_sd_tolerance))
-    return Round(
-        hyper, posterior.models, posterior, inliers, following, label_sd, settled, errors, last.fixed, last.tails
-    )
+    last = last._replace(inliers=inliers)
+    hyper = last.hyper
+    if hyper is None or not keep_sizes:
+        moved = None if last.posterior.unknowns is None else last.posterior.displacement
+        used = last.used(seen, told=False)
+        hyper = estimate_hyperparameters(training, models, used, last.hyper, moved, search=search)
+    used = last.used(seen, told=True)
+    posterior = iterate_linearisation(size_fields(training, models, used, hyper), training.points, used, errors)
+    this = Round(posterior, inliers, hyper, errors, errors, settled=True, tails=last.tails)
+    if errors is None or posterior.unknowns is None:
+        return this
+    mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
+    shape, settings = errors.sd.shape, training.settings
+    following, label_sd = errors.updated(mean.reshape(shape), variance.reshape(shape), settings)
+    settled = bool(np.allclose(following.sd, errors.sd, rtol=settings.shot_sd_tolerance))
+    return this._replace(next_errors=following, label_sd=label_sd, settled=settled)
 
 
-def condition_with_new_fields(
-    training: Training,
-    models: tuple[CameraModel, ...],
-    used: tuple[CameraViews, ...],
-    hyper: Hyperparameters,
-    errors: ShotErrors | None,
-) -> Posterior:
-    """The posterior with fields laid out anew."""
-    return iterate_linearisation(size_fields(training, models, used, hyper), training.points, used, errors)
+def check_fitted(training: Training, state: Round) -> None:
+    """A camera that ends far off its own known points is no camera, whatever its covariance says."""
+    points, posterior = training.points, state.posterior
+    if posterior.displacement is not None:
+        points = points + posterior.displacement
+    for number, (model, views) in enumerate(zip(posterior.models, training.camera_views, strict=True)):
+        used = views.select(state.inliers[number])
+        error = np.linalg.norm(model.predict(points[used.rows])[0] - used.uv, axis=1) / used.relative
+        limit = training.settings.max_median_error_noises * model.noise
+        if len(error) < MIN_POINTS_PER_CAMERA or not np.median(error) < limit:
+            off = float(np.median(error)) if len(error) else np.nan
+            raise CameraFailedError(number, f"it ends {off:.3g} px off its own known points")
