@@ -39,35 +39,39 @@ class InitialCamera(NamedTuple):
 
 
 def start_camera(
-    points: Floats, uv: Floats, image: Image, lens: str, settings: RigModelSettings = DEFAULT_SETTINGS
+    points: Floats,
+    uv: Floats,
+    image: Image,
+    lens: str,
+    settings: RigModelSettings = DEFAULT_SETTINGS,
+    guess: AnyCamera | None = None,
 ) -> InitialCamera:
-    """A camera of the kind `lens` from points (n, 3), all seen at uv (n, 2); FitError where they do not fix one."""
+    """A camera from known points.
+
+    Args:
+        points: Known points (n, 3) in the working frame, all seen by the camera.
+        uv: The pixels (n, 2) at which it sees them.
+        image: Where pixels are measured from.
+        lens: "central" or "none".
+        settings: Which views do not start a fit, and the priors.
+        guess: A camera that fitted most of these points a moment ago.
+
+    Raises:
+        FitError: The points do not fix a camera.
+    """
     if len(points) < MIN_POINTS_PER_CAMERA:
         raise FitError(f"{len(points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
     if lens == "none":
         return _start_projective(points, uv, image, settings)
-    found = resect_any_lens(points, uv, middle=image.centre)
-    k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
-    camera = CentralCamera(
-        KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist()), found.camera_from_world
-    )
-    return _with_prior(camera, points, uv, image, found.inliers, settings)
-
-
-def start_again(
-    camera: AnyCamera, points: Floats, uv: Floats, image: Image, lens: str, settings: RigModelSettings
-) -> InitialCamera:
-    """The same from a camera that fitted most of these points a moment ago; from no guess where it does not."""
-    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    inliers = error <= max(settings.max_start_error_medians * float(np.nanmedian(error)), 1e-4 * image.half)
+    camera = guess
+    if isinstance(camera, CentralCamera):
+        error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+        inliers = error <= max(settings.max_start_error_medians * float(np.nanmedian(error)), 1e-4 * image.half)
     if not isinstance(camera, CentralCamera) or inliers.sum() < max(MIN_POINTS_PER_CAMERA, len(points) / 2):
-        return start_camera(points, uv, image, lens, settings)
-    return _with_prior(camera, points, uv, image, inliers, settings)
-
-
-def _with_prior(
-    camera: CentralCamera, points: Floats, uv: Floats, image: Image, inliers: Bools, settings: RigModelSettings
-) -> InitialCamera:
+        found = resect_any_lens(points, uv, middle=image.centre)
+        k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
+        lens_model = KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist())
+        camera, inliers = CentralCamera(lens_model, found.camera_from_world), found.inliers
     there = camera.pose.apply(points[inliers])
     widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
     prior = camera.prior(image, widest, settings)
@@ -75,9 +79,8 @@ def _with_prior(
 
 
 def _start_projective(points: Floats, uv: Floats, image: Image, settings: RigModelSettings) -> InitialCamera:
-    inliers = resect_any_lens(
-        points, uv, middle=image.centre
-    ).inliers  # any lens at all tells the wrong views from the right
+    # any lens at all tells the wrong views from the right
+    inliers = resect_any_lens(points, uv, middle=image.centre).inliers
     for _ in range(5):
         camera = ProjectiveCamera(resect(points[inliers], uv[inliers]))
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)

@@ -6,6 +6,7 @@ The order of docs/method.md, section "Fit".
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -33,7 +34,6 @@ from implicam.rig_model.initialise import (
     InitialCamera,
     lens_only_model,
     require_two_cameras,
-    start_again,
     start_camera,
     start_rig,
 )
@@ -52,65 +52,49 @@ def fit_rig(training: Training, progress: Progress, before: FitResult | None = N
     hyperparameters costly, they are kept."""
     progress("fitting", 0, 3)
     started, uncalibrated = _start_cameras(training, before)
-    fitted = _fit_without_failing_cameras(training, progress, before, started, uncalibrated)
-    return _try_linear_projections(training, fitted, started) if training.lens == AUTO else fitted
-
-
-def _fit_without_failing_cameras(
-    training: Training,
-    progress: Progress,
-    before: FitResult | None,
-    started: dict[int, InitialCamera],
-    uncalibrated: list[tuple[int, str]],
-) -> FitResult:
-    """One bad camera never takes the rig down: it goes on without a lens model, or is left out. Changes `started` and
-    `uncalibrated`."""
     while True:
         try:
-            return _fit_from_start(training, progress, before, started, uncalibrated)
-        except CameraFailedError as error:
+            fitted = _fit_from_start(training, progress, before, started)
+            break
+        except CameraFailedError as error:  # one bad camera never takes the rig down
             failed = list(started)[error.number]
             again = None
             if training.lens == AUTO and started[failed].family != "none":
-                again = start_without_lens(training, failed)
+                again = start_without_lens(training, failed, started[failed])
             if again is not None:
-                started[failed] = again._replace(ordinary_px=started[failed].ordinary_px)
+                started[failed] = again
                 continue
             uncalibrated.append((failed, f"no camera model fits its views: {error}."))
             del started[failed]
             require_two_cameras(training, started, uncalibrated)
+    if training.lens == AUTO:
+        fitted = _try_linear_projections(training, fitted, started)
+    return replace(fitted, uncalibrated=tuple(uncalibrated))
 
 
 def _try_linear_projections(training: Training, fitted: FitResult, started: dict[int, InitialCamera]) -> FitResult:
     """The rig with those cameras as linear projections that clearly predict left-out views better so."""
     tried = {}
-    for number, c in enumerate(fitted.cameras):
-        model = fitted.posterior.models[number]
+    for model, (c, start) in zip(fitted.posterior.models, started.items(), strict=True):
         large = training.settings.large_field_half_sides * model.image.half
-        odd = model.family in ("free", "crop") or model.signal > large
-        if odd and model.family != "none" and c in started:
-            found = start_without_lens(training, c)
+        if model.family in ("free", "crop") or (model.family != "none" and model.signal > large):
+            found = start_without_lens(training, c, start)
             if found is not None:
-                tried[c] = found._replace(ordinary_px=started[c].ordinary_px)
+                tried[c] = found
     if not tried:
         return fitted
-    uncalibrated = list(fitted.uncalibrated)
     try:
-        other = _fit_from_start(
-            training, silent, None, {c: tried.get(c, started[c]) for c in fitted.cameras}, uncalibrated
-        )
-    except np.linalg.LinAlgError:
-        return fitted
-    if measures_better(training, other, fitted):
-        return other
-    better = {
-        c for number, c in enumerate(fitted.cameras) if c in tried and predicts_better(training, other, fitted, number)
-    }
-    if better == set(tried) or not better:
-        return other if better else fitted
-    mixed = {c: tried[c] if c in better else started[c] for c in fitted.cameras}
-    try:
-        return _fit_from_start(training, silent, None, mixed, uncalibrated)
+        other = _fit_from_start(training, silent, None, started | tried)
+        if measures_better(training, other, fitted):
+            return other
+        better = {
+            c: tried[c]
+            for number, c in enumerate(fitted.cameras)
+            if c in tried and predicts_better(training, other, fitted, number)
+        }
+        if better.keys() == tried.keys():
+            return other
+        return _fit_from_start(training, silent, None, started | better) if better else fitted
     except np.linalg.LinAlgError:
         return fitted
 
@@ -123,9 +107,8 @@ def _start_cameras(
         return choose_cameras(training, guess)
 
     def start(c: int, points: Floats, uv: Floats) -> InitialCamera:
-        if c in guess:
-            return start_again(guess[c].camera, points, uv, training.images[c], training.lens, training.settings)
-        return start_camera(points, uv, training.images[c], training.lens, training.settings)
+        known = guess[c].camera if c in guess else None
+        return start_camera(points, uv, training.images[c], training.lens, training.settings, known)
 
     return start_rig(training, start)
 
@@ -167,7 +150,6 @@ def _fit_from_start(
     progress: Progress,
     before: FitResult | None,
     started: dict[int, InitialCamera],
-    uncalibrated: list[tuple[int, str]],
 ) -> FitResult:
     cameras = tuple(started)
     mine, settings = training.of_cameras(cameras), training.settings
@@ -199,7 +181,7 @@ def _fit_from_start(
     return FitResult(
         state.posterior,
         cameras,
-        tuple(uncalibrated),
+        (),
         state.inliers,
         state.hyper,
         state.errors,

@@ -12,8 +12,8 @@ from implicam.rig_model.initialise import InitialCamera, check_start, start_came
 from implicam.rig_model.leave_one_out import left_out_positions, left_out_residuals
 
 
-def start_without_lens(training: Training, c: int) -> InitialCamera | None:
-    """Camera c as a linear projection with a field; None where it saw too little for one."""
+def start_without_lens(training: Training, c: int, before: InitialCamera) -> InitialCamera | None:
+    """Camera c, started with a lens before, as a linear projection; None where it saw too little for its field."""
     seen = training.camera_views[c]
     if len(seen.rows) < training.settings.min_views_without_lens:
         return None
@@ -22,7 +22,7 @@ def start_without_lens(training: Training, c: int) -> InitialCamera | None:
         check_start(found, training.points[seen.rows], seen.uv, training)
     except FitError:
         return None
-    return found
+    return found._replace(ordinary_px=before.ordinary_px)
 
 
 def predicts_better(training: Training, one: FitResult, other: FitResult, number: int) -> bool:
