@@ -15,7 +15,7 @@ def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most:
     """Positions (n, 3), p-values (n,) and views left out (n, C) of points, up to `most` views each."""
     points = _Seen(posterior, uv, noise, None)
     seen = np.isfinite(uv).all(axis=2)
-    xyz, _, p = points.solved(np.arange(len(uv)), seen)
+    xyz, _, p = points.solve(np.arange(len(uv)), seen)
     left_out = np.zeros_like(seen)
     for count in range(1, most + 1):
         rows = np.flatnonzero((seen.sum(axis=1) >= 2 * count + 1) & ~(p >= DEFAULT_SETTINGS.disagree_p_value))
@@ -27,7 +27,7 @@ def by_trying_all(posterior: Posterior, uv: np.ndarray, noise: np.ndarray, most:
             there = seen[rows][:, group].all(axis=1)
             without = seen[rows] & there[:, None]
             without[:, group] = False
-            x, _, found = points.solved(rows, without)
+            x, _, found = points.solve(rows, without)
             ps[:, k] = np.where(there & np.isfinite(found), found, 0.0)
             tried.append(x)
         best, ordered = np.argmax(ps, axis=1), np.sort(ps, axis=1)

@@ -99,7 +99,7 @@ def test_the_covariance_of_a_labelled_position_is_that_of_a_difference() -> None
     noise = np.array([[model.noise for model in posterior.models]] * len(some))
     bare, labelled = locate(posterior, uv, noise), locate(posterior, uv, noise, labels)
     assert labels.unknowns is not None
-    known, unknown = labels.shots.labels(bare.xyz, labels.sd)[0], labels.world(bare.xyz)
+    known, unknown = labels.shots.label_slope(bare.xyz, labels.sd), labels.world(bare.xyz)
     np.testing.assert_allclose(labelled.xyz, bare.xyz - known @ labels.unknowns.mean, atol=1e-12)
     cross = posterior.joint.T @ labels.unknowns.cross
     for i, x in enumerate(bare.xyz):

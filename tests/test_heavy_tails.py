@@ -17,7 +17,7 @@ from implicam.calibrators.forward_gp.calibration import ForwardGPCalibration
 from implicam.dataset import Dataset, KnownPositions, Observations
 from implicam.measurement import Measurement
 from implicam.rig_model.heavy_tails import (
-    _solved,
+    _solve_stack,
     consistency,
     degrees_of_agreement,
     equivalent_normal_noise,
@@ -327,6 +327,6 @@ def test_a_state_with_half_of_the_tails_is_refused() -> None:
 def test_a_point_that_its_views_do_not_fix_costs_no_rig() -> None:
     """A stack with one singular matrix, as a tank gave it, is solved where it can be."""
     H = np.stack([np.eye(3), np.diag([1.0, 1.0, 0.0])])
-    found = _solved(H, np.ones((2, 3)))
+    found = _solve_stack(H, np.ones((2, 3)))
     np.testing.assert_allclose(found[0], 1.0, rtol=1e-9)
     np.testing.assert_allclose(found[1, :2], 1.0, rtol=1e-9)

@@ -15,7 +15,7 @@ from implicam.dataset import Dataset, KnownPositions
 from implicam.evaluation import cross_validate, evaluate
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.leave_one_out import left_out_points
-from implicam.rig_model.level_errors import levels, untold
+from implicam.rig_model.level_errors import find_levels, find_uncertain_planes
 from implicam.rig_model.position_errors import (
     Agreement,
     PositionErrors,
@@ -24,7 +24,7 @@ from implicam.rig_model.position_errors import (
     _nodes,
     _objective,
     _Scales,
-    _symmetric,
+    _symmetric_matrix,
     estimate_position_errors,
 )
 from implicam.rig_model.settings import DEFAULT_SETTINGS
@@ -161,9 +161,9 @@ def test_a_few_points_far_off_are_a_tail() -> None:
 
 def test_the_matrix_logarithm_is_that() -> None:
     z = np.array([-1.0, -2, -1.5, 0.3, -0.2, 0.1])
-    values, vectors = np.linalg.eigh(_symmetric(z))
-    np.testing.assert_allclose((vectors * np.exp(values)) @ vectors.T, expm(_symmetric(z)))
-    np.testing.assert_allclose(_symmetric(z), _symmetric(z).T)
+    values, vectors = np.linalg.eigh(_symmetric_matrix(z))
+    np.testing.assert_allclose((vectors * np.exp(values)) @ vectors.T, expm(_symmetric_matrix(z)))
+    np.testing.assert_allclose(_symmetric_matrix(z), _symmetric_matrix(z).T)
 
 
 # levels
@@ -185,20 +185,20 @@ STEPS = {
 @pytest.mark.parametrize("name", STEPS)
 def test_a_stepped_target_has_levels(name: str) -> None:
     z = STEPS[name]
-    found = levels(stepped(z), DEFAULT_SETTINGS)
+    found = find_levels(stepped(z), DEFAULT_SETTINGS)
     assert found is not None
     np.testing.assert_allclose(np.abs(found.normal), [0, 0, 1], atol=1e-9)
     assert len(np.unique(found.number)) == len(np.unique(z))
-    planes = untold(stepped(z) / 20, np.full(len(z) * 10, "target"), DEFAULT_SETTINGS)
+    planes = find_uncertain_planes(stepped(z) / 20, np.full(len(z) * 10, "target"), DEFAULT_SETTINGS)
     assert planes is not None
     assert planes.sd[0] == pytest.approx(LEVEL_SD)
     assert planes.shots.pattern.shape[1] == max(len(np.unique(z)) - 3, 0)
-    np.testing.assert_allclose(planes.shots.untold(stepped(z) / 20, planes.sd), 0, atol=1e-15)
+    np.testing.assert_allclose(planes.shots.unresolved_covariance(stepped(z) / 20, planes.sd), 0, atol=1e-15)
 
 
 def test_a_stepped_target_may_be_turned() -> None:
     turn = rotation(1)
-    found = levels(stepped(STEPS["pyramid"]) @ turn.T + 100, DEFAULT_SETTINGS)
+    found = find_levels(stepped(STEPS["pyramid"]) @ turn.T + 100, DEFAULT_SETTINGS)
     assert found is not None
     assert abs(found.normal @ turn[:, 2]) == pytest.approx(1)
     assert len(np.unique(found.number)) == 3
@@ -206,16 +206,16 @@ def test_a_stepped_target_may_be_turned() -> None:
 
 def test_what_has_no_levels() -> None:
     rng = np.random.default_rng(0)
-    assert levels(rng.uniform(-1, 1, (100, 3)), DEFAULT_SETTINGS) is None
-    assert levels(stepped(STEPS["two"])[:9], DEFAULT_SETTINGS) is None
+    assert find_levels(rng.uniform(-1, 1, (100, 3)), DEFAULT_SETTINGS) is None
+    assert find_levels(stepped(STEPS["two"])[:9], DEFAULT_SETTINGS) is None
     points = stepped(STEPS["pyramid"])
     each = np.array([f"p{i}" for i in range(len(points))])  # a ball that stood on a lattice
-    assert untold(points, each, DEFAULT_SETTINGS) is None
+    assert find_uncertain_planes(points, each, DEFAULT_SETTINGS) is None
 
 
 def test_a_level_of_a_few_points_is_none() -> None:
     points = np.concatenate([stepped(STEPS["pyramid"]), [[12.0, 3.0, -30.0], [13.0, 8.0, -30.0]]])
-    found = levels(points, DEFAULT_SETTINGS)
+    found = find_levels(points, DEFAULT_SETTINGS)
     assert found is not None
     assert (found.number[-2:] == -1).all()
     assert len(np.unique(found.number)) == 4
@@ -229,13 +229,15 @@ def test_the_world_is_the_parabola_or_the_line_through_its_shots() -> None:
     shots = Shots.of(three, np.repeat(["a", "b", "c"], 20), fewest=2, direction=axis)
     assert shots is not None
     at = shots.centre.mean(axis=0) + np.array([[0, 0, 2.0], [0, 0, 0], [0, 0, 0.5], [0, 0, 50]])
-    np.testing.assert_allclose(shots.drawn_along(at)[:3], [19, 1, (1 + 36 + 9) / 64], rtol=1e-9)  # 1, -3, 3 and so on
-    assert shots.drawn_along(at)[3] == 100
+    np.testing.assert_allclose(
+        shots.world_variance_ratio(at)[:3], [19, 1, (1 + 36 + 9) / 64], rtol=1e-9
+    )  # 1, -3, 3 and so on
+    assert shots.world_variance_ratio(at)[3] == 100
     two = Shots.of(three[:40], np.repeat(["a", "b"], 20), fewest=2, direction=axis)
     assert two is not None
     at = two.centre.mean(axis=0) + np.array([[0, 0, 1.5], [0, 0, 0]])
-    np.testing.assert_allclose(two.drawn_along(at), [5, 0.5], rtol=1e-9)
-    planes = untold(three, np.repeat(["a", "b", "c"], 20), DEFAULT_SETTINGS)
+    np.testing.assert_allclose(two.world_variance_ratio(at), [5, 0.5], rtol=1e-9)
+    planes = find_uncertain_planes(three, np.repeat(["a", "b", "c"], 20), DEFAULT_SETTINGS)
     assert planes is not None
     assert planes.sd[0] == pytest.approx(SHOT_SD)
 
@@ -305,7 +307,7 @@ def test_noise_is_told_from_errors_of_known_positions() -> None:
 def test_what_is_declared_is_not_estimated() -> None:
     calibration = ForwardGP().fit(moved(known(), DOTS, 5, declared=DOTS))
     assert calibration.fitted.position_errors is None
-    assert calibration.fitted.untold_sd is None
+    assert calibration.fitted.plane_sd is None
     assert not calibration.known_position_covariance(known().xyz).any()
     # what the held-out positions declare is judged by, and not the estimate besides
     judged = evaluate(dots(), moved(others(), DOTS, 6, declared=DOTS), regions=False)
@@ -372,7 +374,7 @@ def test_boards_that_are_too_few_widen_the_bars_between_them() -> None:
     data = simulate(one, moving_board(one, corners=(5, 6), positions=3, step=80.0, square=25.0), seed=7)
     inner = data.shots == "board02"
     calibration = ForwardGP().fit(data.select(~inner))
-    assert calibration.fitted.untold_sd is not None
+    assert calibration.fitted.plane_sd is not None
     assert any(note.startswith("2 shots cannot contradict each other") for note in calibration.notes())
     size = SHOT_SD * calibration.frame.scale
     measured = calibration.measure(data.observations)
@@ -391,7 +393,7 @@ def test_levels_of_one_target_widen_the_bars_between_them() -> None:
     pose, names = one.volume.world_from_box, np.array([f"t{i}" for i in range(len(box))])
     data = simulate(one, Target("target", names, np.full(len(box), "target"), pose.apply(box)), seed=8)
     calibration = ForwardGP().fit(data)
-    assert calibration.fitted.untold_sd is not None
+    assert calibration.fitted.plane_sd is not None
     assert any(note.startswith("3 levels of one target") for note in calibration.notes())
     between = pose.apply(np.array([[0.0, 0, 30], [5, 20, -30]]) * one.units_per_mm)
     own = np.sqrt(np.linalg.eigvalsh(calibration.known_position_covariance(between))[:, -1])

@@ -18,7 +18,7 @@ def test_the_update_of_the_shots_sds_maximises_their_posterior(size: float) -> N
     errors = ShotErrors(np.zeros(3, dtype=np.int64), np.zeros((3, 3, 4)), sd, np.array([0, 0, 1, -1]))
     mean, variance = size * rng.normal(size=(5, 4)), rng.uniform(0.01, 1, (5, 4))
     median, log_sd = np.log(DEFAULT_SETTINGS.shot_sd_prior_median_wf), DEFAULT_SETTINGS.shot_sd_prior_log_sd
-    updated, label = errors.updated(mean, variance, DEFAULT_SETTINGS)
+    updated, label = errors.update(mean, variance, DEFAULT_SETTINGS)
     np.testing.assert_array_equal(updated.sd[:, 3], 0.7)  # declared sds stay
     np.testing.assert_array_equal(label[:, 3], 0.7)
     for columns in ([0, 1], [2]):
@@ -116,16 +116,16 @@ def test_the_label_at_a_shot_is_known_and_far_away_it_is_not() -> None:
     shots = Shots.of(points, labels)
     assert shots is not None
     errors = shots.errors(points)
-    sd = np.repeat([3e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4], 7 - WORLD_POLYNOMIAL_TERMS)
-    known, left = shots.labels(points, sd)
-    np.testing.assert_allclose(known, errors.basis * sd, atol=1e-12)
-    np.testing.assert_allclose(left, 0, atol=1e-15)
-    shift_only = np.where(np.repeat(np.arange(6) < 3, 7 - WORLD_POLYNOMIAL_TERMS), 2e-3, 0.0)
-    known, left = shots.labels(points[:5] + 50 * shots.along[0], shift_only)
-    np.testing.assert_allclose(known, 0, atol=1e-15)
+    each = np.array([3e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4])
+    sd = np.repeat(each, 7 - WORLD_POLYNOMIAL_TERMS)
+    np.testing.assert_allclose(shots.label_slope(points, sd), errors.basis * sd, atol=1e-12)
+    np.testing.assert_allclose(shots.unresolved_covariance(points, each), 0, atol=1e-15)
+    shift_only, far = np.array([2e-3, 2e-3, 2e-3, 0, 0, 0]), points[:5] + 50 * shots.along[0]
+    np.testing.assert_allclose(shots.label_slope(far, sd), 0, atol=1e-15)
+    left = shots.unresolved_covariance(far, shift_only)
     np.testing.assert_allclose(left, np.broadcast_to(4e-6 * np.eye(3), (5, 3, 3)), atol=1e-12)
     between = 0.5 * (points[:25] + points[25:50])
-    _, left = shots.labels(between, shift_only)
+    left = shots.unresolved_covariance(between, shift_only)
     share = np.diagonal(left, axis1=1, axis2=2) / 4e-6
     assert (share > 0.5).all()  # halfway a label says little
     assert (share < 1).all()
@@ -135,17 +135,17 @@ def test_the_unknown_part_of_a_label_turns_with_the_world() -> None:
     points, labels, along, _ = plates(seed=2)
     shots = Shots.of(points, labels)
     assert shots is not None
-    sd = np.repeat([3e-3, 1e-3, 1e-3, 0, 0, 0], 7 - WORLD_POLYNOMIAL_TERMS)
-    _, left = shots.labels(points[:1] + 50 * along, sd)
+    left = shots.unresolved_covariance(points[:1] + 50 * along, np.array([3e-3, 1e-3, 1e-3, 0, 0, 0]))
     expected = 9e-6 * np.outer(along, along) + 1e-6 * (np.eye(3) - np.outer(along, along))
     np.testing.assert_allclose(left[0], expected, atol=1e-12)
 
 
 def test_the_unknown_tilt_of_a_label_turns_with_the_world() -> None:
     points, labels, along, _ = plates()
-    turn, sd = rotation(12), np.repeat([0, 0, 0, 1e-3, 1e-3, 1e-3], 7 - WORLD_POLYNOMIAL_TERMS)
+    turn, sd = rotation(12), np.array([0, 0, 0, 1e-3, 1e-3, 1e-3])
     at = points[::10] + 5 * along
     a, b = Shots.of(points, labels), Shots.of(points @ turn.T, labels)
     assert a is not None
     assert b is not None
-    np.testing.assert_allclose(turn.T @ b.labels(at @ turn.T, sd)[1] @ turn, a.labels(at, sd)[1], atol=1e-9)
+    turned = turn.T @ b.unresolved_covariance(at @ turn.T, sd) @ turn
+    np.testing.assert_allclose(turned, a.unresolved_covariance(at, sd), atol=1e-9)

@@ -106,13 +106,13 @@ class Counted:
     def lines(self, rows):
         return self.points.lines(rows)
 
-    def linear(self, rows, x, seen, before=None):
+    def linearise(self, rows, x, seen, before=None):
         self.linear_rows.append(rows)
-        return self.points.linear(rows, x, seen, before)
+        return self.points.linearise(rows, x, seen, before)
 
-    def solved(self, rows, seen):
+    def solve(self, rows, seen):
         self.solved_rows.append(rows)
-        return self.points.solved(rows, seen)
+        return self.points.solve(rows, seen)
 
 
 @pytest.mark.parametrize("spec", ["bar4", "dome8", "dome16"])
@@ -157,7 +157,7 @@ class Given:
     def lines(self, rows):
         return np.zeros((self.given.r.shape[1], 3)), np.full((*self.given.r.shape[:2], 3), np.nan)
 
-    def linear(self, rows, x, seen, before=None):
+    def linearise(self, rows, x, seen, before=None):
         r = np.where(seen[..., None], self.given.r[rows] - np.einsum("ncij,nj->nci", self.given.D[rows], x), 0)
         joint = None if self.given.joint is None else self.given.joint[rows]
         return LinearisedViews(r, self.given.D[rows].copy(), self.given.each[rows].copy(), joint)

@@ -124,7 +124,7 @@ def alarm_of(table: Table) -> str:
 
 
 def _sentence(what: str, chance: float, table: Table, tested: Bools, moved: Sequence[str]) -> str:
-    return f"{what}; {100 * chance:g} % would be chance: {_cause(table, tested, moved)}"
+    return f"{what}; {100 * chance:g} % would be chance: {_find_cause(table, tested, moved)}"
 
 
 def _surprising_level(p: Floats, views: NDArray[np.int64], settings: RigModelSettings) -> tuple[float, int] | None:
@@ -166,7 +166,7 @@ def _contradicted_cameras(table: Table, views: NDArray[np.int64]) -> list[str]:
     ]
 
 
-def _cause(table: Table, tested: Bools, moved: Sequence[str]) -> str:
+def _find_cause(table: Table, tested: Bools, moved: Sequence[str]) -> str:
     """The likeliest cause as a question: what makes most of some points agree."""
     rows = np.flatnonzero(tested)
     if len(rows) > MAX_POINTS_TRIED:

@@ -123,7 +123,7 @@ class Diagnosis:
         found = list(camera_views_of(self.data.observations, stated_noise(self.data.observations)))
         if self.fitted.tails is not None:
             calibrated = self.fitted.cameras
-            weighted = self.fitted.tails.weighted(tuple(found[c] for c in calibrated), told=True)
+            weighted = self.fitted.tails.weight_views(tuple(found[c] for c in calibrated), with_loss=True)
             for c, camera_views in zip(calibrated, weighted, strict=True):
                 found[c] = camera_views
         return tuple(found)

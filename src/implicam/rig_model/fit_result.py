@@ -17,7 +17,7 @@ class FitResult:
     """cameras: numbers of those that could be fitted, in order, as posterior.models. uncalibrated: (number, why) of the
     others. inliers: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are;
     label_sd (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. label_errors:
-    how single known positions are off besides, if they are; untold_sd (6,): how planes may be off that are too few to
+    how single known positions are off besides, if they are; plane_sd (6,): how planes may be off that are too few to
     tell. ordinary_px: per fitted camera, see `InitialCamera`."""
 
     posterior: Posterior
@@ -29,7 +29,7 @@ class FitResult:
     label_sd: Floats | None
     tails: HeavyTails | None = None
     position_errors: PositionErrors | None = None
-    untold_sd: Floats | None = None
+    plane_sd: Floats | None = None
     ordinary_px: tuple[float, ...] = ()
 
     def left_by_ordinary(self, number: int) -> float:

@@ -51,9 +51,9 @@ class HeavyTails(NamedTuple):
     degrees: float
     weights: tuple[Floats, ...]
 
-    def weighted(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
-        """The views, noisier where they count less; told: by the loss of information too."""
-        loss = self.loss if told else 1.0
+    def weight_views(self, seen: tuple[CameraViews, ...], *, with_loss: bool) -> tuple[CameraViews, ...]:
+        """The views, noisier where they count less; with_loss: by the loss of information, too."""
+        loss = self.loss if with_loss else 1.0
         return tuple(
             s._replace(relative=s.relative * np.sqrt(loss / w)) for s, w in zip(seen, self.weights, strict=True)
         )
@@ -160,24 +160,24 @@ def refine_positions(linear: LinearisedViews, degrees: float, settings: RigModel
         size = max(1, VIEWS_PER_BATCH // int(V))
         for some in np.split(alike, range(size, len(alike), size)):
             chosen = order[some, :V]
-            found = _integrated(A[some[:, None], chosen], b[some[:, None], chosen], degrees, settings)
+            found = _integrate(A[some[:, None], chosen], b[some[:, None], chosen], degrees, settings)
             out.step[some], out.cov[some] = found.step, found.cov
             out.distance[some[:, None], chosen] = found.distance
     return out
 
 
-def _integrated(A: Floats, b: Floats, degrees: float, settings: RigModelSettings) -> RefinedPositions:
+def _integrate(A: Floats, b: Floats, degrees: float, settings: RigModelSettings) -> RefinedPositions:
     """By importance sampling, from a mixture of spherical t about every place that may be a mode: with few views, each
     of them may be the wrong one."""
     n = len(b)
-    modes = [_about_mode(A, b, degrees, start) for start in _starts(A, b, settings.max_views_with_second_mode)]
+    modes = [_expand_at_mode(A, b, degrees, start) for start in _starts(A, b, settings.max_views_with_second_mode)]
     z, log_density = _draws(POSTERIOR_DRAWS)
     centre = np.stack([mode.step for mode in modes], axis=1)  # (n, K, 3)
     spread = np.stack([mode.spread for mode in modes], axis=1)
     K = len(modes)
     own = np.arange(POSTERIOR_DRAWS) % K  # the component that each draw belongs to
     x = centre[:, own] + (spread[:, own] @ z[None, :, :, None])[..., 0]  # (n, POSTERIOR_DRAWS, 3)
-    log_weight = -0.5 * (degrees + 2) * _bent(A, b, x, degrees)
+    log_weight = -0.5 * (degrees + 2) * _log_terms(A, b, x, degrees)
     if K == 1:
         log_weight = log_weight - log_density
     else:
@@ -244,14 +244,16 @@ def degrees_of_agreement(A: Floats, b: Floats, seen: Bools, settings: RigModelSe
     usual = max(float(squares.sum()) / free, 1e-300)
     normal = log_sizes - 0.5 * free * (1 + np.log(usual))
 
-    found = [(*_most_likely(A, b, views, degrees, usual), degrees) for degrees in settings.tail_degrees_of_freedom]
+    found = [
+        (*_maximise_evidence(A, b, views, degrees, usual), degrees) for degrees in settings.tail_degrees_of_freedom
+    ]
     value, scale, degrees = max(found, key=lambda one: one[0])
     alone = _likelihoods(np.sum(b**2, axis=2)[seen], np.zeros(int(seen.sum())), np.array([degrees]))[0, 1]
     confirmed = value > normal + settings.min_confirming_tail_gain_nats
     return degrees if confirmed and scale > settings.min_disagreement_variance_ratio * alone else None
 
 
-def _most_likely(A: Floats, b: Floats, views: Ints, degrees: float, usual: float) -> tuple[float, float]:
+def _maximise_evidence(A: Floats, b: Floats, views: Ints, degrees: float, usual: float) -> tuple[float, float]:
     """The largest evidence over the scale squared, and that."""
     free = float(np.sum(2 * views - 3))
     found = minimize_scalar(
@@ -265,9 +267,9 @@ def _most_likely(A: Floats, b: Floats, views: Ints, degrees: float, usual: float
 
 def _evidence(A: Floats, b: Floats, views: Ints, degrees: float) -> float:
     """Log density of the views of unit scale (those not there are zero), each point's position integrated out."""
-    mode = _about_mode(A, b, degrees)
+    mode = _expand_at_mode(A, b, degrees)
     z, log_density = _draws(EVIDENCE_DRAWS)
-    log_weight = -0.5 * (degrees + 2) * _bent(A, mode.left, z @ mode.spread.swapaxes(1, 2), degrees) - log_density
+    log_weight = -0.5 * (degrees + 2) * _log_terms(A, mode.left, z @ mode.spread.swapaxes(1, 2), degrees) - log_density
     sizes = np.linalg.slogdet(mode.spread)[1] - views * np.log(2 * np.pi)
     return float(np.sum(logsumexp(log_weight, axis=1) - np.log(len(z)) + sizes))
 
@@ -281,15 +283,15 @@ class _Mode(NamedTuple):
     spread: Floats
 
 
-def _about_mode(A: Floats, b: Floats, degrees: float, start: Floats | None = None) -> _Mode:
-    step = _mode(A, b, degrees, np.zeros((len(A), 3)) if start is None else start)
+def _expand_at_mode(A: Floats, b: Floats, degrees: float, start: Floats | None = None) -> _Mode:
+    step = _find_mode(A, b, degrees, np.zeros((len(A), 3)) if start is None else start)
     left = b - np.einsum("ncij,nj->nci", A, step)
     w = student_t_weights(np.sum(left**2, axis=2), degrees)
     H = np.einsum("nc,ncij,ncik->njk", w, A, A)
     return _Mode(step, left, PROPOSAL_WIDENING * np.sqrt(information_loss(degrees)) * _inverse_root(H))
 
 
-def _bent(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
+def _log_terms(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
     """(n, K) sum over the views of log(1 + squared distance / degrees), at steps away (n, K, 3)."""
     n, C = left.shape[:2]
     moved = (A.reshape(n, 2 * C, 3) @ away.swapaxes(1, 2)).reshape(n, C, 2, -1)
@@ -297,13 +299,13 @@ def _bent(A: Floats, left: Floats, away: Floats, degrees: float) -> Floats:
     return np.asarray(np.sum(np.log1p(squares / degrees), axis=1), dtype=np.float64)
 
 
-def _mode(A: Floats, b: Floats, degrees: float, step: Floats) -> Floats:
+def _find_mode(A: Floats, b: Floats, degrees: float, step: Floats) -> Floats:
     """(n, 3) the most probable step near a start: least squares, weighted again and again."""
     for _ in range(REWEIGHTINGS_TO_MODE):
         left = b - np.einsum("ncij,nj->nci", A, step)
         w = student_t_weights(np.sum(left**2, axis=2), degrees)
         H = np.einsum("nc,ncij,ncik->njk", w, A, A)
-        step = step + _solved(H, np.einsum("nc,ncij,nci->nj", w, A, left))
+        step = step + _solve_stack(H, np.einsum("nc,ncij,nci->nj", w, A, left))
     return step
 
 
@@ -313,7 +315,7 @@ def _inverse_root(H: Floats) -> Floats:
     return np.asarray(np.linalg.inv(L).swapaxes(1, 2), dtype=np.float64)
 
 
-def _solved(H: Floats, g: Floats) -> Floats:
+def _solve_stack(H: Floats, g: Floats) -> Floats:
     """H^-1 g of stacks (n, 3, 3) and (n, 3); where one is singular, with as much more on the diagonal as rounding."""
     try:
         return np.asarray(np.linalg.solve(H, g[..., None])[..., 0], dtype=np.float64)

@@ -75,7 +75,7 @@ def start_camera(
     there = camera.pose.apply(points[inliers])
     widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
     prior = camera.prior(image, widest, settings)
-    return _refined(camera, prior, points, uv, image, inliers, settings.max_start_error_medians)
+    return _refine(camera, prior, points, uv, image, inliers, settings.max_start_error_medians)
 
 
 def _start_projective(points: Floats, uv: Floats, image: Image, settings: RigModelSettings) -> InitialCamera:
@@ -92,7 +92,7 @@ def _start_projective(points: Floats, uv: Floats, image: Image, settings: RigMod
     return InitialCamera(camera, camera.prior(image, 1.0, settings), inliers & front, "none")
 
 
-def _refined(
+def _refine(
     camera: AnyCamera, prior: Prior, points: Floats, uv: Floats, image: Image, inliers: Bools, max_medians: float
 ) -> InitialCamera:
     """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong."""
@@ -169,9 +169,9 @@ def start_rig(
             check_start(started, training.points[seen.rows], seen.uv, training)
             return started
         except np.linalg.LinAlgError:
-            return FitError(f"the known points do not fix it.{_why(training, c)}")
+            return FitError(f"the known points do not fix it.{_explain_rows(training, c)}")
         except FitError as error:
-            return type(error)(error.what + _why(training, c), why=error.why, fix=error.fix)
+            return type(error)(error.what + _explain_rows(training, c), why=error.why, fix=error.fix)
 
     started, uncalibrated = {}, []
     for c, found in enumerate(side_by_side(one, range(len(training.camera_views)))):
@@ -191,11 +191,11 @@ def require_two_cameras(
         raise FitError(
             f"{len(started)} of {len(training.names)} cameras can be calibrated; a position takes two.",
             why="; ".join(f"{training.names[c]}: {why}" for c, why in uncalibrated) or "there is one camera",
-            fix=_cure(training, uncalibrated),
+            fix=_advise(training, uncalibrated),
         )
 
 
-def _why(training: TrainingData, c: int) -> str:
+def _explain_rows(training: TrainingData, c: int) -> str:
     """What its rows say of a camera that no model fits, as a sentence after another."""
     seen = training.camera_views[c]
     uv = np.full((len(training.points), 2), np.nan)
@@ -213,7 +213,7 @@ def _check_places(points: Floats) -> None:
         )
 
 
-def _cure(training: TrainingData, uncalibrated: list[tuple[int, str]]) -> str:
+def _advise(training: TrainingData, uncalibrated: list[tuple[int, str]]) -> str:
     if not uncalibrated:
         return "use two cameras or more: a position is where their lines of sight meet"
     if sum(len(seen.rows) >= ENOUGH_VIEWS for seen in training.camera_views) >= 2:

@@ -1,7 +1,8 @@
 """Planes of known points that are too few, or too much of one piece, to tell how far each is off: eq. (28).
 
 Two or three boards on a slide cannot contradict each other, and neither do the levels of one stepped target. What one
-of them may be off is then a matter of experience: `untold` says of what size, and Shots what follows between them.
+of them may be off is then a matter of experience: `find_uncertain_planes` says of what size, and Shots what follows
+between them.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ class Planes(NamedTuple):
     sd: Floats
 
 
-def untold(points: Floats, labels: NDArray[np.str_], settings: RigModelSettings) -> Planes | None:
+def find_uncertain_planes(points: Floats, labels: NDArray[np.str_], settings: RigModelSettings) -> Planes | None:
     """The planes of known points (n, 3) of which nothing can be told; None where there are none, or enough shots."""
     names = np.unique(labels)
     if len(names) == 1:
-        found = levels(points, settings)
+        found = find_levels(points, settings)
         if found is None:
             return None
         there, number = found.number >= 0, found.number.astype(np.str_)
@@ -55,7 +56,7 @@ class Levels(NamedTuple):
     normal: Floats
 
 
-def levels(points: Floats, settings: RigModelSettings) -> Levels | None:
+def find_levels(points: Floats, settings: RigModelSettings) -> Levels | None:
     """Of the points (n, 3) of one target; None if it has none.
 
     Of the axes along which the points stand on a few planes, that with the fewest, and then the one along which the

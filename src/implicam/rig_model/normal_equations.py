@@ -59,7 +59,7 @@ class CameraFailedError(np.linalg.LinAlgError):
 
 
 @contextmanager
-def naming_camera(number: int) -> Iterator[None]:
+def name_failing_camera(number: int) -> Iterator[None]:
     """Say which camera it was whose equations have no solution."""
     try:
         yield

@@ -149,10 +149,10 @@ def _objective(
     """Minus the log posterior of z: the matrix logarithm of the scale (xx, yy, zz, xy, xz, yz), and the log noise."""
 
     def objective(z: Floats) -> tuple[float, Floats]:
-        values, vectors = np.linalg.eigh(_symmetric(z))
+        values, vectors = np.linalg.eigh(_symmetric_matrix(z))
         scale = (vectors * np.exp(values)) @ vectors.T
         found = _Scales.of(agreement, scale).likelihood(z[6], freedom)
-        chain = vectors @ ((vectors.T @ found.by_scale @ vectors) * _divided(values)) @ vectors.T
+        chain = vectors @ ((vectors.T @ found.by_scale @ vectors) * _divided_differences(values)) @ vectors.T
         gradient = np.array([*np.diag(chain), *(2 * chain[_OFF]), found.by_noise])
         prior, by_prior = _prior(z, settings)
         return found.value + prior, gradient + by_prior
@@ -163,13 +163,13 @@ def _objective(
 _OFF = (np.array([0, 0, 1]), np.array([1, 2, 2]))
 
 
-def _symmetric(z: Floats) -> Floats:
+def _symmetric_matrix(z: Floats) -> Floats:
     Z = np.diag(z[:3])
     Z[_OFF] = Z[_OFF[::-1]] = z[3:6]
     return Z
 
 
-def _divided(values: Floats) -> Floats:
+def _divided_differences(values: Floats) -> Floats:
     """(3, 3) divided differences of the exponential: the derivative of a matrix exponential, in its eigenvectors."""
     difference = values[:, None] - values
     near = np.abs(difference) < 1e-6
@@ -260,7 +260,7 @@ def _nodes(freedom: float) -> tuple[Floats, Floats]:
 def _mean_variances(agreement: Agreement, found: _Found, gain: float, settings: RigModelSettings) -> PositionErrors:
     """With mean variances, larger than the most probable ones where there are few points: as eq. (12)."""
     spread = np.linalg.inv(_curvature(agreement, found, settings))
-    logs, axes = np.linalg.eigh(_symmetric(found.at))
+    logs, axes = np.linalg.eigh(_symmetric_matrix(found.at))
     along = 0.5 * np.array([[*(q**2), 2 * q[0] * q[1], 2 * q[0] * q[2], 2 * q[1] * q[2]] for q in axes.T])
     variance = np.einsum("ai,ij,aj->a", along, spread[:6, :6], along)
     variance = np.minimum(variance, settings.max_position_log_sd_variance)

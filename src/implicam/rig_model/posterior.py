@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel, CameraViews
-from implicam.rig_model.normal_equations import NormalEquations, camera_normals, naming_camera, solve_normal
+from implicam.rig_model.normal_equations import NormalEquations, camera_normals, name_failing_camera, solve_normal
 from implicam.rig_model.schur import ShotSchurBlock, Unknowns, views_by_shots
 from implicam.rig_model.shot_errors import ShotErrors
 
@@ -84,15 +84,15 @@ def condition(
     """
     normals = camera_normals(models, points, camera_views)
     if errors is None:
-        return _independent(models, normals)
-    return _tied(models, points, camera_views, normals, errors)
+        return _condition_independent(models, normals)
+    return _condition_tied(models, points, camera_views, normals, errors)
 
 
-def _independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]) -> Posterior:
+def _condition_independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]) -> Posterior:
     """Known positions are exact: every camera on its own, eq. (13)."""
     value, means, roots = 0.0, [], []
     for c, normal in enumerate(normals):
-        with naming_camera(c):
+        with name_failing_camera(c):
             root, mean, log_determinant = solve_normal(normal.A, normal.b)
         value += 0.5 * (float(normal.b @ mean) - log_determinant - normal.squares - normal.logs)
         means.append(mean)
@@ -100,7 +100,7 @@ def _independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]
     return Posterior(move_to_mean(models, means), tuple(roots), None, _steps(models, means), value)
 
 
-def _tied(
+def _condition_tied(
     models: tuple[CameraModel, ...],
     points: Floats,
     camera_views: tuple[CameraViews, ...],
@@ -119,7 +119,7 @@ def _tied(
     kept = meeting(*parts[0]) if len(parts) == 1 else None  # of many, each is made twice and never kept
     alone = []
     for c, normal in enumerate(normals):
-        with naming_camera(c):
+        with name_failing_camera(c):
             alone.append(solve_normal(normal.A, normal.b)[0])
     for each in parts:
         block = kept or meeting(*each)

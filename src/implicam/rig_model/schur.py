@@ -54,7 +54,8 @@ class ShotSchurBlock(NamedTuple):
         """From the views of these shots."""
         S, k = part.stop - part.start, errors.basis.shape[2]
         found = side_by_side(
-            lambda pair: _meet(pair[0], points, pair[1], errors, part), list(zip(models, camera_views, strict=True))
+            lambda pair: _accumulate(pair[0], points, pair[1], errors, part),
+            list(zip(models, camera_views, strict=True)),
         )
         H = np.eye(k) + np.sum([one.H for one in found], axis=0)
         assert H.shape == (S, k, k)
@@ -87,7 +88,9 @@ class ShotSchurBlock(NamedTuple):
         return Unknowns(self.unknowns(mean).ravel(), covariance, cross)
 
 
-def _meet(model: CameraModel, points: Floats, seen: CameraViews, errors: ShotErrors, part: slice) -> ShotSchurBlock:
+def _accumulate(
+    model: CameraModel, points: Floats, seen: CameraViews, errors: ShotErrors, part: slice
+) -> ShotSchurBlock:
     S, k = part.stop - part.start, errors.basis.shape[2]
     p, m = model.camera.size, len(model.field.inducing)
     total = ShotSchurBlock(np.zeros((S, k, k)), np.zeros((S, k)), np.zeros((S, k, model.size)))

@@ -93,44 +93,45 @@ class Shots:
     @cached_property
     def _reach(self) -> float:
         """The distance over which the label of a shot holds; zero where shots overlap."""
-        nearest = [
-            np.min(self._outside(self.centre[[s]])[0, np.arange(len(self.centre)) != s])
-            for s in range(len(self.centre))
-        ]
-        return self.settings.label_reach_gaps * float(np.median(nearest))
+        apart = self._outside(self.centre)
+        np.fill_diagonal(apart, np.inf)
+        return self.settings.label_reach_gaps * float(np.median(apart.min(axis=1)))
 
     def _outside(self, points: Floats) -> Floats:
         """(n, S) how far points are outside the box of each shot's points."""
         local = np.abs(np.einsum("sij,nsj->nsi", self.axes, points[:, None] - self.centre))
         return np.asarray(np.linalg.norm(np.maximum(local - self.extent, 0), axis=2), dtype=np.float64)
 
-    def labels(self, points: Floats, sd: Floats) -> tuple[Floats, Floats]:
-        """How far a label near each point is off: its dependence (n, 3, K) on the unknowns, in their sds, and the
-        covariance (n, 3, 3) of what they do not tell. sd: (K,)."""
-        n = len(points)
-        nearest = np.argmin(outside := self._outside(points), axis=1)
-        distance = outside[np.arange(n), nearest]
-        if self._reach == 0:  # shots that overlap contradict each other in one place: what is measured is their mean
-            return np.zeros((n, 3, len(sd))), np.zeros((n, 3, 3))
-        holds = np.exp(-0.5 * (distance / self._reach) ** 2)
+    def _nearest(self, points: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
+        """The shot nearest to each point (n,), how much its label holds there, and what part of its variance is open.
+
+        Shots that overlap contradict each other in one place: what is measured is their mean, and none of this counts.
+        """
+        outside = self._outside(points)
+        nearest = np.argmin(outside, axis=1)
+        if self._reach == 0:
+            return nearest, np.zeros(len(points)), np.zeros(len(points))
+        holds = np.exp(-0.5 * (outside.min(axis=1) / self._reach) ** 2)
+        return nearest, holds, 1 - holds**2
+
+    def label_slope(self, points: Floats, sd: Floats) -> Floats:
+        """(n, 3, K) how far a label near each point is off, by each of the unknowns in their sds (K,); eq. (22)."""
+        nearest, holds, _ = self._nearest(points)
         rigid = self._rigid(points, nearest)
         known = holds[:, None, None, None] * rigid[:, :, :, None] * self.pattern[nearest][:, None, None, :]
-        return known.reshape(n, 3, len(sd)) * sd, self.untold(points, sd.reshape(6, -1)[:, 0])
+        return np.asarray(known.reshape(len(points), 3, len(sd)) * sd, dtype=np.float64)
 
-    def untold(self, points: Floats, sd: Floats) -> Floats:
+    def unresolved_covariance(self, points: Floats, sd: Floats) -> Floats:
         """(n, 3, 3) of the error of a label near each point, as far as the shots do not tell it: nothing at a shot. sd:
         (6,) of a shot's error."""
-        nearest = np.argmin(outside := self._outside(points), axis=1)
-        if self._reach == 0:
-            return np.zeros((len(points), 3, 3))
-        holds = np.exp(-0.5 * (outside[np.arange(len(points)), nearest] / self._reach) ** 2)
+        nearest, _, open_part = self._nearest(points)
         lengths = np.linalg.norm(points - self.centre[nearest], axis=1) / self.radius[nearest]
         within = np.minimum(1, self.settings.max_tilt_radii / np.maximum(lengths, 1e-12))
         lever = self._rigid(points, nearest) * sd
         lever[:, :, 3:] *= within[:, None, None]
-        return np.asarray((1 - holds**2)[:, None, None] * (lever @ lever.swapaxes(1, 2)), dtype=np.float64)
+        return np.asarray(open_part[:, None, None] * (lever @ lever.swapaxes(1, 2)), dtype=np.float64)
 
-    def drawn_along(self, points: Floats) -> Floats:
+    def world_variance_ratio(self, points: Floats) -> Floats:
         """(n,) variance of the world at each point over that of a shot's error, eq. (28): the world is the parabola
         through the shots by definition, or the line through two."""
         t = (self.centre - (middle := self.centre.mean(axis=0))) @ self.along[0]
@@ -180,7 +181,7 @@ class ShotErrors:
         """Whether any sd is estimated."""
         return bool((self.group >= 0).any())
 
-    def updated(self, mean: Floats, variance: Floats, settings: RigModelSettings) -> tuple[ShotErrors, Floats]:
+    def update(self, mean: Floats, variance: Floats, settings: RigModelSettings) -> tuple[ShotErrors, Floats]:
         """With more probable sds, from the posterior of the unknowns (shots, k) in sds: one step of EM, eq. (17); and
         (shots, k) the sds for error bars.
 

@@ -57,13 +57,13 @@ def condition_scattered(
     M = np.zeros((P, P))
     for views, slopes in rig.views():
         shots += np.tensordot(views[:, :, :k], views, axes=((0, 1), (0, 1)))
-        half, squares_less_logs = _eliminated(*_displacements(views, slopes))
+        half, squares_less_logs = _eliminate(*_displacement_equations(views, slopes))
         value += squares_less_logs
         shots -= half[:, :k].T @ half
         M += half[:, k:-1].T @ half[:, k:-1]
         b -= half[:, k:-1].T @ half[:, -1]
     if k:
-        half, squares_less_logs = _eliminated(shots[None, :, :k], shots[None, :, k:])
+        half, squares_less_logs = _eliminate(shots[None, :, :k], shots[None, :, k:])
         value += squares_less_logs
         M += half[:, :-1].T @ half[:, :-1]
         b -= half[:, :-1].T @ half[:, -1]
@@ -88,13 +88,13 @@ def condition_scattered(
     )
 
 
-def _displacements(views: Floats, slopes: Floats) -> tuple[Floats, Floats]:
+def _displacement_equations(views: Floats, slopes: Floats) -> tuple[Floats, Floats]:
     """Normal equations of the points' displacements: H (m, 3, 3), and (m, 3, k + P + 1) with all the rest."""
     across = slopes.swapaxes(1, 2)
     return np.eye(3) + across @ slopes, across @ views
 
 
-def _eliminated(H: Floats, rest: Floats) -> tuple[Floats, float]:
+def _eliminate(H: Floats, rest: Floats) -> tuple[Floats, float]:
     """L^-1 rest, of H = L L^T, its rows one below the other; and what it adds to twice the evidence."""
     L = np.linalg.cholesky(H)
     half = np.linalg.solve(L, rest).reshape(-1, rest.shape[2])
@@ -162,7 +162,7 @@ class _Rig:
     def displacement(self, white: Floats, shots: Floats) -> Floats:
         """(n, 3) of the known points, the posterior mean, that of their shot included."""
         taken = np.concatenate([-shots, -white, [1.0]])
-        parts = [_displacements(*each) for each in self.views()]
+        parts = [_displacement_equations(*each) for each in self.views()]
         found = np.concatenate([np.linalg.solve(H, (rest @ taken)[..., None])[..., 0] for H, rest in parts])
         found = self.scatter.size[:, None] * (found @ self.scatter.root.T)
         return found if self.errors is None else found + self.errors.scaled @ shots

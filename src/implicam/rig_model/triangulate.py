@@ -56,15 +56,15 @@ class Labels(NamedTuple):
         """(n, 3) how far a label near each of x (n, 3) is off, as far as it is known."""
         if self.unknowns is None:
             return np.zeros_like(x)
-        return np.asarray(self.shots.labels(x, self.sd)[0] @ self.unknowns.mean, dtype=np.float64)
+        return np.asarray(self.shots.label_slope(x, self.sd) @ self.unknowns.mean, dtype=np.float64)
 
     def own(self, x: Floats) -> Floats:
         """(n, 3, 3) covariance of the error that a known position near each of x (n, 3) may have besides."""
-        return np.nan_to_num(self.shots.untold(x, self.bars))
+        return np.nan_to_num(self.shots.unresolved_covariance(x, self.bars))
 
     def world(self, x: Floats) -> Floats:
         """(n, 3, 3) how well the shots say what the world is there, which is made of their labels, eq. (28)."""
-        return self.own(x) * np.nan_to_num(self.shots.drawn_along(x))[:, None, None]
+        return self.own(x) * np.nan_to_num(self.shots.world_variance_ratio(x))[:, None, None]
 
 
 def locate(
@@ -90,7 +90,7 @@ def locate(
 
 def _locate(points: _Seen) -> Located:
     seen = np.asarray(np.isfinite(points.uv).all(axis=2))
-    xyz, cov, p = points.solved(np.arange(len(seen)), seen)
+    xyz, cov, p = points.solve(np.arange(len(seen)), seen)
     left_out = np.zeros_like(seen)
     bad = np.flatnonzero((seen.sum(axis=1) >= 3) & ~(p >= points.settings.disagree_p_value))
     for some in np.split(bad, range(POINTS_PER_CHUNK // 16, len(bad), POINTS_PER_CHUNK // 16)):
@@ -113,7 +113,7 @@ class _Seen:
     degrees: float | None = None
     settings: RigModelSettings = DEFAULT_SETTINGS
 
-    def solved(self, rows: NDArray[np.int64], seen: Bools) -> tuple[Floats, Floats, Floats]:
+    def solve(self, rows: NDArray[np.int64], seen: Bools) -> tuple[Floats, Floats, Floats]:
         """Positions, covariances and p-values of points from the views `seen` alone."""
         start = _start(*self.lines(rows), seen)
         found = _solve(self.posterior, start, self.uv[rows], self.noise[rows], seen, self.labels)
@@ -122,7 +122,7 @@ class _Seen:
         return self._by_t(found, rows, seen, self.degrees)
 
     def _by_t(
-        self, found: _Solved, rows: NDArray[np.int64], seen: Bools, degrees: float
+        self, found: _Solution, rows: NDArray[np.int64], seen: Bools, degrees: float
     ) -> tuple[Floats, Floats, Floats]:
         """The same with noise that is a t, from the solution with normal noise of the same scale."""
         good = np.flatnonzero(np.isfinite(found.x).all(axis=1))
@@ -130,7 +130,7 @@ class _Seen:
         if not len(good):
             return xyz, cov, p
         rows, seen = rows[good], seen[good]
-        linear = self.linear(rows, found.x[good], seen)
+        linear = self.linearise(rows, found.x[good], seen)
         if linear.joint is None:
             better = refine_positions(linear, degrees, self.settings)
             xyz[good], cov[good] = found.x[good] + better.step, better.cov
@@ -140,13 +140,13 @@ class _Seen:
             distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
             noise = equivalent_normal_noise(self.noise[rows], distance, seen, degrees)
             again = _solve(self.posterior, found.x[good], self.uv[rows], noise, seen, self.labels)
-            linear = self.linear(rows, again.x, seen, linear)
+            linear = self.linearise(rows, again.x, seen, linear)
         xyz[good], cov[good] = again.xyz, again.cov
         distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
         p[good] = consistency(distance, seen, degrees)
         return xyz, cov, p
 
-    def linear(
+    def linearise(
         self, rows: NDArray[np.int64], x: Floats, seen: Bools, before: LinearisedViews | None = None
     ) -> LinearisedViews:
         """The views about x (n, 3)."""
@@ -169,7 +169,7 @@ def _p_value(chi2: Floats, views: NDArray[np.int64]) -> Floats:
     return np.where((views >= 2) & np.isfinite(chi2), chdtrc(degrees, chi2), np.nan)
 
 
-def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Bools, labels: Labels | None) -> _Solved:
+def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Bools, labels: Labels | None) -> _Solution:
     """Points with the views `seen` (n, C), from x (n, 3)."""
     n = len(uv)
     before = np.full((n, 3), np.nan)
@@ -182,7 +182,7 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
     weights = _Weights(posterior, x, noise, seen)
     for iteration in range(MAX_GAUSS_NEWTON_STEPS):
         H, g, squares = weights.normal(x[going], uv[going], seen[going])
-        step = _solved(H, g)
+        step = _solve_stack(H, g)
         size = np.einsum("ni,nij,nj->n", step, H, step)
         x[going] += step
         done[going] = size < CONVERGED_STEP_SDS**2
@@ -197,7 +197,7 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
             weights = weights.select(on)
     weights = _Weights(posterior, x, noise, seen)
     H, g, squares = weights.normal(x, uv, seen)
-    step = _solved(H, g)
+    step = _solve_stack(H, g)
     found = done & np.isfinite(H).all(axis=(1, 2)) & np.isfinite(step).all(axis=1)
     information = np.linalg.eigvalsh(np.where(found[:, None, None], H, np.eye(3)))
     found &= information[:, 0] > MIN_INFORMATION_RATIO * information[:, 2]
@@ -212,10 +212,10 @@ def _solve(posterior: Posterior, x: Floats, uv: Floats, noise: Floats, seen: Boo
     cov[kept] = covariance[found]
     chi2[kept] = (squares - np.einsum("ni,ni->n", g, step))[found]
     chi2[rows[hopeless]] = HOPELESS_CHI_SQUARED
-    return _Solved(xyz, cov, chi2, before)
+    return _Solution(xyz, cov, chi2, before)
 
 
-class _Solved(NamedTuple):
+class _Solution(NamedTuple):
     """Positions (n, 3), covariances and chi-squared (n,) of points, NaN where there is none; x (n, 3): the positions
     before labels are taken into account."""
 
@@ -231,7 +231,7 @@ def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen
     unknown = labels.world(x)
     if labels.unknowns is None:
         return x, cov + unknown
-    known = np.nan_to_num(labels.shots.labels(x, labels.sd)[0])
+    known = np.nan_to_num(labels.shots.label_slope(x, labels.sd))
     own = known @ labels.unknowns.covariance @ known.swapaxes(1, 2)
     tied = weights.with_cameras(x, cov, seen, labels.unknowns.cross) @ known.swapaxes(1, 2)
     return x - known @ labels.unknowns.mean, cov + own + tied + tied.swapaxes(1, 2) + unknown
@@ -243,7 +243,7 @@ def _start(centres: Floats, directions: Floats, seen: Bools) -> Floats:
     d = np.where(good[..., None], directions, 0)
     across = good[..., None, None] * np.eye(3) - d[..., :, None] * d[..., None, :]
     A, b = across.sum(axis=1), np.einsum("ncij,cj->ni", across, centres)
-    start = _solved(A, b)
+    start = _solve_stack(A, b)
     start[(good.sum(axis=1) < 2) | (np.linalg.eigvalsh(A)[:, 0] < 1e-9)] = np.nan
     return start
 
@@ -327,6 +327,6 @@ def _square(half: Floats) -> Floats:
     return np.asarray(half @ half.swapaxes(1, 2), dtype=np.float64)
 
 
-def _solved(A: Floats, b: Floats) -> Floats:
+def _solve_stack(A: Floats, b: Floats) -> Floats:
     """A^-1 b of stacks, NaN where A is singular or not finite."""
     return np.asarray(np.einsum("nij,nj->ni", invert_stack(A), b), dtype=np.float64)

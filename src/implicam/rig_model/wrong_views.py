@@ -67,11 +67,11 @@ class Points(Protocol):
     def lines(self, rows: Ints) -> tuple[Floats, Floats]:
         """Centres (C, 3) of the cameras and directions (n, C, 3) of the lines of sight, NaN for none."""
 
-    def linear(self, rows: Ints, x: Floats, seen: Bools, before: LinearisedViews | None = None) -> LinearisedViews:
+    def linearise(self, rows: Ints, x: Floats, seen: Bools, before: LinearisedViews | None = None) -> LinearisedViews:
         """The views `seen` (n, C) about x (n, 3); NaN where a camera has no answer. The covariances are those of
         `before`, if it is given: of a place nearby."""
 
-    def solved(self, rows: Ints, seen: Bools) -> tuple[Floats, Floats, Floats]:
+    def solve(self, rows: Ints, seen: Bools) -> tuple[Floats, Floats, Floats]:
         """Positions (n, 3), covariances and p-values (n,) from the views `seen` alone; NaN for none."""
 
 
@@ -96,7 +96,7 @@ def exclude_wrong_views(points: Points, rows: Ints, seen: Bools) -> Iterator[Bet
     """Of points (rows) whose views `seen` (n, C) disagree, those that agree without a few, clearly the wrong ones."""
     views = seen.sum(axis=1)
     if (views == 3).any():
-        yield _tried_each(points, rows[views == 3], seen[views == 3])
+        yield _try_each(points, rows[views == 3], seen[views == 3])
     rows, seen = rows[views > 3], seen[views > 3]
     if not len(rows):
         return
@@ -110,12 +110,12 @@ def exclude_wrong_views(points: Points, rows: Ints, seen: Bools) -> Iterator[Bet
         for number in np.unique(sizes[eligible]):
             some = np.flatnonzero(eligible & (sizes == number))
             best, second = choices.two_best(some, int(number))
-            hopeful = choices.hopeful(some, best, second, int(number))
-            some, best, second = some[hopeful], best.select(hopeful), second.select(hopeful)
+            promising = choices.promising(some, best, second, int(number))
+            some, best, second = some[promising], best.select(promising), second.select(promising)
             close = _close(seen[some].sum(axis=1) - number, second.chi2)
             for rivals, part in ((True, close), (False, ~close)):
                 groups = (best.group[part], second.group[part]) if rivals else (best.group[part],)
-                found = _clearly_better(points, rows[some[part]], seen[some[part]], groups)
+                found = _choose_clearly_better(points, rows[some[part]], seen[some[part]], groups)
                 left[some[np.isin(rows[some], found.rows)]] = False
                 yield found
 
@@ -126,13 +126,13 @@ def _close(views: Ints, chi2: Floats) -> Bools:
     return np.asarray((views <= 3) | (chi2 < HOPELESS_CHI_SQUARED))
 
 
-def _tried_each(points: Points, rows: Ints, seen: Bools) -> BetterChoice:
+def _try_each(points: Points, rows: Ints, seen: Bools) -> BetterChoice:
     """Three views: the three pairs are tried."""
     member = np.argsort(~seen, axis=1, kind="stable")[:, :3]
-    return _clearly_better(points, rows, seen, tuple(member[:, [k]] for k in range(3)))
+    return _choose_clearly_better(points, rows, seen, tuple(member[:, [k]] for k in range(3)))
 
 
-def _clearly_better(points: Points, rows: Ints, seen: Bools, groups: tuple[Ints, ...]) -> BetterChoice:
+def _choose_clearly_better(points: Points, rows: Ints, seen: Bools, groups: tuple[Ints, ...]) -> BetterChoice:
     """Solve without each group of views (n, k), and keep the points where one of them clearly makes the rest agree."""
     n = len(rows)
     if n == 0:
@@ -142,7 +142,7 @@ def _clearly_better(points: Points, rows: Ints, seen: Bools, groups: tuple[Ints,
     for k, group in enumerate(groups):
         np.put_along_axis(out[k], group, True, axis=1)
     again = np.tile(rows, len(groups))
-    x, cov, p = points.solved(again, (seen & ~out).reshape(-1, seen.shape[1]))
+    x, cov, p = points.solve(again, (seen & ~out).reshape(-1, seen.shape[1]))
     ps = np.where(np.isfinite(p), p, 0.0).reshape(len(groups), n)
     order = np.argsort(-ps, axis=0)
     best, index = order[0], np.arange(n)
@@ -184,7 +184,7 @@ class _Choices(NamedTuple):
     @classmethod
     def about(cls, points: Points, rows: Ints, seen: Bools) -> _Choices:
         """Linearise about the place that most views agree on."""
-        linear = _about_most(points, rows, seen)
+        linear = _linearise_at_majority(points, rows, seen)
         n, C = seen.shape
         D, r = linear.D, linear.r
         B, Wr = apply_weights(linear, D), apply_weights(linear, r[..., None])[..., 0]
@@ -224,7 +224,7 @@ class _Choices(NamedTuple):
                 _insert(best, group, value)
         return best[0], best[1]
 
-    def hopeful(self, some: Ints, best: _Groups, second: _Groups, size: int) -> Bools:
+    def promising(self, some: Ints, best: _Groups, second: _Groups, size: int) -> Bools:
         """Which of the points are worth solving again."""
         free = np.maximum(2 * (self.seen[some].sum(axis=1) - size) - 3, 1)
         p = [np.where(np.isfinite(g.chi2), chdtrc(free, self._misfit(some, g)), 0) for g in (best, second)]
@@ -315,39 +315,39 @@ def _insert(best: list[_Groups], group: Ints, value: Floats) -> None:
     best[0] = _Groups(np.where(first[:, None], group, best[0].group), np.where(first, value, best[0].chi2))
 
 
-def _about_most(points: Points, rows: Ints, seen: Bools) -> LinearisedViews:
+def _linearise_at_majority(points: Points, rows: Ints, seen: Bools) -> LinearisedViews:
     """The views about a place that most of them agree on; those whose camera has no answer there are as far off as can
     be."""
     trusted = seen.sum(axis=1) - max_wrong_views(seen.sum(axis=1))
     centres, directions = points.lines(rows)
     usable = seen & np.isfinite(directions).all(axis=2)
-    across = _across(np.where(usable[..., None], directions, [0.0, 0.0, 1.0]))
-    x = _agreed(across, np.einsum("ncij,cj->nci", across, centres), usable, trusted)
-    linear = points.linear(rows, x, seen)
+    across = _normals_of(np.where(usable[..., None], directions, [0.0, 0.0, 1.0]))
+    x = _least_trimmed_squares(across, np.einsum("ncij,cj->nci", across, centres), usable, trusted)
+    linear = points.linearise(rows, x, seen)
     far = np.arange(len(rows))
     for number in range(MAX_LINEARISATIONS):
         if number:
-            linear = _replaced(linear, far, points.linear(rows[far], x[far], seen[far]))
+            linear = _replace_rows(linear, far, points.linearise(rows[far], x[far], seen[far]))
         step, pixels = _step(linear, far, seen, trusted)
         x[far] += step
         far = far[pixels > FAR_STEP_PX]
         if not len(far):
             break
-    linear = points.linear(rows, x, seen, linear)
+    linear = points.linearise(rows, x, seen, linear)
     there = ~seen | _answered(linear)
     if there.all():
         return linear
-    again = points.linear(rows, x, seen & there)
+    again = points.linearise(rows, x, seen & there)
     return again._replace(r=np.where(there[..., None], again.r, UNANSWERED_RESIDUAL_SDS))
 
 
 def _step(linear: LinearisedViews, some: Ints, seen: Bools, trusted: Ints) -> tuple[Floats, Floats]:
     """(n, 3) from the place of some points to where most of their views agree, and (n,) how many pixels that is."""
     fine = (seen & _answered(linear))[some]
-    root = _half(np.where(fine[..., None, None], linear.each[some], np.eye(2)))
+    root = _root_2x2(np.where(fine[..., None, None], linear.each[some], np.eye(2)))
     D = np.where(fine[..., None, None], linear.D[some], 0)
     r = np.where(fine[..., None], linear.r[some], 0)
-    step = _agreed(root @ D, (root @ r[..., None])[..., 0], fine, trusted[some])
+    step = _least_trimmed_squares(root @ D, (root @ r[..., None])[..., 0], fine, trusted[some])
     moved = np.linalg.norm(np.einsum("ncij,nj->nci", D, step), axis=2)
     return step, moved.sum(axis=1) / np.maximum(fine.sum(axis=1), 1)
 
@@ -358,7 +358,7 @@ def _answered(linear: LinearisedViews) -> Bools:
     return np.asarray(there & np.isfinite(linear.each).all(axis=(2, 3)))
 
 
-def _replaced(linear: LinearisedViews, some: Ints, new: LinearisedViews) -> LinearisedViews:
+def _replace_rows(linear: LinearisedViews, some: Ints, new: LinearisedViews) -> LinearisedViews:
     """With that of some points anew; in place."""
     for old, other in zip(linear, new, strict=True):
         if old is not None and other is not None:
@@ -366,7 +366,7 @@ def _replaced(linear: LinearisedViews, some: Ints, new: LinearisedViews) -> Line
     return linear
 
 
-def _agreed(A: Floats, b: Floats, usable: Bools, trusted: Ints) -> Floats:
+def _least_trimmed_squares(A: Floats, b: Floats, usable: Bools, trusted: Ints) -> Floats:
     """(n, 3) x of which the `trusted` (n,) smallest of `|A_c x - b_c|^2` (A (n, C, 2, 3)) have the smallest sum: least
     trimmed squares (Rousseeuw 1984), from pairs of views, then concentrated twice, eq. (W1)."""
     n, C = usable.shape
@@ -416,7 +416,7 @@ def _pair_table(C: int) -> Ints:
     return table
 
 
-def _across(directions: Floats) -> Floats:
+def _normals_of(directions: Floats) -> Floats:
     """(n, C, 2, 3) two unit vectors across each direction (n, C, 3)."""
     least = np.eye(3)[np.argmin(np.abs(directions), axis=2)]
     first = np.cross(directions, least)
@@ -424,7 +424,7 @@ def _across(directions: Floats) -> Floats:
     return np.stack([first, np.cross(directions, first)], axis=2)
 
 
-def _half(W: Floats) -> Floats:
+def _root_2x2(W: Floats) -> Floats:
     """Roots R of 2 x 2 matrices W = R^T R, in stacks."""
     a = np.sqrt(np.maximum(W[..., 0, 0], 1e-300))
     b = W[..., 0, 1] / a

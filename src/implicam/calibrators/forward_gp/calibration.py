@@ -37,7 +37,7 @@ from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.rig_model.diagnostics import Diagnosis
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.level_errors import untold
+from implicam.rig_model.level_errors import find_uncertain_planes
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.rig import FittedRig
 from implicam.rig_model.shot_errors import Shots
@@ -141,9 +141,9 @@ class ForwardGPCalibration(RigCalibration):
         errors, unknowns = self.fitted.errors, self.posterior.unknowns
         points, settings = self.frame.to_working(self.used.xyz), self.calibrator.settings
         if errors is None or unknowns is None or self.fitted.label_sd is None:
-            untold_sd = self.fitted.untold_sd
-            planes = None if untold_sd is None else untold(points, self.used.shots, settings)
-            return None if planes is None or untold_sd is None else Labels(planes.shots, np.zeros(0), None, untold_sd)
+            plane_sd = self.fitted.plane_sd
+            planes = None if plane_sd is None else find_uncertain_planes(points, self.used.shots, settings)
+            return None if planes is None or plane_sd is None else Labels(planes.shots, np.zeros(0), None, plane_sd)
         shots = Shots.of(points, self.used.shots, settings)
         bars = self.fitted.label_sd.reshape(6, -1)[:, 0]
         return None if shots is None else Labels(shots, errors.sd[0], unknowns, bars)

@@ -194,7 +194,7 @@ class RigEvidence:
 
         if start is not None and not search:
             at(np.log(start.lengthscale[0]))
-            return self._found(known, spectra)
+            return self._choose_best(known, spectra)
         if start is None:  # a second, shorter range can be as likely: look everywhere first
             for across in LENGTHSCALE_GRID[0]:
                 for along in LENGTHSCALE_GRID[1]:
@@ -210,17 +210,17 @@ class RigEvidence:
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": 12},
         )
-        return self._found(known, spectra)
+        return self._choose_best(known, spectra)
 
-    def _found(
+    def _choose_best(
         self, known: dict[tuple[float, ...], tuple[float, Floats]], spectra: dict[tuple[float, ...], list[Spectrum]]
     ) -> Hyperparameters:
         """The best of the lengthscales looked at."""
         lengthscale = min(known, key=lambda key: known[key][0])
-        signal, noise = self._averaged(spectra[lengthscale], known[lengthscale][1])
+        signal, noise = self._average_sizes(spectra[lengthscale], known[lengthscale][1])
         return Hyperparameters(np.tile(np.exp(lengthscale), (len(self.cameras), 1)), signal, noise)
 
-    def _averaged(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
+    def _average_sizes(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
         """Signal and noise (C,) whose squares are the posterior means of the variances, eq. (12).
 
         The most probable variance is smaller than the mean one, much so with few points: error bars made from it would

@@ -39,7 +39,7 @@ def refit_with_heavy_tails(training: Training, fitted: FitResult) -> FitResult:
     keep_sizes = errors is not None and not errors.estimated
     try:
         for number in range(training.settings.tail_rounds):
-            found = _tails(mine, state)
+            found = _estimate_tails(mine, state)
             if found is None:
                 break
             tails, inliers = found
@@ -62,11 +62,11 @@ def refit_with_heavy_tails(training: Training, fitted: FitResult) -> FitResult:
     )
 
 
-def _tails(training: Training, state: Round) -> tuple[HeavyTails, tuple[Bools, ...]] | None:
+def _estimate_tails(training: Training, state: Round) -> tuple[HeavyTails, tuple[Bools, ...]] | None:
     """Degrees of freedom of the noise, from how far all views are from what the others predict; the weight of each view
     by how far it is from what all say; and the views to use. None where the noise is normal."""
     seen, settings = training.camera_views, training.settings
-    weighted = seen if state.tails is None else state.tails.weighted(seen, told=True)
+    weighted = seen if state.tails is None else state.tails.weight_views(seen, with_loss=True)
 
     def one(c: int, most: int) -> _Predicted:
         some = random_subset(len(seen[c].rows), most)
@@ -81,7 +81,7 @@ def _tails(training: Training, state: Round) -> tuple[HeavyTails, tuple[Bools, .
         if not looks_heavy(np.concatenate([f.distance for f in few]), np.concatenate(background), settings):
             return None
         try:
-            degrees = degrees_of_agreement(*_agreement(state.posterior, training, few), settings)
+            degrees = degrees_of_agreement(*_whiten_views(state.posterior, training, few), settings)
         except np.linalg.LinAlgError:  # the cameras among themselves say nothing of the noise
             return None
     else:
@@ -121,7 +121,9 @@ class _Predicted(NamedTuple):
         return cls(seen.rows, residual, covariance, distance, np.where(inliers, expected, distance), variance)
 
 
-def _agreement(posterior: Posterior, training: Training, predicted: list[_Predicted]) -> tuple[Floats, Floats, Bools]:
+def _whiten_views(
+    posterior: Posterior, training: Training, predicted: list[_Predicted]
+) -> tuple[Floats, Floats, Bools]:
     """Of points, slopes and residuals of their views in the scale of the noise, and which there are: not those that are
     wrong even with heavy tails."""
     settings = training.settings

@@ -32,7 +32,7 @@ def estimate_hyperparameters(
     off, where that is known; search: for other lengthscales too."""
     found = Hyperparameters(np.ones((len(models), 2)), np.ones(len(models)), np.ones(len(models)))
     groups = []
-    for numbers in _alike(models):
+    for numbers in _group_by_kind(models):
         evidence = [_evidence(training, models[c], used[c], moved) for c in numbers]
         half = np.array([models[c].image.half for c in numbers])
         kind = models[numbers[0]].camera.kind
@@ -49,7 +49,7 @@ def estimate_hyperparameters(
     return _joint_sizes(training, models, used, found, groups)
 
 
-def _alike(models: tuple[CameraModel, ...]) -> list[list[int]]:
+def _group_by_kind(models: tuple[CameraModel, ...]) -> list[list[int]]:
     """The numbers of cameras whose fields are of one kind: what a lens model leaves, or a linear projection."""
     none = [c for c, model in enumerate(models) if model.camera.kind == ProjectiveCamera.kind]
     return [group for group in ([c for c in range(len(models)) if c not in none], none) if group]

@@ -16,7 +16,7 @@ from implicam.dataset import Names
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.leave_one_out import LeftOutViews, left_out_views, sum_over_cameras
-from implicam.rig_model.level_errors import untold
+from implicam.rig_model.level_errors import find_uncertain_planes
 from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.position_errors import Agreement, PositionErrors, estimate_position_errors
 from implicam.rig_model.tied import Scatter
@@ -32,29 +32,29 @@ def separate_position_errors(training: Training, fitted: FitResult, shots: Names
     """
     if training.errors is not None and not training.errors.estimated:
         return refit_with_heavy_tails(training, fitted)
-    planes = untold(training.points, shots, training.settings) if training.errors is None else None
+    planes = find_uncertain_planes(training.points, shots, training.settings) if training.errors is None else None
     if planes is not None:
-        fitted = replace(fitted, untold_sd=planes.sd)
-    scattered = _with_scatter(training, fitted)
+        fitted = replace(fitted, plane_sd=planes.sd)
+    scattered = _separate(training, fitted)
     if scattered.position_errors is not None:
         return scattered
     heavy = refit_with_heavy_tails(training, fitted)
-    return fitted if heavy.tails is None else _with_scatter(training, heavy)
+    return fitted if heavy.tails is None else _separate(training, heavy)
 
 
-def _with_scatter(training: Training, fitted: FitResult) -> FitResult:
+def _separate(training: Training, fitted: FitResult) -> FitResult:
     seen, settings = training.of_cameras(fitted.cameras).camera_views, training.settings
     if fitted.tails is not None:
-        seen = fitted.tails.weighted(seen, told=True)
+        seen = fitted.tails.weight_views(seen, with_loss=True)
     inliers, points = fitted.inliers, training.points
     views = left_out_views(fitted.posterior, points, seen, inliers)
     total, ratio = sum_over_cameras(views, inliers, len(points))
-    errors = _estimated(total, ratio, settings)
+    errors = _estimate(total, ratio, settings)
     if errors is None:
         return fitted
-    inliers = _judged(views, inliers, errors, total, settings.max_squared_mahalanobis)
+    inliers = _update_inliers(views, inliers, errors, total, settings.max_squared_mahalanobis)
     if any((a != b).any() for a, b in zip(inliers, fitted.inliers, strict=True)):
-        errors = _estimated(*sum_over_cameras(views, inliers, len(points)), settings) or errors
+        errors = _estimate(*sum_over_cameras(views, inliers, len(points)), settings) or errors
     models = tuple(replace(model, noise=model.noise * errors.noise) for model in fitted.posterior.models)
     used = tuple(one.select(k) for one, k in zip(seen, inliers, strict=True))
     assert errors.size is not None
@@ -65,7 +65,7 @@ def _with_scatter(training: Training, fitted: FitResult) -> FitResult:
     return replace(fitted, posterior=posterior, inliers=inliers, position_errors=errors)
 
 
-def _estimated(total: Agreement, variance_ratio: Floats, settings: ForwardGPSettings) -> PositionErrors | None:
+def _estimate(total: Agreement, variance_ratio: Floats, settings: ForwardGPSettings) -> PositionErrors | None:
     """The errors, with how much larger than usual each point's own scale is."""
     limit, most = settings.max_left_out_variance_ratio, settings.max_points_for_position_errors
     rows = np.flatnonzero((total.coordinates >= 4) & (variance_ratio < limit)).astype(np.int64)
@@ -78,7 +78,7 @@ def _estimated(total: Agreement, variance_ratio: Floats, settings: ForwardGPSett
     return replace(errors, size=size)
 
 
-def _judged(
+def _update_inliers(
     views: list[LeftOutViews], inliers: tuple[Bools, ...], found: PositionErrors, total: Agreement, limit: float
 ) -> tuple[Bools, ...]:
     """The views to use: those that agree with what the others say of where their point is."""

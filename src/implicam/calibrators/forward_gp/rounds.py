@@ -36,9 +36,9 @@ class Round(NamedTuple):
     settled: bool = False
     tails: HeavyTails | None = None
 
-    def used(self, seen: tuple[CameraViews, ...], *, told: bool) -> tuple[CameraViews, ...]:
-        """The views to use, with their weights as noise; told: as much as they tell, for what is known of cameras."""
-        weighted = seen if self.tails is None else self.tails.weighted(seen, told=told)
+    def used(self, seen: tuple[CameraViews, ...], *, with_loss: bool) -> tuple[CameraViews, ...]:
+        """The views to use, with their weights as noise; with_loss: for what is known of the cameras."""
+        weighted = seen if self.tails is None else self.tails.weight_views(seen, with_loss=with_loss)
         return tuple(views.select(k) for views, k in zip(weighted, self.inliers, strict=True))
 
 
@@ -66,16 +66,16 @@ def next_round(training: Training, last: Round, *, search: bool, keep_sizes: boo
     hyper = last.hyper
     if hyper is None or not keep_sizes:
         moved = None if last.posterior.unknowns is None else last.posterior.displacement
-        used = last.used(seen, told=False)
+        used = last.used(seen, with_loss=False)
         hyper = estimate_hyperparameters(training, models, used, last.hyper, moved, search=search)
-    used = last.used(seen, told=True)
+    used = last.used(seen, with_loss=True)
     posterior = iterate_linearisation(size_fields(training, models, used, hyper), training.points, used, errors)
     this = Round(posterior, inliers, hyper, errors, errors, settled=True, tails=last.tails)
     if errors is None or posterior.unknowns is None:
         return this
     mean, variance = posterior.unknowns.mean, np.diag(posterior.unknowns.covariance)
     shape, settings = errors.sd.shape, training.settings
-    following, label_sd = errors.updated(mean.reshape(shape), variance.reshape(shape), settings)
+    following, label_sd = errors.update(mean.reshape(shape), variance.reshape(shape), settings)
     settled = bool(np.allclose(following.sd, errors.sd, rtol=settings.shot_sd_tolerance))
     return this._replace(next_errors=following, label_sd=label_sd, settled=settled)
 

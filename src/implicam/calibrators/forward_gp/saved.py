@@ -60,8 +60,8 @@ def state(fitted: FitResult, names: Sequence[str]) -> tuple[dict[str, Any], dict
             "labels/numbers": np.array([1 / found.freedom, found.noise, found.gain, len(posterior.ties)]),
             "labels/size": found.size,
         }
-    if fitted.untold_sd is not None:
-        arrays["untold_sd"] = fitted.untold_sd
+    if fitted.plane_sd is not None:
+        arrays["untold_sd"] = fitted.plane_sd
     if posterior.unknowns is not None and fitted.errors is not None and fitted.label_sd is not None:
         arrays |= {f"shots/{key}": value for key, value in posterior.unknowns._asdict().items()}
         arrays |= {"shots/sd": fitted.errors.sd, "shots/label_sd": fitted.label_sd}
@@ -115,9 +115,9 @@ def restored(
     errors, label_sd = _shot_errors(data, points, arrays, posterior, settings)
     hyper = Hyperparameters(lengthscales, sizes[:, 0], sizes[:, 1])
     ordinary = tuple(float(one.get("ordinary_would_leave_px", np.nan)) for one in described)
-    position_errors, untold_sd = _position_errors(data, arrays, posterior, settings), None
+    position_errors, plane_sd = _position_errors(data, arrays, posterior, settings), None
     if "untold_sd" in arrays:
-        untold_sd = finite_column(arrays, "untold_sd", (6,), positive=True)
+        plane_sd = finite_column(arrays, "untold_sd", (6,), positive=True)
     tails = _tails(arrays, inliers)
     return FitResult(
         posterior,
@@ -129,7 +129,7 @@ def restored(
         label_sd,
         tails,
         position_errors,
-        untold_sd,
+        plane_sd,
         ordinary,
     )
 
