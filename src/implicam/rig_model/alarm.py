@@ -92,7 +92,7 @@ class Table:
 
 
 def alarm_of(table: Table) -> str:
-    """What is wrong with the table as a whole, in a sentence; empty where nothing is."""
+    """Say what is wrong with a measured table as a whole, in one sentence; nothing where all is well."""
     settings, views = table.settings, table.seen.sum(axis=1)
     many, tested = settings.max_contradicting_share, views >= 2
     n = int(tested.sum())

@@ -80,10 +80,13 @@ def student_t_weights(distance: Floats, degrees: float) -> Floats:
 
 
 def looks_heavy(distance: Floats, background: Floats, settings: RigModelSettings) -> bool:
-    """Whether the noise of single cameras looks as if it had heavy tails, from squared distances (n,) of views to what
-    all others predict: that is quickly seen, and seldom so.
+    """Whether the noise of single cameras looks as if it had heavy tails: that is quickly seen, and seldom so.
 
-    background: (n,) the density of a wrong detection, anywhere in the image, over that of a normal view at its centre.
+    Args:
+        distance: Squared distances (n,) of views from what all others predict, in their covariances.
+        background: (n,) the density of a wrong detection, anywhere in the image, over that of a normal view at its
+            centre.
+        settings: The degrees of freedom to try, and how much more likely a t must be.
     """
     good = np.isfinite(distance) & (distance >= 0)
     q, b = distance[good], background[good]
@@ -148,7 +151,13 @@ class RefinedPositions(NamedTuple):
 
 
 def refine_positions(linear: LinearisedViews, degrees: float, settings: RigModelSettings) -> RefinedPositions:
-    """Mean and covariance of the position under t noise, from views linearised near it, eq. (T4)."""
+    """Mean and covariance of each position under noise with heavy tails, eq. (T4).
+
+    Args:
+        linear: The views of n points, linearised near the positions; cameras are not tied.
+        degrees: Degrees of freedom of the noise.
+        settings: With how many views a second mode is looked for, and when two places are too different.
+    """
     A, b = whiten(linear)
     n, C = b.shape[:2]
     out = RefinedPositions(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, C)))

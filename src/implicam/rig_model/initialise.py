@@ -113,8 +113,16 @@ def levenberg_marquardt(
 ) -> AnyCamera:
     """The camera that minimises `sum (residual / sd)^2` plus the prior's own square, eq. (6).
 
-    It ends after `max_steps`, or with a step that gains less than the part `gain`. The damped equations are solved in
-    units of their own diagonal: parameters differ by many orders of magnitude.
+    The damped equations are solved in units of their own diagonal: parameters differ by many orders of magnitude.
+
+    Args:
+        camera: Where to start.
+        prior: Of its parameters.
+        points: Known positions (n, 3).
+        uv: Pixels (n, 2) at which the camera sees them.
+        sd: Of the pixels.
+        max_steps: Steps at most.
+        gain: The part of the sum that a step must gain for another one to follow.
     """
 
     def cost(candidate: AnyCamera) -> float:
@@ -156,9 +164,17 @@ def levenberg_marquardt(
 def start_rig(
     training: TrainingData, start: Callable[[int, Floats, Floats], InitialCamera]
 ) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
-    """Each camera that `start` can place from its number, known points (n, 3) and pixels, and why it cannot the others.
+    """Start every camera that can be started.
 
-    FitError where fewer than two can be placed.
+    Args:
+        training: What the cameras saw.
+        start: Makes a camera from its number, known points (n, 3) and the pixels (n, 2) at which it sees them.
+
+    Returns:
+        The cameras by number, and (number, why not) of the others.
+
+    Raises:
+        FitError: Fewer than two can be started.
     """
 
     def one(c: int) -> InitialCamera | FitError:

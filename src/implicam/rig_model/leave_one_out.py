@@ -33,10 +33,20 @@ def squared_distances(posterior: Posterior, c: int, points: Floats, seen: Camera
 def left_out_residuals(
     posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools
 ) -> tuple[Floats, Floats]:
-    """Residuals (n, 2) of camera c's views from the prediction without them, and their covariance (n, 2, 2), px.
+    """How far a camera's views are from what all other views predict, in closed form, eq. (18).
 
     A lens is extrapolated behind the camera, to pixels that may be anything, with a spread to match. A view that is
     off by more than the picture is none of that point, whatever the spread: its covariance is that of the noise.
+
+    Args:
+        posterior: What is known of the cameras.
+        c: Number of the camera in it.
+        points: Known positions (m, 3) in the working frame.
+        seen: The camera's views, n of them.
+        inliers: (n,) those that the posterior is from.
+
+    Returns:
+        Residuals (n, 2) in pixels, and their covariances (n, 2, 2).
     """
     at = posterior_residuals(posterior, c, points, seen)
     residual, covariance = left_out_residuals_from(at, inliers)
@@ -83,7 +93,18 @@ def update_inliers(
     inliers: tuple[Bools, ...],
     limit: float = DEFAULT_SETTINGS.max_squared_mahalanobis,
 ) -> tuple[Bools, ...]:
-    """Per camera, the views to use next: not those that contradict the others."""
+    """The views to use next: not those that contradict the others.
+
+    Args:
+        posterior: What is known of the cameras.
+        points: Known positions (n, 3) in the working frame.
+        seen: Per camera, what it saw.
+        inliers: Per camera, the views that the posterior is from.
+        limit: Squared distance from what the others predict beyond which a view contradicts them.
+
+    Returns:
+        Per camera, which of its views to use.
+    """
 
     def one(c: int) -> Bools:
         return next_inliers(squared_distances(posterior, c, points, seen[c], inliers[c]), inliers[c], limit)
@@ -178,9 +199,17 @@ def left_out_positions(
 
 
 def left_out_points(fitted: FitResult, points: Floats, seen: tuple[CameraViews, ...]) -> tuple[Floats, Floats]:
-    """Of the known points that two cameras see: the error (m, 3) against the known position of each, measured without
-    its own views, and its covariance (m, 3, 3), in which the error of the position is included; eq. (18) with all views
-    of a point together. seen: what each fitted camera saw."""
+    """Errors of known points, each measured without its own views: eq. (18) with all views of a point together.
+
+    Args:
+        fitted: A fit that found errors of known positions.
+        points: Known positions (n, 3) in the working frame.
+        seen: What each fitted camera saw.
+
+    Returns:
+        Of the m points that two cameras see: errors (m, 3) against the known positions, and their covariances
+        (m, 3, 3), in which the errors of the positions are included.
+    """
     errors, posterior = fitted.position_errors, fitted.posterior
     assert errors is not None
     assert errors.size is not None

@@ -28,7 +28,16 @@ class Planes(NamedTuple):
 
 
 def find_uncertain_planes(points: Floats, labels: NDArray[np.str_], settings: RigModelSettings) -> Planes | None:
-    """The planes of known points (n, 3) of which nothing can be told; None where there are none, or enough shots."""
+    """Planes of known points whose errors cannot be estimated, since they cannot contradict each other.
+
+    Args:
+        points: Known positions (n, 3) in the working frame.
+        labels: (n,) name of each point's shot.
+        settings: How far planes are usually off, and what a level is.
+
+    Returns:
+        Two or three shots, or the levels of one; None where there are none, or shots enough to estimate.
+    """
     names = np.unique(labels)
     if len(names) == 1:
         found = find_levels(points, settings)

@@ -34,7 +34,18 @@ def iterate_linearisation(
     errors: ShotErrors | None,
     scatter: Scatter | None = None,
 ) -> Posterior:
-    """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field."""
+    """The posterior, linearised where it ends: Gauss-Newton for the lens, exact for the field.
+
+    Args:
+        models: The cameras to start from, with their fields laid out.
+        points: Known positions (n, 3) in the working frame.
+        used: Per camera, the views to use.
+        errors: How whole shots may be off; None where they are not.
+        scatter: How single known positions are off; None where they are not.
+
+    Raises:
+        CameraFailedError: The views of a camera do not fix it.
+    """
     if errors is None and scatter is None and len(models) > 1:
         return _linearise_alone(models, points, used)
     misfits: list[_Misfit] = []

@@ -85,7 +85,15 @@ class PositionErrors:
 
 
 def estimate_position_errors(agreement: Agreement, settings: RigModelSettings) -> PositionErrors | None:
-    """The most probable errors of known positions; None where noise alone explains the views as well."""
+    """The most probable errors of known positions, eqs. (23) to (25).
+
+    Args:
+        agreement: What the views of each point say of its position, each predicted without the point.
+        settings: Priors, and how clearly errors must explain the views better than noise alone.
+
+    Returns:
+        The errors, with mean variances; None where noise alone explains the views as well.
+    """
     if len(agreement.coordinates) < 4:
         return None
     found = _most_probable(agreement, np.inf, None, settings)

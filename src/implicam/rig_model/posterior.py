@@ -78,9 +78,19 @@ class Posterior:
 def condition(
     models: tuple[CameraModel, ...], points: Floats, camera_views: tuple[CameraViews, ...], errors: ShotErrors | None
 ) -> Posterior:
-    """The posterior from known points (n, 3) and what each camera saw, eqs. (13) to (15).
+    """The posterior from known points and what each camera saw, eqs. (13) to (15).
 
-    The models returned have moved to the posterior mean, so that a second call linearises there.
+    Args:
+        models: The cameras where they are linearised, with their priors.
+        points: Known positions (n, 3) in the working frame.
+        camera_views: Per camera, what it saw.
+        errors: How whole shots may be off; None where known positions are exact.
+
+    Returns:
+        The posterior, whose models have moved to its mean, so that a second call linearises there.
+
+    Raises:
+        CameraFailedError: The views of a camera do not fix it.
     """
     normals = camera_normals(models, points, camera_views)
     if errors is None:

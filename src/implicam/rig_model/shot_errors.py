@@ -49,11 +49,17 @@ class Shots:
         fewest: int = WORLD_POLYNOMIAL_TERMS + 1,
         direction: Floats | None = None,
     ) -> Shots | None:
-        """None where there are too few shots, or too few points in them.
+        """The shots of known points; up to `WORLD_POLYNOMIAL_TERMS` of them have no unknowns.
 
-        Up to `WORLD_POLYNOMIAL_TERMS` shots have no unknowns.
+        Args:
+            points: Known positions (n, 3) in the working frame.
+            labels: (n,) name of each point's shot.
+            settings: How many points a shot takes, and when shots are parallel plates.
+            fewest: Shots at least.
+            direction: (3,) in which the shots follow each other, where it is known.
 
-        direction: (3,) in which the shots follow each other, where it is known.
+        Returns:
+            None where there are too few shots, or too few points in them, or where all stand in one place.
         """
         _, shot, count = np.unique(labels, return_inverse=True, return_counts=True)
         S = len(count)
@@ -182,11 +188,18 @@ class ShotErrors:
         return bool((self.group >= 0).any())
 
     def update(self, mean: Floats, variance: Floats, settings: RigModelSettings) -> tuple[ShotErrors, Floats]:
-        """With more probable sds, from the posterior of the unknowns (shots, k) in sds: one step of EM, eq. (17); and
-        (shots, k) the sds for error bars.
+        """More probable sds: one step of EM, eq. (17).
 
         With few shots the most probable sd is too small for error bars: as for the noise, eq. (12), they are made of
         the mean variance.
+
+        Args:
+            mean: Posterior mean (shots, k) of the unknowns, in sds.
+            variance: Their posterior variance (shots, k).
+            settings: The prior of the sds.
+
+        Returns:
+            These errors with other sds, and sds (shots, k) for error bars.
         """
         second = (mean**2 + variance) * self.sd**2
         sd, mean_sd = self.sd.copy(), self.sd.copy()

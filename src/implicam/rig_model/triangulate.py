@@ -75,8 +75,19 @@ def locate(
     degrees: float | None = None,
     settings: RigModelSettings = DEFAULT_SETTINGS,
 ) -> Located:
-    """Points from pixels uv (n, C, 2), NaN where not seen, with noise (n, C) in pixels: normal, or the scale of a t
-    with so many degrees of freedom."""
+    """Where points are, from what the cameras see, eqs. (19) to (22).
+
+    Args:
+        posterior: What is known of the C cameras.
+        uv: Pixels (n, C, 2), NaN where a camera does not see a point.
+        noise: (n, C) in pixels: the sd of normal noise, or the scale of a Student t.
+        labels: How known positions are off; None where they are not.
+        degrees: Degrees of freedom of the noise; None where it is normal.
+        settings: Which views disagree, and which choice among them is clear.
+
+    Returns:
+        Positions in the working frame, NaN where a point has none.
+    """
     if len(uv) == 0:
         return Located(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(uv.shape[:2], dtype=np.bool_))
     parts = [slice(i, i + POINTS_PER_CHUNK) for i in range(0, len(uv), POINTS_PER_CHUNK)]

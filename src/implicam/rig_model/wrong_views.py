@@ -93,7 +93,16 @@ def max_wrong_views(views: Ints) -> Ints:
 
 
 def exclude_wrong_views(points: Points, rows: Ints, seen: Bools) -> Iterator[BetterChoice]:
-    """Of points (rows) whose views `seen` (n, C) disagree, those that agree without a few, clearly the wrong ones."""
+    """The points that agree without a few of their views, which are clearly the wrong ones; eqs. (W1) to (W3).
+
+    Args:
+        points: All points.
+        rows: Numbers (n,) of those whose views disagree.
+        seen: Their views (n, C).
+
+    Yields:
+        Some of these points at a time, each at most once; nothing of those that cannot be mended.
+    """
     views = seen.sum(axis=1)
     if (views == 3).any():
         yield _try_each(points, rows[views == 3], seen[views == 3])

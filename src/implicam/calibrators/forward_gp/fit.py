@@ -47,9 +47,18 @@ AUTO = "auto"
 
 
 def fit_rig(training: Training, progress: Progress, before: FitResult | None = None) -> FitResult:
-    """Fit every camera that can be fitted. before: a fit in the same working frame to most of these points, from a
-    moment ago: its cameras and hyperparameters are the guess. Where known positions have declared errors, which make
-    hyperparameters costly, they are kept."""
+    """Fit every camera that can be fitted.
+
+    Args:
+        training: What all cameras saw.
+        progress: Is told how far it is.
+        before: A fit in the same working frame to most of these points, from a moment ago: its cameras and
+            hyperparameters are the guess. Where known positions have declared errors, which make hyperparameters
+            costly, they are kept.
+
+    Raises:
+        FitError: Fewer than two cameras can be fitted.
+    """
     progress("fitting", 0, 3)
     started, uncalibrated = _start_cameras(training, before)
     while True:

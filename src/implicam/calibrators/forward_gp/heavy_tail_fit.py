@@ -31,7 +31,15 @@ from implicam.rig_model.wrong_views import LinearisedViews
 
 
 def refit_with_heavy_tails(training: Training, fitted: FitResult) -> FitResult:
-    """After a few rounds more with views weighted by a t, where the noise of the fit clearly is one; else the same."""
+    """A few rounds more with views weighted by a Student t, where the noise of the fit clearly is one.
+
+    Args:
+        training: What all cameras saw.
+        fitted: A fit that took the noise for normal.
+
+    Returns:
+        The fit with heavy tails, or as it was.
+    """
     mine, errors = training.of_cameras(fitted.cameras), fitted.errors
     state = Round(
         fitted.posterior, fitted.inliers, fitted.hyperparameters, errors, errors, fitted.label_sd, settled=True

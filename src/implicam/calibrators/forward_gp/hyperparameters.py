@@ -28,8 +28,16 @@ def estimate_hyperparameters(
     *,
     search: bool,
 ) -> Hyperparameters:
-    """Most probable for all cameras, from the views in use. before: a guess; moved (n, 3): how far the known points are
-    off, where that is known; search: for other lengthscales too."""
+    """The most probable hyperparameters of all cameras, eqs. (9) to (12).
+
+    Args:
+        training: What these cameras saw.
+        models: The cameras where they are linearised.
+        used: Per camera, the views to use.
+        before: A guess, or None.
+        moved: (n, 3) how far the known points are off, or None where that is not known.
+        search: Look for other lengthscales than those of the guess, too.
+    """
     found = Hyperparameters(np.ones((len(models), 2)), np.ones(len(models)), np.ones(len(models)))
     groups = []
     for numbers in _group_by_kind(models):

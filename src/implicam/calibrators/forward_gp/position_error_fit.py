@@ -23,12 +23,19 @@ from implicam.rig_model.tied import Scatter
 
 
 def separate_position_errors(training: Training, fitted: FitResult, shots: Names) -> FitResult:
-    """The rig where what the fit took for normal pixel noise is something else: errors of known positions if all
-    cameras agree on them, else heavy tails; else the same. shots: (n,) of the points.
+    """Tell errors of known positions and heavy tails from the pixel noise, for which the fit took them.
 
     Errors of positions come first. A dot that is off makes outliers in all cameras at once, which look like heavy tails
     to each of them; tails of the pixels, which cameras do not share, never look like dots that are off. What is
     declared is not estimated.
+
+    Args:
+        training: What all cameras saw.
+        fitted: A fit to it.
+        shots: (n,) name of each point's shot.
+
+    Returns:
+        The fit with errors of known positions if all cameras agree on them, or with heavy tails, or as it was.
     """
     if training.errors is not None and not training.errors.estimated:
         return refit_with_heavy_tails(training, fitted)
