@@ -26,12 +26,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from implicam.calibrators import Explicit, ForwardGP, InverseGP
-from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.coverage import assess
 from implicam.dataset import Camera, Observations
 from implicam.errors import ImplicamError
 from implicam.files import write_text
 from implicam.geometry import Pose, look_at, rotation_from_vector
+from implicam.lenses import BrownConrady, KannalaBrandt
 from implicam.simulate import Box, Rig, SimulatedCamera, Target, Window, simulate, views
 from implicam.simulate.camera import random_error
 from implicam.threads import blas_threads

@@ -15,7 +15,7 @@ from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, KINDS
 from implicam.dataset import Dataset, Observations, read_dataset
 from implicam.evaluation import cross_validate, evaluate
 from implicam.geometry import camera_from_linear, resect_affine, resect_robustly, rotation_from_vector
-from implicam.rig_model.camera import PERSPECTIVE_K
+from implicam.lenses import PERSPECTIVE_K
 from implicam.rig_model.general_camera import GeneralCamera
 from implicam.simulate import Unusual, build_rig, random_positions, simulate
 

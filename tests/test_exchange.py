@@ -13,11 +13,11 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.exchange import FORMATS, UNKNOWN, ExplicitCamera, Rig, dlt, export_cameras, import_cameras
 from implicam.exchange.colmap import MODELS
 from implicam.geometry import Pose, look_at, resect, rotation_from_vector
+from implicam.lenses import BrownConrady, KannalaBrandt
 
 DATA = Path(__file__).parent / "data" / "exchange"
 FILES = {

@@ -12,11 +12,10 @@ from scipy.optimize import least_squares
 
 from implicam.calibrators.explicit.adjust import Bundle, Placed, Views, _Normal, adjust
 from implicam.calibrators.explicit.boards import BoardView, boards_of
-from implicam.calibrators.explicit.lenses import as_brown_conrady
 from implicam.calibrators.explicit.zhang import calibrate_camera, planar_poses
-from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Pose, candidate_rays, rotation_from_vector
+from implicam.lenses import BrownConrady, KannalaBrandt
 from implicam.rig_model.camera import CentralCamera, Image, Prior
 from implicam.simulate import Rig, build_rig, simulate_boards
 
@@ -283,7 +282,7 @@ def test_a_named_lens_is_used_or_refused_with_the_reason() -> None:
     assert isinstance(found.camera.lens, BrownConrady)
     wide = CentralCamera(KannalaBrandt(300.0, 300.0, 640.0, 400.0), Pose(np.eye(3), np.zeros(3)))
     with pytest.raises(FitError, match="cannot look 84° off its axis"):
-        as_brown_conrady(wide, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.1]]))
+        BrownConrady.nearest(wide.lens, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.1]]))
 
 
 def test_corners_of_no_board_are_refused() -> None:

@@ -16,10 +16,10 @@ from implicam.calibrators.explicit import Explicit, ExplicitCalibration, rig_of
 from implicam.calibrators.explicit.boards import boards_of
 from implicam.calibrators.explicit.network import Network, calibrate_network
 from implicam.calibrators.explicit.zhang import calibrate_camera
-from implicam.cameras import BrownConrady
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
 from implicam.errors import FitError
 from implicam.geometry import Pose, poses_from_rays, resect_any_pixels, rotation_from_vector, vector_from_rotation
+from implicam.lenses import BrownConrady
 
 CASES = Path(__file__).parent / "data" / "cases"
 SIZE = (1280, 720)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from implicam.cameras import KannalaBrandt
 from implicam.geometry import Pose, rotation_from_vector
-from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera
+from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
+from implicam.rig_model.camera import CentralCamera
 from implicam.rig_model.general_camera import MIN_RHO, GeneralCamera
 
 RNG = np.random.default_rng(0)

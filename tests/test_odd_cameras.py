@@ -15,9 +15,9 @@ import pytest
 import tomli_w
 from scipy.optimize import minimize
 
-from implicam.cameras import BrownConrady, KannalaBrandt
 from implicam.errors import UsageError
 from implicam.geometry import Pose, look_at, rotation_from_vector
+from implicam.lenses import BrownConrady, KannalaBrandt
 from implicam.row_order import order_of
 from implicam.simulate import (
     Optics,

@@ -10,9 +10,9 @@ from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
 from forward_gp_cases import IMAGE, LENGTHSCALE, covariance_of, design, numeric, se
-from implicam.cameras import KannalaBrandt
 from implicam.geometry import look_at
-from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, Prior
+from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
+from implicam.rig_model.camera import CentralCamera, Prior
 from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.field import empty_field
 from implicam.rig_model.leave_one_out import left_out_residuals, squared_distances

@@ -21,7 +21,6 @@ import implicam.cli.simulate  # noqa: F401  the five register their commands
 from implicam import calibration_file
 from implicam.calibrators import DEFAULT_METHOD, Calibration, Explicit, InverseGP, calibrator, load_calibration
 from implicam.calibrators.explicit.boards import has_boards
-from implicam.calibrators.explicit.lenses import FAMILIES
 from implicam.cli import show
 from implicam.cli.app import (
     CALIBRATION_SUFFIX,
@@ -56,6 +55,7 @@ from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_
 from implicam.files import must_be_no_folder, toml_text
 from implicam.formatting import decimal_number
 from implicam.images import PATTERN
+from implicam.lenses import LENSES
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
 __all__ = ["EXAMPLES", "app"]
@@ -84,7 +84,7 @@ class _Wanted:
 
     def _likely(self) -> str:
         """The method that is meant where only its options are given."""
-        if self.boards or self.align or self.lens in FAMILIES:
+        if self.boards or self.align or self.lens in LENSES:
             return Explicit.method
         return InverseGP.method if (self.kernel or self.preset) and not self.lens else DEFAULT_METHOD
 

@@ -15,6 +15,7 @@ from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.exchange import anipose, colmap, dlt, kalibr, opencv
 from implicam.exchange.checks import read_text
 from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
+from implicam.lenses import BrownConrady, KannalaBrandt
 
 __all__ = ["FORMATS", "UNKNOWN", "ExplicitCamera", "Format", "Rig", "export_cameras", "import_cameras"]
 
@@ -29,6 +30,8 @@ class Format:
     write: Callable[[Rig, Path], list[str]]
     read: Callable[[Path], Rig]
     what: str
+    fits_lenses: bool = False
+    """Whether it fits its own camera to any lens; the others hold the two families of OpenCV as they are."""
 
 
 FORMATS = {
@@ -36,8 +39,8 @@ FORMATS = {
     "kalibr": Format(kalibr.write, kalibr.read, "Kalibr's camchain.yaml"),
     "colmap": Format(colmap.write, colmap.read, "COLMAP's text model, a folder"),
     "aniposelib": Format(anipose.write_aniposelib, anipose.read_aniposelib, "aniposelib's calibration.toml"),
-    "pose2sim": Format(anipose.write_pose2sim, anipose.read_pose2sim, "Pose2Sim's Calib.toml"),
-    "dlt": Format(dlt.write, dlt.read, "DLT coefficients as a CSV of DLTdv or easyWand"),
+    "pose2sim": Format(anipose.write_pose2sim, anipose.read_pose2sim, "Pose2Sim's Calib.toml", True),
+    "dlt": Format(dlt.write, dlt.read, "DLT coefficients as a CSV of DLTdv or easyWand", True),
 }
 
 
@@ -46,7 +49,15 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
 
     UsageError for a format that does not exist; DatasetError where it cannot hold the rig, with another that can.
     """
-    return _format(to).write(rig, Path(path))
+    form = _format(to)
+    for camera in rig.cameras:
+        if not (form.fits_lenses or isinstance(camera.lens, BrownConrady | KannalaBrandt)):
+            raise DatasetError(
+                f"camera {camera.name!r} has a {camera.lens.family} lens, which {to} does not know.",
+                why="it holds the two families of OpenCV, brown-conrady and kannala-brandt",
+                fix="calibrate with one of these, or export to dlt or pose2sim, which fit their own to it",
+            )
+    return form.write(rig, Path(path))
 
 
 def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | None = None) -> Rig:

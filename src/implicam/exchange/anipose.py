@@ -18,7 +18,6 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
-from implicam.cameras import KannalaBrandt, Lens
 from implicam.dataset.tables import naming, parse_toml
 from implicam.errors import DatasetError
 from implicam.exchange.checks import (
@@ -36,6 +35,7 @@ from implicam.exchange.fits import four_coefficients
 from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
 from implicam.files import toml_text, write_text
 from implicam.geometry import Pose, rotation_from_vector, vector_from_rotation
+from implicam.lenses import KannalaBrandt, Lens
 
 NOT_CAMERAS = ("metadata", "capture_volume", "charuco", "checkerboard")
 """Tables that Pose2Sim and others leave out when they look for cameras."""

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from implicam.cameras import BrownConrady, Floats, KannalaBrandt, Lens
 from implicam.errors import DatasetError, did_you_mean, import_extra
 from implicam.geometry import Pose
+from implicam.lenses import BrownConrady, Floats, KannalaBrandt, Lens
 
 MAX_BYTES = 1 << 18  # YAML takes seconds for more
 MAX_COEFFICIENTS = 14  # of OpenCV's largest lens model

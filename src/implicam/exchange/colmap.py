@@ -15,7 +15,6 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from implicam.cameras import KannalaBrandt, Lens
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError, did_you_mean
 from implicam.exchange.checks import MAX_CAMERAS, lens_from_numbers, numbers, read_text, shown
@@ -23,6 +22,7 @@ from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
 from implicam.files import replacing_folder
 from implicam.geometry import Pose
 from implicam.images import ENDINGS
+from implicam.lenses import KannalaBrandt, Lens
 
 CAMERAS, IMAGES, POINTS = "cameras.txt", "images.txt", "points3D.txt"
 MAX_BYTES = 1 << 26  # images.txt lists the points of every image

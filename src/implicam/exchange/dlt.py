@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from implicam.cameras import Floats
 from implicam.dataset.model import Camera
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
@@ -26,6 +25,7 @@ from implicam.exchange.checks import as_list, as_table, entry, numbers, read_tex
 from implicam.exchange.fits import Cost, nearest_matrix, pinhole_from_matrix
 from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.files import toml_text, write_text
+from implicam.lenses import Floats
 
 ORIGINS = ("upper-left", "lower-left")
 COEFFICIENTS = 11

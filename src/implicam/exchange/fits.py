@@ -12,10 +12,10 @@ import numpy as np
 from scipy.linalg import rq
 from scipy.optimize import least_squares
 
-from implicam.cameras import BrownConrady, Floats
 from implicam.errors import DatasetError
 from implicam.exchange.model import ExplicitCamera, has_distortion
 from implicam.geometry import Pose, rotation_from_vector
+from implicam.lenses import BrownConrady, Floats, KannalaBrandt
 
 LATTICE = 25
 """Pixels along each side of the image."""
@@ -91,10 +91,13 @@ def four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None
     at, valid = found.pixel_from_camera_point(rays)
     cost = Cost.between(at, uv) if valid.all() else Cost(np.inf, np.inf)
     if not cost.largest <= TOLERABLE:
+        known = isinstance(lens, BrownConrady | KannalaBrandt)
         raise DatasetError(
             f"camera {camera.name!r} cannot be written as {form}.",
             why=f"the nearest such lens is off by {cost.largest:.3g} px somewhere in the image",
-            fix="use a format that holds its lens: opencv, aniposelib or colmap",
+            fix="use a format that holds its lens: opencv, aniposelib or colmap"
+            if known
+            else "use dlt, or calibrate with brown-conrady or kannala-brandt",
         )
     return found, cost
 

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from implicam.cameras import Floats, KannalaBrandt, Lens
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
 from implicam.exchange.checks import (
@@ -39,6 +38,7 @@ from implicam.exchange.fits import four_coefficients
 from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.files import write_text
 from implicam.geometry import Pose
+from implicam.lenses import Floats, KannalaBrandt, Lens
 
 AGREE = 1e-5
 """How far T_cn_cnm1 and T_cam_world may be apart, as a part of the rig's size."""

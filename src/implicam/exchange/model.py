@@ -11,10 +11,10 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from implicam.cameras import Bools, BrownConrady, Floats, Lens
 from implicam.dataset.model import METRES, Camera
 from implicam.errors import DatasetError, did_you_mean
 from implicam.geometry import Pose
+from implicam.lenses import Bools, BrownConrady, Floats, Lens
 
 UNKNOWN = "unknown"
 """The length unit of a rig whose file does not say it."""

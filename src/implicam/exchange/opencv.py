@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 
-from implicam.cameras import Floats, KannalaBrandt
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
 from implicam.exchange.checks import (
@@ -41,6 +40,7 @@ from implicam.exchange.checks import (
 from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
 from implicam.files import write_text
 from implicam.geometry import Pose, rotation_from_vector
+from implicam.lenses import Floats, KannalaBrandt
 
 
 def write(rig: Rig, path: Path) -> list[str]:

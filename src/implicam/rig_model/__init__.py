@@ -9,7 +9,6 @@ of it by what `settings` take for usual and for clear. The mathematics: docs/met
 """
 
 from implicam.rig_model.camera import (
-    PERSPECTIVE_K,
     CentralCamera,
     Image,
     Prior,
@@ -44,7 +43,6 @@ from implicam.rig_model.triangulate import locate
 __all__ = [
     "MAX_NAMED_IN_NOTE",
     "MIN_POINTS_PER_CAMERA",
-    "PERSPECTIVE_K",
     "CameraModel",
     "CameraViews",
     "CentralCamera",

@@ -11,18 +11,9 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from implicam.cameras import BrownConrady, KannalaBrandt, Lens
 from implicam.geometry import Floats, Pose, camera_centre, rotation_from_vector
+from implicam.lenses import Lens
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
-
-PERSPECTIVE_K = np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
-"""k1 ... k4 of a perspective lens: tan(t) = t + t^3/3 + 2 t^5/15 + ..."""
-
-BROWN_PRIOR_SD, BROWN_AT_EDGE_PRIOR_SD = np.array([0.5, 0.5, 0.3]), np.array([0.4, 0.3, 0.15])
-"""Prior sd of k1, k2, k3 of a Brown-Conrady lens, about none, and of what each term may do at the edge of the image."""
-
-DECENTRING_PRIOR_SD = 0.005
-"""Prior sd of p1 and p2."""
 
 
 class Image(NamedTuple):
@@ -117,29 +108,19 @@ class CentralCamera:
         precision[:2, :2] = aspect * np.array([[1, -1], [-1, 1]])
         mean[2:4] = image.centre
         precision[2, 2] = precision[3, 3] = 1 / (settings.centre_prior_sd_sides * 2 * image.half) ** 2
-        if isinstance(self.lens, KannalaBrandt):
-            at_edge = settings.distortion_at_edge_prior_sd / widest ** np.array([2, 4, 6, 8])
-            own = np.minimum(settings.distortion_prior_sd, at_edge)
-            mean[4:8] = 0.5 * PERSPECTIVE_K
-            precision[4:8, 4:8] = np.linalg.inv(np.diag(own**2) + 0.25 * np.outer(PERSPECTIVE_K, PERSPECTIVE_K))
-        else:
-            radial = np.minimum(
-                BROWN_PRIOR_SD, BROWN_AT_EDGE_PRIOR_SD / np.tan(min(widest, 1.5)) ** np.array([2, 4, 6])
-            )
-            sd = np.array([radial[0], radial[1], DECENTRING_PRIOR_SD, DECENTRING_PRIOR_SD, radial[2]])
-            precision[range(4, 9), range(4, 9)] = 1 / sd**2
+        own = slice(4, self.size - 6)
+        mean[own], precision[own, own] = self.lens.distortion_prior(widest, settings.distortion_sds(self.lens.family))
         return Prior(mean, precision)
 
     def as_array(self) -> Floats:
-        """Lens parameters, rotation and translation: (20,) of Kannala-Brandt, (21,) of Brown-Conrady."""
+        """(p + 12,) the p lens parameters, rotation and translation; which lens they are of is said beside it."""
         return np.concatenate([lens_parameters(self.lens), self.pose.rotation.ravel(), self.pose.translation])
 
     @classmethod
-    def from_array(cls, array: Floats) -> CentralCamera:
-        """The inverse of `as_array`; ValueError for what is none."""
-        lens = {20: KannalaBrandt, 21: BrownConrady}.get(len(array))
-        if lens is None:
-            raise ValueError(f"{len(array)} numbers are no camera")
+    def from_array(cls, array: Floats, lens: type[Lens]) -> CentralCamera:
+        """The inverse of `as_array`, with a lens of this family; ValueError for what is none."""
+        if len(array) != len(fields(lens)) + 12:
+            raise ValueError(f"an array of {len(array)} numbers is no {lens.family} lens with its pose")
         rotation = array[-12:-3].reshape(3, 3)
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
             raise ValueError("a camera's rotation is not one")

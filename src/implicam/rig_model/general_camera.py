@@ -21,9 +21,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from implicam.cameras import KannalaBrandt
 from implicam.geometry import Floats, Pose, rotation_from_vector
-from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, ProjectiveCamera, View, cross
+from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
+from implicam.rig_model.camera import CentralCamera, ProjectiveCamera, View, cross
 
 MIN_FOCAL_PX = 0.1
 """A picture smaller than a pixel: every point is in one place, which fits anything equally badly."""

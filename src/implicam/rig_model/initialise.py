@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, resect, resect_any_lens
-from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera, Image, Prior, ProjectiveCamera
+from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
+from implicam.rig_model.camera import CentralCamera, Image, Prior, ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.field import empty_field
 from implicam.rig_model.general_camera import AnyCamera

@@ -15,6 +15,8 @@ from dataclasses import Field, asdict, dataclass, fields
 from typing import Any, Self
 
 from implicam.errors import UsageError, did_you_mean
+from implicam.lenses import DistortionSds, KannalaBrandt
+from implicam.lenses.kannala_brandt import AT_EDGE_PRIOR_SD, PRIOR_SD
 
 BELOW_ONE = ("_share", "_probability", "_p_value", "_p_values", "error_bar_level")
 """What a setting's name ends in where its value must be below one."""
@@ -33,9 +35,9 @@ class RigModelSettings:
     """The same of a linear projection, which leaves the lens to its field."""
 
     # priors of cameras, eqs. (3) and (4); those of single lens families are with the lenses
-    distortion_prior_sd: tuple[float, float, float, float] = (0.15, 0.1, 0.05, 0.02)
+    distortion_prior_sd: tuple[float, float, float, float] = PRIOR_SD
     """Prior sd of k1 ... k4 of a Kannala-Brandt lens, about the line from an equidistant to a perspective one."""
-    distortion_at_edge_prior_sd: tuple[float, float, float, float] = (0.15, 0.1, 0.07, 0.05)
+    distortion_at_edge_prior_sd: tuple[float, float, float, float] = AT_EDGE_PRIOR_SD
     """Prior sd of what each term may do at the edge of the image, as a part of the radius: it tames fisheyes."""
     log_aspect_prior_sd: float = 0.002
     """Prior sd of log(fy / fx) of an ordinary camera: pixels are square."""
@@ -174,6 +176,11 @@ class RigModelSettings:
     """By how much error bars may be too small without an alarm."""
     max_independent_points: int = 50
     """Points of a table that count as independent at most: all share what is not known of the cameras."""
+
+    def distortion_sds(self, family: str) -> DistortionSds | None:
+        """What these settings say of the distortion of a family of lenses; None where its own numbers hold."""
+        known = family == KannalaBrandt.family
+        return (self.distortion_prior_sd, self.distortion_at_edge_prior_sd) if known else None
 
     def __post_init__(self) -> None:
         for field in fields(self):

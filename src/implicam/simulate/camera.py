@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.cameras import Lens
 from implicam.dataset import Floats
 from implicam.geometry import Pose, rotation_from_vector
+from implicam.lenses import Lens
 from implicam.simulate.window import Window
 
 WAVES = 64

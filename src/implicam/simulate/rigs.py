@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from implicam.cameras import BrownConrady, KannalaBrandt, Lens
 from implicam.dataset import Floats
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Pose, look_at, rotation_from_vector
+from implicam.lenses import BrownConrady, KannalaBrandt, Lens
 from implicam.simulate.camera import SimulatedCamera, random_error
 from implicam.simulate.window import Window
 

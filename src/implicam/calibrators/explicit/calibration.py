@@ -20,7 +20,7 @@ from implicam.calibrators.explicit.align import MATCHING
 from implicam.calibrators.explicit.boards import boards_of, has_boards
 from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_boards_alone, fit_to_points
 from implicam.calibrators.explicit.from_boards import fit_to_boards
-from implicam.calibrators.explicit.lenses import AUTO, FAMILIES
+from implicam.calibrators.explicit.lenses import AUTO
 from implicam.calibrators.explicit.network import Groups, calibrate_groups
 from implicam.calibrators.protocol import (
     Arrays,
@@ -35,6 +35,7 @@ from implicam.dataset import Dataset
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
+from implicam.lenses import LENSES
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig
@@ -51,7 +52,7 @@ class Explicit(CalibratorBase):
     the closest ones as in the paper. seed changes nothing: no part of this method is left to chance.
     """
 
-    lens: str = field(default=AUTO, metadata=option(f"auto, {', '.join(FAMILIES)}"))
+    lens: str = field(default=AUTO, metadata=option(f"auto, {', '.join(LENSES)}"))
     align: str = field(default=MATCHING[0], metadata=option("known points match boards by name (points), or icp"))
     seed: int = 0
     boards: Dataset | None = field(
@@ -61,7 +62,7 @@ class Explicit(CalibratorBase):
     method: ClassVar[str] = "explicit"
 
     def __post_init__(self) -> None:
-        for what, value, known in (("lens", self.lens, (AUTO, *FAMILIES)), ("align", self.align, MATCHING)):
+        for what, value, known in (("lens", self.lens, (AUTO, *LENSES)), ("align", self.align, MATCHING)):
             if value not in known:
                 raise UsageError(
                     f"explicit has no {what} {value!r}{did_you_mean(value, known)}.",
@@ -71,7 +72,7 @@ class Explicit(CalibratorBase):
     @classmethod
     def variants(cls) -> dict[str, dict[str, Any]]:
         """The lenses."""
-        return {lens: {"lens": lens} for lens in (AUTO, *FAMILIES)}
+        return {lens: {"lens": lens} for lens in (AUTO, *LENSES)}
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
         """Fit to the known points; or to the boards, and then to the known points.

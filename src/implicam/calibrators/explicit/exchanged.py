@@ -6,7 +6,7 @@ import numpy as np
 
 from implicam.calibrators.explicit.calibration import Explicit, ExplicitCalibration
 from implicam.calibrators.explicit.fitted import Fitted, posterior_of
-from implicam.calibrators.explicit.lenses import Choice, name_of
+from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.protocol import Calibration, RigCalibration
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import UsageError
@@ -113,7 +113,7 @@ def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
         frame,
         tuple(range(len(described))),
         posterior_of(models, np.zeros((1, sum(model.camera.size for model in models)))),
-        tuple(Choice(name_of(model.camera), {}) for model in models if isinstance(model.camera, CentralCamera)),
+        tuple(Choice(model.camera.lens.family, {}) for model in models if isinstance(model.camera, CentralCamera)),
         np.zeros((0, 3)),
         np.zeros((0, 3)),
         (),

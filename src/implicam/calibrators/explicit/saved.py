@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.explicit.fitted import Fitted
-from implicam.calibrators.explicit.lenses import FAMILIES, USUAL_PIXELS, Choice, name_of
+from implicam.calibrators.explicit.lenses import USUAL_PIXELS, Choice
 from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.unused import Rejected, Unused
+from implicam.lenses import LENSES
 from implicam.rig_model import (
     CameraModel,
     CentralCamera,
@@ -115,9 +116,12 @@ def _trained(data: Dataset, boards: Dataset | None) -> Any:
 
 
 def _model(arrays: Arrays, number: int, sizes: NDArray[np.float64], lens: str) -> CameraModel:
-    camera = CentralCamera.from_array(finite_column(arrays, f"{number}/camera", arrays[f"{number}/camera"].shape))
-    if lens not in FAMILIES or name_of(camera) != lens or not camera.sane:
-        raise ValueError(f"camera {number} is no {lens} lens")
+    if lens not in LENSES:
+        raise ValueError(f"camera {number} has a lens {lens!r}; this version knows {', '.join(LENSES)}")
+    numbers = finite_column(arrays, f"{number}/camera", arrays[f"{number}/camera"].shape)
+    camera = CentralCamera.from_array(numbers, LENSES[lens])
+    if not camera.sane:
+        raise ValueError(f"camera {number} is inside out")
     noise, *centre, half = sizes.tolist()
     if not (noise > 0 and half > 0):
         raise ValueError("noise and image size must be positive")

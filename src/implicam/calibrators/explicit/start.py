@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
+from implicam.calibrators.explicit.lenses import START_FAMILY, Choice, angles, choose_lens, clipped, with_lens
 from implicam.calibrators.explicit.pixels import (
     ASPECTS,
     MAX_USUAL_GAIN_NATS,
@@ -22,12 +22,11 @@ from implicam.calibrators.explicit.pixels import (
     prior_of,
     square,
 )
-from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, resect_any_pixels
+from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
 from implicam.rig_model import (
     MIN_POINTS_PER_CAMERA,
-    PERSPECTIVE_K,
     CentralCamera,
     Image,
     InitialCamera,
@@ -74,14 +73,14 @@ def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tu
     first = _resected(points, uv, image)
     _check_mirror(first, points, uv, image)
     tried = _with_pixels([first], points, uv, image)
-    bent = tried[0]
 
-    def perspective() -> _Candidate:
-        starts = [one._replace(camera=as_brown_conrady(one.camera, points[one.inliers])) for one in tried]
+    def with_family(name: str) -> _Candidate:
+        if name == START_FAMILY:
+            return tried[0]
+        starts = [one._replace(camera=with_lens(one.camera, name, points[one.inliers])) for one in tried]
         return _with_pixels(starts, points, uv, image)[0]
 
-    candidates = {"kannala-brandt": lambda: bent, "brown-conrady": perspective}
-    found, choice = chosen(family, candidates, lambda one: _held_out(one.started, points, uv, image))
+    found, choice = choose_lens(family, with_family, lambda one: _held_out(one.started, points, uv, image))
     return found.started, choice._replace(pixels=found.pixels.name)
 
 

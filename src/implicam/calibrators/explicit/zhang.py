@@ -7,7 +7,7 @@ lens, and the wrong ones fit worse. The best rung starts a bundle adjustment of 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from implicam.calibrators.explicit.adjust import (
     spreads,
 )
 from implicam.calibrators.explicit.boards import MIN_CORNERS, BoardView, renumbered
-from implicam.calibrators.explicit.lenses import Choice, angles, as_brown_conrady, chosen, clipped
+from implicam.calibrators.explicit.lenses import START_FAMILY, Choice, angles, choose_lens, clipped, with_lens
 from implicam.calibrators.explicit.pixels import (
     ASPECTS,
     MAX_USUAL_GAIN_NATS,
@@ -35,10 +35,10 @@ from implicam.calibrators.explicit.pixels import (
     prior_of,
     square,
 )
-from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, candidate_rays, rotation_from_vector
-from implicam.rig_model import PERSPECTIVE_K, CentralCamera, Image, Prior
+from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
+from implicam.rig_model import CentralCamera, Image, Prior
 
 MAX_BOARDS_FOR_LENS = 30
 """Boards that the lens is looked for with; the adjustment has them all."""
@@ -88,12 +88,13 @@ def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> t
             fix="look at the overlays of its pictures (detections/), and take out those with wrong corners",
         )
 
-    def perspective() -> _Candidate:
-        camera = as_brown_conrady(first.bundle.cameras[0], first.bundle.corners(0))
+    def with_family(name: str) -> _Candidate:
+        if name == START_FAMILY:
+            return first
+        camera = with_lens(first.bundle.cameras[0], name, first.bundle.corners(0))
         return _with_pixels([(camera, first.bundle.boards)], first.bundle.views, image)
 
-    candidates: dict[str, Callable[[], _Candidate]] = {"kannala-brandt": lambda: first, "brown-conrady": perspective}
-    found, choice = chosen(family, candidates, lambda one: _held_out(one.adjusted))
+    found, choice = choose_lens(family, with_family, lambda one: _held_out(one.adjusted))
     one = OneCamera(found.bundle.cameras[0], found.bundle.boards, float(spreads(found.bundle)[0]), pixels=found.pixels)
     return one, choice._replace(pixels=found.pixels.name)
 

@@ -20,7 +20,6 @@ from implicam.calibrators.forward_gp.families import (
     widest_angle,
 )
 from implicam.calibrators.forward_gp.settings import KINDS, ForwardGPSettings
-from implicam.cameras import KannalaBrandt
 from implicam.errors import FitError
 from implicam.geometry import (
     Bools,
@@ -32,7 +31,8 @@ from implicam.geometry import (
     resect_any_lens,
     resect_robustly,
 )
-from implicam.rig_model.camera import PERSPECTIVE_K, CentralCamera
+from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
+from implicam.rig_model.camera import CentralCamera
 from implicam.rig_model.general_camera import MIN_RHO, RHO, AnyCamera, GeneralCamera
 from implicam.rig_model.initialise import InitialCamera, levenberg_marquardt
 from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA

@@ -19,7 +19,8 @@ from implicam.calibrators.forward_gp.evidence import (
 )
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.geometry import Bools, Floats
-from implicam.rig_model.camera import PERSPECTIVE_K, Image, Prior
+from implicam.lenses import PERSPECTIVE_K
+from implicam.rig_model.camera import Image, Prior
 from implicam.rig_model.field import DepthScale, field_coordinates
 from implicam.rig_model.general_camera import CENTRE, KAPPA, MIN_RHO, RHO, GeneralCamera
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset
 from implicam.geometry import Floats
 from implicam.gp.low_rank import LowRank
+from implicam.lenses import KannalaBrandt
 from implicam.rig_model.camera import CentralCamera, Image, Prior, ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.field import DepthScale, Hyperparameters, field_kernel
@@ -68,10 +70,12 @@ def state(fitted: FitResult, names: Sequence[str]) -> tuple[dict[str, Any], dict
     return table, arrays
 
 
-CAMERAS: dict[str, type[CentralCamera] | type[GeneralCamera] | type[ProjectiveCamera]] = {
-    kind.kind: kind for kind in (CentralCamera, GeneralCamera, ProjectiveCamera)
+CAMERAS: dict[str, tuple[Callable[[Floats], CentralCamera | GeneralCamera | ProjectiveCamera], int, str]] = {
+    CentralCamera.kind: (partial(CentralCamera.from_array, lens=KannalaBrandt), 20, KannalaBrandt.family),
+    GeneralCamera.kind: (GeneralCamera.from_array, 24, KannalaBrandt.family),
+    ProjectiveCamera.kind: (ProjectiveCamera.from_array, 12, "none"),
 }
-"""Name in a file -> camera model."""
+"""Name of a camera model in a file -> how it is read, from how many numbers, and the lens that the file must name."""
 
 
 def _described(fitted: FitResult, number: int, name: str) -> dict[str, Any]:
@@ -79,7 +83,7 @@ def _described(fitted: FitResult, number: int, name: str) -> dict[str, Any]:
     ordinary camera would have left."""
     model = fitted.posterior.models[number]
     mirrored = isinstance(model.camera, GeneralCamera) and model.camera.mirrored
-    lens = "none" if isinstance(model.camera, ProjectiveCamera) else "kannala-brandt"
+    lens = CAMERAS[model.camera.kind][2]
     table = {"name": name, "model": model.camera.kind, "lens": lens, "kind": model.family, "mirrored": mirrored}
     left = fitted.left_by_ordinary(number)
     return table | ({"ordinary_would_leave_px": left} if np.isfinite(left) else {})
@@ -188,13 +192,13 @@ def _shot_errors(
 def _model(
     described: Mapping[str, Any], arrays: Arrays, number: int, sizes: Floats, lengthscale: Floats
 ) -> tuple[CameraModel, Floats]:
-    kind, family = CAMERAS[str(described["model"])], str(described["kind"])
+    family = str(described["kind"])
     if family not in (*KINDS, "none"):
         raise ValueError(f"{family!r} is no kind of camera")
-    numbers = {"central": (20,), "general": (24,), "none": (12,)}[kind.kind]
-    camera, field_camera = (
-        kind.from_array(finite_column(arrays, f"{number}/{what}", numbers)) for what in ("camera", "ruler")
-    )
+    read, numbers, lens = CAMERAS[str(described["model"])]
+    if described["lens"] != lens:
+        raise ValueError(f"a camera of the model {described['model']!r} has the lens {lens}, not {described['lens']!r}")
+    camera, field_camera = (read(finite_column(arrays, f"{number}/{what}", (numbers,))) for what in ("camera", "ruler"))
     m = len(arrays[f"{number}/inducing"])
     inducing = finite_column(arrays, f"{number}/inducing", (m, 3))
     weights = finite_column(arrays, f"{number}/weights", (m, 2))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from implicam.cameras import BrownConrady, KannalaBrandt, Lens
+from implicam.lenses import LENSES as LENS_FAMILIES
+from implicam.lenses import BrownConrady, KannalaBrandt, Lens
+from toy_lens import Equisolid
 
 LENSES: dict[str, Lens] = {
     "pinhole": BrownConrady(900.0, 910.0, 640.0, 400.0),
@@ -18,6 +22,8 @@ LENSES: dict[str, Lens] = {
     "equidistant": KannalaBrandt(430.0, 432.0, 640.0, 400.0),
     "fisheye": KannalaBrandt(433.0, 431.0, 630.0, 405.0, -0.02, 0.004, -1e-3, 2e-4),
     "folding fisheye": KannalaBrandt(433.0, 431.0, 630.0, 405.0, -0.15, 0.01, 0.0, 0.0),
+    "equisolid": Equisolid(433.0, 431.0, 630.0, 405.0, -0.02, 0.004, -1e-3, 2e-4),
+    "folding equisolid": Equisolid(433.0, 431.0, 630.0, 405.0, -0.15),
 }
 
 
@@ -142,7 +148,38 @@ def test_a_fisheye_sees_behind_itself() -> None:
     np.testing.assert_allclose(uv[0], [100 * theta, 0], atol=1e-10)
 
 
+def test_parameter_jacobian_is_the_derivative(lens: Lens) -> None:
+    points = inside(lens, 7, part=0.9)
+    at = np.array(astuple(lens))
+    for column, exact in enumerate(np.moveaxis(lens.parameter_jacobian(points), 2, 0)):
+        h = 1e-6 * max(abs(at[column]), 1e-2) * np.eye(len(at))[column]
+        up, down = (type(lens)(*(at + s * h).tolist()).pixel_from_camera_point(points)[0] for s in (1, -1))
+        both = np.isfinite(up) & np.isfinite(down)
+        np.testing.assert_allclose(((up - down) / (2 * h[column]))[both], exact[both], rtol=1e-5, atol=1e-4)
+
+
+def test_the_prior_of_the_distortion_is_a_normal_one(lens: Lens) -> None:
+    for widest in (0.1, 0.7, 1.8):
+        mean, precision = lens.distortion_prior(widest)
+        assert mean.shape == (len(astuple(lens)) - 4,)
+        np.testing.assert_allclose(precision, precision.T)
+        assert np.linalg.eigvalsh(precision).min() > 0
+
+
+@pytest.mark.parametrize("family", ["brown-conrady", "kannala-brandt", "equisolid"])
+def test_the_nearest_lens_of_a_family_is_near_within_its_narrow_field(lens: Lens, family: str) -> None:
+    kind = {"equisolid": Equisolid, **LENS_FAMILIES}[family]
+    points = inside(lens, 8)
+    points = points[np.hypot(points[:, 0], points[:, 1]) < np.tan(0.2) * points[:, 2]]
+    found = kind.nearest(lens, points)
+    assert isinstance(found, kind)
+    off = found.pixel_from_camera_point(points)[0] - lens.pixel_from_camera_point(points)[0]
+    assert np.abs(off).max() < 1.0
+
+
 def test_agrees_with_opencv(lens: Lens) -> None:
+    if isinstance(lens, Equisolid):
+        pytest.skip("OpenCV has no such lens")
     points = inside(lens, 6)
     points = points[points[:, 2] > 0.05 * np.linalg.norm(points, axis=1)]  # OpenCV stays in front of the camera
     matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])

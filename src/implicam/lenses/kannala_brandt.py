@@ -1,0 +1,155 @@
+"""The lens whose image radius is a polynomial of the angle to the axis, as OpenCV's fisheye model defines it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from implicam.lenses.base import (
+    Bools,
+    DistortionSds,
+    Floats,
+    Lens,
+    check_rays,
+    fit_lens,
+    pixel_from_plane,
+    plane_from_pixel,
+)
+from implicam.lenses.polynomials import (
+    divide,
+    first_turning_point,
+    invert_odd_polynomial,
+    odd_polynomial,
+    odd_polynomial_slope,
+)
+
+PERSPECTIVE_K = np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
+"""k1 ... k4 of a perspective lens: tan(t) = t + t^3/3 + 2 t^5/15 + ..."""
+
+PRIOR_SD, AT_EDGE_PRIOR_SD = (0.15, 0.1, 0.05, 0.02), (0.15, 0.1, 0.07, 0.05)
+"""Prior sd of k1 ... k4 off that line, and of what each term may do at the edge of the image."""
+
+
+@dataclass(frozen=True)
+class KannalaBrandt:
+    """Lens whose image radius is a polynomial of the angle to the axis; from telephoto to fisheye beyond 180°.
+
+    fx, fy, cx, cy in pixels. Formula: OpenCV, "Fisheye camera model", with zero skew.
+    """
+
+    family: ClassVar[str] = "kannala-brandt"
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    def pixel_from_camera_point(self, points: Floats) -> tuple[Floats, Bools]:
+        """As `BrownConrady.pixel_from_camera_point`; a lens that bends so far sees points behind the camera."""
+        at = self._polar(points)
+        return pixel_from_plane(self, at.xyz[:, :2] * at.across[:, None]), at.valid
+
+    def jacobian(self, points: Floats) -> Floats:
+        """(n, 2, 3) derivative of the pixels with respect to the points; NaN where there is no pixel."""
+        return self._by_point(self._polar(points))
+
+    def parameter_jacobian(self, points: Floats) -> Floats:
+        """(n, 2, 8) derivative of the pixels with respect to fx, fy, cx, cy, k1 ... k4; NaN where there is no pixel."""
+        return self._by_parameters(self._polar(points))
+
+    def pixel_and_slopes(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """Pixels, `jacobian` and `parameter_jacobian` at once, in half the time."""
+        at = self._polar(points)
+        pixel = pixel_from_plane(self, at.xyz[:, :2] * at.across[:, None])
+        return pixel, self._by_point(at), self._by_parameters(at)
+
+    def _by_point(self, at: _Polar) -> Floats:
+        x, y, z = at.xyz.T
+        cos, sin = at.outward.T
+        slope = odd_polynomial_slope(at.theta, self._radial) / (at.r * at.r + z * z)
+        along = slope * z  # away from the axis
+        out = np.empty((len(x), 2, 3))
+        out[:, 0, 0] = along * cos * cos + at.across * sin * sin
+        out[:, 1, 1] = along * sin * sin + at.across * cos * cos
+        out[:, 0, 1] = out[:, 1, 0] = (along - at.across) * cos * sin
+        out[:, 0, 2], out[:, 1, 2] = -slope * x, -slope * y
+        jacobian: Floats = np.array([self.fx, self.fy])[:, None] * out
+        return jacobian
+
+    def _by_parameters(self, at: _Polar) -> Floats:
+        out = np.zeros((len(at.xyz), 2, 8))
+        diagonal = at.outward * at.bent[:, None]
+        out[:, 0, 0], out[:, 1, 1] = diagonal.T
+        out[:, 0, 2] = out[:, 1, 3] = np.where(np.isnan(at.theta), np.nan, 1.0)
+        power = at.outward * [self.fx, self.fy] * at.theta[:, None]
+        squared = (at.theta * at.theta)[:, None]
+        for k in range(4, 8):
+            power = power * squared
+            out[:, :, k] = power
+        return out
+
+    def ray_from_pixel(self, uv: Floats) -> tuple[Floats, Bools]:
+        """Unit rays (n, 3) in the camera frame of pixels (n, 2); and (n,) where they exist, else NaN."""
+        bent = plane_from_pixel(self, uv)
+        radius = np.hypot(*bent.T)
+        theta = invert_odd_polynomial(radius, self._radial, self._critical_angle)
+        rays = np.column_stack([bent * divide(np.sin(theta), radius, 1.0)[:, None], np.cos(theta)])
+        return check_rays(self, rays, uv)
+
+    def distortion_prior(self, widest: float, sds: DistortionSds | None = None) -> tuple[Floats, Floats]:
+        """As of `Lens`: about the line from an equidistant to a perspective lens, eq. (3) of docs/method.md."""
+        own, at_edge = sds or (PRIOR_SD, AT_EDGE_PRIOR_SD)
+        sd = np.minimum(own, at_edge / widest ** np.array([2, 4, 6, 8]))
+        covariance = np.diag(sd**2) + 0.25 * np.outer(PERSPECTIVE_K, PERSPECTIVE_K)
+        return 0.5 * PERSPECTIVE_K, np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+
+    @classmethod
+    def nearest(cls, lens: Lens, points: Floats) -> KannalaBrandt:
+        """As of `Lens`; one of this family is itself."""
+        if isinstance(lens, cls):
+            return lens
+        k = PERSPECTIVE_K.tolist() if lens.pixel_from_camera_point(points)[1].all() else []
+        return fit_lens(cls(lens.fx, lens.fy, lens.cx, lens.cy, *k), points, lens.pixel_from_camera_point(points)[0])
+
+    @property
+    def _radial(self) -> tuple[float, ...]:
+        return self.k1, self.k2, self.k3, self.k4
+
+    @cached_property
+    def _critical_angle(self) -> float:
+        return min(first_turning_point(self._radial), float(np.pi))
+
+    def _polar(self, points: Floats) -> _Polar:
+        r = np.hypot(points[:, 0], points[:, 1])
+        theta = np.arctan2(r, points[:, 2])
+        valid = (theta < self._critical_angle) & points.any(axis=1)
+        xyz = points
+        if not valid.all():
+            xyz = np.where(valid[:, None], points, np.nan)
+            r, theta = np.where(valid, r, np.nan), np.where(valid, theta, np.nan)
+        bent = odd_polynomial(theta, self._radial)
+        if (r > 0).all():
+            return _Polar(xyz, valid, r, theta, bent, bent / r, xyz[:, :2] / r[:, None])
+        across = divide(bent, r, 1 / np.where(r > 0, 1.0, xyz[:, 2]))
+        outward = np.column_stack([divide(xyz[:, 0], r, 1.0), divide(xyz[:, 1], r, 0.0)])  # on the axis any will do
+        return _Polar(xyz, valid, r, theta, bent, across, outward)
+
+
+class _Polar(NamedTuple):
+    """Of points xyz (n, 3), NaN where not valid (n,): how far off the axis r, at which angle theta, the image's radius
+    bent, bent / r, and the direction away from the axis (n, 2)."""
+
+    xyz: Floats
+    valid: Bools
+    r: Floats
+    theta: Floats
+    bent: Floats
+    across: Floats
+    outward: Floats
