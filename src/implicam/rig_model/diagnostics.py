@@ -13,7 +13,7 @@ from implicam.dataset.unused import Rejected, Unused
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.leave_one_out import left_out_points, left_out_positions, left_out_residuals
+from implicam.rig_model.leave_one_out import left_out_points, left_out_positions, left_out_residuals, left_out_views
 from implicam.rig_model.training_data import Frame, camera_views_of, stated_noise
 
 MAX_NAMED_IN_NOTE = 5
@@ -64,7 +64,8 @@ class Diagnosis:
         if fitted.position_errors is not None:
             error, cov = left_out_points(fitted, self._points, seen)
         else:
-            error, cov = left_out_positions(fitted.posterior, self._points, seen, fitted.inliers)
+            views = left_out_views(fitted.posterior, self._points, seen, fitted.inliers)
+            error, cov = left_out_positions(views, fitted.inliers, len(self._points))
             measured = np.isfinite(error[:, 0])
             error, cov = error[measured], cov[measured]
         return error * self.frame.scale, np.sqrt(np.diagonal(cov, axis1=1, axis2=2)) * self.frame.scale

@@ -130,6 +130,11 @@ class LeftOutViews(NamedTuple):
     variance_ratio: Floats
 
     @property
+    def squared_distance(self) -> Floats:
+        """(n,) of each view from its prediction, in the covariance of this."""
+        return np.asarray(np.einsum("ni,nij,nj->n", self.residual, self.inverse, self.residual), dtype=np.float64)
+
+    @property
     def information(self) -> Floats:
         """(n, 3, 3) what each view says of the displacement of its point."""
         return np.asarray(self.slope.swapaxes(1, 2) @ self.inverse @ self.slope, dtype=np.float64)
@@ -166,28 +171,24 @@ def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: i
         information, pull = view.information, view.pull
         total.information[rows] += information[k]
         total.pull[rows] += pull[k]
-        total.squares[rows] += np.einsum("ni,nij,nj->n", view.residual, view.inverse, view.residual)[k]
+        total.squares[rows] += view.squared_distance[k]
         total.coordinates[rows] += 2
         largest[rows] = np.maximum(largest[rows], view.variance_ratio[k])
     return total, largest
 
 
-def left_out_positions(
-    posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
-) -> tuple[Floats, Floats]:
+def left_out_positions(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Floats, Floats]:
     """How far each known point is measured off its position by views predicted without it, eq. (18).
 
     Args:
-        posterior: What is known of the cameras.
-        points: Known positions (n, 3) in the working frame.
-        seen: Per camera, what it saw.
-        inliers: Per camera (n seen,), the views in use.
+        views: Per camera, predicted without themselves.
+        inliers: Per camera, which of them are in use.
+        n: Number of known points.
 
     Returns:
         Errors (n, 3) and their covariances (n, 3, 3) in the working frame; NaN where fewer than two cameras see it.
     """
-    n = len(points)
-    total, _ = sum_over_cameras(left_out_views(posterior, points, seen, inliers), inliers, n)
+    total, _ = sum_over_cameras(views, inliers, n)
     information = np.where(np.isfinite(total.information), total.information, 0.0)
     values = np.linalg.eigvalsh(information)
     good = (total.coordinates >= 4) & (values[:, 0] > MIN_INFORMATION_RATIO * values[:, 2])

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.normal_equations import NormalEquations, camera_normals, name_failing_camera, solve_normal
-from implicam.rig_model.schur import ShotSchurBlock, Unknowns, views_by_shots
+from implicam.rig_model.schur import ShotSchurBlock, Unknowns, eliminate, unknowns_given_cameras, views_by_shots
 from implicam.rig_model.shot_errors import ShotErrors
 
 
@@ -133,14 +133,18 @@ def _condition_tied(
             alone.append(solve_normal(normal.A, normal.b)[0])
     for each in parts:
         block = kept or meeting(*each)
-        squares, logs = block.eliminate(A, b)
-        value += squares - logs
+        half, squares_less_logs = eliminate(block.H, block.rest)
+        A -= half[:, :-1].T @ half[:, :-1]
+        b -= half[:, :-1].T @ half[:, -1]
+        value += squares_less_logs
     joint, mean, log_determinant = solve_normal(A, b)
     value += float(b @ mean) - log_determinant
     means = np.split(mean, ends[:-1])
     found = np.concatenate([(kept or meeting(*each)).unknowns(mean) for each in parts])
     displacement = np.asarray(np.einsum("nik,nk->ni", errors.scaled, found[errors.shot]), dtype=np.float64)
-    unknowns = kept.all_unknowns(mean, joint) if kept is not None and errors.estimated else None
+    unknowns = None
+    if kept is not None and errors.estimated:
+        unknowns = unknowns_given_cameras(block_diag(*kept.H), np.concatenate(kept.rest), mean, joint)
     return Posterior(
         move_to_mean(models, means), tuple(alone), joint, _steps(models, means), 0.5 * value, unknowns, displacement
     )

@@ -61,31 +61,47 @@ class ShotSchurBlock(NamedTuple):
         assert H.shape == (S, k, k)
         return cls(H, np.sum([one.g for one in found], axis=0), np.concatenate([one.G for one in found], axis=2))
 
-    def eliminate(self, A: Floats, b: Floats) -> tuple[float, float]:
-        """Take the shots out of the cameras' normal equations, eq. (15); what they add to the evidence."""
-        L = np.linalg.cholesky(self.H)
-        half = np.linalg.solve(L, np.concatenate([self.G, self.g[..., None]], axis=2))
-        flat = half.reshape(-1, half.shape[2])
-        A -= flat[:, :-1].T @ flat[:, :-1]
-        b -= flat[:, :-1].T @ flat[:, -1]
-        logs = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
-        return float(np.sum(flat[:, -1] ** 2)), logs
+    @property
+    def rest(self) -> Floats:
+        """(S, k, sum P + 1) with the cameras, and the right hand side."""
+        return np.concatenate([self.G, self.g[..., None]], axis=2)
 
     def unknowns(self, mean: Floats) -> Floats:
         """(S, k) posterior mean, from that of the cameras."""
         found = np.linalg.solve(self.H, (self.g - self.G @ mean)[..., None])[..., 0]
         return np.asarray(found, dtype=np.float64)
 
-    def all_unknowns(self, mean: Floats, joint: Floats) -> Unknowns:
-        """What is known of the shots' errors, after that of the cameras."""
-        S, k = self.g.shape
-        inverse = np.linalg.inv(self.H)
-        pull = (inverse @ self.G).reshape(S * k, -1)
-        cross = -joint @ pull.T
-        covariance = cross.T @ cross
-        for s in range(S):
-            covariance[s * k : (s + 1) * k, s * k : (s + 1) * k] += inverse[s]
-        return Unknowns(self.unknowns(mean).ravel(), covariance, cross)
+
+def eliminate(H: Floats, rest: Floats) -> tuple[Floats, float]:
+    """Take unknowns out of normal equations, eq. (15).
+
+    Args:
+        H: Their own blocks (S, k, k).
+        rest: The blocks (S, k, q) with all other unknowns, the right hand side last.
+
+    Returns:
+        L^-1 rest (S k, q), of H = L L^T, whose product with itself is taken from the equations of the others; and what
+        it adds to twice the evidence.
+    """
+    L = np.linalg.cholesky(H)
+    half = np.linalg.solve(L, rest).reshape(-1, rest.shape[2])
+    logs = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
+    return half, float(np.sum(half[:, -1] ** 2)) - logs
+
+
+def unknowns_given_cameras(H: Floats, rest: Floats, mean: Floats, root: Floats) -> Unknowns:
+    """What is known of the shots' errors, after that of the cameras.
+
+    Args:
+        H: Normal equations (K, K) of the shots.
+        rest: (K, sum P + 1) with the cameras, and their right hand side.
+        mean: (sum P,) of the cameras.
+        root: (q, sum P) of the cameras' covariance.
+    """
+    inverse = np.linalg.inv(H)
+    pull = inverse @ rest[:, :-1]
+    cross = -root @ pull.T
+    return Unknowns(inverse @ rest[:, -1] - pull @ mean, inverse + cross.T @ cross, cross)
 
 
 def _accumulate(

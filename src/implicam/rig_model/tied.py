@@ -16,7 +16,7 @@ from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
 from implicam.rig_model.normal_equations import camera_normals, solve_normal
 from implicam.rig_model.posterior import Posterior, move_to_mean
-from implicam.rig_model.schur import Unknowns
+from implicam.rig_model.schur import eliminate, unknowns_given_cameras
 from implicam.rig_model.shot_errors import ShotErrors
 from implicam.threads import side_by_side
 
@@ -57,13 +57,13 @@ def condition_scattered(
     M = np.zeros((P, P))
     for views, slopes in rig.views():
         shots += np.tensordot(views[:, :, :k], views, axes=((0, 1), (0, 1)))
-        half, squares_less_logs = _eliminate(*_displacement_equations(views, slopes))
+        half, squares_less_logs = eliminate(*_displacement_equations(views, slopes))
         value += squares_less_logs
         shots -= half[:, :k].T @ half
         M += half[:, k:-1].T @ half[:, k:-1]
         b -= half[:, k:-1].T @ half[:, -1]
     if k:
-        half, squares_less_logs = _eliminate(shots[None, :, :k], shots[None, :, k:])
+        half, squares_less_logs = eliminate(shots[None, :, :k], shots[None, :, k:])
         value += squares_less_logs
         M += half[:, :-1].T @ half[:, :-1]
         b -= half[:, :-1].T @ half[:, -1]
@@ -74,7 +74,9 @@ def condition_scattered(
     value += float(b @ white) - float(np.sum(np.log1p(-lost)))
     kept = grown > MIN_VARIANCE_GROWTH
     ties = np.sqrt(grown[kept])[:, None] * turned[:, kept].T
-    unknowns = _unknowns(shots, white, ties) if k else None
+    unknowns = None
+    if k:  # the root of the white unknowns is their own above the ties
+        unknowns = unknowns_given_cameras(shots[:, :k], shots[:, k:], white, np.concatenate([np.eye(P), ties]))
     means = [root.T @ part for root, part in zip(rig.alone, rig.split(white), strict=True)]
     return Posterior(
         move_to_mean(models, means),
@@ -92,22 +94,6 @@ def _displacement_equations(views: Floats, slopes: Floats) -> tuple[Floats, Floa
     """Normal equations of the points' displacements: H (m, 3, 3), and (m, 3, k + P + 1) with all the rest."""
     across = slopes.swapaxes(1, 2)
     return np.eye(3) + across @ slopes, across @ views
-
-
-def _eliminate(H: Floats, rest: Floats) -> tuple[Floats, float]:
-    """L^-1 rest, of H = L L^T, its rows one below the other; and what it adds to twice the evidence."""
-    L = np.linalg.cholesky(H)
-    half = np.linalg.solve(L, rest).reshape(-1, rest.shape[2])
-    logs = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
-    return half, float(np.sum(half[:, -1] ** 2)) - logs
-
-
-def _unknowns(shots: Floats, white: Floats, ties: Floats) -> Unknowns:
-    """What is known of the shots' errors, after that of the cameras, whose root is their own roots above the ties."""
-    inverse = np.linalg.inv(shots[:, : len(shots)])
-    pull = inverse @ shots[:, len(shots) : -1]
-    cross = -np.concatenate([np.eye(len(white)), ties]) @ pull.T
-    return Unknowns(inverse @ shots[:, -1] - pull @ white, inverse + cross.T @ cross, cross)
 
 
 @dataclass(frozen=True, eq=False)

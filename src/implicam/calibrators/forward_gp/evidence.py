@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -171,54 +172,46 @@ class RigEvidence:
     settings: ForwardGPSettings
 
     def maximise(self, start: Hyperparameters | None = None, *, search: bool = True) -> Hyperparameters:
-        """The most probable hyperparameters; `start` is a good guess, from a moment ago, of which the lengthscales
-        stay where there is nothing to `search`."""
+        """The most probable hyperparameters.
+
+        Args:
+            start: A good guess, from a moment ago.
+            search: Look for other lengthscales than those of the guess.
+        """
         shared = np.zeros(2)  # log deviations of signal and noise from their prior medians
         if start is not None:  # two pairs of them can be likely, a large field and large noise: stay with that found
-            logs = [np.log(found / median) for found, median in zip(start[1:], self._medians(), strict=True)]
-            shared = np.clip(np.mean(logs, axis=1), -6.0, 6.0)
-        known: dict[tuple[float, ...], tuple[float, Floats]] = {}
-        spectra: dict[tuple[float, ...], list[Spectrum]] = {}
+            shared = np.clip(self._mean_deviations(start.signal, start.noise), -6.0, 6.0)
+        tried: dict[tuple[float, ...], tuple[float, Floats, list[Spectrum]]] = {}
         median, log_sd = np.log(self.settings.lengthscale_prior_median), self.settings.lengthscale_prior_log_sd
         least, most = np.log(self.settings.min_lengthscale), np.log(self.settings.max_lengthscale)
 
         def at(log_lengthscale: Floats) -> float:
             nonlocal shared
             inside = np.clip(log_lengthscale, least, most)
-            spectra[tuple(inside)] = self._spectra(inside)
-            found = self._minimum(self._sizes_objective(spectra[tuple(inside)], own=False)[0], shared, GTOL)
+            spectra = [camera.spectrum(np.exp(inside), self.tolerance) for camera in self.cameras]
+            found = self._minimum(self._sizes_objective(spectra, own=False)[0], shared, GTOL)
             shared = found.x
-            penalty = 0.5 * np.sum(((inside - median) / log_sd) ** 2)
-            known[tuple(inside)] = float(found.fun + penalty), shared
-            return known[tuple(inside)][0] + float(np.sum((log_lengthscale - inside) ** 2))
+            value = float(found.fun + 0.5 * np.sum(((inside - median) / log_sd) ** 2))
+            tried[tuple(inside)] = value, shared, spectra
+            return value + float(np.sum((log_lengthscale - inside) ** 2))
 
-        if start is not None and not search:
-            at(np.log(start.lengthscale[0]))
-            return self._choose_best(known, spectra)
         if start is None:  # a second, shorter range can be as likely: look everywhere first
-            for across in LENGTHSCALE_GRID[0]:
-                for along in LENGTHSCALE_GRID[1]:
-                    at(np.log([across, along]))
-            first, size = np.array(min(known, key=lambda key: known[key][0])), 0.5
+            for lengthscale in product(*LENGTHSCALE_GRID):
+                at(np.log(lengthscale))
+            best = min(tried, key=lambda key: tried[key][0])
+            first, size, shared = np.array(best), 0.5, tried[best][1]
         else:
             first, size = np.log(start.lengthscale[0]), 0.2
-        shared = known[tuple(first)][1] if start is None else shared
-        simplex = first + size * np.array([[0, 0], [-1, 0.3], [0.3, -1]])
-        minimize(
-            at,
-            first,
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": 12},
-        )
-        return self._choose_best(known, spectra)
-
-    def _choose_best(
-        self, known: dict[tuple[float, ...], tuple[float, Floats]], spectra: dict[tuple[float, ...], list[Spectrum]]
-    ) -> Hyperparameters:
-        """The best of the lengthscales looked at."""
-        lengthscale = min(known, key=lambda key: known[key][0])
-        signal, noise = self._average_sizes(spectra[lengthscale], known[lengthscale][1])
-        return Hyperparameters(np.tile(np.exp(lengthscale), (len(self.cameras), 1)), signal, noise)
+        if start is not None and not search:
+            at(first)
+        else:
+            simplex = first + size * np.array([[0, 0], [-1, 0.3], [0.3, -1]])
+            options = {"initial_simplex": simplex, "xatol": 0.1, "fatol": 0.1, "maxfev": 12}
+            minimize(at, first, method="Nelder-Mead", options=options)
+        best = min(tried, key=lambda key: tried[key][0])
+        _, shared, spectra = tried[best]
+        signal, noise = self._average_sizes(spectra, shared)
+        return Hyperparameters(np.tile(np.exp(best), (len(self.cameras), 1)), signal, noise)
 
     def _average_sizes(self, spectra: list[Spectrum], shared: Floats) -> tuple[Floats, Floats]:
         """Signal and noise (C,) whose squares are the posterior means of the variances, eq. (12).
@@ -245,21 +238,19 @@ class RigEvidence:
         signal, noise = self._sizes(z)
         return signal * larger[:C], noise * larger[C:]
 
-    def _spectra(self, log_lengthscale: Floats) -> list[Spectrum]:
-        return [camera.spectrum(np.exp(log_lengthscale), self.tolerance) for camera in self.cameras]
-
     def _medians(self) -> tuple[Floats, Floats]:
         usual = np.exp(self.settings.log_noise_prior[0]) * self.half
         noise = np.where(np.isfinite(self.stated), self.stated, usual)
         return np.exp(self.settings.log_signal_prior(lens=self.lens)[0]) * self.half, noise
 
+    def _mean_deviations(self, signal: Floats, noise: Floats) -> Floats:
+        """(2,) logs of signal and noise (C,) over their prior medians, in the mean of the rig."""
+        pairs = zip((signal, noise), self._medians(), strict=True)
+        return np.array([np.mean(np.log(found / median)) for found, median in pairs])
+
     def penalty(self, signal: Floats, noise: Floats) -> float:
         """Minus the log prior of sizes (C,) in pixels, as far as the rig shares them."""
-        medians = self._medians()
-        shared = [
-            float(np.mean(np.log(found / median))) for found, median in zip((signal, noise), medians, strict=True)
-        ]
-        return 0.5 * float(np.sum((np.array(shared) / self._shared_sds()) ** 2))
+        return 0.5 * float(np.sum((self._mean_deviations(signal, noise) / self._shared_sds()) ** 2))
 
     def _shared_sds(self) -> Floats:
         stated, settings = np.isfinite(self.stated).all(), self.settings

@@ -18,11 +18,7 @@ from implicam.calibrators.forward_gp.choose_camera import (
     choose,
 )
 from implicam.calibrators.forward_gp.families import Scene
-from implicam.calibrators.forward_gp.linear_projections import (
-    measures_better,
-    predicts_better,
-    start_without_lens,
-)
+from implicam.calibrators.forward_gp.linear_projections import Comparison, start_without_lens
 from implicam.calibrators.forward_gp.rounds import Round, check_fitted, next_round
 from implicam.calibrators.forward_gp.settings import Training
 from implicam.errors import FitError
@@ -94,13 +90,11 @@ def _try_linear_projections(training: Training, fitted: FitResult, started: dict
         return fitted
     try:
         other = _fit_from_start(training, silent, None, started | tried)
-        if measures_better(training, other, fitted):
+        compared = Comparison(training, other, fitted)
+        if compared.measures_better():
             return other
-        better = {
-            c: tried[c]
-            for number, c in enumerate(fitted.cameras)
-            if c in tried and predicts_better(training, other, fitted, number)
-        }
+        cameras = enumerate(fitted.cameras)
+        better = {c: tried[c] for number, c in cameras if c in tried and compared.predicts_better(number)}
         if better.keys() == tried.keys():
             return other
         return _fit_from_start(training, silent, None, started | better) if better else fitted

@@ -9,7 +9,7 @@ from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.initialise import InitialCamera, check_start, start_camera
-from implicam.rig_model.leave_one_out import left_out_positions, left_out_residuals
+from implicam.rig_model.leave_one_out import LeftOutViews, left_out_positions, left_out_views
 
 
 def start_without_lens(training: Training, c: int, before: InitialCamera) -> InitialCamera | None:
@@ -25,35 +25,39 @@ def start_without_lens(training: Training, c: int, before: InitialCamera) -> Ini
     return found._replace(ordinary_px=before.ordinary_px)
 
 
-def predicts_better(training: Training, one: FitResult, other: FitResult, number: int) -> bool:
-    """Whether a camera's left-out views are clearly more probable in one fit than in another."""
-    gain = _left_out_log_densities(training, one, number) - _left_out_log_densities(training, other, number)
-    clearly = 2 * float(np.std(gain)) * np.sqrt(len(gain))
-    return bool(np.sum(gain) > max(clearly, training.settings.min_gain_without_lens_nats))
+class Comparison:
+    """Two fits of the same cameras to the same points, by what each predicts of views and points without themselves."""
+
+    def __init__(self, training: Training, one: FitResult, other: FitResult) -> None:
+        self.settings = training.settings
+        mine, n = training.of_cameras(one.cameras), len(training.points)
+        fits = (one, other)
+        self.views = [left_out_views(f.posterior, mine.points, mine.camera_views, f.inliers) for f in fits]
+        self.errors = [left_out_positions(views, f.inliers, n)[0] for views, f in zip(self.views, fits, strict=True)]
+
+    def predicts_better(self, number: int) -> bool:
+        """Whether the left-out views of a camera are clearly more probable in the one fit than in the other."""
+        one, other = (self._log_densities(views[number]) for views in self.views)
+        return _clearly_positive(one - other, self.settings.min_gain_without_lens_nats)
+
+    def measures_better(self) -> bool:
+        """Whether known points, measured without themselves, are clearly nearer to their positions in the one fit than
+        in the other. A view of a steep camera says little of depth, so its density is not all that counts."""
+        squares = np.sum(np.square(self.errors), axis=2)
+        one, other = squares[:, np.isfinite(squares).all(axis=0)]
+        if len(one) < self.settings.min_views_without_lens:
+            return False
+        # a wrong point says nothing of either
+        limit = self.settings.max_squared_error_medians * float(np.median(other))
+        return _clearly_positive(np.minimum(other, limit) - np.minimum(one, limit))
+
+    def _log_densities(self, view: LeftOutViews) -> Floats:
+        """(n,) of each view of a camera, up to a constant; a wrong one costs what a view just rejected does."""
+        distance, limit = view.squared_distance, self.settings.max_squared_mahalanobis
+        distance = np.minimum(np.where(np.isfinite(distance), distance, limit), limit)
+        return np.asarray(0.5 * (np.linalg.slogdet(view.inverse)[1] - distance), dtype=np.float64)
 
 
-def measures_better(training: Training, one: FitResult, other: FitResult) -> bool:
-    """Whether known points, measured without themselves, are clearly nearer to their positions in one fit than in
-    another. A view of a steep camera says little of depth, so its density is not all that counts."""
-    squares = []
-    for fitted in (one, other):
-        seen = training.of_cameras(fitted.cameras).camera_views
-        error, _ = left_out_positions(fitted.posterior, training.points, seen, fitted.inliers)
-        squares.append(np.sum(error**2, axis=1))
-    one_squares, other_squares = np.array(squares)[:, np.isfinite(squares).all(axis=0)]
-    if len(one_squares) < training.settings.min_views_without_lens:
-        return False
-    most = training.settings.max_squared_error_medians  # a wrong point says nothing of either
-    limit = most * float(np.median(other_squares))
-    gain = np.minimum(other_squares, limit) - np.minimum(one_squares, limit)
-    return bool(np.sum(gain) > 2 * float(np.std(gain)) * np.sqrt(len(gain)))
-
-
-def _left_out_log_densities(training: Training, fitted: FitResult, number: int) -> Floats:
-    """(n,) of each view of a camera, predicted from all others; a wrong view costs what a view just rejected does."""
-    seen, inliers = training.camera_views[fitted.cameras[number]], fitted.inliers[number]
-    residual, covariance = left_out_residuals(fitted.posterior, number, training.points, seen, inliers)
-    distance = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(covariance), residual)
-    limit = training.settings.max_squared_mahalanobis
-    distance = np.minimum(np.where(np.isfinite(distance), distance, limit), limit)
-    return np.asarray(-0.5 * (distance + np.linalg.slogdet(covariance)[1]), dtype=np.float64)
+def _clearly_positive(gain: Floats, least: float = 0.0) -> bool:
+    """Whether a sum of gains (n,) is above twice its standard error, and above the least."""
+    return bool(np.sum(gain) > max(2 * float(np.std(gain)) * np.sqrt(len(gain)), least))
