@@ -17,7 +17,7 @@ The first and third hold whatever the points have in common, as the errors of a 
 probability `disagree_p_value` at most, more than that share of them do with the ratio of the two at most (Markov), 3 in
 10 000. The second counts points as independent, but at most `max_independent_points`: 285 points of a rig with 16 known
 ones shared its errors.
-What moves every view along the lines on which two cameras would see it nobody can find in the pixels of two cameras.
+What moves every view along the lines on which two cameras would see it cannot be found in their pixels alone.
 
 Then the likeliest causes are tried on some of the points, and the one that makes them agree is named.
 """
@@ -76,8 +76,8 @@ class Table:
     lines: Callable[[Floats], Iterator[tuple[Floats, Floats]]]
     pixels: Callable[[Floats], Floats]
     checked: bool = True
-    """Whether the calibration was held against known points. Of cameras from elsewhere nobody knows how good they are,
-    and that their views agree badly is no news."""
+    """Whether the calibration was held against known points. How good cameras from elsewhere are is not known, and that
+    their views agree badly is no news."""
     settings: RigModelSettings = DEFAULT_SETTINGS
 
     @property

@@ -20,8 +20,9 @@ from implicam.rig_model.general_camera import AnyCamera
 class CameraModel:
     """A camera, its residual field and its noise; weights (m, 2) of the field's features, zero before the fit.
 
-    The field is looked up where the `ruler` sees a point: the camera as it was when the field was laid out. It stays
-    when the camera moves, for a telephoto lens may move far along its axis with its focal length, and no pixel shows.
+    The field is looked up where the `field_camera` sees a point: the camera as it was when the field was laid out. It
+    stays when the camera moves, for a telephoto lens may move far along its axis with its focal length, and no pixel
+    shows.
     """
 
     camera: AnyCamera

@@ -161,9 +161,9 @@ def refine_positions(linear: LinearisedViews, degrees: float, settings: RigModel
     A, b = whiten(linear)
     n, C = b.shape[:2]
     out = RefinedPositions(np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, C)))
-    there = np.any(A != 0, axis=(2, 3))
-    views = there.sum(axis=1)
-    order = np.argsort(~there, axis=1, kind="stable")
+    seen = np.any(A != 0, axis=(2, 3))
+    views = seen.sum(axis=1)
+    order = np.argsort(~seen, axis=1, kind="stable")
     for V in np.unique(views):
         alike = np.flatnonzero(views == V)
         size = max(1, VIEWS_PER_BATCH // int(V))

@@ -72,8 +72,8 @@ def start_camera(
         k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
         lens_model = KannalaBrandt(found.focal, found.focal, *image.centre.tolist(), *k.tolist())
         camera, inliers = CentralCamera(lens_model, found.camera_from_world), found.inliers
-    there = camera.pose.apply(points[inliers])
-    widest = float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
+    in_camera = camera.pose.apply(points[inliers])
+    widest = float(np.arctan2(np.hypot(in_camera[:, 0], in_camera[:, 1]), in_camera[:, 2]).max())
     prior = camera.prior(image, widest, settings)
     return _refine(camera, prior, points, uv, image, inliers, settings.max_start_error_medians)
 

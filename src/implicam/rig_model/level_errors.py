@@ -43,8 +43,8 @@ def find_uncertain_planes(points: Floats, labels: NDArray[np.str_], settings: Ri
         found = find_levels(points, settings)
         if found is None:
             return None
-        there, number = found.number >= 0, found.number.astype(np.str_)
-        shots = Shots.of(points[there], number[there], settings, fewest=2, direction=found.normal)
+        on_level, number = found.number >= 0, found.number.astype(np.str_)
+        shots = Shots.of(points[on_level], number[on_level], settings, fewest=2, direction=found.normal)
         return None if shots is None else Planes(shots, settings.level_sd_ratio * _shot_sd(settings))
     if len(names) > WORLD_POLYNOMIAL_TERMS:
         return None

@@ -129,12 +129,12 @@ class FittedRig:
         """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
         points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
         uv = np.full((len(points), len(self.trained.cameras), 2), np.nan)
-        there = np.isfinite(points).all(axis=1)
-        where = points[there]
+        finite = np.isfinite(points).all(axis=1)
+        where = points[finite]
         if self.labels is not None:
             where = where + self.labels.off(where)
         for number, c in enumerate(self.cameras):
-            uv[there, c] = self.posterior.models[number].predict(where)[0]
+            uv[finite, c] = self.posterior.models[number].predict(where)[0]
         return uv
 
     def sensitivities(self, xyz: Floats) -> list[Sensitivity]:

@@ -80,7 +80,7 @@ class RigModelSettings:
     max_world_half_lengths: float = 3.0
     """Half lengths of the traverse off its middle to which the parabola through the shots is followed."""
     max_world_variance_ratio: float = 100.0
-    """Times the variance of a shot's error to which it is followed: beyond, nobody would believe it."""
+    """Times the variance of a shot's error to which it is followed: beyond, it says nothing any more."""
     across_sd_ratio: float = 0.7
     """Across the traverse a shot is off by this part of what it is along it. Experience with half a dozen targets, as
     the next two."""

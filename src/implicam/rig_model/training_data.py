@@ -66,7 +66,7 @@ class Frame:
 def camera_views_of(observations: Observations, stated: Floats) -> tuple[CameraViews, ...]:
     """What each camera saw, all of it."""
     relative = relative_noise(observations, stated)
-    seen = (np.flatnonzero(there) for there in observations.seen.T)
+    seen = (np.flatnonzero(column) for column in observations.seen.T)
     return tuple(CameraViews(rows, observations.uv[rows, c], relative[rows, c]) for c, rows in enumerate(seen))
 
 

@@ -343,11 +343,11 @@ def _linearise_at_majority(points: Points, rows: Ints, seen: Bools) -> Linearise
         if not len(far):
             break
     linear = points.linearise(rows, x, seen, linear)
-    there = ~seen | _answered(linear)
-    if there.all():
+    answered = ~seen | _answered(linear)
+    if answered.all():
         return linear
-    again = points.linearise(rows, x, seen & there)
-    return again._replace(r=np.where(there[..., None], again.r, UNANSWERED_RESIDUAL_SDS))
+    again = points.linearise(rows, x, seen & answered)
+    return again._replace(r=np.where(answered[..., None], again.r, UNANSWERED_RESIDUAL_SDS))
 
 
 def _step(linear: LinearisedViews, some: Ints, seen: Bools, trusted: Ints) -> tuple[Floats, Floats]:
@@ -363,8 +363,8 @@ def _step(linear: LinearisedViews, some: Ints, seen: Bools, trusted: Ints) -> tu
 
 def _answered(linear: LinearisedViews) -> Bools:
     """(n, C) where the camera has an answer."""
-    there = np.isfinite(linear.r).all(axis=2) & np.isfinite(linear.D).all(axis=(2, 3))
-    return np.asarray(there & np.isfinite(linear.each).all(axis=(2, 3)))
+    finite = np.isfinite(linear.r).all(axis=2) & np.isfinite(linear.D).all(axis=(2, 3))
+    return np.asarray(finite & np.isfinite(linear.each).all(axis=(2, 3)))
 
 
 def _replace_rows(linear: LinearisedViews, some: Ints, new: LinearisedViews) -> LinearisedViews:

@@ -138,11 +138,11 @@ def _whiten_views(
     limit = outlier_distance(min(settings.tail_degrees_of_freedom), settings.max_squared_mahalanobis)
     n, C = len(training.points), len(predicted)
     each = np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy()
-    r, D, there = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3)), np.zeros((n, C), dtype=np.bool_)
+    r, D, seen = np.zeros((n, C, 2)), np.zeros((n, C, 2, 3)), np.zeros((n, C), dtype=np.bool_)
     for c, view in enumerate(predicted):
         good = view.distance <= limit
         rows = view.rows[good]
         each[rows, c] = np.linalg.inv(view.covariance[good])
-        r[rows, c], there[rows, c] = view.residual[good], True
+        r[rows, c], seen[rows, c] = view.residual[good], True
         D[rows, c] = posterior.models[c].predict(training.points[rows])[1]
-    return *whiten(LinearisedViews(r, D, each, None)), there
+    return *whiten(LinearisedViews(r, D, each, None)), seen
