@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from implicam.dataset import read_dataset
 from implicam.detect.folder import detect_folder
 from implicam.detect.journal import Entry, Journal, Key
-from implicam.detect.model import Detected, View, nothing
+from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.overlay import COLUMNS, ROWS, STATES, Result, overlay, thumbnail
 from implicam.errors import DatasetError, ImageError, MissingExtraError, UsageError
 from implicam.images import eight_bit, read_picture
@@ -32,7 +32,7 @@ SIZE = (160, 120)
 
 
 @dataclass(frozen=True)
-class Spot:
+class Spot(DetectorBase):
     """The centroid of the brightest spot: a real detector, if a simple one."""
 
     above: float = 0.5

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import numpy as np
 from implicam.calibrators import Calibration, ForwardGP, ForwardGPCalibration, InverseGP
 from implicam.compare import Trial, trial_of
 from implicam.dataset import Dataset, folder_files, write_dataset
-from implicam.detect import Ball, DetectionRun, centred, detect_folder
+from implicam.detect import Ball, DetectionRun, detect_folder
 from implicam.errors import UsageError, import_extra
 from implicam.evaluation import Evaluation, evaluate
 from implicam.files import toml_text
@@ -130,10 +129,10 @@ def _photograph(rig: Rig, shown: list[Recorded], folder: Path, progress: Progres
 
 def _looked_at(folder: Path, seed: int, progress: Progress) -> tuple[DetectionRun, DetectionRun]:
     """What is found in the photographs; that of the held-out positions is corrected without knowing them."""
-    known = detect_folder(folder, Ball(), correct=partial(centred, radius=BALL_RADIUS_MM), progress=progress)
+    known = detect_folder(folder, Ball(radius=BALL_RADIUS_MM), progress=progress)
     calibration: ForwardGPCalibration = ForwardGP(seed=seed).fit(known.data)
-    correct = partial(centred, radius=BALL_RADIUS_MM, calibration=calibration)
-    return known, detect_folder(folder / "check", Ball(), correct=correct, overlays=False, progress=progress)
+    ball = Ball(radius=BALL_RADIUS_MM, calibration=calibration)
+    return known, detect_folder(folder / "check", ball, overlays=False, progress=progress)
 
 
 def _found(*runs: DetectionRun) -> tuple[int, float]:

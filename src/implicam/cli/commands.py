@@ -16,8 +16,9 @@ import typer
 import implicam.cli.acquire
 import implicam.cli.cameras
 import implicam.cli.compare
+import implicam.cli.detect
 import implicam.cli.paper
-import implicam.cli.simulate  # noqa: F401  the five register their commands
+import implicam.cli.simulate  # noqa: F401  the six register their commands
 from implicam import calibration_file
 from implicam.calibrators import DEFAULT_METHOD, Calibration, Explicit, InverseGP, calibrator, load_calibration
 from implicam.calibrators.explicit.boards import has_boards
@@ -49,12 +50,10 @@ from implicam.cli.app import (
     read,
 )
 from implicam.dataset import Dataset, read_dataset, write_dataset
-from implicam.dataset.folder import IMAGES
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import must_be_no_folder, toml_text
 from implicam.formatting import decimal_number
-from implicam.images import PATTERN
 from implicam.lenses import LENSES
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
@@ -118,68 +117,6 @@ def demo_command(
     )
     for key, path in files.items():
         show.line(f"  {key:<12}{path}")
-
-
-@command("detect")
-def detect_command(
-    dataset: Annotated[Path, typer.Argument(help="A folder with the photographs in images/<camera>/<shot>.png.")],
-    target: Annotated[
-        str | None, typer.Option(metavar="NAME", help="ball, board, charuco or dots (default: what dataset.toml says).")
-    ] = None,
-    radius: Annotated[
-        float | None, typer.Option(min=0, metavar="LENGTH", help="ball: its radius, in the dataset's unit.")
-    ] = None,
-    bright: Annotated[bool, typer.Option("--bright", help="ball: it is lighter than what is behind it.")] = False,
-    template: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="ball: a picture of it before its plate, ball in the middle.")
-    ] = None,
-    click: Annotated[
-        str | None, typer.Option(metavar="FILE:U,V", help="ball: learn what it looks like at this pixel.")
-    ] = None,
-    calibration: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="ball: correct its outline's middle with this calibration.")
-    ] = None,
-    board: Annotated[
-        str | None, typer.Option(metavar="RxC", help="board: inner corners, 8x11; charuco: squares, 9x12.")
-    ] = None,
-    square: Annotated[float | None, typer.Option(min=0, metavar="MM", help="board, charuco: edge of a square.")] = None,
-    marker: Annotated[float | None, typer.Option(min=0, metavar="MM", help="charuco: edge of a marker.")] = None,
-    dictionary: Annotated[
-        str | None, typer.Option(metavar="NAME", help="charuco: OpenCV's name, such as DICT_5X5_100.")
-    ] = None,
-    layout: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="dots: where they are (default DATASET/points.csv).")
-    ] = None,
-    labels: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="dots: six or more named (default DATASET/labels.csv).")
-    ] = None,
-    pictures: Annotated[str, typer.Option("--pictures", metavar="FOLDER", help="Where they are in DATASET.")] = IMAGES,
-    pattern: Annotated[
-        str, typer.Option(metavar="PATTERN", help="How their names tell camera and shot, without ending.")
-    ] = PATTERN,
-    overlays: Annotated[bool, typer.Option(help="Draw what was found, to check by eye.")] = True,
-    restart: Annotated[bool, typer.Option("--restart", help="Forget what an earlier run found.")] = False,
-    unit: Annotated[
-        str | None, typer.Option(metavar="UNIT", help="Length unit, where dataset.toml is missing.")
-    ] = None,
-    json: Json = False,
-) -> None:
-    """Find the target in photographs: images -> observations.csv, each view with its uncertainty."""
-    from implicam.cli.detect import Wanted, tell
-    from implicam.detect import detect_folder
-
-    if not dataset.is_dir():
-        raise UsageError(f"{dataset} is not a folder.", fix="give the folder that holds images/<camera>/<shot>.png")
-    wanted = Wanted(
-        target, radius, bright, template, click, board, square, marker, dictionary, layout, labels, calibration
-    )
-    detector, correct = wanted.detector(dataset)
-    with show.progress(json) as progress:
-        run = detect_folder(
-            dataset, detector, unit=unit, pictures=pictures, pattern=pattern, overlays=overlays, restart=restart,
-            correct=correct, progress=progress,
-        )  # fmt: skip
-    tell(run, json)
 
 
 @command("calibrate")

@@ -9,16 +9,9 @@ from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
 from implicam.detect.dots import Dots
 from implicam.detect.folder import Correct, DetectionRun, detect_folder
-from implicam.detect.model import Detected, Detector, View
+from implicam.detect.model import Detected, Detector, DetectorBase, Option, View
+from implicam.detect.registry import TARGETS, detector_from_options, options_of
 from implicam.detect.silhouette import centred, outline_shift
-
-TARGETS: dict[str, type[Ball] | type[Board] | type[Charuco] | type[Dots]] = {
-    "ball": Ball,
-    "board": Board,
-    "charuco": Charuco,
-    "dots": Dots,
-}
-"""Target -> its detector."""
 
 __all__ = [
     "TARGETS",
@@ -29,10 +22,14 @@ __all__ = [
     "Detected",
     "DetectionRun",
     "Detector",
+    "DetectorBase",
     "Dots",
+    "Option",
     "Template",
     "View",
     "centred",
     "detect_folder",
+    "detector_from_options",
+    "options_of",
     "outline_shift",
 ]

@@ -14,14 +14,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset import Floats
+from implicam.calibrators import PredictsPixels, load_calibration
+from implicam.dataset import Dataset, Floats
 from implicam.detect.edge import Edge, Rough, fit_edge, rough_edge
-from implicam.detect.model import Detected, View, nothing
+from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
+from implicam.detect.silhouette import centred
 from implicam.errors import ImageError, UsageError
 from implicam.images import Grey, opencv, read_picture
 
@@ -94,6 +96,18 @@ class Template:
         return cls._cropped(picture, best)
 
     @classmethod
+    def from_words(cls, text: str) -> Template:
+        """From one click as the command line has it, `images/cam1/001.png:613,402`."""
+        try:
+            name, _, place = text.rpartition(":")
+            u, v = (float(part) for part in place.split(","))
+        except ValueError:
+            raise UsageError(
+                f"--click {text!r} is not a place in a picture.", fix="for example images/cam1/001.png:613,402"
+            ) from None
+        return cls.from_click(Path(name), u, v)
+
+    @classmethod
     def from_file(cls, path: Path) -> Template:
         """A picture of the ball before its plate, cropped so that the ball is in the middle."""
         picture = read_picture(path)
@@ -109,16 +123,19 @@ class Template:
 
 
 @dataclass(frozen=True, eq=False)
-class Ball:
+class Ball(DetectorBase):
     """Detector of one ball a picture. bright: a light ball on a dark ground. smallest, largest: its radius in pixels.
 
-    template: what to look for first; a drawn disc where None.
+    template: what to look for first; a drawn disc where None. radius, in the dataset's unit, and calibration, of the
+    rig, are for `correct`; without a radius nothing is corrected, without a calibration one is fitted.
     """
 
     bright: bool = False
     smallest: float = MIN_RADIUS_PX
     largest: float = 120.0
     template: Template | None = None
+    radius: float | None = None
+    calibration: PredictsPixels | None = None
 
     def __post_init__(self) -> None:
         if not 2 <= self.smallest < self.largest:
@@ -126,6 +143,33 @@ class Ball:
                 f"a ball from {self.smallest:g} to {self.largest:g} pixels in radius is not possible.",
                 fix="give radii of 2 pixels or more, the smallest first",
             )
+
+    @classmethod
+    def from_options(
+        cls,
+        dataset: Path,
+        described: Mapping[str, Any],
+        *,
+        radius: Annotated[float | None, Option("its radius, in the dataset's unit", "LENGTH", 0)] = None,
+        bright: Annotated[bool, Option("it is lighter than what is behind it")] = False,
+        template: Annotated[Path | None, Option("a picture of it before its plate, ball in the middle", "FILE")] = None,
+        click: Annotated[str | None, Option("learn what it looks like at this pixel", "FILE:U,V")] = None,
+        calibration: Annotated[
+            Path | None, Option("correct its outline's middle with this calibration", "FILE")
+        ] = None,
+    ) -> Ball:
+        """As the command line says it."""
+        if template and click:
+            raise UsageError("--template and --click exclude each other.", fix="give one of them")
+        learned = Template.from_words(click) if click else Template.from_file(template) if template else None
+        known = None if calibration is None else load_calibration(calibration)
+        if known is not None and not isinstance(known, PredictsPixels):
+            raise UsageError(
+                f"{calibration} was made by {known.method}.",
+                why="that method does not know what a camera sees of a place",
+                fix="give a calibration by forward-gp or explicit",
+            )
+        return cls(bright, template=learned, radius=float(radius) if radius else None, calibration=known)
 
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
@@ -159,6 +203,15 @@ class Ball:
             if every
         }
         return {view: _if_usual(moving[view], usual.get(view.camera, 0.0)) for view in found}
+
+    def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
+        """The ball's middle for that of its outline."""
+        if self.radius is not None:
+            return centred(data, self.radius, self.calibration)
+        return data, [
+            "the pixels are those of the ball's outline, whose middle is not quite that of the ball: "
+            f"give its radius with --radius, in {data.length_unit}, and it is corrected"
+        ]
 
     def _balls(self, picture: Grey) -> list[Edge]:
         """Different balls, the likeliest first."""

@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
 from implicam.dataset import Floats
 from implicam.detect.grid import Grid, grow, join
-from implicam.detect.model import Detected, View, nothing
+from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
 from implicam.detect.numbering import END, MORE, Numbering, numberings, sides
 from implicam.detect.seeds import from_libcbdetect, from_opencv, from_saddles, in_original, resized, saddles
 from implicam.errors import UsageError
@@ -40,7 +41,7 @@ MIN_CORNERS_OF_ANOTHER = 12
 
 
 @dataclass(frozen=True)
-class Board:
+class Board(DetectorBase):
     """A checkerboard with rows x columns inner corners, and squares of `square` millimetres.
 
     rows + columns must be odd: a board whose half turn looks the same cannot be numbered.
@@ -66,6 +67,19 @@ class Board:
                 fix=f"use a ChArUco board, or another size, for example {self.rows} x {self.columns + 1}",
             )
 
+    @classmethod
+    def from_options(
+        cls,
+        dataset: Path,
+        described: Mapping[str, Any],
+        *,
+        board: Annotated[str | None, Option("inner corners, 8x11", "RxC")] = None,
+        square: Annotated[float | None, Option("edge of a square", "MM", 0)] = None,
+    ) -> Board:
+        """As the command line says it."""
+        rows, columns = size_of_board(board, described, "--board 8x11 (inner corners, rows x columns)")
+        return cls(rows, columns, float(square or 1.0))
+
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
         return {"target": "board", **asdict(self)}
@@ -82,10 +96,6 @@ class Board:
                 "whole and sharp, well lit and without glare, with squares at least 5 pixels wide."
             )
         return self._read(picture, grids, view)
-
-    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
-        """Nothing to add: a board that can be read in several ways stays refused."""
-        return dict(found)
 
     def _grids(self, picture: Grey) -> list[Grid]:
         """All checkerboards in the picture, the one with the most corners first."""
@@ -202,6 +212,19 @@ class Board:
     def _missing(self, found: int) -> str:
         total = self.rows * self.columns
         return "" if found == total else f"{total - found} of the board's {total} corners are hidden or not clear."
+
+
+def size_of_board(text: str | None, described: Mapping[str, Any], example: str) -> tuple[int, int]:
+    """Rows and columns from "8x11", or, where that is None, from what dataset.toml says; `example` is the cure."""
+    rows, columns = described.get("rows"), described.get("columns")
+    if text is not None:
+        rows, _, columns = text.lower().partition("x")
+    try:
+        return int(rows), int(columns)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise UsageError(
+            "the size of the board is not known." if text is None else f"--board {text!r} is not a size.", fix=example
+        ) from None
 
 
 def corner_name(shot: str, number: int) -> str:

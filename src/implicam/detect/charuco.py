@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
-from implicam.detect.board import MAX_SEARCH_PIXELS, corner_name, unusable
+from implicam.detect.board import MAX_SEARCH_PIXELS, corner_name, size_of_board, unusable
 from implicam.detect.corners import Corners, fit_corners
 from implicam.detect.grid import MAX_ASTRAY_SQUARES, Places, places_from
-from implicam.detect.model import Detected, View, nothing
+from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
 from implicam.detect.seeds import in_original, resized
 from implicam.errors import UsageError, did_you_mean
 from implicam.images import Grey, eight_bit, opencv
@@ -33,7 +34,7 @@ MAX_MARKER_OFF_SQUARES = 0.3
 
 
 @dataclass(frozen=True)
-class Charuco:
+class Charuco(DetectorBase):
     """A ChArUco board of rows x columns SQUARES, edges of squares and markers in millimetres.
 
     dictionary: OpenCV's name of the set of markers. legacy: printed with OpenCV before 4.6, and an even number of rows.
@@ -73,6 +74,25 @@ class Charuco:
                 fix="use the dictionary that the board was printed with",
             )
 
+    @classmethod
+    def from_options(
+        cls,
+        dataset: Path,
+        described: Mapping[str, Any],
+        *,
+        board: Annotated[str | None, Option("squares, 9x12", "RxC")] = None,
+        square: Annotated[float | None, Option("edge of a square", "MM", 0)] = None,
+        marker: Annotated[float | None, Option("edge of a marker", "MM", 0)] = None,
+        dictionary: Annotated[str | None, Option("OpenCV's name, such as DICT_5X5_100")] = None,
+    ) -> Charuco:
+        """As the command line says it."""
+        rows, columns = size_of_board(board, described, "--board 9x12 (squares, rows x columns)")
+        if not square or not marker:
+            raise UsageError(
+                "a ChArUco board needs --square and --marker.", fix="measure both edges on the printed board, in mm"
+            )
+        return cls(rows, columns, float(square), float(marker), str(dictionary or cls.dictionary))
+
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
         return {"target": "charuco", **asdict(self)}
@@ -104,10 +124,6 @@ class Charuco:
             f"{missing} of the board's {self._total} corners are hidden or not clear." if missing else "",
             (np.vstack([hull, hull[:1]]),),
         )
-
-    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
-        """Nothing to add."""
-        return dict(found)
 
     @property
     def _total(self) -> int:

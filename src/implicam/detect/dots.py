@@ -17,17 +17,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from implicam.dataset import Floats, KnownPositions
-from implicam.dataset.folder import read_points
+from implicam.dataset.folder import POINTS, read_points
 from implicam.dataset.tables import name_in, number, read_table
 from implicam.detect.blobs import find_spots, measure_spots, scale_shown
-from implicam.detect.model import Detected, View, nothing
+from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.gp.kernels import Kernel
 from implicam.gp.linalg import cholesky, solve, solve_lower
@@ -36,6 +36,8 @@ from implicam.images import Grey
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 Labels = Mapping[View, Mapping[str, tuple[float, float]]]
+
+LABELS = "labels.csv"
 
 MIN_LABELS = 6
 """Labels that a camera needs."""
@@ -63,7 +65,7 @@ MAX_ROUNDS = 25
 
 
 @dataclass(frozen=True, eq=False)
-class Dots:
+class Dots(DetectorBase):
     """Finds the dots of a target.
 
     points: n names and `known`, where they are; labels: pixels (u, v) of dots by point name, for each camera and shot,
@@ -100,15 +102,30 @@ class Dots:
         table = read_points(Path(layout))
         return cls(tuple(table.names), table.known, _read_labels(Path(labels), table.names), polarity)
 
+    @classmethod
+    def from_options(
+        cls,
+        dataset: Path,
+        described: Mapping[str, Any],
+        *,
+        layout: Annotated[Path | None, Option("where they are (default DATASET/points.csv)", "FILE")] = None,
+        labels: Annotated[Path | None, Option("six or more named (default DATASET/labels.csv)", "FILE")] = None,
+    ) -> Dots:
+        """As the command line says it."""
+        labels = labels or dataset / LABELS
+        if not labels.exists():
+            raise UsageError(
+                f"{labels} does not exist.",
+                why="six or more dots of each camera must be named by a person",
+                fix=f"write {labels}: point,camera,u,v, a row for each labelled dot; a pixel or two off will do",
+            )
+        return cls.from_files(layout or dataset / POINTS, labels)
+
     def options(self) -> dict[str, Any]:
         """Layout, labels and polarity as plain values."""
         marks = [[*view, name, *uv] for view, named in self.labels.items() for name, uv in named.items()]
         layout = {"points": list(self.points), "shots": self.known.shots.tolist(), "xyz": self.known.xyz.tolist()}
         return {"target": "dots", "layout": layout, "labels": marks, "polarity": self.polarity}
-
-    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
-        """The same: a dot that recurs is what a target that stands still shows."""
-        return dict(found)
 
     def detect(self, picture: Grey, view: View) -> Detected:
         """The dots found; notes: "labelled", "missing" (where those not found are predicted), "scale" in pixels."""

@@ -94,7 +94,7 @@ def detect_folder(
     pictures, pattern: where the pictures are, as `find_pictures` takes them, below `dataset`. Without dataset.toml one
     is made, with lengths in `unit`. overlays: whether to draw pictures to check by eye. A run that was stopped goes on
     where it was; `restart` forgets what it had found. correct: what is done to the observations before they are
-    written.
+    written, instead of `detector.correct`.
 
     UsageError for options that do not go together, DatasetError for a damaged dataset.toml or points.csv, ImageError
     where there are no pictures, or nothing was found in any of them.
@@ -110,10 +110,8 @@ def detect_folder(
         folder = rig.path / DETECTIONS
         write_text(folder / SUMMARY, _summary(rig, results))
         if data is not None:
-            if correct is not None:
-                data, said = correct(data)
-                more += said
-            more += _written(rig, data)
+            data, said = (correct or detector.correct)(data)
+            more += [*said, *_written(rig, data)]
         sheets, undrawn = draw(folder, results, progress, redraw=restart) if overlays else ((), ())
     if data is None:
         raise _nothing_at_all(rig, results, sheets)

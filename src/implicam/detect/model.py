@@ -1,7 +1,6 @@
 """What a detector finds in one picture, and what every detector offers.
 
-To add a target: 1. write `detect/<target>.py` with a frozen `Detector`; 2. add it to `TARGETS` in detect/__init__.py;
-3. run the tests: one contract runs over every detector.
+CONTRIBUTING.md has the recipe for one more.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from implicam.dataset import Floats
+from implicam.dataset import Dataset, Floats
 from implicam.images import Grey
 
 
@@ -75,8 +74,22 @@ def nothing(reason: str, **more: Any) -> Detected:
     return Detected(reason=reason, **more)
 
 
+class Option(NamedTuple):
+    """An option of `implicam detect`: what `--help` says of it, what stands for its value there, the least value."""
+
+    help: str
+    metavar: str = "NAME"
+    minimum: float | None = None
+
+
 class Detector(Protocol):
-    """Finds one kind of target; a frozen value, so that its options can be written beside its results."""
+    """Finds one kind of target; a frozen value, so that its options can be written beside its results.
+
+    On the command line it is made by the classmethod `from_options(dataset, described, *, ...)`. Its keyword arguments
+    are the options, `name: Annotated[type, Option(...)] = None`; `dataset` is the folder, and `described` the table
+    `[target]` of dataset.toml, empty where that is of another target. A key of that table with the name of an option
+    is its value where the option is not given.
+    """
 
     def options(self) -> dict[str, Any]:
         """All that its results depend on, as plain values: other options, other results."""
@@ -86,3 +99,18 @@ class Detector(Protocol):
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
         """A second look when all pictures are known: what recurs in every shot is no target, and so on."""
+
+    def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
+        """What it found as observations, made better, and notes: the middle of a ball for that of its outline, say."""
+
+
+class DetectorBase:
+    """What most detectors say of themselves: each picture speaks for itself, and nothing is to be corrected."""
+
+    def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
+        """Nothing to add."""
+        return dict(found)
+
+    def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
+        """The same."""
+        return data, []

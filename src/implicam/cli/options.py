@@ -1,0 +1,57 @@
+"""Options of the command line that registered parts bring with them, such as those of detectors."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, get_args
+
+import typer
+
+Options = Mapping[str, Mapping[str, inspect.Parameter]]
+
+
+class OptionsOfParts:
+    """A command whose `**options` are those of the parts in a registry, as they are when the command is run.
+
+    Args:
+        function: the command, with `**options` as its last parameter.
+        position: the name of the parameter after which `--help` lists them.
+        options: part -> option -> the parameter that describes it: annotated with its type and with `help`, `metavar`
+            and `minimum`. An option that several parts have is one option, of the type that it has in the first.
+    """
+
+    def __init__(self, function: Callable[..., None], position: str, options: Callable[[], Options]) -> None:
+        functools.update_wrapper(self, function)
+        self._function, self._position, self._options = function, position, options
+
+    def __call__(self, **given: Any) -> None:
+        """Run the command."""
+        self._function(**given)
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        """What Typer reads to parse the command line."""
+        own = list(inspect.signature(self._function, eval_str=True).parameters.values())[:-1]
+        place = [parameter.name for parameter in own].index(self._position) + 1
+        return inspect.Signature([*own[:place], *_merged(self._options()), *own[place:]])
+
+
+def _merged(options: Options) -> list[inspect.Parameter]:
+    """One parameter for each option, with the help of all parts that have it."""
+    helps: dict[str, dict[str, list[str]]] = {}
+    first: dict[str, inspect.Parameter] = {}
+    for part, parameters in options.items():
+        for name, parameter in parameters.items():
+            first.setdefault(name, parameter)
+            parts = helps.setdefault(name, {}).setdefault(get_args(parameter.annotation)[1].help, [])
+            parts.append(part)
+    made = []
+    for name, parameter in first.items():
+        kind, option = get_args(parameter.annotation)
+        text = "; ".join(f"{', '.join(parts)}: {meaning}" for meaning, parts in helps[name].items())
+        metavar = None if kind is bool else option.metavar
+        told = typer.Option(f"--{name.replace('_', '-')}", help=f"{text}.", metavar=metavar, min=option.minimum)
+        made.append(parameter.replace(annotation=Annotated[kind, told], kind=parameter.POSITIONAL_OR_KEYWORD))
+    return made

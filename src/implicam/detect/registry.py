@@ -1,0 +1,73 @@
+"""The detectors by name: from the name of a target and options, as the command line has them, to a detector.
+
+CONTRIBUTING.md has the recipe for one more.
+"""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+from implicam.dataset.folder import DESCRIPTION, read_description
+from implicam.detect.ball import Ball
+from implicam.detect.board import Board
+from implicam.detect.charuco import Charuco
+from implicam.detect.dots import Dots
+from implicam.detect.model import Detector
+from implicam.errors import UsageError, did_you_mean
+from implicam.registry import Registry
+
+TARGETS: Registry[type[Any]] = Registry(
+    "target", {"ball": Ball, "board": Board, "charuco": Charuco, "dots": Dots}, "implicam.detectors"
+)
+"""Target -> its detector."""
+
+
+def options_of(target: str) -> dict[str, inspect.Parameter]:
+    """The options that a target has on the command line: the keyword arguments of its detector's `from_options`."""
+    parameters = inspect.signature(TARGETS[target].from_options, eval_str=True).parameters
+    return {name: one for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
+
+
+def detector_from_options(target: str | None, dataset: Path, **options: Any) -> Detector:
+    """The detector that finds a target in the pictures of a dataset folder.
+
+    Args:
+        target: a name in `TARGETS`; where it is None, the `kind` of the table `[target]` of dataset.toml.
+        dataset: the folder; what dataset.toml says of the target fills the options that are not given.
+        **options: those of `options_of(target)`; None and False stand for "not given".
+
+    Raises:
+        UsageError: the target or an option is not known, or an option is missing or wrong.
+    """
+    described = _described_target(dataset)
+    name = target or str(described.get("kind", ""))
+    if not name:
+        raise UsageError(
+            "which target is it?",
+            why=f"neither --target nor {dataset / DESCRIPTION} says so",
+            fix=f"--target {'|'.join(TARGETS)}",
+        )
+    detector, variant = TARGETS.find(name)
+    if variant:
+        raise UsageError(f"target {name!r} has no variants.", fix=f"--target {name.partition(':')[0]}")
+    known = options_of(name)
+    given = {key: value for key, value in options.items() if value is not None and value is not False}
+    for key in given:
+        if key not in known:
+            raise UsageError(
+                f"the target {name!r} has no option --{key}{did_you_mean(key, known)}.",
+                fix=f"leave it out; {name} has {', '.join(f'--{one}' for one in known) or 'none'}",
+            )
+    own = described if described.get("kind") == name else {}
+    made: Detector = detector.from_options(dataset, own, **{**{k: own[k] for k in known if k in own}, **given})
+    return made
+
+
+def _described_target(dataset: Path) -> dict[str, Any]:
+    """The table [target] of dataset.toml."""
+    if not (dataset / DESCRIPTION).exists():
+        return {}
+    table = read_description(dataset)[3].get("target", {})
+    return table if isinstance(table, dict) else {}
