@@ -36,7 +36,7 @@ class Diagnosis:
             inliers = self.fitted.inliers[number]
             if inliers.all():
                 continue
-            seen = self._camera_views[c]
+            seen = self._seen[number]
             residual, _ = left_out_residuals(self.fitted.posterior, number, self._points, seen, inliers)
             for row in np.flatnonzero(~inliers):
                 point = str(self.data.points[seen.rows[row]])
@@ -60,7 +60,7 @@ class Diagnosis:
     def leave_one_out(self) -> tuple[Floats, Floats]:
         """Errors and sds (m, 3) of the known points that two cameras see, in the world's unit, each measured without
         its own views, to first order; where errors of known positions are estimated, they are part of both."""
-        fitted, seen = self.fitted, tuple(self._camera_views[c] for c in self.fitted.cameras)
+        fitted, seen = self.fitted, self._seen
         if fitted.position_errors is not None:
             error, cov = left_out_points(fitted, self._points, seen)
         else:
@@ -120,19 +120,16 @@ class Diagnosis:
         return self.frame.to_working(self.data.xyz)
 
     @cached_property
-    def _camera_views(self) -> tuple[CameraViews, ...]:
-        found = list(camera_views_of(self.data.observations, stated_noise(self.data.observations)))
-        if self.fitted.tails is not None:
-            calibrated = self.fitted.cameras
-            weighted = self.fitted.tails.weight_views(tuple(found[c] for c in calibrated), with_loss=True)
-            for c, camera_views in zip(calibrated, weighted, strict=True):
-                found[c] = camera_views
-        return tuple(found)
+    def _seen(self) -> tuple[CameraViews, ...]:
+        """What each fitted camera saw, with the noise that counts."""
+        every = camera_views_of(self.data.observations, stated_noise(self.data.observations))
+        seen = tuple(every[c] for c in self.fitted.cameras)
+        return seen if self.fitted.tails is None else self.fitted.tails.weight_views(seen, with_loss=True)
 
     @cached_property
     def _used(self) -> NDArray[np.bool_]:
         """(n, calibrated cameras) the views used."""
         used = np.zeros((len(self.data), len(self.fitted.cameras)), dtype=np.bool_)
-        for number, c in enumerate(self.fitted.cameras):
-            used[self._camera_views[c].rows, number] = self.fitted.inliers[number]
+        for number, (seen, inliers) in enumerate(zip(self._seen, self.fitted.inliers, strict=True)):
+            used[seen.rows, number] = inliers
         return used

@@ -34,17 +34,12 @@ class Posterior:
 
     models: tuple[CameraModel, ...]
     alone: tuple[Floats, ...]
-    joint: Floats | None
-    steps: tuple[Floats, ...]
-    evidence: float
+    joint: Floats | None = None
+    steps: tuple[Floats, ...] = ()
+    evidence: float = 0.0
     unknowns: Unknowns | None = None
     displacement: Floats | None = None
     ties: Floats | None = None
-
-    @classmethod
-    def unknown(cls, models: tuple[CameraModel, ...]) -> Posterior:
-        """Cameras before they have seen anything."""
-        return cls(models, (), None, (), 0.0)
 
     @property
     def tied(self) -> bool:

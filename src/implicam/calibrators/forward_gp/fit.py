@@ -160,7 +160,7 @@ def _fit_from_start(
     progress("fitting", 1, 3)
     guess = before.hyperparameters if before is not None and before.cameras == cameras else None
     inliers = tuple(start.inliers for start in started.values())
-    state = Round(Posterior.unknown(models), inliers, guess, training.errors)
+    state = Round(Posterior(models, ()), inliers, guess, training.errors)
     shots = training.errors is not None and training.errors.estimated
     keep_sizes = guess is not None and training.errors is not None and not shots
     rounds = settings.max_rounds_with_shots if shots else settings.max_rounds
