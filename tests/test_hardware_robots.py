@@ -89,7 +89,7 @@ def robot(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[hardware.R
         path.write_text("x,y,z,sd_x,sd_y,sd_z\n300,210,400,1,1,2\n320,200,400,,,\n")
         yield CsvPlayer(path)
     else:
-        person = Person(lambda xyz: person.said(xyz))
+        person = Person(lambda xyz: person.set_position(xyz))
         yield person
 
 
@@ -298,13 +298,13 @@ def test_a_bad_table_is_named_with_its_line(tmp_path: Path, text: str, words: st
 def test_a_person_is_only_asked() -> None:
     asked: list[list[float]] = []
     person = Person(lambda xyz: asked.append(xyz.tolist()), (0.5, 0.5, 1.0))
-    with pytest.raises(HardwareError, match="nobody has said"):
+    with pytest.raises(HardwareError, match="it is not known yet"):
         person.position()
     assert person.move(np.array([1.0, 2.0, 3.0])).tolist() == [1, 2, 3]
     assert asked == [[1, 2, 3]]
-    with pytest.raises(HardwareError, match="nobody has said"):
+    with pytest.raises(HardwareError, match="it is not known yet"):
         person.position()
-    person.said(np.array([1.1, 2.0, 3.0]))
+    person.set_position(np.array([1.1, 2.0, 3.0]))
     assert person.position().tolist() == [1.1, 2.0, 3.0]
     person.move(np.zeros(3))
     with pytest.raises(HardwareError):  # what was said before is not where it is now

@@ -1,4 +1,4 @@
-"""Cameras, triggers and robots behind three small protocols; one driver, one file. See docs/hardware.md.
+"""Cameras, triggers and robots behind small protocols; one driver, one file. See docs/hardware.md.
 
 camera = camera_from("cam1", "rtsp://192.168.0.21/main")
 robot = robot_from("ur:192.168.0.10", box=((200, -300, 100), (600, 300, 500)))
@@ -7,8 +7,6 @@ robot.move(xyz); frame = camera.frame()
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from implicam.errors import UsageError, did_you_mean
@@ -17,22 +15,37 @@ from implicam.hardware.folder_camera import FolderCamera
 from implicam.hardware.genicam import GenICamCamera
 from implicam.hardware.opencv_camera import STREAMS, OpenCVCamera
 from implicam.hardware.person import Person
-from implicam.hardware.protocol import Frame, FrameSource, Robot, Trigger, exposed
+from implicam.hardware.protocol import (
+    CameraDriver,
+    Frame,
+    FrameSource,
+    MovedByHand,
+    Robot,
+    RobotDriver,
+    RobotOptions,
+    Trigger,
+    exposed,
+)
 from implicam.hardware.simulated import PhotographingCamera, SimulatedRobot, simulated_rig
 from implicam.hardware.trigger import NetworkTrigger, TriggerSimulator
 from implicam.hardware.ur import URRobot
+from implicam.registry import Registry
 
 __all__ = [
+    "CAMERAS",
+    "ROBOTS",
     "CsvPlayer",
     "FolderCamera",
     "Frame",
     "FrameSource",
     "GenICamCamera",
+    "MovedByHand",
     "NetworkTrigger",
     "OpenCVCamera",
     "Person",
     "PhotographingCamera",
     "Robot",
+    "RobotOptions",
     "SimulatedRobot",
     "Trigger",
     "TriggerSimulator",
@@ -41,50 +54,61 @@ __all__ = [
     "exposed",
     "robot_from",
     "simulated_rig",
+    "specs",
     "trigger_from",
 ]
 
-CAMERAS = "0, /dev/video0, rtsp://..., http://..., film.avi, folder/, genicam:SERIAL@producer.cti"
+CAMERAS: Registry[type[CameraDriver]] = Registry(
+    "camera", {"opencv": OpenCVCamera, "folder": FolderCamera, "genicam": GenICamCamera}, "implicam.cameras"
+)
+"""Name -> driver; those that take a spec without their name are asked in this order."""
+
+ROBOTS: Registry[type[RobotDriver]] = Registry(
+    "robot", {"person": Person, "csv": CsvPlayer, "ur": URRobot}, "implicam.robots"
+)
+"""Name -> driver."""
+
+
+def specs(drivers: Registry[Any]) -> str:
+    """What the specs of all drivers look like, for help and errors."""
+    return ", ".join(driver.spec for driver in drivers.values())
 
 
 def camera_from(name: str, spec: str, *, triggered: bool = False) -> FrameSource:
-    """The camera that the words of a command line name: one of `CAMERAS`; UsageError for others. Opens nothing.
+    """The camera that the words of a command line name; it is not opened.
 
-    triggered: it exposes only when a trigger fires.
+    Args:
+        name: the camera's name in the dataset.
+        spec: a driver's name, a colon, and what it asks for; or what one of the drivers takes as it is.
+        triggered: the camera exposes only when a trigger fires.
+
+    Raises:
+        UsageError: no driver takes it; the error says what the specs look like.
     """
-    if spec.startswith("genicam:"):
-        serial, _, producer = spec.removeprefix("genicam:").partition("@")
-        if not serial or not producer:
-            raise _unknown("camera", spec, (), "genicam:SERIAL@/path/of/producer.cti")
-        return GenICamCamera(name, serial, producer, triggered=triggered)
-    if spec.isdecimal() or spec.startswith(("/dev/", *STREAMS)):
-        return OpenCVCamera(name, spec, triggered=triggered)
-    if spec.endswith("/") or (spec and Path(spec).is_dir()):
-        return FolderCamera(name, spec)
-    if Path(spec).is_file():
-        return OpenCVCamera(name, spec)
-    raise _unknown("camera", spec, ("genicam", "/dev/video0", *STREAMS), CAMERAS)
+    driver, colon, rest = spec.partition(":")
+    if colon and driver in CAMERAS:
+        return CAMERAS[driver].from_spec(name, rest, triggered=triggered)
+    for kind in CAMERAS.values():
+        if kind.takes(spec):
+            return kind.from_spec(name, spec, triggered=triggered)
+    known = (*CAMERAS, "/dev/video0", *STREAMS)
+    raise _unknown("camera", spec, known, CAMERAS, why="there is no such file or folder either")
 
 
-def robot_from(spec: str, *, ask: Callable[[Any], None] | None = None, **ur: Any) -> Robot:
-    """The robot that "ur:HOST", "csv:FILE" or "person" names; UsageError for others. Opens nothing.
+def robot_from(spec: str, **options: Any) -> Robot:
+    """The robot that the words of a command line name; it is not connected.
 
-    ask: what shows a person where the target is to go. ur: options of `URRobot`; its box is required.
+    Args:
+        spec: a driver's name; for most a colon, and what it asks for: "ur:192.168.0.10".
+        options: the fields of `RobotOptions`.
+
+    Raises:
+        UsageError: there is no such driver, or something that it needs is missing.
     """
-    kind, _, rest = spec.partition(":")
-    if kind == "ur" and rest:
-        if ur.get("box") is None:
-            raise UsageError(
-                f"{spec} needs a box that it may move in.",
-                why="without one, a mistyped number is a collision",
-                fix="give two opposite corners of the free space, in the dataset's unit, robot base frame",
-            )
-        return URRobot(rest, **ur)
-    if kind == "csv" and rest:
-        return CsvPlayer(rest)
-    if spec == "person" and ask is not None:
-        return Person(ask)
-    raise _unknown("robot", spec, ("ur:HOST", "csv:FILE", "person"), "ur:HOST, csv:FILE, person")
+    name, _, rest = spec.partition(":")
+    if name not in ROBOTS:
+        raise _unknown("robot", spec, tuple(ROBOTS), ROBOTS)
+    return ROBOTS[name].from_spec(rest, RobotOptions(**options))
 
 
 def trigger_from(spec: str) -> Trigger:
@@ -92,8 +116,6 @@ def trigger_from(spec: str) -> Trigger:
     return NetworkTrigger(spec)
 
 
-def _unknown(what: str, spec: str, known: tuple[str, ...], fix: str) -> UsageError:
+def _unknown(what: str, spec: str, known: tuple[str, ...], drivers: Registry[Any], why: str = "") -> UsageError:
     hint = did_you_mean(spec, known) or did_you_mean(spec.partition(":")[0], [word.partition(":")[0] for word in known])
-    return UsageError(
-        f"{spec!r} names no {what}{hint}.", why="there is no such file or folder either", fix=f"write {fix}"
-    )
+    return UsageError(f"{spec!r} names no {what}{hint}.", why=why, fix=f"write {specs(drivers)}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import ClassVar, Self
 
 import numpy as np
 
-from implicam.errors import HardwareError
-from implicam.hardware.protocol import Floats, point
+from implicam.errors import HardwareError, UsageError
+from implicam.hardware.protocol import Floats, RobotOptions, incomplete, point
 
 COLUMNS, SD_COLUMNS = ("x", "y", "z"), ("sd_x", "sd_y", "sd_z")
 MAX_BYTES = 200_000_000
@@ -23,6 +24,16 @@ class CsvPlayer:
 
     moves = True
     alone = False  # somebody puts the target there; the table says where that is
+    spec: ClassVar[str] = "csv:FILE"
+
+    @classmethod
+    def from_spec(cls, rest: str, options: RobotOptions) -> Self:
+        """As of `RobotDriver`; it needs no option."""
+        if not rest:
+            raise incomplete("robot", cls)
+        if options.sd is not None:
+            raise UsageError("the table says how well its positions are known.", fix="give it columns sd_x, sd_y, sd_z")
+        return cls(rest)
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)

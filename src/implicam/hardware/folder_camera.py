@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 from implicam.errors import HardwareError, ImageError
 from implicam.hardware.protocol import Frame, Grey, wait_for
@@ -28,6 +28,17 @@ class FolderCamera:
     """
 
     live = False
+    spec: ClassVar[str] = "folder/"
+
+    @classmethod
+    def takes(cls, spec: str) -> bool:
+        """A folder, or a name that ends like one."""
+        return spec.endswith("/") or (bool(spec) and Path(spec).is_dir())
+
+    @classmethod
+    def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
+        """As of `CameraDriver`; whether a trigger makes the pictures is the same here."""
+        return cls(name, rest)
 
     def __init__(self, name: str, folder: Path | str, pattern: str = "*") -> None:
         self.name = name

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from implicam.errors import HardwareError, import_extra
-from implicam.hardware.protocol import Frame, Grey
+from implicam.hardware.protocol import Frame, Grey, incomplete
 from implicam.images import opencv
 
 BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
@@ -26,6 +26,21 @@ class GenICamCamera:
 
     triggered: see `OpenCVCamera`; what exposure, gain and trigger the camera is set to is kept in the camera itself.
     """
+
+    spec: ClassVar[str] = "genicam:SERIAL@producer.cti"
+
+    @classmethod
+    def takes(cls, spec: str) -> bool:
+        """Only by its name."""
+        return False
+
+    @classmethod
+    def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
+        """As of `CameraDriver`."""
+        serial, _, producer = rest.partition("@")
+        if not serial or not producer:
+            raise incomplete("camera", cls)
+        return cls(name, serial, producer, triggered=triggered)
 
     def __init__(self, name: str, serial: str, producer: Path | str, *, triggered: bool = False) -> None:
         self.name, self.serial, self.producer = name, serial, Path(producer)

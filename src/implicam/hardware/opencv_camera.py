@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,18 @@ class OpenCVCamera:
     free-running camera's first ones may have been exposed before the call: a later one is given. A film gives its
     pictures in order; at its end, HardwareError until it is closed and opened again.
     """
+
+    spec: ClassVar[str] = "0, /dev/video0, rtsp://..., http://..., film.avi"
+
+    @classmethod
+    def takes(cls, spec: str) -> bool:
+        """The number or the file of a device, the address of a stream, a film."""
+        return spec.isdecimal() or spec.startswith(("/dev/", *STREAMS)) or Path(spec).is_file()
+
+    @classmethod
+    def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
+        """As of `CameraDriver`."""
+        return cls(name, rest, triggered=triggered)
 
     def __init__(self, name: str, source: int | str | Path, *, triggered: bool = False) -> None:
         self.name = name

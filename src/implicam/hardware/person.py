@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import ClassVar, Self
 
 import numpy as np
 
 from implicam.errors import HardwareError
-from implicam.hardware.protocol import Floats, point
+from implicam.hardware.protocol import Floats, RobotOptions, incomplete, point
 
 
 class Person:
     """The `Robot` that has hands. ask: shown every wish, a position (3,); sd: of what is typed, in its unit."""
 
     moves = alone = False
+    spec: ClassVar[str] = "person"
+
+    @classmethod
+    def from_spec(cls, rest: str, options: RobotOptions) -> Self:
+        """As of `RobotDriver`; options: ask, sd."""
+        if rest or options.ask is None:
+            raise incomplete("robot", cls)
+        return cls(options.ask) if options.sd is None else cls(options.ask, options.sd)
 
     def __init__(self, ask: Callable[[Floats], None], sd: Sequence[float] = (np.nan, np.nan, np.nan)) -> None:
         self._ask = ask
@@ -23,22 +32,22 @@ class Person:
     def open(self) -> None:
         """Nothing to connect."""
 
-    def said(self, xyz: Floats) -> None:
+    def set_position(self, xyz: Floats) -> None:
         """The target is at xyz (3,): what was read from the ruler."""
         self._position = point(xyz)
 
     def position(self) -> Floats:
-        """What was said last."""
+        """Where it was said to be last."""
         if self._position is None:
             raise HardwareError(
-                "nobody has said yet where the target is.",
+                "it is not known yet where the target is.",
                 why="a person's position is known once it is typed",
                 fix="put the target somewhere, measure x, y, z and type them",
             )
         return self._position.copy()
 
     def move(self, xyz: Floats) -> Floats:
-        """Ask for xyz; returns the wish. Where the target ends up is what `said` is told afterwards."""
+        """Ask for xyz; returns the wish. Where the target ends up is what `set_position` is given afterwards."""
         wish = point(xyz)
         self._position = None  # what was true before is not true while hands move the target
         self._ask(wish)

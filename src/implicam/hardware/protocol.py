@@ -4,8 +4,9 @@
     Trigger       the box that exposes all cameras at once: open, fire, close
     Robot         whatever puts the target somewhere and knows where it is: open, position, move, stop, close
 
-Add the driver to the tables in `hardware/__init__.py` and to the contract test in tests/test_hardware.py, which holds
-every driver to the sentences below. A driver never imports its vendor's library before `open`.
+A driver is found by a spec, the words of a command line: `from_spec` makes one of it. CONTRIBUTING.md, "A robot", has
+the steps; contract tests hold every driver to the sentences below. A driver never imports its vendor's library before
+`open`.
 """
 
 from __future__ import annotations
@@ -14,15 +15,30 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, wait
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from implicam.errors import HardwareError
+from implicam.errors import HardwareError, UsageError
 from implicam.geometry import Floats
 from implicam.images import Grey
 
-__all__ = ["Floats", "Frame", "FrameSource", "Grey", "Robot", "Trigger", "exposed", "point", "wait_for"]
+__all__ = [
+    "CameraDriver",
+    "Floats",
+    "Frame",
+    "FrameSource",
+    "Grey",
+    "MovedByHand",
+    "Robot",
+    "RobotDriver",
+    "RobotOptions",
+    "Trigger",
+    "exposed",
+    "incomplete",
+    "point",
+    "wait_for",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +72,30 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Give the camera back. Closing twice is harmless; `open` opens it again."""
+
+
+class CameraDriver(Protocol):
+    """What the registry of cameras asks of a driver's class."""
+
+    spec: ClassVar[str]
+    """What its specs look like, for help and errors: "genicam:SERIAL@producer.cti"."""
+
+    @classmethod
+    def takes(cls, spec: str) -> bool:
+        """Whether a spec without the driver's name, such as a number or a folder, is meant for it."""
+
+    @classmethod
+    def from_spec(cls, name: str, rest: str, *, triggered: bool) -> FrameSource:
+        """A camera of this driver, not yet opened.
+
+        Args:
+            name: the camera's name in the dataset.
+            rest: the spec, or what follows the driver's name and a colon.
+            triggered: the camera exposes only when a trigger fires.
+
+        Raises:
+            UsageError: the spec is not complete.
+        """
 
 
 class Trigger(Protocol):
@@ -108,6 +148,65 @@ class Robot(Protocol):
 
     def close(self) -> None:
         """Disconnect; the robot stays where it is. Closing twice is harmless."""
+
+
+@runtime_checkable
+class MovedByHand(Protocol):
+    """A `Robot` that is told where the target has been put, because it cannot know: a person with a ruler."""
+
+    def set_position(self, xyz: Floats) -> None:
+        """The target is at xyz (3,)."""
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """What a session knows when it makes a robot; a driver takes what it needs.
+
+    Attributes:
+        ask: shows a person where the target is to go, a position (3,).
+        unit: the length unit of the dataset; box, sd and tool are in it.
+        box: two opposite corners (3,) of the space that a robot may move in, in its base frame.
+        speed: m/s; None for the driver's own.
+        sd: standard uncertainty of positions along x, y, z; None for the driver's own.
+        tool: (3,) the target's centre in the frame of the robot's flange; None where the robot knows it.
+        dry_run: say where it would go; move nothing.
+        confirm: asked before each move with here and there, each (3,); only True lets it move.
+        say: shows a line of text to the user.
+    """
+
+    ask: Callable[[Floats], None] | None = None
+    unit: str = "mm"
+    box: tuple[Sequence[float] | Floats, Sequence[float] | Floats] | None = None
+    speed: float | None = None
+    sd: Sequence[float] | None = None
+    tool: Sequence[float] | None = None
+    dry_run: bool = False
+    confirm: Callable[[Floats, Floats], bool] | None = None
+    say: Callable[[str], None] = print
+
+
+class RobotDriver(Protocol):
+    """What the registry of robots asks of a driver's class."""
+
+    spec: ClassVar[str]
+    """What its specs look like, for help and errors: "ur:HOST"."""
+
+    @classmethod
+    def from_spec(cls, rest: str, options: RobotOptions) -> Robot:
+        """A robot of this driver, not yet connected.
+
+        Args:
+            rest: what follows the driver's name and a colon; empty where the name stands alone.
+            options: what the session knows.
+
+        Raises:
+            UsageError: the spec, or an option that this driver needs, is missing or wrong.
+        """
+
+
+def incomplete(what: str, driver: type[CameraDriver] | type[RobotDriver]) -> UsageError:
+    """The error of a spec that names a driver and lacks what must follow."""
+    return UsageError(f"that names no {what}.", why="something is missing after the colon", fix=f"write {driver.spec}")
 
 
 def point(xyz: Floats, what: str = "position") -> Floats:

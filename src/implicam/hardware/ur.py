@@ -10,13 +10,13 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from implicam.dataset.model import METRES
 from implicam.errors import HardwareError, UsageError, import_extra
-from implicam.hardware.protocol import Floats, point, wait_for
+from implicam.hardware.protocol import Floats, RobotOptions, incomplete, point, wait_for
 from implicam.hardware.ur_worker import DECELERATION, Worker
 
 FASTEST = 0.25
@@ -55,6 +55,22 @@ class URRobot:
     """
 
     moves = alone = True
+    spec: ClassVar[str] = "ur:HOST"
+
+    @classmethod
+    def from_spec(cls, rest: str, options: RobotOptions) -> Self:
+        """As of `RobotDriver`; options: all but ask. The box is required."""
+        if not rest:
+            raise incomplete("robot", cls)
+        if options.box is None:
+            raise UsageError(
+                f"ur:{rest} needs a box that it may move in.",
+                why="without one, a mistyped number is a collision",
+                fix="give two opposite corners of the free space, in the dataset's unit, robot base frame",
+            )
+        kept = ("unit", "box", "sd", "dry_run", "confirm", "say", "speed")
+        given = {key: value for key in kept if (value := getattr(options, key)) is not None}
+        return cls(rest, options.tool, **given)
 
     def __init__(
         self,

@@ -28,7 +28,7 @@ from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observatio
 from implicam.detect import Detected, Detector, View, centred
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.formatting import json_safe
-from implicam.hardware import Frame, FrameSource, Robot, Trigger, exposed
+from implicam.hardware import Frame, FrameSource, MovedByHand, Robot, Trigger, exposed
 from implicam.images import blank
 from implicam.progress import Progress, silent
 from implicam.session.detections import Look, reject_implausible
@@ -150,9 +150,8 @@ class SessionController:
     def arrived(self, xyz: Floats) -> None:
         """A person says where the ball is (3,), measured with a ruler; then look."""
         with self._working("moving", "looking"):
-            say = getattr(self.equipment.robot, "said", None)
-            if say is not None:
-                say(np.asarray(xyz, dtype=np.float64))
+            if isinstance(self.equipment.robot, MovedByHand):
+                self.equipment.robot.set_position(np.asarray(xyz, dtype=np.float64))
             self._shown(self.equipment.robot.position())
 
     def redo(self) -> None:

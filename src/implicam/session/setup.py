@@ -19,14 +19,24 @@ from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
-from implicam.hardware import FrameSource, Robot, Trigger, camera_from, exposed, robot_from, simulated_rig, trigger_from
+from implicam.hardware import (
+    FrameSource,
+    Person,
+    Robot,
+    Trigger,
+    camera_from,
+    exposed,
+    robot_from,
+    simulated_rig,
+    trigger_from,
+)
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
 from implicam.session.journal import Session
 from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
 
-SIMULATED, PERSON = "simulated", "person"
+SIMULATED = "simulated"
 SIMULATED_SPEED = 0.4
 """m/s of the simulated robot: fast enough not to wait for, slow enough to see it move."""
 
@@ -89,8 +99,6 @@ class Setup:
             raise UsageError(
                 f"{self.budget} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
             )
-        if self.sd is not None and self.robot.startswith("csv:"):
-            raise UsageError("the table says how well its positions are known.", fix="give it columns sd_x, sd_y, sd_z")
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any]) -> Setup:
@@ -224,22 +232,17 @@ def _simulated(setup: Setup) -> Hardware:
 
 
 def _robot(setup: Setup, say: Callable[[str], None]) -> Robot:
-    kind = setup.robot or PERSON
-    options: dict[str, Any] = {}
-    if kind.startswith("ur:"):
-        options = {
-            "box": _corners(setup),
-            "unit": setup.unit,
-            "dry_run": setup.dry_run,
-            "tool": setup.tool,
-            "say": say,
-            **({} if setup.speed is None else {"speed": setup.speed}),
-            **({} if setup.sd is None else {"sd": (setup.sd,) * 3}),
-        }
-    robot = robot_from(kind, ask=lambda _: None, **options)
-    if kind == PERSON and setup.sd is not None:
-        robot.sd = (setup.sd,) * 3  # type: ignore[misc]
-    return robot
+    return robot_from(
+        setup.robot or Person.spec,
+        ask=lambda _: None,
+        unit=setup.unit,
+        box=_corners(setup),
+        speed=setup.speed,
+        sd=None if setup.sd is None else (setup.sd,) * 3,
+        tool=setup.tool,
+        dry_run=setup.dry_run,
+        say=say,
+    )
 
 
 def _corners(setup: Setup) -> tuple[Floats, Floats] | None:
