@@ -12,12 +12,17 @@ import numpy as np
 import pytest
 
 import implicam
-from forward_gp_cases import fitted, known, rig, with_positions
+from forward_gp_cases import IMAGE, fitted, known, rig, rotation, with_positions
 from implicam.calibration_file import describe
 from implicam.calibrators import ForwardGP, ForwardGPCalibration, ForwardGPSettings, load_calibration
 from implicam.dataset import Dataset
 from implicam.errors import UsageError
+from implicam.geometry import Pose
+from implicam.lenses import KannalaBrandt
+from implicam.rig_model.camera import CentralCamera, ProjectiveCamera
+from implicam.rig_model.level_errors import find_levels
 from implicam.rig_model.settings import BELOW_ONE, RigModelSettings
+from implicam.rig_model.shot_errors import Shots
 from implicam.simulate import moving_board, random_positions, simulate
 
 ROOT = Path(implicam.__file__).parent
@@ -168,6 +173,51 @@ def test_settings_of_measuring_are_those_of_the_calibration() -> None:
     assert np.isnan(strict.xyz[:, 0]).sum() > 30
     assert not usual.alarm
     assert measured(max_contradicting_share=0.01, usual_wrong_share=1e-6, false_alarm_probability=0.99).alarm
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["distortion_prior_sd", "distortion_at_edge_prior_sd", "log_aspect_prior_sd", "centre_prior_sd_sides",
+     "projection_prior_relative_sd"],
+)  # fmt: skip
+def test_priors_of_cameras_are_those_of_the_settings(name: str) -> None:
+    pose, widest = Pose(rotation(0), np.array([0.1, -0.2, 3.0])), 1.05
+    cameras = (
+        CentralCamera(KannalaBrandt(400.0, 401.0, 630.0, 405.0, 0.02, 0.0, 0.0, 0.0), pose),
+        ProjectiveCamera(np.column_stack([pose.rotation, pose.translation])),
+    )
+    changed = ForwardGPSettings(**{name: other(name)})
+    same = [
+        np.array_equal(camera.prior(IMAGE, widest).precision, camera.prior(IMAGE, widest, changed).precision)
+        for camera in cameras
+    ]
+    assert same == [name == "projection_prior_relative_sd", name != "projection_prior_relative_sd"]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"min_levels": 4}, {"max_levels": 2}, {"min_points_per_level": 13}, {"max_level_thickness_ratio": 1e-7}],
+)
+def test_what_a_level_is_the_settings_say(changed: dict[str, Any]) -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([np.column_stack([rng.uniform(-1, 1, (12, 2)), np.full(12, z)]) for z in (0.0, 0.4, 1.0)])
+    points[:, 2] += rng.uniform(0, 1e-4, len(points))
+    found = find_levels(points, ForwardGPSettings())
+    assert found is not None
+    assert len(np.unique(found.number)) == 3
+    assert find_levels(points, ForwardGPSettings(**changed)) is None
+
+
+def test_what_parallel_plates_are_the_settings_say() -> None:
+    """Where plates are none, the direction of the traverse is that of their centres."""
+    data = plates()
+    points = data.xyz / 100 + np.random.default_rng(0).normal(scale=5e-4, size=data.xyz.shape)
+    along = [
+        Shots.of(points, data.shots, ForwardGPSettings(**changed)).along[0]  # type: ignore[union-attr]
+        for changed in ({}, {"max_plate_thickness_ratio": 1e-6}, {"max_plate_one_minus_cosine": 1e-15})
+    ]
+    assert not np.array_equal(along[0], along[1])
+    np.testing.assert_array_equal(along[1], along[2])
 
 
 @pytest.mark.parametrize(
