@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
 from dataclasses import fields, replace
 from functools import cache
@@ -68,6 +70,18 @@ def test_settings_at_their_defaults_change_nothing() -> None:
     again = ForwardGP(settings=stated).fit(known())
     np.testing.assert_array_equal(again.posterior.root(0), fitted().posterior.root(0))
     assert again.calibrator == fitted().calibrator
+
+
+def test_settings_are_shown_as_they_would_be_written() -> None:
+    shown = repr(ForwardGP(settings=ForwardGPSettings(max_rounds=9, min_lengthscale=(1.0, 0.2))))
+    assert shown.endswith("settings=ForwardGPSettings(min_lengthscale=(1.0, 0.2), max_rounds=9))")
+    assert repr(RigModelSettings()) == "RigModelSettings()"
+
+
+def test_settings_go_to_other_processes() -> None:
+    settings = ForwardGPSettings(max_rounds=9)
+    assert pickle.loads(pickle.dumps(settings)) == copy.deepcopy(settings) == replace(settings) == settings
+    assert len({settings, replace(settings), ForwardGPSettings()}) == 2
 
 
 def test_a_file_from_before_there_were_settings_has_the_defaults() -> None:
@@ -247,6 +261,8 @@ def test_a_setting_that_makes_no_sense_is_refused(name: str, value: Any, words: 
 def test_a_setting_that_is_not_there_is_refused_with_the_nearest() -> None:
     with pytest.raises(UsageError, match=r"there is no setting 'max_round'.*max_rounds"):
         ForwardGPSettings.from_table({"max_round": 3})
+    with pytest.raises(UsageError, match="no setting 'max_round'"):
+        ForwardGPSettings(max_round=3)  # type: ignore[call-arg]
     with pytest.raises(UsageError, match="no setting 'max_rounds'"):
         RigModelSettings.from_table({"max_rounds": 3})
     with pytest.raises(UsageError, match="settings of forward-gp"):

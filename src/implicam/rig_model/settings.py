@@ -22,7 +22,7 @@ BELOW_ONE = ("_share", "_probability", "_p_value", "_p_values", "error_bar_level
 """What a setting's name ends in where its value must be below one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RigModelSettings:
     """The settings of cameras, of the posterior, of errors of known positions, and of measuring."""
 
@@ -182,6 +182,17 @@ class RigModelSettings:
         known = family == KannalaBrandt.family
         return (self.distortion_prior_sd, self.distortion_at_edge_prior_sd) if known else None
 
+    def __new__(cls, **given: Any) -> Self:
+        """UsageError, instead of a TypeError, for a name that is no setting."""
+        known = [field.name for field in fields(cls)]
+        for name in given:
+            if name not in known:
+                raise UsageError(
+                    f"there is no setting {name!r}{did_you_mean(name, known)}.",
+                    fix=f"the settings are the fields of {cls.__name__}",
+                )
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
@@ -191,6 +202,11 @@ class RigModelSettings:
                     f"the setting {field.name} must be {problem}, and is {value!r}.",
                     fix=f"leave it out: {field.default!r} is the default",
                 )
+
+    def __repr__(self) -> str:
+        """As it would be written: the settings that are not at their default."""
+        changed = (f"{f.name}={value!r}" for f in fields(self) if (value := getattr(self, f.name)) != f.default)
+        return f"{type(self).__name__}({', '.join(changed)})"
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Self:
@@ -202,14 +218,8 @@ class RigModelSettings:
         Raises:
             UsageError: A name is not known, or a value makes no sense.
         """
-        known = {field.name: field.default for field in fields(cls)}
-        for name in table:
-            if name not in known:
-                raise UsageError(
-                    f"there is no setting {name!r}{did_you_mean(name, known)}.",
-                    fix=f"the settings are the fields of {cls.__name__}",
-                )
-        return cls(**{name: _as_default(known[name], value) for name, value in table.items()})
+        defaults = {field.name: field.default for field in fields(cls)}
+        return cls(**{name: _as_default(defaults.get(name), value) for name, value in table.items()})
 
     def as_table(self) -> dict[str, Any]:
         """All settings, as a calibration file keeps them: numbers and lists of numbers."""

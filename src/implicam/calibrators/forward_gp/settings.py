@@ -27,7 +27,7 @@ class CameraKind(NamedTuple):
     odds: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class ForwardGPSettings(RigModelSettings):
     """The settings of `ForwardGP(settings=...)`; names and units as in `RigModelSettings`.
 
