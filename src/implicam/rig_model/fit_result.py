@@ -14,11 +14,21 @@ from implicam.rig_model.shot_errors import ShotErrors
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """cameras: numbers of those that could be fitted, in order, as posterior.models. uncalibrated: (number, why) of the
-    others. inliers: per fitted camera (n seen,) the views used. errors: how known positions are off, where they are;
-    label_sd (1, k) its estimated sds, for error bars. tails: of the pixel noise, where it is not normal. label_errors:
-    how single known positions are off besides, if they are; plane_sd (6,): how planes may be off that are too few to
-    tell. ordinary_px: per fitted camera, see `InitialCamera`."""
+    """The posterior of the cameras that could be fitted, the views in use, and how positions and pixels are off.
+
+    Attributes:
+        posterior: What is known of the fitted cameras, in the working frame.
+        cameras: Their numbers in the dataset, in the order of `posterior.models`.
+        uncalibrated: (number, why) of the others.
+        inliers: Per fitted camera (n seen,), the views used.
+        hyperparameters: Of their fields and noise.
+        errors: How known positions are off with their shots; None where they are not.
+        label_sd: (1, k) the estimated sds of these, for error bars.
+        tails: Of the pixel noise; None where it is normal.
+        position_errors: How single known positions are off besides; None where they are not.
+        plane_sd: (6,) how planes that are too few to tell may be off; None where there are none.
+        ordinary_px: Per fitted camera, see `InitialCamera`; empty where no other camera was tried.
+    """
 
     posterior: Posterior
     cameras: tuple[int, ...]

@@ -26,10 +26,17 @@ class Posterior:
 
     Covariances are kept as *roots* W with `covariance = W^T W`: where parameters nearly make up for each other (focal
     length and distance of a telephoto lens) the covariance itself would lose all digits of what pixels show.
-    alone: of each camera (P, P), if the known positions were where they seem now; joint: (sum P, sum P) where unknown
-    positions tie the cameras, else None. steps: how far each lens moved. evidence: log marginal likelihood, up to a
-    constant. displacement: (n, 3) of the known points, the posterior mean. ties: (q, sum P) instead of joint, where
-    single known positions are off: the roots of the cameras alone above these rows are the joint root, eq. (27).
+
+    Attributes:
+        models: The cameras at the posterior mean.
+        alone: Roots (P, P) of each camera, if the known positions were where they seem now.
+        joint: The root (sum P, sum P) where errors of whole shots tie the cameras; else None.
+        steps: How far the lens and pose of each camera moved.
+        evidence: Log marginal likelihood, up to a constant.
+        unknowns: What is known of the errors of shots, where they are estimated.
+        displacement: (n, 3) posterior mean of how far the known points are off, where they are.
+        ties: (q, sum P) instead of joint, where single known positions are off: the roots of the cameras alone above
+            these rows are the joint root, eq. (27).
     """
 
     models: tuple[CameraModel, ...]

@@ -43,10 +43,19 @@ class Sensitivity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FittedRig:
-    """trained: what the cameras saw when they were fitted, all cameras; cameras: numbers of those that could be, in
-    the order of posterior.models; posterior: in the working frame; labels: how known positions are off, if they are.
-    misfit_adds: residuals that are larger than the views state come from the lens models, and not from the views.
-    degrees: of freedom of the noise, None where it is normal. settings: which views disagree, and when that alarms."""
+    """Cameras that measure.
+
+    Attributes:
+        trained: What all cameras saw when they were fitted.
+        length_unit: Of the world.
+        frame: The working frame.
+        cameras: Numbers of the cameras that could be fitted, in the order of `posterior.models`.
+        posterior: What is known of them, in the working frame.
+        labels: How known positions are off; None where they are not.
+        misfit_adds: Residuals that are larger than the views state come from the lens models, and not from the views.
+        degrees: Degrees of freedom of the noise; None where it is normal.
+        settings: Which views disagree, and when that is an alarm.
+    """
 
     trained: Observations
     length_unit: str

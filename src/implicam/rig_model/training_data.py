@@ -125,8 +125,18 @@ def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """Known points (n, 3) in the working frame; per camera what it saw (all of it), its image, and its stated noise in
-    pixels or NaN; how the points may be off; lens: "auto", "central" or "none"; what the fit takes for usual."""
+    """What a fit starts from.
+
+    Attributes:
+        points: Known positions (n, 3) in the working frame.
+        names: Of the C cameras.
+        camera_views: Per camera what it saw, all of it.
+        images: Per camera, where its pixels are measured from.
+        stated: (C,) stated noise in pixels, NaN where none is.
+        errors: How known positions may be off with their shots; None where they are exact.
+        lens: "auto", "central" or "none".
+        settings: What the fit takes for usual and for clear.
+    """
 
     points: Floats
     names: tuple[str, ...]
@@ -147,7 +157,15 @@ class TrainingData:
         *,
         shots_off: bool = True,
     ) -> Self:
-        """What known points say, in the working frame; shots_off: estimate how shots are off as a whole."""
+        """What known points say.
+
+        Args:
+            lens: "auto", "central" or "none".
+            data: The known points and what the cameras saw of them.
+            frame: The working frame.
+            settings: What the fit takes for usual and for clear.
+            shots_off: Estimate how shots are off as a whole, where nothing is declared.
+        """
         observations, points = data.observations, frame.to_working(data.xyz)
         stated = stated_noise(observations)
         images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))

@@ -1,6 +1,6 @@
 """After the fit: are single known positions off, by how much, and what then is known of the cameras.
 
-The fit takes errors of known positions for pixel noise. Here they are told apart (label_errors.py), the views are
+The fit takes errors of known positions for pixel noise. Here they are told apart (position_errors.py), the views are
 judged again, and the cameras are conditioned once more, with less noise and tied by the errors of the positions.
 """
 
