@@ -214,9 +214,8 @@ def _misfit(table: Table, rows: NDArray[np.int64], uv: Floats, noise: Floats) ->
 def _without_one(table: Table) -> Iterator[tuple[str, Floats]]:
     """Words with a place for the share that agrees, and the pixels without one camera."""
     for c, name in enumerate(table.names if len(table.names) > 2 else ()):
-        uv = table.uv.copy()
-        uv[:, c] = np.nan
-        yield f"has {name} been moved or refocused, or are its pictures cropped? Without it {{share}}", uv
+        words = f"has {name} been moved or refocused, or are its pictures cropped? Without it {{share}}"
+        yield words, _changed(table, c, np.array(np.nan))[0]
 
 
 def _guesses(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
