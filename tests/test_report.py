@@ -173,6 +173,11 @@ def test_hostile_names_stay_text():
         assert "<img" not in str(json.loads(figure))  # Plotly shows entities as text, and tags as tags
 
 
+def test_plotlys_toolbar_is_no_bar_over_the_figure():
+    figures = [json.loads(figure) for figure in Reader(page(report_data(n=40))).content["json"]]
+    assert [figure["layout"]["modebar"]["bgcolor"] for figure in figures] == ["rgba(0,0,0,0)"] * 3
+
+
 def test_same_data_same_page():
     assert page(report_data(n=40)) == page(report_data(n=40))
 
@@ -212,8 +217,9 @@ def test_parts_that_do_not_belong_together_are_refused():
         ReportData("x", report_data(n=30).measurement, true_xyz=data.true_xyz)
 
 
-def test_without_plotly_the_cure_is_named(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(__import__("sys").modules, "plotly.offline", None)
+@pytest.mark.parametrize("library", ["plotly.offline", "jinja2"])
+def test_without_a_library_the_cure_is_named(library: str, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(__import__("sys").modules, library, None)
     with pytest.raises(MissingExtraError, match=r"implicam\[report\]"):
         page(report_data(n=40))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -23,11 +22,12 @@ from implicam.figures.panels3d import (
     title_of,
     to_fit,
 )
-from implicam.figures.style import BLACK, BLUE, CLEAR, GREEN, GREY, ORANGE, SKY, graph_objects, layout, plain
+from implicam.figures.style import BLACK, BLUE, CLEAR, GREEN, GREY, ORANGE, SKY, WHITE, graph_objects, layout, plain
 from implicam.formatting import number
+from implicam.templates import Markup, render
 
 # Nothing may be loaded from anywhere; Plotly compiles some of its own code, hence eval.
-POLICY = (
+POLICY = Markup(
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:; "
     "font-src data:; base-uri 'none'; form-action 'none'"
 )
@@ -69,30 +69,26 @@ def aligned_3d(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None 
 
 def html_page(figure: Any, *, title: str, caption: str = "") -> str:
     """A figure as one HTML page that works offline (about 5 MB, nearly all of it plotly.js); same figure, same text."""
-    plotly = import_extra("plotly.offline", "report", "an interactive figure")
-    # Inside a script element only "<" can end it; in JSON it stands in strings only, where \u003c is the same.
-    content = figure.to_json().replace("<", "\\u003c")
-    return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
-        f"<style>{_STYLE}</style>\n<script>{plotly.get_plotlyjs()}</script>\n</head>\n<body>\n"
-        f'<h1>{escape(title)}</h1>\n<div id="plot" role="img" aria-label="{escape(title)}"></div>\n'
-        f"<p>{escape(caption)}</p>\n"
-        f'<script type="application/json" id="data">{content}</script>\n<script>{_SCRIPT}</script>\n</body>\n</html>\n'
+    return render(
+        __package__,
+        "figure.html",
+        policy=POLICY,
+        plotly_js=plotly_js("an interactive figure"),
+        figure=figure_json(figure),
+        title=title,
+        caption=caption,
     )
 
 
-_STYLE = """
-body { margin: 0 auto; padding: 20px; max-width: 1100px; color: #1d2733; background: #ffffff;
-  font: 16px/1.5 system-ui, sans-serif; }
-h1 { font-size: 22px; margin: 0 0 8px; } p { color: #5a6675; } #plot { width: 100%; height: 72vh; min-height: 420px; }
-"""
-_SCRIPT = """
-"use strict";
-const figure = JSON.parse(document.getElementById("data").textContent);
-Plotly.newPlot("plot", figure.data, figure.layout, {displaylogo: false, responsive: true, scrollZoom: true});
-"""
+def plotly_js(purpose: str) -> Markup:
+    """Plotly's own script, for a page that loads nothing. MissingExtraError, which names the purpose, without it."""
+    return Markup(import_extra("plotly.offline", "report", purpose).get_plotlyjs())
+
+
+def figure_json(figure: Any) -> Markup:
+    """A Plotly figure as JSON that may stand inside a script element of a page."""
+    # Only "<" can end a script element; in JSON it stands in strings only, where \u003c is the same.
+    return Markup(figure.to_json().replace("<", "\\u003c"))
 
 
 def _traces(go: Any, panel: Panel, found: Drawn, scales: Scales, visible: bool) -> list[Any]:
@@ -142,7 +138,7 @@ def _menu(titles: Sequence[str]) -> dict[str, Any]:
     buttons = [{"label": t, "method": "restyle", "args": [{"visible": shown(i)}]} for i, t in enumerate(titles)]
     return {
         "type": "dropdown", "buttons": buttons, "x": 0, "xanchor": "left", "y": 1.0, "yanchor": "bottom",
-        "pad": {"b": 6}, "bgcolor": "#ffffff", "bordercolor": GREY,
+        "pad": {"b": 6}, "bgcolor": WHITE, "bordercolor": GREY,
     }  # fmt: skip
 
 
@@ -157,7 +153,7 @@ def _figure(go: Any, traces: list[Any], corners: Floats, menus: list[Any]) -> An
     }  # fmt: skip
     scene = {**sides, "aspectmode": "data", "camera": _VIEW}
     figure = go.Figure(traces, layout(scene=scene, updatemenus=menus, uirevision="keep"))
-    figure.update_layout(margin={"l": 0, "r": 0, "t": 44, "b": 0}, modebar={"bgcolor": CLEAR, "color": GREY})
+    figure.update_layout(margin={"l": 0, "r": 0, "t": 44, "b": 0})
     return figure.update_layout(
         legend={"x": 0, "y": 0, "yanchor": "bottom", "bgcolor": CLEAR, "itemsizing": "constant"}
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from implicam.dataset import Floats, Names
-from implicam.figures.style import CLEAR, GREY, SKY, VERMILLION, graph_objects, layout, plain
+from implicam.figures.style import CLEAR, GREY, INK, SKY, VERMILLION, graph_objects, layout, plain
 from implicam.formatting import number
 
 _FACTORS = (1, 10, 100, 1000, 10_000)
@@ -124,7 +124,7 @@ def _buttons(first: int, factors: list[int], chosen: int) -> dict[str, Any]:
         "type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": 1.0, "yanchor": "bottom",
         "pad": {"b": 6}, "active": factors.index(chosen), "showactive": True,
         # Fixed colours: Plotly lights the active button near-white in every theme.
-        "font": {"color": "#1d2733", "size": 12}, "bgcolor": "#d5dee8", "bordercolor": GREY,
+        "font": {"color": INK, "size": 12}, "bgcolor": "#d5dee8", "bordercolor": GREY,
         "buttons": [button(f"errors ×{f:,}", f) for f in factors] + [button("no errors", 0)],
     }  # fmt: skip
 

@@ -17,6 +17,8 @@ MARKS = ("o", "s", "^", "D", "v", "P", "X")
 # Half-transparent grey reads on white and on black, so that a page can switch its theme under the figure.
 GRID = "rgba(128,128,128,0.25)"
 GREY = "#7f7f7f"
+INK = "#1d2733"
+WHITE = "#ffffff"
 CLEAR = "rgba(0,0,0,0)"
 
 
@@ -36,9 +38,11 @@ def layout(**more: Any) -> dict[str, Any]:
         "template": "none",
         "paper_bgcolor": CLEAR,
         "plot_bgcolor": CLEAR,
-        "font": {"family": "system-ui, sans-serif", "size": 13, "color": "#1d2733"},
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
         "margin": {"l": 62, "r": 16, "t": 16, "b": 52},
-        "hoverlabel": {"bgcolor": "#ffffff", "bordercolor": GREY, "font": {"color": "#1d2733", "size": 13}},
+        # Plotly's own toolbar has the background's colour at half strength: of a clear one a grey bar over the figure.
+        "modebar": {"bgcolor": CLEAR, "color": GREY, "activecolor": BLUE},
+        "hoverlabel": {"bgcolor": WHITE, "bordercolor": GREY, "font": {"color": INK, "size": 13}},
         **more,
     }
 

@@ -83,6 +83,12 @@ class ReportData:
         m = self.measurement
         return [(str(m.points[i]), str(m.reason[i])) for i in np.flatnonzero(m.measured & (m.reason != ""))]
 
+    @property
+    def not_judged(self) -> list[tuple[str, str]]:
+        """Name and reason of each point that was measured, but whose covariance could not be judged."""
+        reasons = () if self.coverage is None else self.coverage.reasons
+        return [(str(self.measurement.points[i]), reason) for i, reason in reasons]
+
 
 def report_of(evaluation: Evaluation, title: str) -> ReportData:
     """The report of an evaluation."""
