@@ -22,7 +22,8 @@ from implicam.dataset import read_dataset
 from implicam.detect.folder import detect_folder
 from implicam.detect.journal import Entry, Journal, Key
 from implicam.detect.model import Detected, DetectorBase, View, nothing
-from implicam.detect.overlay import COLUMNS, ROWS, STATES, Result, overlay, thumbnail
+from implicam.detect.overlay import STATES, Result, overlay, thumbnail
+from implicam.detect.sheets import COLUMNS, ROWS
 from implicam.errors import DatasetError, ImageError, MissingExtraError, UsageError
 from implicam.images import eight_bit, read_picture
 
@@ -744,7 +745,8 @@ def board(rows=8, columns=11, step=40.0) -> Detected:
 
 
 def test_rows_of_a_board_are_joined_and_no_row_to_the_next():
-    from implicam.detect.overlay import SKY, _rows
+    from implicam.detect.overlay import _rows
+    from implicam.drawing import SKY
 
     found = board()
     chains = _rows(found.points, found.uv)

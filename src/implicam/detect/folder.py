@@ -29,7 +29,8 @@ from implicam.dataset.model import check_name
 from implicam.dataset.tables import parse_toml
 from implicam.detect.journal import Entry, Looked, look_at_all
 from implicam.detect.model import Detector, View, nothing
-from implicam.detect.overlay import Result, draw
+from implicam.detect.overlay import Result
+from implicam.detect.sheets import draw
 from implicam.errors import DatasetError, ImageError, UsageError, did_you_mean
 from implicam.files import replacing, toml_text, write_text
 from implicam.images import PATTERN, find_pictures, in_order, one_thread_each

@@ -7,45 +7,30 @@ in sky blue: the ball. Every state is written in words as well.
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from implicam import drawing
 from implicam.dataset import Floats
-from implicam.errors import import_extra
-from implicam.figures.style import GREEN, ORANGE, SKY, VERMILLION
-from implicam.images import Grey, eight_bit, opencv
+from implicam.drawing import Canvas, Pixels
+from implicam.images import eight_bit, opencv
 from implicam.session.controller import State
 from implicam.session.detections import Look
 
-Canvas = NDArray[np.uint8]
-Colour = tuple[int, int, int]
+TARGET, BALL, GOOD, BAD = drawing.ORANGE, drawing.SKY, drawing.GREEN, drawing.VERMILLION
+PAPER, GREY = (36, 38, 43), (74, 77, 84)
 
-
-def rgb(code: str) -> Colour:
-    """#RRGGBB as red, green, blue."""
-    return int(code[1:3], 16), int(code[3:5], 16), int(code[5:7], 16)
-
-
-TARGET, BALL, GOOD, BAD = rgb(ORANGE), rgb(SKY), rgb(GREEN), rgb(VERMILLION)
-DARK, PAPER, GREY, WHITE = (16, 18, 22), (36, 38, 43), (74, 77, 84), (255, 255, 255)
-
-NEAR = 12.0
+ON_TARGET_PX = 12.0
 """Pixels: a ball so near to its reticle is where it has to be."""
 
-LOUPE = 4.0
+LOUPE_RADII = 4.0
 """The loupe shows so many radii of the ball around it."""
 
-FAR = 1e4
-"""Pixels of the montage beyond which nothing is drawn: OpenCV's whole numbers end."""
+GAP_PX = 8
 
-SHIFT = 4  # OpenCV takes coordinates in 1/16 pixels
-GAP = 8
+_WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 
 
 @dataclass(frozen=True)
@@ -63,30 +48,26 @@ def layout(aspects: Sequence[float], width: int, height: int) -> Layout:
     aspect, best = max(aspects), Layout(1, len(aspects), 1, 1)
     for columns in range(1, len(aspects) + 1):
         rows = -(-len(aspects) // columns)
-        room = (width - GAP * (columns - 1)) / columns, (height - GAP * (rows - 1)) / rows
+        room = (width - GAP_PX * (columns - 1)) / columns, (height - GAP_PX * (rows - 1)) / rows
         across = min(room[0], room[1] * aspect)
         if across > best.width:
             best = Layout(columns, rows, max(1, int(across)), max(1, int(across / aspect)))
     return best
 
 
-def montage(state: State, cameras: Sequence[str], aspects: Sequence[float], width: int, height: int) -> Canvas:
+def montage(state: State, cameras: Sequence[str], aspects: Sequence[float], width: int, height: int) -> Pixels:
     """(height, width, 3) red, green, blue: a tile for each camera, as large as they fit; a grey one with words for a
     camera that has no picture. aspects: width over height of each camera's pictures."""
     plan = layout(aspects, width, height)
     looks = {look.camera: look for look in state.looks}
-    wide = plan.columns * plan.width + (plan.columns - 1) * GAP
-    tall = plan.rows * plan.height + (plan.rows - 1) * GAP
-    page = np.full((tall, max(wide, width), 3), DARK, np.uint8)
-    words: list[_Words] = []
+    across = plan.columns * plan.width + (plan.columns - 1) * GAP_PX
+    page = drawing.blank(max(across, width), plan.rows * plan.height + (plan.rows - 1) * GAP_PX, drawing.DARK)
     for i, name in enumerate(cameras):
-        top = i // plan.columns * (plan.height + GAP)
-        left = (page.shape[1] - wide) // 2 + i % plan.columns * (plan.width + GAP)
-        tile = _Tile(np.full((plan.height, plan.width, 3), PAPER, np.uint8))
-        _draw(tile, state, name, looks.get(name))
-        page[top : top + plan.height, left : left + plan.width] = tile.canvas
-        words += [one.moved(left, top) for one in tile.words]
-    return _written(page, words)
+        tile = drawing.blank(plan.width, plan.height, PAPER)
+        _draw_tile(tile, state, name, looks.get(name))
+        left = (page.width - across) // 2 + i % plan.columns * (plan.width + GAP_PX)
+        page.paste(tile, left, i // plan.columns * (plan.height + GAP_PX))
+    return page.pixels
 
 
 def trouble_of(state: State, camera: str) -> str:
@@ -110,14 +91,14 @@ def away(look: Look) -> float:
     return float(np.linalg.norm(look.uv - look.expected))
 
 
-def verdict(state: State, look: Look) -> tuple[str, Colour]:
+def verdict(state: State, look: Look) -> tuple[str, drawing.Colour]:
     """What there is to say of one camera, in a few words, and in which colour."""
     found, planned = len(look.found) > 0, state.target is not None and bool(np.isfinite(look.expected).all())
     if found and planned:
         distance = away(look)
         if state.phase == "shown":
             return f"found, {distance:.0f} px from the circle", GOOD
-        return ("on target", GOOD) if distance <= NEAR else (f"{distance:.0f} px to go", TARGET)
+        return ("on target", GOOD) if distance <= ON_TARGET_PX else (f"{distance:.0f} px to go", TARGET)
     if state.calibration is not None and not planned and state.target is not None:
         return "target not in view", GREY
     if found:
@@ -125,198 +106,132 @@ def verdict(state: State, look: Look) -> tuple[str, Colour]:
     return ("ball not found", BAD) if state.phase == "shown" else ("no ball seen", GREY)
 
 
-@dataclass(frozen=True)
-class _Words:
-    text: str
-    x: float
-    y: float
-    size: float
-    colour: Colour = WHITE
-    anchor: str = "lm"
-    rim: int = 0
-
-    def moved(self, dx: float, dy: float) -> _Words:
-        return replace(self, x=self.x + dx, y=self.y + dy)
+def _text_px(tile: Canvas) -> float:
+    """Height of the type: what can be read from two metres where the tile is large."""
+    return float(np.clip(tile.height / 13, 15, 40))
 
 
-@dataclass
-class _Tile:
-    canvas: Canvas
-    words: list[_Words] = field(default_factory=list)
-
-    @property
-    def letters(self) -> float:
-        """Height of the type: what can be read from two metres where the tile is large."""
-        return float(np.clip(self.canvas.shape[0] / 13, 15, 40))
-
-
-def _draw(tile: _Tile, state: State, camera: str, look: Look | None) -> None:
+def _draw_tile(tile: Canvas, state: State, camera: str, look: Look | None) -> None:
     problem = trouble_of(state, camera)
     if problem or look is None or look.frame is None:
         reason = problem or (look.found.reason if look is not None else "") or "waiting for its first picture"
-        _paragraph(tile, reason, BAD if problem else WHITE)
-        _strip(tile, camera, "camera trouble" if problem else "no picture", BAD if problem else GREY)
+        _write_paragraph(tile, reason, BAD if problem else drawing.WHITE)
+        _draw_strip(tile, camera, "camera trouble" if problem else "no picture", BAD if problem else GREY)
         return
-    picture = look.frame.picture
-    scale = _paint(tile, picture)
-    _marks(tile, state, look, scale)
+    grey = eight_bit(look.frame.picture)
+    scale = min(tile.width / grey.shape[1], tile.height / grey.shape[0])
+    tile.paste(drawing.enlarge(grey, scale), 0, 0)
+    _draw_marks(tile, state, look, scale)
     if state.phase == "shown" and len(look.found):
-        _loupe(tile, look, picture, scale)
+        _draw_loupe(tile, look, grey, scale)
     if state.phase == "shown" and look.found.reason:
-        _footnote(tile, look.found.reason)
+        _write_footnote(tile, look.found.reason)
     text, colour = verdict(state, look)
-    _strip(tile, camera, text, colour)
+    _draw_strip(tile, camera, text, colour)
     if state.phase == "shown":
-        opencv().rectangle(tile.canvas, (0, 0), tile.canvas.shape[1::-1], GOOD if len(look.found) else BAD, 6)
+        tile.border(4, GOOD if len(look.found) else BAD)
 
 
-def _paint(tile: _Tile, picture: Grey) -> float:
-    """Put the picture into the tile; pixels of the tile per pixel of the picture."""
-    cv2 = opencv()
-    height, width = tile.canvas.shape[:2]
-    scale = min(width / picture.shape[1], height / picture.shape[0])
-    size = max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale))
-    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    tile.canvas[: size[1], : size[0]] = cv2.resize(eight_bit(picture), size, interpolation=how)[..., None]
-    return float(scale)
-
-
-def _marks(tile: _Tile, state: State, look: Look, scale: float) -> None:
+def _draw_marks(tile: Canvas, state: State, look: Look, scale: float) -> None:
     """The ball, the reticle, and the way from one to the other."""
-    radius = max(16.0, tile.canvas.shape[0] / 16)
+    radius = max(16.0, tile.height / 16)
     planned = bool(np.isfinite(look.expected).all()) and state.phase in ("aim", "moving", "shown")
     if len(look.found):
-        _ball(tile, look, scale, radius / 2)
+        _draw_ball(tile, look, scale, radius / 2)
     if not planned:
         return
-    there = _placed(look.expected, scale)
-    _reticle(tile, there, radius)
+    reticle = _place(look.expected, scale)
+    arms = [reticle + radius * np.outer((0.35, 1.6), way) for way in _WAYS]
+    _stroke(tile, [drawing.circle(reticle, radius), *arms], TARGET)
     below = bool(look.uv[1] < look.expected[1])  # away from the ball, or else above
-    x, y = float(there[0] + 0.8 * radius), float(there[1] + (1.2 if below else -1.2) * radius)
-    tile.words.append(_Words("target", x, y, 0.75 * tile.letters, TARGET, "lm", 3))
-    if len(look.found) and state.phase == "aim" and away(look) > NEAR:
-        _way(tile, _placed(look.uv, scale), there, radius, f"{away(look):.0f} px")
+    at = float(reticle[0] + 0.8 * radius), float(reticle[1] + (1.2 if below else -1.2) * radius)
+    tile.write("target", at, 0.75 * _text_px(tile), TARGET, "lm", 3)
+    if len(look.found) and state.phase == "aim" and away(look) > ON_TARGET_PX:
+        _draw_way(tile, _place(look.uv, scale), reticle, radius, f"{away(look):.0f} px")
 
 
-def _placed(uv: Floats, scale: float) -> Floats:
+def _place(uv: Floats, scale: float) -> Floats:
     """Where pixels (..., 2) of the picture come to lie in the tile."""
-    return np.clip((uv + 0.5) * scale - 0.5, -FAR, FAR)
+    return np.asarray((uv + 0.5) * scale - 0.5, dtype=np.float64)
 
 
-def _ball(tile: _Tile, look: Look, scale: float, least: float) -> None:
-    there = _placed(look.uv, scale)
-    curves = [_placed(curve[np.isfinite(curve).all(axis=1)], scale) for curve in look.found.outlines]
-    _stroke(tile.canvas, [curve for curve in curves if len(curve) > 1], BALL)
-    if not curves or max(float(np.linalg.norm(curve - there, axis=1).max(initial=0)) for curve in curves) < least:
-        _ring(tile.canvas, there, least, BALL)  # an outline that nobody could see from two metres
+def _stroke(canvas: Canvas, curves: Sequence[Floats], colour: drawing.Colour) -> None:
+    canvas.stroke(curves, colour, 3, 2)
 
 
-def _reticle(tile: _Tile, there: Floats, radius: float) -> None:
-    _ring(tile.canvas, there, radius, TARGET)
-    arms = [np.array([there + way * radius * a, there + way * radius * b]) for way in _WAYS for a, b in ((0.35, 1.6),)]
-    _stroke(tile.canvas, arms, TARGET)
+def _draw_ball(tile: Canvas, look: Look, scale: float, least: float) -> None:
+    centre = _place(look.uv, scale)
+    curves = [_place(drawing.finite_points(curve), scale) for curve in look.found.outlines]
+    _stroke(tile, curves, BALL)
+    if max((float(np.linalg.norm(curve - centre, axis=1).max(initial=0)) for curve in curves), default=0.0) < least:
+        _stroke(tile, [drawing.circle(centre, least)], BALL)  # an outline that could not be seen from two metres
 
 
-_WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
-
-
-def _way(tile: _Tile, ball: Floats, there: Floats, radius: float, words: str) -> None:
+def _draw_way(tile: Canvas, ball: Floats, reticle: Floats, radius: float, words: str) -> None:
     """An arrow from the ball to the reticle's rim."""
-    along = there - ball
+    along = reticle - ball
     length = float(np.linalg.norm(along))
     if length <= 1.6 * radius:
         return
     along = along / length
-    start, tip = ball + along * 0.7 * radius, there - along * 1.1 * radius
+    start, tip = ball + along * 0.7 * radius, reticle - along * 1.1 * radius
     side = np.array([-along[1], along[0]])
-    head = [tip, tip - along * 0.8 * radius + side * 0.4 * radius, tip - along * 0.8 * radius - side * 0.4 * radius]
-    _stroke(tile.canvas, [np.array([start, tip]), np.array([head[1], head[0], head[2]])], WHITE)
+    head = [tip + radius * (sign * 0.4 * side - 0.8 * along) for sign in (1, -1)]
+    _stroke(tile, [np.array([start, tip]), np.array([head[0], tip, head[1]])], drawing.WHITE)
     if length < 6 * radius:
         return
-    middle = (start + tip) / 2 + side * tile.letters * (0.9 if side[1] < 0 else -0.9)
-    tile.words.append(_Words(words, float(middle[0]), float(middle[1]), tile.letters, WHITE, "mm", 4))
+    size = _text_px(tile)
+    u, v = (start + tip) / 2 + side * size * (0.9 if side[1] < 0 else -0.9)
+    tile.write(words, (u, v), size, drawing.WHITE, "mm", 4)
 
 
-def _loupe(tile: _Tile, look: Look, picture: Grey, scale: float) -> None:
+def _draw_loupe(tile: Canvas, look: Look, grey: Pixels, scale: float) -> None:
     """The ball, enlarged, in the corner that is farthest from it: whether its outline is right is seen here."""
     cv2 = opencv()
-    curves = [curve[np.isfinite(curve).all(axis=1)] for curve in look.found.outlines]
+    curves = [drawing.finite_points(curve) for curve in look.found.outlines]
     radius = max([6.0, *(float(np.linalg.norm(c - look.uv, axis=1).max(initial=0)) for c in curves)])
-    side = round(0.36 * tile.canvas.shape[0])
-    zoom = side / (LOUPE * radius)
+    side = round(0.36 * tile.height)
+    zoom = side / (LOUPE_RADII * radius)
     if zoom < 1.3 * scale:
         return
     shift = np.array([[zoom, 0, side / 2 - zoom * look.uv[0]], [0, zoom, side / 2 - zoom * look.uv[1]]])
-    enlarged = cv2.warpAffine(eight_bit(picture), shift, (side, side), flags=cv2.INTER_LINEAR)
-    inset = np.ascontiguousarray(np.repeat(enlarged[..., None], 3, axis=2))
-    _stroke(inset, [c * zoom + shift[:, 2] for c in curves if len(c) > 1], BALL)
-    _ring(inset, np.array([side / 2, side / 2]), 2.0, BALL)
-    cv2.rectangle(inset, (0, 0), (side - 1, side - 1), WHITE, 2)
-    height, width = tile.canvas.shape[:2]
-    ball = _placed(look.uv, scale)
-    left = width - side - 12 if ball[0] < width / 2 else 12
-    top = height - side - 12 if ball[1] < 0.55 * height else round(1.7 * tile.letters) + 12
-    tile.canvas[top : top + side, left : left + side] = inset
+    inset = drawing.enlarge(cv2.warpAffine(grey, shift, (side, side), flags=cv2.INTER_LINEAR), 1)
+    _stroke(inset, [c * zoom + shift[:, 2] for c in curves], BALL)
+    _stroke(inset, [drawing.circle(np.full(2, side / 2), 2.0)], BALL)
+    inset.border(2, drawing.WHITE)
+    ball = _place(look.uv, scale)
+    left = tile.width - side - 12 if ball[0] < tile.width / 2 else 12
+    top = tile.height - side - 12 if ball[1] < 0.55 * tile.height else round(1.7 * _text_px(tile)) + 12
+    tile.paste(inset, left, top)
 
 
-def _strip(tile: _Tile, camera: str, text: str, colour: Colour) -> None:
+def _draw_strip(tile: Canvas, camera: str, text: str, colour: drawing.Colour) -> None:
     """The camera's name, and what there is to say of it."""
-    high = round(1.7 * tile.letters)
-    strip = tile.canvas[:high]
-    strip[:] = (0.35 * strip + 0.65 * np.array(DARK)).astype(np.uint8)
-    width = tile.canvas.shape[1]
-    tile.words.append(_Words(camera, 0.5 * tile.letters, high / 2, 1.05 * tile.letters))
-    size = 0.9 * tile.letters
-    font = _font(round(size))
-    box = font.getlength(text) + size
-    right = width - 0.3 * tile.letters
-    if right - box < font.getlength(camera) + 2 * tile.letters:
-        return tile.words.append(_Words(text, width - 0.5 * tile.letters, high / 2, 0.6 * tile.letters, WHITE, "rm"))
-    opencv().rectangle(tile.canvas, (int(right - box), 4), (int(right), high - 5), colour, -1)
-    tile.words.append(_Words(text, right - box / 2, high / 2, size, WHITE if sum(colour) < 400 else DARK, "mm"))
-    return None
+    letters = _text_px(tile)
+    height = round(1.7 * letters)
+    strip = tile.pixels[:height]
+    strip[:] = (0.35 * strip + 0.65 * np.array(drawing.DARK)).astype(np.uint8)
+    tile.write(camera, (0.5 * letters, height / 2), 1.05 * letters, drawing.WHITE, "lm")
+    size = 0.9 * letters
+    width = drawing.text_width(text, size) + size
+    right = tile.width - 0.3 * letters
+    if right - width < drawing.text_width(camera, size) + 2 * letters:
+        tile.write(text, (tile.width - 0.5 * letters, height / 2), 0.6 * letters, drawing.WHITE, "rm")
+        return
+    tile.fill(right - width, 4, right + 1, height - 4, colour)
+    tile.write(text, (right - width / 2, height / 2), size, drawing.WHITE if sum(colour) < 400 else drawing.DARK, "mm")
 
 
-def _paragraph(tile: _Tile, text: str, colour: Colour) -> None:
-    height, width = tile.canvas.shape[:2]
-    lines = textwrap.wrap(text, max(10, int(width / (0.52 * tile.letters)) - 3))[:6]
+def _write_paragraph(tile: Canvas, text: str, colour: drawing.Colour) -> None:
+    """In the middle of a tile that has no picture."""
+    size = _text_px(tile)
+    lines = drawing.wrap_text(text, tile.width - 2 * size, size, 6)
     for i, line in enumerate(lines):
-        y = height / 2 + 0.7 * tile.letters + (i - (len(lines) - 1) / 2) * 1.35 * tile.letters
-        tile.words.append(_Words(line, width / 2, y, tile.letters, WHITE if colour == BAD else colour, "mm"))
+        y = tile.height / 2 + 0.7 * size + (i - (len(lines) - 1) / 2) * 1.35 * size
+        tile.write(line, (tile.width / 2, y), size, drawing.WHITE if colour == BAD else colour, "mm")
 
 
-def _footnote(tile: _Tile, text: str) -> None:
-    height, width = tile.canvas.shape[:2]
-    size = 0.75 * tile.letters
-    lines = textwrap.wrap(text, max(10, int(width / (0.52 * size)) - 2))[:3]
-    for i, line in enumerate(reversed(lines)):
-        tile.words.append(_Words(line, 0.5 * size, height - (0.8 + 1.3 * i) * size, size, WHITE, "lm", 4))
-
-
-def _stroke(canvas: Canvas, curves: Sequence[Floats], colour: Colour) -> None:
-    cv2 = opencv()
-    fixed = [np.rint(curve * 2**SHIFT).astype(np.int32)[:, None] for curve in curves]
-    for width, ink in ((7, DARK), (3, colour)):
-        cv2.polylines(canvas, fixed, False, ink, width, cv2.LINE_AA, SHIFT)
-
-
-def _ring(canvas: Canvas, there: Floats, radius: float, colour: Colour) -> None:
-    turn = np.linspace(0, 2 * np.pi, 49)
-    _stroke(canvas, [there + radius * np.column_stack([np.cos(turn), np.sin(turn)])], colour)
-
-
-@lru_cache(maxsize=32)
-def _font(size: int) -> Any:
-    return import_extra("PIL.ImageFont", "viewer", "text in the pictures of implicam acquire").load_default(size)
-
-
-def _written(page: Canvas, words: Sequence[_Words]) -> Canvas:
-    """The text, in type that reads better than OpenCV's."""
-    image = import_extra("PIL.Image", "viewer", "text in pictures").fromarray(page)
-    pen = import_extra("PIL.ImageDraw", "viewer", "text in pictures").Draw(image)
-    for one in words:
-        pen.text(
-            (one.x, one.y), one.text, fill=one.colour, font=_font(max(8, round(one.size))), anchor=one.anchor,
-            stroke_width=one.rim, stroke_fill=DARK,
-        )  # fmt: skip
-    return np.asarray(image, dtype=np.uint8)
+def _write_footnote(tile: Canvas, text: str) -> None:
+    size = 0.75 * _text_px(tile)
+    for i, line in enumerate(reversed(drawing.wrap_text(text, tile.width - size, size, 3))):
+        tile.write(line, (0.5 * size, tile.height - (0.8 + 1.3 * i) * size), size, drawing.WHITE, "lm", 4)

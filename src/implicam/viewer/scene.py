@@ -8,10 +8,11 @@ import numpy as np
 
 from implicam.active import Loop
 from implicam.dataset import Floats
+from implicam.drawing import WHITE
 from implicam.images import eight_bit, opencv
 from implicam.session.controller import State
 from implicam.viewer.legend import EXCESS, EXCESS_SCALE, U95, line
-from implicam.viewer.pictures import BALL, GREY, TARGET, WHITE
+from implicam.viewer.pictures import BALL, GREY, TARGET
 from implicam.viewer.space import Eye, Placing, Scale, edges, eyes, upwards, vantage
 
 if TYPE_CHECKING:

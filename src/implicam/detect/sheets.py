@@ -1,0 +1,158 @@
+"""All photographs of a camera on sheets, and each with what was found: files that are drawn where they are missing.
+
+detections/<camera>.jpg, -2.jpg, ...         thumbnails
+detections/overlays/<camera>/<shot>.jpg      a picture with what was found
+detections/drawn.json                        what is drawn in which state
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from implicam.detect.overlay import INK, STATES, Result, overlay, thumbnail
+from implicam.drawing import Canvas, Pixels, blank, cut_text, text_width
+from implicam.errors import ImageError
+from implicam.files import write_text
+from implicam.images import eight_bit, read_picture, write_picture
+from implicam.progress import Progress
+from implicam.threads import side_by_side
+
+COLUMNS, ROWS = 6, 6
+"""Thumbnails of a page."""
+
+PAPER = (250, 250, 250)
+
+DRAWN = "drawn.json"
+
+
+def sheet(title: str, tiles: Sequence[Pixels]) -> Pixels:
+    """Thumbnails side by side under a title and the meaning of the colours."""
+    gap, head = 12, 56
+    height, width = tiles[0].shape[:2]
+    columns = min(COLUMNS, len(tiles))
+    rows = -(-len(tiles) // columns)
+    page = blank(max(columns, 3) * (width + gap) + gap, head + rows * (height + gap), PAPER)
+    x = float(page.width - gap)
+    for state, colour in reversed(STATES.items()):
+        x -= text_width(state, 15) + 12
+        page.write(state, (x, 35), 15, INK)
+        page.fill(x - 24, 22, x - 8, 38, colour)
+        x -= 34
+    page.write(cut_text(title, x - 2 * gap, 18.5), (gap, 36), 18.5, INK)
+    for i, tile in enumerate(tiles):
+        page.paste(Canvas(tile), gap + i % columns * (width + gap), head + i // columns * (height + gap))
+    return page.pixels
+
+
+def draw(
+    folder: Path, results: Sequence[Result], progress: Progress, *, redraw: bool = False
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """Write folder/overlays/<camera>/<shot>.jpg and folder/<camera>.jpg, -2.jpg, ...; the sheets, and notes of failure.
+
+    What is there and shows the same is left alone, unless `redraw`. What shows pictures that are gone is removed.
+    """
+    before = {} if redraw else _drawn_before(folder / DRAWN)
+    now: dict[str, str] = {}
+    notes: list[str] = []
+    pages = _pages(results)
+    done = iter(range(1, len(results) + 1))
+    for page in pages:
+        now |= page.draw(folder, before, lambda: progress("drawing overlays", next(done), len(results)), notes)
+        write_text(folder / DRAWN, json.dumps({**before, **now}))
+    for name in before.keys() - now.keys():
+        path = folder / name
+        if path.suffix == ".jpg" and path.resolve().is_relative_to(folder.resolve()):
+            path.unlink(missing_ok=True)
+    write_text(folder / DRAWN, json.dumps(now))
+    return tuple(folder / page.name for page in pages if (folder / page.name).exists()), tuple(notes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Page:
+    """Some pictures of a camera. name: of the sheet."""
+
+    name: str
+    title: str
+    results: Sequence[Result]
+
+    def draw(
+        self, folder: Path, before: Mapping[str, str], step: Callable[[], None], notes: list[str]
+    ) -> dict[str, str]:
+        """Draw the sheet and its overlays where they are not there; {file: digest} of what is there then."""
+        digests = {_overlay_name(result): _digest(result) for result in self.results}
+        content = hashlib.sha256(json.dumps([self.title, list(digests.items())]).encode()).hexdigest()
+
+        def wanted(name: str, digest: str) -> bool:
+            return before.get(name) != digest or not (folder / name).exists()
+
+        def one(result: Result) -> Pixels:
+            name, tile = _overlay_name(result), thumbnail(None, result)
+            try:
+                new = wanted(name, digests[name])
+                grey = _readable(result.path) if new or whole else None
+                if new:
+                    write_picture(folder / name, overlay(grey, result)[..., ::-1])
+                tile = thumbnail(grey, result) if whole else tile
+            except Exception as error:  # what was found is worth more than its drawing
+                digests.pop(name)
+                notes.append(f"{folder / name} is not drawn: {error}")
+            step()
+            return tile
+
+        whole = wanted(self.name, content)
+        tiles = side_by_side(one, self.results)
+        if whole:
+            write_picture(folder / self.name, sheet(self.title, tiles)[..., ::-1])
+        return {**digests, self.name: content}
+
+
+def _pages(results: Sequence[Result]) -> list[_Page]:
+    pages = []
+    cameras = list(dict.fromkeys(result.view.camera for result in results))
+    for camera in cameras:
+        own = [result for result in results if result.view.camera == camera]
+        states = Counter(result.state for result in own)
+        counts = ", ".join(f"{states[state]} {state}" for state in STATES if states[state])
+        for number, first in enumerate(range(0, len(own), COLUMNS * ROWS), 1):
+            name = camera if number == 1 else f"{camera}-{number}"
+            while number > 1 and name in cameras:
+                name += "_"
+            of = f", page {number} of {-(-len(own) // (COLUMNS * ROWS))}" if len(own) > COLUMNS * ROWS else ""
+            title = f"{camera}: {len(own)} picture{'s' if len(own) > 1 else ''}, {counts}{of}"
+            pages.append(_Page(f"{name}.jpg", title, own[first : first + COLUMNS * ROWS]))
+    return pages
+
+
+def _overlay_name(result: Result) -> str:
+    return f"overlays/{result.view.camera}/{result.view.shot}.jpg"
+
+
+def _digest(result: Result) -> str:
+    try:
+        state = result.path.stat()
+        file = [state.st_size, state.st_mtime_ns]
+    except OSError:
+        file = []
+    content = json.dumps([file, result.expected, result.found.as_dict()], default=repr)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def _drawn_before(record: Path) -> dict[str, str]:
+    """{file: digest} of what earlier runs drew."""
+    try:
+        table = json.loads(record.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return {str(name): str(digest) for name, digest in table.items()} if isinstance(table, dict) else {}
+
+
+def _readable(path: Path) -> Pixels | None:
+    try:
+        return eight_bit(read_picture(path))
+    except ImageError:
+        return None
