@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -604,6 +605,13 @@ def test_the_page_of_the_docs_is_what_its_numbers_make() -> None:
     """docs/reproduce.md is written by `make paper`; its numbers are kept in benchmarks/results."""
     summary = json.loads((ROOT / "benchmarks" / "results" / "paper.json").read_text())
     assert (ROOT / "docs" / "reproduce.md").read_text() == markdown(summary, figures="images/paper")
+
+
+def test_reasons_are_of_findings_of_the_paper() -> None:
+    reasons = tomllib.loads((ROOT / "src" / "implicam" / "experiments" / "reasons.toml").read_text())["reasons"]
+    given = [key for reason in reasons for key in reason["findings"]]
+    assert len(given) == len(set(given))
+    assert set(given) <= {key for name in EXPERIMENTS for key in published.load(name).findings}
 
 
 def test_every_method_has_a_name_that_makes_it() -> None:

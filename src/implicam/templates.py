@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from implicam.errors import import_extra
-from implicam.formatting import number, percent
 
 
 class Markup(str):
@@ -40,6 +39,5 @@ def render(package: str, name: str, **values: Any) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"number": number, "percent": percent}
     text: str = environment.get_template(name).render(values)
     return text

@@ -1,149 +1,167 @@
-"""The account of a reproduction as Markdown: published, ours, the difference, and why. docs/reproduce.md is one."""
+"""The account of a reproduction as Markdown: published, ours, the difference, and why. docs/reproduce.md is one.
+
+The words are in templates/account.md; here are the tables that it shows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from importlib import resources
 from typing import Any
 
-from implicam.experiments import chapters
+from implicam.experiments import plan, published
 from implicam.experiments.evidence import FAILS, HOLDS
-from implicam.experiments.markdown import number, table
-from implicam.experiments.plan import EXPLICIT, FORWARD, GP, NETWORK, PAPER
-from implicam.experiments.reasons import WHY
+from implicam.experiments.markdown import number, quartiles, span, spread, table
+from implicam.experiments.plan import EXPLICIT, GP, METHODS, PAPER, SHOWN, slug
+from implicam.experiments.source import BALL, BOARD_CHECK, BUDGETS, CHECK, RANDOM
+from implicam.formatting import percent
+from implicam.templates import render
 
 Summary = Mapping[str, Any]
+Rows = Sequence[Mapping[str, Any]]
+
+_HEADS = {"set": "cameras", "known": "points", "boards": "boards"}
 
 
 def markdown(summary: Summary, *, figures: str = "figures") -> str:
-    """The account; `figures` is where the pictures are, as the text links them."""
-    parts = [
-        _head(summary),
-        _failures(summary["failures"]),
-        _findings(summary),
-        chapters.ball(summary, figures),
-        chapters.active(summary, figures),
-        chapters.boards(summary, figures),
-        _times(summary),
-    ]
-    return "\n\n".join(part for part in parts if part).rstrip() + "\n"
+    """Write the account.
+
+    Args:
+        summary: what `reproduction.reproduce` writes as summary.json.
+        figures: where the pictures are, as the text links them.
+
+    Returns:
+        The text, as Markdown.
+    """
+    ball, bias = summary.get("ball", ()), summary.get("flattery", ())
+    lattice = _select(ball, trained=BALL, judged=BALL)
+    off_the_lattice = _select(ball, trained=BALL, judged=CHECK)
+    most_points = max((row["known"] for row in bias), default=0)
+    tables = {
+        "findings": _tabulate_findings(summary["verdicts"]),
+        "lattice": _tabulate_ball(lattice, _error),
+        "off_the_lattice": _tabulate_ball(off_the_lattice, _error),
+        "random": _tabulate_ball(_select(ball, trained=RANDOM, judged=CHECK), _error),
+        "coverage": _tabulate_ball(off_the_lattice or lattice, _coverage),
+        "explicit": _tabulate_explicit(_select(ball, method=EXPLICIT)),
+        "lattice_bias": _pivot(
+            _select(bias, known=most_points), lambda row: number(row["random"] / row["lattice"]), "set"
+        ),
+        "nearness": _tabulate_boards(
+            summary.get("nearness", ()), lambda row: f"{number(row['sd'])}, {number(row['error'])}"
+        ),
+        "off_the_boards": _tabulate_boards(
+            _select(summary.get("board", ()), judged=BOARD_CHECK),
+            lambda row: f"{number(row.get('rmse'))}, {percent(row.get('ellipsoid_95'))}",
+        ),
+    }
+    text = render(
+        __package__,
+        "account.md",
+        s=summary,
+        figures=figures,
+        tables=tables,
+        reasons=_group_reasons(summary["verdicts"]),
+        count_verdicts=_count_verdicts,
+        most_points=most_points,
+        judged_at="random positions" if off_the_lattice else "the positions left out",
+        table_place=published.load("board").place,
+        drawn_methods=[slug(method) for method in SHOWN],
+        number=number,
+        quartiles=quartiles,
+        span=span,
+        spread=spread,
+        **{name: getattr(plan, name) for name in ("PAPER", "GP", "NETWORK", "EXPLICIT", "FORWARD")},
+    )
+    return re.sub(r"\n{3,}", "\n\n", text).rstrip() + "\n"
 
 
-def _head(summary: Summary) -> str:
-    return f"""# The paper, reproduced
-
-Written by `implicam paper`; run it again and this text is made anew. The paper is De Boi et al., "Implicit Multi-Camera
-System Calibration Using Gaussian Processes".
-
-{_data(summary)}
-
-Methods: `{PAPER}` is the paper's Gaussian process with its own software (GPyTorch, positions in metres, its
-defaults); `{GP}` the same model with our fit; `{NETWORK}` its network; `{EXPLICIT}` the classical calibration;
-`{FORWARD}` our own method. Lengths are mm. Square brackets: 95 % intervals of ratios; of errors, the middle half of the
-runs. {_runs(summary["plan"])}"""
-
-
-def _runs(plan: Mapping[str, Any]) -> str:
-    """How many runs the tables rest on."""
-    parts = (("splits of the lattice", "runs"), ("splits of random positions", "random_runs"))
-    said = [f"{what}: {_grouped(plan[key])}" for what, key in parts]
-    return f"Runs for each number of points, {'; '.join(said)}. Subsets of the pictures: {plan['subsets']}."
-
-
-def _grouped(counts: Mapping[str, int]) -> str:
-    groups: dict[int, list[str]] = {}
-    for method, count in counts.items():
-        if method != EXPLICIT:
-            groups.setdefault(count, []).append(f"`{method}`")
-    return ", ".join(f"{count} of {' and '.join(names)}" for count, names in sorted(groups.items(), reverse=True))
-
-
-def _failures(failures: Mapping[str, str]) -> str:
-    if not failures:
-        return ""
-    lines = [f"- `{name}`: {reason}" for name, reason in failures.items()]
-    return "\n\n".join([f"**{len(lines)} pieces of work failed**, and are missing below:", "\n".join(lines)])
-
-
-def _data(summary: Summary) -> str:
-    source = summary["source"]
-    if source["folder"]:
-        sets = "; ".join(f"{name}: {', '.join(cameras)}" for name, cameras in source["sets"].items())
-        return f"The data are measured: `{source['folder']}`. Sets of cameras: {sets}."
-    return f"""Its measured data are not public, so the same numbers cannot come out: what can be compared is what the
-paper *finds*. The data here are its rig, simulated (seed {source["seed"]}): six cameras with its focal lengths on a
-bar, noise of 0.2 px, lens errors of 0.5 px rms that no lens model contains, known positions without error."""
+def _select(rows: Rows, **wanted: Any) -> Rows:
+    return [row for row in rows if all(row.get(key) == value for key, value in wanted.items())]
 
 
 # findings
 
 
-def _findings(summary: Summary) -> str:
-    verdicts = summary["verdicts"]
-    if not verdicts:
-        return ""
+def _tabulate_findings(verdicts: Rows) -> str:
+    """A line for each finding and its sets of cameras; the statement stands once, over the lines of its sets."""
     lines: list[list[str]] = []
     groups: dict[tuple[str, str, str], dict[str, Mapping[str, Any]]] = {}
     for verdict in verdicts:
         key = verdict["experiment"], verdict["key"], verdict["sets"]
         groups.setdefault(key, {})[verdict["method"]] = verdict
     for (_, _, sets), verdict_of in groups.items():
-        first = next(iter(verdict_of.values()))
+        statement = next(iter(verdict_of.values()))["statement"]
         cells = [_verdict(verdict_of.get(method)) for method in (PAPER, GP)]
         if "" in verdict_of:
             cells = [_verdict(verdict_of[""]), "the same"]
-        said = any(line[0] == first["statement"] for line in lines)  # once, over the rows of its sets
-        lines.append(["" if said else first["statement"], sets, *cells])
-    counts = {method: _count(verdicts, method) for method in (PAPER, GP)}
-    text = [
-        "## Does what the paper finds hold?",
-        "A row for each finding and set of cameras, with the case that decides and its 95 % interval over the runs. "
-        f"With the paper's own software {counts[PAPER]}; with our fit of the same model {counts[GP]}.",
-        table(["finding", "cameras", f"`{PAPER}`", f"`{GP}`"], lines, left=4),
-    ]
-    text.append(
-        f"Standard deviations of `{PAPER}` contain a floor of 10 mm, so that theirs differ by parts of a percent: "
-        "such a finding holds for the rest above the floor."
-    )
-    remarks = dict.fromkeys(f"- *{v['statement']}* {v['remark']}" for v in verdicts if v["remark"])
-    if remarks:
-        text += ["Where the paper's own table says otherwise:", "\n".join(remarks)]
-    reasons = "" if summary["source"]["folder"] else _reasons(verdicts)
-    if reasons:
-        text += ["Why some do not hold on this rig:", reasons]
-    return "\n\n".join(text)
-
-
-def _reasons(verdicts: Sequence[Mapping[str, Any]]) -> str:
-    """Each reason that is known, with the findings that do not hold for it."""
-    found: dict[str, list[str]] = {}
-    for verdict in verdicts:
-        if verdict["verdict"] == FAILS and verdict["key"] in WHY:
-            found.setdefault(WHY[verdict["key"]], []).append(f"*{verdict['statement']}*")
-    return "\n".join(f"- {' '.join(dict.fromkeys(said))} {reason}" for reason, said in found.items())
+        repeated = any(line[0] == statement for line in lines)
+        lines.append(["" if repeated else statement, sets, *cells])
+    return table(["finding", "cameras", f"`{PAPER}`", f"`{GP}`"], lines, left=4)
 
 
 def _verdict(verdict: Mapping[str, Any] | None) -> str:
     return "" if verdict is None else f"**{verdict['verdict']}**: {verdict['number']}"
 
 
-def _count(verdicts: Sequence[Mapping[str, Any]], method: str) -> str:
-    mine = [verdict["verdict"] for verdict in verdicts if verdict["method"] in (method, "")]
-    return f"{mine.count(HOLDS)} of {len(mine)} hold, {mine.count(FAILS)} do not"
+def _count_verdicts(verdicts: Rows, method: str) -> str:
+    found = [verdict["verdict"] for verdict in verdicts if verdict["method"] in (method, "")]
+    return f"{found.count(HOLDS)} of {len(found)} hold, {found.count(FAILS)} do not"
 
 
-# how long
+def _group_reasons(verdicts: Rows) -> dict[str, list[str]]:
+    """Each reason that is known, with the statements of the findings that do not hold for it."""
+    text = resources.files(__package__).joinpath("reasons.toml").read_text(encoding="utf-8")
+    why = {key: reason["why"] for reason in tomllib.loads(text)["reasons"] for key in reason["findings"]}
+    found: dict[str, dict[str, None]] = {}
+    for verdict in verdicts:
+        if verdict["verdict"] == FAILS and verdict["key"] in why:
+            found.setdefault(why[verdict["key"]], {})[verdict["statement"]] = None
+    return {reason: list(statements) for reason, statements in found.items()}
 
 
-def _times(summary: Summary) -> str:
-    body = []
-    for name, part in summary["parts"].items():
-        methods = ", ".join(f"{m} {number(s, 2)}" for m, s in sorted(part["by_method"].items(), key=lambda p: -p[1]))
-        body.append([name, str(part["cells"]), number(part["seconds"]), methods])
-    cells = summary["cells"]
-    before = f"; {cells['already']} of {cells['all']} cells had been computed before" if cells["already"] else ""
-    lost = f" {cells['failed']} cells failed." if cells["failed"] else ""
-    return (
-        f"## How long it took\n\nSeconds of work of one core, by part and method. Wall time of the run: "
-        f"{number(summary['wall_seconds'])} s{before}.{lost}\n\n"
-        + table(["part", "cells", "seconds", "by method"], body, left=1)
-    )
+# tables with a column for each method
+
+
+def _tabulate_ball(rows: Rows, cell: Callable[[Mapping[str, Any]], str]) -> str:
+    return _pivot(sorted(rows, key=lambda row: (row["set"], -row["known"])), cell, "set", "known")
+
+
+def _tabulate_boards(rows: Rows, cell: Callable[[Mapping[str, Any]], str]) -> str:
+    return _pivot(sorted(rows, key=lambda row: (row["set"], row["boards"])), cell, "set", "boards")
+
+
+def _pivot(rows: Rows, cell: Callable[[Mapping[str, Any]], str], *keys: str) -> str:
+    """A line for each value of the keys, in the order of the rows; nothing without rows."""
+    cells = {(*(row[key] for key in keys), row["method"]): cell(row) for row in rows}
+    methods = [method for method in METHODS if any(key[-1] == method for key in cells)]
+    lines = dict.fromkeys(key[:-1] for key in cells)
+    body = [[*map(str, line), *(cells.get((*line, method), "") for method in methods)] for line in lines]
+    return table([*(_HEADS[key] for key in keys), *(f"`{method}`" for method in methods)], body) if body else ""
+
+
+def _error(row: Mapping[str, Any]) -> str:
+    """The quartiles of the error, and what is missing: failed runs, and the share of positions that were measured."""
+    missing = [f"{row['failed']} failed"] if row.get("failed") else []
+    measured = row.get("measured")
+    missing += [f"{percent(measured)} measured"] if measured is not None and measured < 1 else []
+    return quartiles(row["rmse"]) + (f" ({', '.join(missing)})" if missing else "")
+
+
+def _coverage(row: Mapping[str, Any]) -> str:
+    return f"{percent(row['ellipsoid_95'][1])}, {number(row['mean_sd'][1])} mm"
+
+
+def _tabulate_explicit(rows: Rows) -> str:
+    """A line for each set of cameras and where it was judged, a column for each budget of pictures."""
+    budgets = ["{}+{}".format(*budget) for budget in BUDGETS]
+    body = list[list[str]]()
+    for cameras in sorted({row["set"] for row in rows}):
+        for judged, words in ((BALL, "lattice"), (CHECK, "random")):
+            found = {row.get("budget"): _error(row) for row in _select(rows, set=cameras, judged=judged)}
+            if found:
+                body.append([cameras, words, *(found.get(budget, "") for budget in budgets)])
+    heads = ["cameras", "judged at", *(budget.replace("+", " + ") for budget in budgets)]
+    return table(heads, body, left=2) if body else ""
