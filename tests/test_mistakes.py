@@ -11,7 +11,7 @@ import implicam as ic
 from implicam.dataset import Dataset, Floats
 from implicam.errors import FitError
 from implicam.mistakes import mistakes_in
-from implicam.row_order import moved_up
+from implicam.row_order import shift_rows
 from implicam.simulate import ball_grid, build_rig, random_positions, simulate
 from implicam.verdict import _of_data
 
@@ -118,4 +118,4 @@ def test_rows_are_moved_up_whatever_their_number(rows: int) -> None:
     for n in range(4):
         values = np.arange(2.0 * n).reshape(n, 2)
         expected = [values[i + rows] if 0 <= i + rows < n else np.full(2, np.nan) for i in range(n)]
-        assert np.array_equal(moved_up(values, rows), np.array(expected).reshape(n, 2), equal_nan=True)
+        assert np.array_equal(shift_rows(values, rows), np.array(expected).reshape(n, 2), equal_nan=True)

@@ -134,18 +134,9 @@ def _held_out_in_turn(
 def _stacked(parts: Iterable[Measurement]) -> Measurement:
     all_parts = list(parts)
 
-    def together(name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(part, name) for part in all_parts])
-
-    return Measurement(
-        together("points"),
-        together("xyz"),
-        together("cov"),
-        together("views"),
-        together("consistency"),
-        together("reason"),
-        all_parts[0].length_unit,
-    )
+    names = ("points", "xyz", "cov", "views", "consistency", "reason")
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in all_parts]) for name in names}
+    return Measurement(**columns, length_unit=all_parts[0].length_unit)
 
 
 def _judge(
@@ -228,11 +219,6 @@ def _same_views(fitted: Observations, given: Observations) -> NDArray[np.bool_]:
 
 def _fingerprints(observations: Observations) -> list[bytes]:
     """Per point its pixels as bytes; a point without any is known by its name."""
-    marks, seen_at_all = (
-        fingerprints(observations.uv.reshape(len(observations), 2 * len(observations.cameras))),
-        observations.seen.sum(axis=1) > 0,
-    )
-    return [
-        mark if seen else str(name).encode()
-        for mark, seen, name in zip(marks, seen_at_all, observations.points, strict=True)
-    ]
+    marks = fingerprints(observations.uv.reshape(len(observations), 2 * len(observations.cameras)))
+    seen = observations.seen.sum(axis=1) > 0
+    return [mark if s else str(name).encode() for mark, s, name in zip(marks, seen, observations.points, strict=True)]

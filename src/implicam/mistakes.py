@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from implicam.dataset import Dataset, Floats
 from implicam.dataset.copies import without_copies
 from implicam.errors import FitError
-from implicam.row_order import FEWEST, order_of, said_of
+from implicam.row_order import MIN_VIEWS, describe_order, order_of
 
 UNITS = {
     1000.0: "metres and millimetres, say",
@@ -27,10 +27,10 @@ UNITS = {
 }
 """By how much positions in two units differ."""
 
-FEWEST_IN_UNIT = 3
+MIN_POINTS_IN_UNIT = 3
 """Points in another unit."""
 
-ALIKE = (0.1, 3.0)
+WIDTH_RATIO_RANGE = (0.1, 3.0)
 """Width of the points in another unit, once converted, over that of the others; of their pixels at least the first."""
 
 
@@ -77,9 +77,9 @@ def _two_units(data: Dataset) -> Iterator[Finding]:
     xyz = data.xyz
     size = np.linalg.norm(xyz, axis=1)
     order = np.argsort(size)
-    if len(xyz) < 2 * FEWEST_IN_UNIT or not size[order[0]] > 0:
+    if len(xyz) < 2 * MIN_POINTS_IN_UNIT or not size[order[0]] > 0:
         return
-    parts = range(FEWEST_IN_UNIT, len(xyz) - FEWEST_IN_UNIT + 1)
+    parts = range(MIN_POINTS_IN_UNIT, len(xyz) - MIN_POINTS_IN_UNIT + 1)
     k = max(parts, key=lambda k: float(size[order[k]] / size[order[k - 1]]))
     few, many = order[:k], order[k:]
     low, high = xyz[many].min(axis=0), xyz[many].max(axis=0)
@@ -89,7 +89,7 @@ def _two_units(data: Dataset) -> Iterator[Finding]:
         ratio = float(np.linalg.norm(np.ptp(converted, axis=0))) / max(width, 1e-300)
         beside = (converted > low - 0.5 * width) & (converted < high + 0.5 * width)
         apart = size[few].max() * 2 < size[many].min()
-        if apart and ALIKE[0] < ratio < ALIKE[1] and beside.all() and _as_wide(data, few, many):
+        if apart and WIDTH_RATIO_RANGE[0] < ratio < WIDTH_RATIO_RANGE[1] and beside.all() and _as_wide(data, few, many):
             names = ", ".join(str(data.points[i]) for i in np.sort(few)[:3])
             yield Finding(
                 True,
@@ -107,7 +107,7 @@ def _as_wide(data: Dataset, few: NDArray[np.int64], many: NDArray[np.int64]) -> 
         widths = [_spread(uv[rows, c]) for rows in (few, many)]
         if all(width > 0 for width in widths):
             ratios.append(widths[0] / widths[1])
-    return bool(ratios) and float(np.median(ratios)) > ALIKE[0]
+    return bool(ratios) and float(np.median(ratios)) > WIDTH_RATIO_RANGE[0]
 
 
 def _spread(uv: Floats) -> float:
@@ -120,7 +120,7 @@ def _other_rows(data: Dataset) -> Iterator[Finding]:
     """Each camera alone: do its views fit the positions of other rows, and not those of their own?"""
     names, uv = data.observations.camera_names, data.observations.uv
     orders = {name: order for c, name in enumerate(names) if (order := order_of(data.xyz, uv[:, c])) is not None}
-    judged = sum(np.isfinite(uv[..., 0]).sum(axis=0) >= FEWEST)
+    judged = sum(np.isfinite(uv[..., 0]).sum(axis=0) >= MIN_VIEWS)
     for rows, count in Counter(order.rows for order in orders.values()).items():
         if count > 0.5 * judged:
             those = {name: order for name, order in orders.items() if order.rows == rows}
@@ -134,7 +134,7 @@ def _other_rows(data: Dataset) -> Iterator[Finding]:
             )
             return
     for name, order in orders.items():
-        yield of_rows(name, said_of(order))
+        yield of_rows(name, describe_order(order))
 
 
 def of_rows(camera: str, why: str) -> Finding:

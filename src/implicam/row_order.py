@@ -18,31 +18,31 @@ from implicam.geometry import resect_robustly
 
 Floats = NDArray[np.float64]
 
-SLIPPED = 3
+MAX_ROW_SHIFT = 3
 """By so many rows the pixels may be late or early."""
 
 REVERSED = 0
 """In place of a number of rows: from the last row to the first."""
 
-FEWEST = 10
+MIN_VIEWS = 10
 """Views that a linear camera is fitted to here: 20 numbers for 11."""
 
-CLEAR = 0.2
+MAX_ERROR_RATIO = 0.2
 """What is left with the rows put right, in what is left as they are, that says that they were wrong."""
 
-TOLERABLE = 0.02
+MAX_RELATIVE_ERROR = 0.02
 """And in half the extent of the pixels."""
 
-FAR = 10.0
+MISFIT_ERROR_MEDIANS = 10.0
 """Times the median error, for a row that does not fit."""
 
-FEWEST_ENDS, ENDS = 4, 0.03
+MIN_MISFITS, MIN_MISFIT_SHARE = 4, 0.03
 """Such rows, and their share, that are more than wrong detections if they all fit once the rows are moved."""
 
-FEWEST_REPEATED, REPEATED = 5, 0.2
+MIN_REPEATED_PIXELS, MIN_REPEATED_SHARE = 5, 0.2
 """Pixels that are those of the row before, and their share, which are no chance."""
 
-MOST = 1000
+MAX_ROWS = 1000
 """Rows that are looked at."""
 
 
@@ -56,15 +56,15 @@ class Order(NamedTuple):
     @property
     def how(self) -> str:
         """What they are, in words."""
-        return "in the order from the last row to the first" if self.rows == REVERSED else late_or_early(self.rows)
+        return "in the order from the last row to the first" if self.rows == REVERSED else describe_shift(self.rows)
 
 
-def late_or_early(rows: int) -> str:
+def describe_shift(rows: int) -> str:
     """A number of rows in words, of which late ones are above zero."""
     return f"{abs(rows)} row{'s' * (abs(rows) > 1)} {'late' if rows > 0 else 'early'}"
 
 
-def moved_up(values: Floats, rows: int) -> Floats:
+def shift_rows(values: Floats, rows: int) -> Floats:
     """Each row (n, ...) with the values of the one `rows` after it; NaN where there is none."""
     out = np.full_like(values, np.nan)
     if abs(rows) >= len(values):
@@ -76,7 +76,7 @@ def moved_up(values: Floats, rows: int) -> Floats:
     return out
 
 
-def other_camera(row: int) -> str:
+def describe_moved_camera(row: int) -> str:
     """What is said of a camera that moved before the row of this number, counted from zero."""
     return (
         f"from row {row + 1} on it sees like another camera: was it moved, turned or refocused there? Then take the "
@@ -87,19 +87,19 @@ def other_camera(row: int) -> str:
 def order_of(points: Floats, uv: Floats) -> Order | None:
     """Of known points (n, 3) in the order they were seen in, at pixels (n, 2), NaN where not seen: the order that the
     pixels are in; None where it is that of the points."""
-    ways = {rows: moved_up(uv, rows)[:MOST] for rows in _shifts()} | {REVERSED: uv[::-1][:MOST]}
-    points, uv = points[:MOST], uv[:MOST]
+    ways = {rows: shift_rows(uv, rows)[:MAX_ROWS] for rows in _shifts()} | {REVERSED: uv[::-1][:MAX_ROWS]}
+    points, uv = points[:MAX_ROWS], uv[:MAX_ROWS]
     as_is = _errors_seen(points, uv, at_best=True)  # wrong detections alone must not make the order look wrong
     if not len(as_is):
         return None
-    now, far = float(np.median(as_is)), FAR * float(np.median(as_is))
+    now, far = float(np.median(as_is)), MISFIT_ERROR_MEDIANS * float(np.median(as_is))
     put_right = {rows: errors for rows, way in ways.items() if len(errors := _errors_seen(points, way))}
     if not put_right:
         return None
     misfits = {rows: float(np.mean(np.minimum(errors, far))) for rows, errors in put_right.items()}
     best = min(misfits, key=lambda rows: misfits[rows])
-    left, tolerable = float(np.median(put_right[best])), TOLERABLE * _half(uv)
-    if left < CLEAR * now and left < tolerable:
+    left, tolerable = float(np.median(put_right[best])), MAX_RELATIVE_ERROR * _half(uv)
+    if left < MAX_ERROR_RATIO * now and left < tolerable:
         return Order(best, f"they fit to {left:.2g} px, as they are to {now:.2g}")
     # a lattice that slips along itself fits as it did, but for the ends of its lines; one that is turned over fits as
     # it did in all of them, and there a few wrong views would decide
@@ -110,13 +110,13 @@ def order_of(points: Floats, uv: Floats) -> Order | None:
     left = float(np.median(put_right[best]))
     if not left < tolerable:
         return None
-    before, after = (int(np.sum(errors > FAR * max(left, now))) for errors in (as_is, put_right[best]))
-    if before >= max(FEWEST_ENDS, ENDS * len(as_is)) and after <= CLEAR * before:
+    before, after = (int(np.sum(errors > MISFIT_ERROR_MEDIANS * max(left, now))) for errors in (as_is, put_right[best]))
+    if before >= max(MIN_MISFITS, MIN_MISFIT_SHARE * len(as_is)) and after <= MAX_ERROR_RATIO * before:
         return Order(best, f"{f'all but {after}' if after else 'all'} fit, as they are {before} of {len(as_is)} do not")
     return None
 
 
-def said_of(order: Order) -> str:
+def describe_order(order: Order) -> str:
     """Of one camera."""
     return f"its pixels are {order.how}: put right {order.fit}"
 
@@ -130,30 +130,30 @@ def change_of(points: Floats, uv: Floats) -> str:
 def what_is_wrong(points: Floats, uv: Floats) -> str:
     """The same of a camera that misses its known points, for whatever reason that its rows show."""
     order = order_of(points, uv)
-    return change_of(points, uv) if order is None else said_of(order)
+    return change_of(points, uv) if order is None else describe_order(order)
 
 
 def _repeated(points: Floats, uv: Floats) -> str:
     """Pictures that are there twice: a camera that is slower than the others, or froze."""
     same = (uv[1:] == uv[:-1]).all(axis=1) & (points[1:] != points[:-1]).any(axis=1)
     count, seen = int(same.sum()), int(np.isfinite(uv[:, 0]).sum())
-    if count < max(FEWEST_REPEATED, REPEATED * seen):
+    if count < max(MIN_REPEATED_PIXELS, MIN_REPEATED_SHARE * seen):
         return ""
     return f"{count} of its {seen} pixels are those of the row before, to the last bit: its pictures are there twice"
 
 
 def _in_two_parts(points: Floats, uv: Floats) -> str:
     """Rows of which the first and the last fit well, but not with the same camera, or not as they stand."""
-    points, uv = points[:MOST], uv[:MOST]
+    points, uv = points[:MAX_ROWS], uv[:MAX_ROWS]
     seen = np.flatnonzero(np.isfinite(uv[:, 0]))
-    size = max(FEWEST, len(seen) // 3)
+    size = max(MIN_VIEWS, len(seen) // 3)
     if len(seen) < 2 * size:
         return ""
     first, last = slice(0, seen[size - 1] + 1), slice(seen[-size], None)
     before, after = _shift_of(points[first], uv[first]), _shift_of(points[last], uv[last])
     if before is None or after is None or (before == after and before != 0):
         return ""
-    views = [moved_up(uv, before), moved_up(uv, after)]
+    views = [shift_rows(uv, before), shift_rows(uv, after)]
     cameras = _camera(points[first], views[0][first]), _camera(points[last], views[1][last])
     if cameras[0] is None or cameras[1] is None:
         return ""
@@ -162,46 +162,46 @@ def _in_two_parts(points: Floats, uv: Floats) -> str:
     now = float(np.median(_errors_seen(points, uv, at_best=True)))
     if before != after:
         together = np.concatenate([views[0][:row], views[1][row:]])
-        if not float(np.median(_errors_seen(points, together, at_best=True))) < CLEAR * now:
+        if not float(np.median(_errors_seen(points, together, at_best=True))) < MAX_ERROR_RATIO * now:
             return ""
-        slip = late_or_early(after - before)
+        slip = describe_shift(after - before)
         return f"from about row {row + 1} on its pixels are {slip}: a picture or a row is there twice, or missing"
     if not seen[0] < row <= seen[-1]:
         return ""
     alone = max(float(np.nanmedian(errors[0][:row])), float(np.nanmedian(errors[1][row:])))
-    if not alone < CLEAR * now:
+    if not alone < MAX_ERROR_RATIO * now:
         return ""
     ratio = _pixel_ratio(points, cameras[0], cameras[1])
     if ratio is not None:
         return f"from row {row + 1} on its pictures are {ratio:.3g} times the size of those before"
-    return other_camera(row)
+    return describe_moved_camera(row)
 
 
 def _shift_of(points: Floats, uv: Floats) -> int | None:
     """By how many rows the pixels are late, so that a camera fits; None where none does."""
-    left = {rows: _left(points, moved_up(uv, rows)) for rows in (0, *_shifts())}
+    left = {rows: _left(points, shift_rows(uv, rows)) for rows in (0, *_shifts())}
     best = min(left, key=lambda rows: (left[rows], abs(rows)))
-    best = best if left[best] < CLEAR * left[0] else 0
-    return best if left[best] < TOLERABLE * _half(uv) else None
+    best = best if left[best] < MAX_ERROR_RATIO * left[0] else 0
+    return best if left[best] < MAX_RELATIVE_ERROR * _half(uv) else None
 
 
 def _shifts() -> list[int]:
-    return [rows for rows in range(-SLIPPED, SLIPPED + 1) if rows]
+    return [rows for rows in range(-MAX_ROW_SHIFT, MAX_ROW_SHIFT + 1) if rows]
 
 
 def _camera(points: Floats, uv: Floats, *, at_best: bool = False) -> Floats | None:
     """(3, 4) the linear camera that sees most of the points at their pixels, as `resect_robustly`; None for too few.
 
-    at_best: the least that any camera leaves, however few views it fits; else they must be FEWEST."""
+    at_best: the least that any camera leaves, however few views it fits; else they must be MIN_VIEWS."""
     seen = np.isfinite(uv[:, 0])
-    if seen.sum() < FEWEST:
+    if seen.sum() < MIN_VIEWS:
         return None
-    subsets = at_best and bool(seen.sum() >= 2 * FEWEST)  # of fewer some subset fits half, whatever they are
+    subsets = at_best and bool(seen.sum() >= 2 * MIN_VIEWS)  # of fewer some subset fits half, whatever they are
     try:
         camera, kept = resect_robustly(points[seen], uv[seen], subsets=subsets)
     except (FitError, np.linalg.LinAlgError):
         return None
-    return camera if at_best or kept.sum() >= FEWEST else None
+    return camera if at_best or kept.sum() >= MIN_VIEWS else None
 
 
 def _errors(camera: Floats, points: Floats, uv: Floats) -> Floats:
@@ -242,5 +242,5 @@ def _pixel_ratio(points: Floats, first: Floats, last: Floats) -> float | None:
     """How many times larger the pictures of the last camera are, where they are the first one's, resized."""
     before, after = _pixels(first, points), _pixels(last, points)
     ratio = float(np.median(np.linalg.norm(after, axis=1) / np.linalg.norm(before, axis=1)))
-    same = np.median(np.linalg.norm(after - ratio * before, axis=1)) < TOLERABLE * _half(after)
+    same = np.median(np.linalg.norm(after - ratio * before, axis=1)) < MAX_RELATIVE_ERROR * _half(after)
     return ratio if same and abs(np.log(ratio)) > 0.1 else None

@@ -28,11 +28,11 @@ from implicam.formatting import percent
 from implicam.mistakes import Finding, mistakes_in, of_rows
 from implicam.progress import Progress, silent
 from implicam.rig_model.training_data import stated_noise
-from implicam.row_order import change_of, other_camera
+from implicam.row_order import change_of, describe_moved_camera
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
 
-ON_SURFACE = 0.05
+MIN_QUADRIC_RMS = 0.05
 """Rms of the best quadratic equation at known points, in coordinates of unit variance: with 14 or more points all over
 less was never seen in 2000 draws, two planes good to a hundredth of their distance have 0.03."""
 
@@ -45,42 +45,42 @@ ENOUGH_POINTS = 17
 FLAT_RATIO = 0.01
 """Thickness over width of known points that are nearly on a plane, or a line: beyond it nothing is known."""
 
-MANY_REJECTED, USUAL_WRONG = 0.3, 0.15
+MAX_REJECTED_SHARE, USUAL_WRONG_SHARE = 0.3, 0.15
 """Share of a camera's views that contradict the others beyond which it is not the views; share that is usual."""
 
-RARE = 1e-4
+MAX_CHANCE_PROBABILITY = 1e-4
 """A share is beyond the usual where chance would show it so rarely."""
 
-RESIDUAL_RATIO = 4.0
+MAX_RESIDUAL_SDS = 4.0
 """Median error of a camera at its own known points, in its stated noise; 1.2 is right."""
 
-UNLIKE_OTHERS, UNLIKE_OTHERS_PIXELS = 10.0, 2.0
+MAX_RESIDUAL_RATIO, MIN_UNLIKE_RESIDUAL_PX = 10.0, 2.0
 """The same where no noise is stated: in the median error of the other cameras, and at least so many pixels."""
 
-MOVED, FEWEST_IN_PART = 0.5, 4
+MIN_MOVE_SHARE, MIN_VIEWS_IN_PART = 0.5, 4
 """Share of a camera's residuals that a move explains at least: a lens that is not quite understood leaves some that
 depend on the place, and so on the order of a lattice. Views before and after a move."""
 
-WORST_NEES, HOPELESS_NEES = 7.0, 60.0
+MAX_NEES, HOPELESS_NEES = 7.0, 60.0
 """Mean NEES of held-out points, 3 is right, above which error bars are doubtful, and above which they are nothing."""
 
-USUAL_OUTSIDE = 0.15
+USUAL_OUTSIDE_SHARE = 0.15
 """Share of the held-out points outside of their 95 % ellipsoids that is usual: 5 %, and wrong views."""
 
-TRIMMED = 0.05
+TRIMMED_SHARE = 0.05
 """Share of the held-out points, the worst and at least one, that have no say: a wrong view may hide among two."""
 
-FEW_FOR_FOLDS = 25
+MAX_POINTS_FOR_FIVE_FOLDS = 25
 """Up to so many, a fit without a third of the points would be another calibration: a fifth is left out."""
 
-FEWEST_JUDGED = 6
+MIN_JUDGED_POINTS = 6
 """Held-out points of which something can be said."""
 
-USELESS = 0.3
+MAX_RELATIVE_RMS = 0.3
 """rms error of held-out points, in the rms distance of the known points from their middle, that is no measurement."""
 
 
-NOTHING = 0.8
+NOTHING_LEARNED_RELATIVE_RMS = 0.8
 """The same, above which nothing was learned, whatever the error bars say: the middle of the known points, guessed for
 all, is off by 1."""
 
@@ -90,8 +90,8 @@ class HeldOut:
     """Known points measured by fits that had not seen them; lengths in the dataset's unit.
 
     points: measured with all their views. rms, stated: their error, and what the error bars say it is. nees: mean
-    without the worst TRIMMED, right near 2.6. inside: share in the 95 % ellipsoids. contradicting: share of all that
-    were held out whose views contradict each other. how: in words.
+    without the worst TRIMMED_SHARE, right near 2.6. inside: share in the 95 % ellipsoids. contradicting: share of all
+    that were held out whose views contradict each other. how: in words.
     """
 
     points: int
@@ -140,9 +140,9 @@ def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | N
         return None, list(_of_kept_back(calibration))
     data = _clean(calibration)
     n = len(data)
-    if n < FEWEST_JUDGED:
+    if n < MIN_JUDGED_POINTS:
         return None, []
-    plan = calibration.check_plan or (CheckPlan(5, 5, 300) if n <= FEW_FOR_FOLDS else CheckPlan(3, 3, 300))
+    plan = calibration.check_plan or (CheckPlan(5, 5, 300) if n <= MAX_POINTS_FOR_FIVE_FOLDS else CheckPlan(3, 3, 300))
     places = calibration.data.places
     fold = np.random.default_rng(0).permutation(np.arange(n) % plan.folds)[data.places]
     found: list[_Measured] = []
@@ -213,12 +213,12 @@ def _measured(calibration: Calibration, data: Dataset) -> _Measured:
 
 def _summary(found: list[_Measured], how: str) -> HeldOut | None:
     errors, cov, contradicting = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    if len(errors) < FEWEST_JUDGED:
+    if len(errors) < MIN_JUDGED_POINTS:
         return None
     with np.errstate(all="ignore"):
         nees = np.einsum("ni,nij,nj->n", errors, np.linalg.pinv(cov, hermitian=True), errors)
     nees = np.sort(np.nan_to_num(nees, nan=np.inf))
-    kept = nees[: len(nees) - max(1, int(np.ceil(TRIMMED * len(nees))))]
+    kept = nees[: len(nees) - max(1, int(np.ceil(TRIMMED_SHARE * len(nees))))]
     return HeldOut(
         points=len(errors),
         rms=float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
@@ -237,20 +237,24 @@ def _of_held_out(found: HeldOut | None, calibration: Calibration, cure: str) -> 
     said = f"{found.points} known points that a fit had not seen are off by {found.rms:.2g} {unit} rms"
     extent = float(np.sqrt(np.mean(np.sum((calibration.data.xyz - calibration.data.xyz.mean(axis=0)) ** 2, axis=1))))
     within = f"{said}, and all of them lie within {extent:.2g} {unit}"
-    if found.rms > NOTHING * extent or (found.rms > USELESS * extent and found.nees > WORST_NEES):
+    if found.rms > NOTHING_LEARNED_RELATIVE_RMS * extent or (
+        found.rms > MAX_RELATIVE_RMS * extent and found.nees > MAX_NEES
+    ):
         yield Finding(True, f"{within}: this is no measurement. {_LOOK}")
-    elif found.rms > USELESS * extent:
+    elif found.rms > MAX_RELATIVE_RMS * extent:
         yield Finding(False, f"{within}: this is hardly a measurement, as the error bars say. {_LOOK}")
     elif found.nees > HOPELESS_NEES and found.inside < 0.5:
         yield Finding(True, f"{said}, where the error bars say {found.stated:.2g}: they mean nothing. {_LOOK}")
-    elif found.nees > WORST_NEES or _beyond(round((1 - found.inside) * found.points), found.points, USUAL_OUTSIDE):
+    elif found.nees > MAX_NEES or _beyond(round((1 - found.inside) * found.points), found.points, USUAL_OUTSIDE_SHARE):
         yield Finding(
             False,
             f"{said}, where the error bars say {found.stated:.2g}, and {percent(found.inside)} lie in their 95 % "
             f"ellipsoids. {cure}",
         )
     tested = found.points + round(found.contradicting * found.points / max(1 - found.contradicting, 1e-3))
-    if found.contradicting > MANY_REJECTED and _beyond(round(found.contradicting * tested), tested, USUAL_WRONG):
+    if found.contradicting > MAX_REJECTED_SHARE and _beyond(
+        round(found.contradicting * tested), tested, USUAL_WRONG_SHARE
+    ):
         yield Finding(
             False,
             f"The views of {percent(found.contradicting)} of the known points contradict each other in a fit that "
@@ -270,7 +274,7 @@ def _of_kept_back(calibration: Calibration) -> Iterator[Finding]:
     """Of a method that keeps points back from training, because to train it again takes too long."""
     summary = calibration.summary()
     n, inside = 3 * (summary.held_out_points or 0), summary.held_out_in_95 or 0.0
-    if n >= 3 * FEWEST_JUDGED and inside < 0.5:
+    if n >= 3 * MIN_JUDGED_POINTS and inside < 0.5:
         yield Finding(
             False,
             f"{percent(inside)} of the {n} coordinates of points kept for early stopping lie in their 95 % bars: "
@@ -325,7 +329,7 @@ def _of_surface(calibration: Calibration) -> Iterator[Finding]:
     q = left * np.sqrt(n)
     first, second = np.triu_indices(3)
     monomials = np.column_stack([np.ones(n), q, q[:, first] * q[:, second]])
-    if np.linalg.svd(monomials / np.sqrt(n), compute_uv=False)[-1] < ON_SURFACE:
+    if np.linalg.svd(monomials / np.sqrt(n), compute_uv=False)[-1] < MIN_QUADRIC_RMS:
         yield Finding(
             False,
             "The known points lie on two planes, or on another surface that a quadratic equation describes: between "
@@ -357,7 +361,7 @@ def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
     bad = {}
     for name, n in zip(names, seen.tolist(), strict=True):
         k = rejected.count(name)
-        if k > MANY_REJECTED * n and _beyond(k, n, USUAL_WRONG):
+        if k > MAX_REJECTED_SHARE * n and _beyond(k, n, USUAL_WRONG_SHARE):
             bad[name] = f"{name} ({k} of {n})"
     if not bad:
         return
@@ -383,7 +387,7 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
         first = _moved_at(uv[rows, c] - predicted[rows, c])
         if first is not None:
             moved.add(name)
-            yield of_rows(name, other_camera(int(rows[first])))
+            yield of_rows(name, describe_moved_camera(int(rows[first])))
     medians, stated = _missed_by(calibration)
     declared = _declared(data)
     for c, (name, median, sd) in enumerate(zip(data.observations.camera_names, medians, stated, strict=True)):
@@ -391,14 +395,14 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
             continue
         others = np.delete(medians, c)
         usual = np.nanmedian(others) if np.isfinite(others).any() else np.nan
-        if np.isfinite(sd) and median > RESIDUAL_RATIO * sd and not declared:
+        if np.isfinite(sd) and median > MAX_RESIDUAL_SDS * sd and not declared:
             yield Finding(
                 False,
                 f"{name} misses its own known points by {median:.2g} px in the median, and its views state {sd:.2g} "
                 "px: the stated sd is wrong, known positions are off, or the camera is not understood.",
                 (name,),
             )
-        elif not np.isfinite(sd) and median > max(UNLIKE_OTHERS * usual, UNLIKE_OTHERS_PIXELS):
+        elif not np.isfinite(sd) and median > max(MAX_RESIDUAL_RATIO * usual, MIN_UNLIKE_RESIDUAL_PX):
             yield Finding(
                 False,
                 f"{name} misses its own known points by {median:.2g} px in the median, the other cameras by "
@@ -414,7 +418,7 @@ def _of_stated_sds(calibration: Calibration) -> Iterator[Finding]:
     medians, stated = _missed_by(calibration)
     ratio = medians / stated
     judged = np.isfinite(ratio)
-    if (ratio > RESIDUAL_RATIO).sum() > 0.5 * judged.sum():
+    if (ratio > MAX_RESIDUAL_SDS).sum() > 0.5 * judged.sum():
         yield Finding(
             False,
             f"In the median the cameras miss the known points by {np.median(ratio[judged]):.2g} times what the stated "
@@ -457,13 +461,13 @@ def _moved_at(residual: Floats) -> int | None:
         return None
     centred = residual - residual.mean(axis=0)
     total = float(np.sum(centred**2))
-    k = np.arange(FEWEST_IN_PART, n - FEWEST_IN_PART + 1)
+    k = np.arange(MIN_VIEWS_IN_PART, n - MIN_VIEWS_IN_PART + 1)
     between = np.sum(np.cumsum(centred, axis=0)[k - 1] ** 2, axis=1) * n / (k * (n - k))
     best = int(np.argmax(between))
     explained = float(between[best]) / max(total, 1e-300)
     F = 0.5 * explained / max((1 - explained) / (2 * n - 4), 1e-300)
     by_chance = len(k) * float(fdtrc(2, 2 * n - 4, F))
-    return int(k[best]) if explained > MOVED and by_chance < RARE else None
+    return int(k[best]) if explained > MIN_MOVE_SHARE and by_chance < MAX_CHANCE_PROBABILITY else None
 
 
 def _seen_of_labels(calibration: Calibration) -> Floats:
@@ -478,4 +482,4 @@ def _seen_of_labels(calibration: Calibration) -> Floats:
 
 
 def _beyond(count: int, n: int, share: float) -> bool:
-    return count > 0 and float(bdtrc(count - 1, n, share)) < RARE
+    return count > 0 and float(bdtrc(count - 1, n, share)) < MAX_CHANCE_PROBABILITY

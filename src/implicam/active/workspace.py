@@ -16,16 +16,16 @@ from implicam.errors import HardwareError, UsageError
 from implicam.hardware.csv_player import read_positions
 from implicam.simulate import Box
 
-ON_SURFACE = 5
+SURFACE_STEP = 5
 """One candidate of so many lies on the surface: the outermost places tell most of a lens."""
 
-HARDLY = 0.05
+MIN_INSIDE_SHARE = 0.05
 """Where less than this part of a box around it is inside, the box is turned."""
 
-INWARD = 0.9
+START_DISTANCE_RATIO = 0.9
 """The places to begin with are so much nearer to the centre than candidates: nobody knows yet what the cameras see."""
 
-EDGE = 1e-9
+RELATIVE_TOLERANCE = 1e-9
 """Part of the size by which a point may be outside and still counts as inside."""
 
 
@@ -48,7 +48,7 @@ class Workspace:
             raise UsageError(
                 f"a workspace from {a.tolist()} to {b.tolist()} is empty.", fix="give x, y and z, the lower end first"
             )
-        corners = np.array([[(a, b)[i][k] for k, i in enumerate(ends)] for ends in product((0, 1), repeat=3)])
+        corners = np.array(list(product(*zip(a, b, strict=True))))
         size = " x ".join(f"{n:.4g}" for n in b - a)
         return cls._of(corners, None, f"a box of {size}")
 
@@ -98,7 +98,9 @@ class Workspace:
 
     def inside(self, xyz: Floats) -> NDArray[np.bool_]:
         """(n,) which of points (n, 3) are in it."""
-        return np.asarray((xyz @ self.normals.T <= self.offsets + EDGE * self.size).all(axis=1), dtype=np.bool_)
+        return np.asarray(
+            (xyz @ self.normals.T <= self.offsets + RELATIVE_TOLERANCE * self.size).all(axis=1), dtype=np.bool_
+        )
 
     def candidates(self, n: int, seed: int) -> Floats:
         """(n, 3) where the next target may be: evenly spread, some of them on the surface, and the corners, where a
@@ -107,8 +109,8 @@ class Workspace:
             return self.places[np.random.default_rng(seed).permutation(len(self.places))[:n]]
         corners = self._corners(n)
         found = self._spread(n - len(corners), seed)
-        found[::ON_SURFACE] = self._on_surface(found[::ON_SURFACE])
-        return self._pulled_in(np.concatenate([found, corners]), 1 - EDGE)
+        found[::SURFACE_STEP] = self._on_surface(found[::SURFACE_STEP])
+        return self._pull_in(np.concatenate([found, corners]), 1 - RELATIVE_TOLERANCE)
 
     def judged(self, n: int, seed: int = 0) -> Floats:
         """(about n, 3) places at which a calibration is judged: evenly spread, and the corners."""
@@ -119,7 +121,7 @@ class Workspace:
         """(n, 3) places to begin with while nothing is known of the cameras: each as far from the others as can be."""
         pool = self.candidates(64 * n, seed)
         if self.places is None:
-            pool = self._pulled_in(pool, INWARD)
+            pool = self._pull_in(pool, START_DISTANCE_RATIO)
         if len(pool) < n:
             raise UsageError(f"{self.name} are fewer than the {n} that are needed to begin.", fix="add places")
         chosen = [int(np.argmax(np.linalg.norm(pool - self.centre, axis=1)))]
@@ -129,7 +131,7 @@ class Workspace:
             distance = np.minimum(distance, np.linalg.norm(pool - pool[chosen[-1]], axis=1))
         return pool[chosen]
 
-    def _pulled_in(self, xyz: Floats, part: float) -> Floats:
+    def _pull_in(self, xyz: Floats, part: float) -> Floats:
         """Towards the centre: to `part` of the distance. A billionth less and no rounding puts a point outside."""
         return np.asarray(self.centre + part * (xyz - self.centre), dtype=np.float64)
 
@@ -147,7 +149,9 @@ class Workspace:
             points = (low + sequence.random(1 << max(6, int(np.ceil(np.log2(max(1, n)))))) * (high - low)) @ axes
             inside = self.inside(points)
             found = np.concatenate([found, points[inside]])
-            if inside.mean() < HARDLY:  # a thin slab that lies askew: a box along it holds less that is outside
+            if (
+                inside.mean() < MIN_INSIDE_SHARE
+            ):  # a thin slab that lies askew: a box along it holds less that is outside
                 axes = np.linalg.svd(self.vertices - self.centre, full_matrices=False)[2]
         return found[:n]
 

@@ -18,11 +18,11 @@ RANDOM, SHOT = "random", "shot"
 AXES = "xyz"
 _PLANES = {f"plane {axis}": axis for axis in AXES}  # kind of a split whose held-out points share a coordinate
 
-THIN = 1e-3
+MAX_PLANE_THICKNESS = 1e-3
 """How far the points of one plane may differ in its coordinate, as a share of the largest extent of all points."""
-PER_PLANE = 4
+MIN_POINTS_PER_PLANE = 4
 """Fewer points than this on a plane, on average, are no lattice: random positions fall together too."""
-FILLED = 1 / 8
+MIN_CROSSING_SHARE = 1 / 8
 """The least share of the crossings of the planes of two axes that holds points."""
 
 
@@ -94,7 +94,7 @@ def shot_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int 
             fix="leave out --leave-out: random splits are as honest here",
         )
     held_out = [(name, data.shots == name) for name in _at_most(most, names)]
-    return _left_out(SHOT, data, held_out, sizes)
+    return _leave_out(SHOT, data, held_out, sizes)
 
 
 def plane_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int | None = None) -> list[Split]:
@@ -107,7 +107,7 @@ def plane_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int
     for kind, axis in _PLANES.items():
         planes = lattice_planes(data.xyz, AXES.index(axis))
         inner = [] if planes is None else [(f"{axis} = {value:g}", on) for value, on in planes[1:-1]]
-        splits += _left_out(kind, data, _at_most(most, inner), sizes)
+        splits += _leave_out(kind, data, _at_most(most, inner), sizes)
     if not splits:
         raise _no_lattice(data)
     return splits
@@ -116,27 +116,28 @@ def plane_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int
 def lattice_planes(xyz: Floats, axis: int) -> list[tuple[float, NDArray[np.bool_]]] | None:
     """The planes of a lattice across one axis, by rising coordinate: its value, and (n,) which points lie on it.
 
-    None where the coordinates (n, 3) do not gather at few values: a plane is thinner than THIN and has PER_PLANE points
-    on average; and where they do, but meet those of another axis at few of their crossings only (FILLED): these are
-    the rows of a lattice that is turned about the third axis. Planes are looked for across the axes of the world.
+    None where the coordinates (n, 3) do not gather at few values: a plane is thinner than MAX_PLANE_THICKNESS and has
+    MIN_POINTS_PER_PLANE points on average; and where they do, but meet those of another axis at few of their crossings
+    only (MIN_CROSSING_SHARE): these are the rows of a lattice that is turned about the third axis. Planes are looked
+    for across the axes of the world.
     """
-    gathered = [_gathered(xyz, k) for k in range(3)]
+    gathered = [_plane_numbers(xyz, k) for k in range(3)]
     mine = gathered[axis]
     if mine is None:
         return None
     for other in (found for k, found in enumerate(gathered) if k != axis and found is not None):
         crossings = (mine.max() + 1) * (other.max() + 1)
-        if len(np.unique(mine * (other.max() + 1) + other)) < FILLED * crossings:
+        if len(np.unique(mine * (other.max() + 1) + other)) < MIN_CROSSING_SHARE * crossings:
             return None
     return [(float(np.median(xyz[mine == k, axis])), mine == k) for k in range(mine.max() + 1)]
 
 
-def _gathered(xyz: Floats, axis: int) -> NDArray[np.intp] | None:
+def _plane_numbers(xyz: Floats, axis: int) -> NDArray[np.intp] | None:
     """(n,) which of few values the coordinate has, counted from the least; None where it has many."""
     if not len(xyz):
         return None
     values = xyz[:, axis]
-    tolerance = THIN * float(np.ptp(xyz, axis=0).max())
+    tolerance = MAX_PLANE_THICKNESS * float(np.ptp(xyz, axis=0).max())
     order = np.argsort(values)
     label = np.empty(len(values), dtype=np.intp)
     label[order] = np.cumsum(np.diff(values[order], prepend=values[order[0]]) > tolerance)
@@ -145,10 +146,10 @@ def _gathered(xyz: Floats, axis: int) -> NDArray[np.intp] | None:
     np.minimum.at(lowest, label, values)
     np.maximum.at(highest, label, values)
     too_thick = (highest - lowest).max() > tolerance
-    return None if too_thick or len(values) < PER_PLANE * count else label
+    return None if too_thick or len(values) < MIN_POINTS_PER_PLANE * count else label
 
 
-def _left_out(
+def _leave_out(
     kind: str, data: Dataset, held_out: list[tuple[str, NDArray[np.bool_]]], sizes: Sequence[int] | None
 ) -> list[Split]:
     """By number of points, then by what is left out, which has the same number in every cell."""
@@ -157,12 +158,12 @@ def _left_out(
     splits = []
     for size in (None,) if sizes is None else tuple(dict.fromkeys(sizes)):
         for i, (name, out) in enumerate(held_out):
-            train = _drawn(data.select(~out), size, i, name)
+            train = _draw(data.select(~out), size, i, name)
             splits.append(Split(kind, train, data.select(out), i, name, size is None))
     return splits
 
 
-def _drawn(others: Dataset, size: int | None, seed: int, left_out: str) -> Dataset:
+def _draw(others: Dataset, size: int | None, seed: int, left_out: str) -> Dataset:
     if size is None or size == len(others):
         return others
     if size > len(others):
@@ -190,7 +191,8 @@ def _no_lattice(data: Dataset) -> DatasetError:
     return DatasetError(
         f"the {len(data)} known positions of {data.name!r} stand on no lattice with an inner plane.",
         why=f"x, y and z have {found[0]}, {found[1]} and {found[2]} values; a lattice has three or more, each shared "
-        f"by {PER_PLANE} points or more within {THIN:g} of the extent. Planes are looked for across x, y and z of the "
+        f"by {MIN_POINTS_PER_PLANE} points or more within {MAX_PLANE_THICKNESS:g} of the extent. Planes are looked for "
+        "across x, y and z of the "
         "world only, not across a lattice that stands at an angle",
         fix="leave out --lattice: away from a lattice a random split flatters nobody; or --leave-out shot, where each "
         "plane is a shot",

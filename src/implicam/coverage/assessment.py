@@ -24,9 +24,9 @@ READING_ORDER = ("near", "low", "middle", "far", "high")
 
 _NEES_QUANTILE_95 = float(chdtri(3, 0.05))
 # A correlation matrix this close to singular claims to know one direction a million times better than another.
-_SINGULAR = 1e-12
+_MIN_CORRELATION_EIGENVALUE = 1e-12
 # Beyond these, squares of squares overflow; no length unit makes sense of them.
-_LARGEST_ERROR, _SMALLEST_VARIANCE = 1e70, 1e-100
+_MAX_ERROR, _MIN_VARIANCE = 1e70, 1e-100
 
 
 def assess(
@@ -53,7 +53,7 @@ def assess(
     unknown = np.full((n, 3, 3), np.nan)
     bound = unknown if limit is None else _shaped(np.asarray(limit, dtype=np.float64), (n, 3, 3), "limit")
     shots = None if clusters is None else _shaped(np.asarray(clusters), (n,), "clusters")
-    measured = _every(np.abs(e) < _LARGEST_ERROR)
+    measured = _every(np.abs(e) < _MAX_ERROR)
     why = np.where(measured, _objections(c), "")
     sample = _Sample(e, c, bound, shots, measured, measured & (why == ""))
     rows = [_summary("all", "all points", sample)]
@@ -163,12 +163,12 @@ def _over_limit(errors: Floats, limit: Floats) -> float:
 def _objections(cov: Floats) -> Names:
     """(n,) why a covariance cannot be judged; empty where it can. Later tests see the identity where one failed."""
     finite = _every(np.isfinite(cov).reshape(-1, 9))
-    positive = finite & _every(np.diagonal(cov, axis1=1, axis2=2) > _SMALLEST_VARIANCE)
+    positive = finite & _every(np.diagonal(cov, axis1=1, axis2=2) > _MIN_VARIANCE)
     safe = np.where(positive[:, None, None], cov, np.eye(3))
     # A correlation beyond 1 is not definite, however large; clipped, it cannot overflow on the way there.
     correlation = np.clip(_correlation(safe, np.sqrt(np.diagonal(safe, axis1=1, axis2=2))), -2, 2)
     symmetric = np.abs(correlation - correlation.swapaxes(1, 2)).max(axis=(1, 2), initial=0.0) < 1e-6
-    definite = np.linalg.eigvalsh(correlation)[:, 0] > _SINGULAR
+    definite = np.linalg.eigvalsh(correlation)[:, 0] > _MIN_CORRELATION_EIGENVALUE
     return np.select(
         [~finite, ~positive, ~symmetric, ~definite],
         [

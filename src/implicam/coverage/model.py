@@ -14,7 +14,7 @@ LEVELS = (0.50, 0.68, 0.90, 0.95, 0.99)
 """Nominal probabilities at which coverage is counted."""
 
 # Below this a 95 % interval that holds 0.95 says little: at most 4 in 5 could be all there is.
-_TOO_WIDE = 0.80
+_MIN_LOWER_BOUND = 0.80
 
 NEES_RIGHT = 3.0
 """Expected squared error of a position in its own covariance: one for each axis."""
@@ -97,7 +97,7 @@ class Summary:
         if inside.low > 0.95 or nees.value < NEES_RIGHT / sure:
             return "too large"
         sharp = nees.low >= NEES_RIGHT / VAGUE_NEES_RATIO and nees.high <= NEES_RIGHT * VAGUE_NEES_RATIO
-        return "right" if inside.low >= _TOO_WIDE and sharp else "cannot tell"
+        return "right" if inside.low >= _MIN_LOWER_BOUND and sharp else "cannot tell"
 
 
 @dataclass(frozen=True)

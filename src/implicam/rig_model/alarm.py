@@ -36,7 +36,7 @@ from implicam.dataset import Camera
 from implicam.formatting import percent
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
-from implicam.row_order import late_or_early, moved_up
+from implicam.row_order import describe_shift, shift_rows
 
 MAX_POINTS_TRIED = 24
 """Points on which the causes are tried."""
@@ -225,8 +225,8 @@ def _guesses(table: Table) -> Iterator[tuple[str, Floats, Floats]]:
     names = table.names
     for c, name in enumerate(names):
         for rows in (1, -1):
-            words = f"are the pictures of {name} {late_or_early(rows)}? Put right {{share}}"
-            yield words, *_changed(table, c, moved_up(table.uv[:, c], rows))
+            words = f"are the pictures of {name} {describe_shift(rows)}? Put right {{share}}"
+            yield words, *_changed(table, c, shift_rows(table.uv[:, c], rows))
     pairs = list(combinations(range(len(names)), 2))
     if len(pairs) > MAX_PAIRS:  # those that follow each other are exchanged most easily
         pairs = [*pairs[: len(names) - 1], *((c, c + 1) for c in range(1, len(names) - 1))]
