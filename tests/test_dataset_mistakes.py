@@ -85,14 +85,14 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
     'duplicate view': (
         put("observations.csv", "p1,cam2", "p1,cam1"),
         (
-            "{at}/rig/observations.csv, line 3: point 'p1' is seen twice by camera 'cam1' (first on line 2).\n"
+            "{at}/rig/observations.csv, line 3: point 'p1' is seen twice by camera 'cam1' (first at {at}/rig/observations.csv, line 2).\n"
             '  fix: keep one of the two rows'
         ),
     ),
     'duplicate point': (
         put("points.csv", "\np2,s1", "\np1,s1"),
         (
-            "{at}/rig/points.csv, line 3: point 'p1' is there twice (first on line 2).\n"
+            "{at}/rig/points.csv, line 3: point 'p1' is there twice (first at {at}/rig/points.csv, line 2).\n"
             '  fix: remove one, or give each point a name of its own'
         ),
     ),
@@ -172,14 +172,15 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
     'nan pixel': (
         put("observations.csv", "50,60", "nan,60"),
         (
-            "{at}/rig/observations.csv, line 4: u = 'nan' is not a finite number.\n"
-            '  fix: leave both u and v empty where the view is missing, or remove the row'
+            "{at}/rig/observations.csv, line 4, camera 'cam1': u = nan, v = 60.\n"
+            '  why: a view has both u and v, finite, or neither\n'
+            '  fix: correct the value, or leave both u and v empty (NaN) where the view is missing'
         ),
     ),
     'far outside': (
         put("observations.csv", "50,60", "50,-60"),
         (
-            "{at}/rig/observations.csv, line 4: pixel u = 50, v = -60 is far outside the 640 x 480 image of 'cam1'.\n"
+            "{at}/rig/observations.csv, line 4, camera 'cam1': pixel u = 50, v = -60 is far outside the 640 x 480 image.\n"
             '  why: u is the column and v the row, counted from 0 at the centre of the top-left pixel\n'
             '  fix: correct the value, remove the row, or correct width and height in dataset.toml'
         ),
@@ -187,7 +188,7 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
     'far outside 2': (
         put("observations.csv", "50,60", "1e4,60"),
         (
-            "{at}/rig/observations.csv, line 4: pixel u = 10000, v = 60 is far outside the 640 x 480 image of 'cam1'.\n"
+            "{at}/rig/observations.csv, line 4, camera 'cam1': pixel u = 10000, v = 60 is far outside the 640 x 480 image.\n"
             '  why: u is the column and v the row, counted from 0 at the centre of the top-left pixel\n'
             '  fix: correct the value, remove the row, or correct width and height in dataset.toml'
         ),
@@ -202,25 +203,25 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
     'only u': (
         put("observations.csv", "50,60", "50,"),
         (
-            "{at}/rig/observations.csv, line 4: v = '' is not a number.\n"
-            '  why: the cell is empty\n'
-            '  fix: leave both u and v empty where the view is missing, or remove the row'
+            "{at}/rig/observations.csv, line 4, camera 'cam1': u = 50, v = nan.\n"
+            '  why: a view has both u and v, finite, or neither\n'
+            '  fix: correct the value, or leave both u and v empty (NaN) where the view is missing'
         ),
     ),
     'negative sd': (
         put("points.csv", ".1,.1,0", ".1,-.1,0"),
         (
-            "{at}/rig/points.csv, line 2: sd_y = '-.1' must be at least zero.\n"
-            '  why: it is a standard uncertainty\n'
-            '  fix: leave the cell empty where no uncertainty is stated'
+            "{at}/rig/points.csv, line 2: sd_y = -0.1.\n"
+            '  why: a standard uncertainty is at least zero and finite\n'
+            '  fix: correct the value, or leave it empty (NaN) where no uncertainty is stated'
         ),
     ),
     'zero sd_u': (
         put("observations.csv", "10,20,.1,.1", "10,20,0,.1"),
         (
-            "{at}/rig/observations.csv, line 2: sd_u = '0' must be greater than zero.\n"
-            '  why: it is a standard uncertainty\n'
-            '  fix: leave the cell empty where no uncertainty is stated'
+            "{at}/rig/observations.csv, line 2, camera 'cam1': sd_u = 0, sd_v = 0.1.\n"
+            '  why: a standard uncertainty is greater than zero and finite\n'
+            '  fix: correct the value, or leave it empty (NaN) where no uncertainty is stated'
         ),
     ),
     'sd nan': (
@@ -233,15 +234,17 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
     'empty point name': (
         put("observations.csv", "p2,cam1", ",cam1"),
         (
-            "{at}/rig/observations.csv, line 4: point '' is not a name.\n"
-            '  fix: every row needs a printable point name of at most 200 characters'
+            "{at}/rig/observations.csv, line 4: point '' is not usable.\n"
+            '  why: names are printable text of at most 200 characters without spaces at either end\n'
+            '  fix: rename it'
         ),
     ),
     'unprintable shot': (
         put("points.csv", "p2,s1", "p2,s\u200b1"),
         (
-            "{at}/rig/points.csv, line 3: shot 's\\u200b1' is not a name.\n"
-            '  fix: every row needs a printable shot name of at most 200 characters'
+            "{at}/rig/points.csv, line 3: shot 's\\u200b1' is not usable.\n"
+            '  why: names are printable text of at most 200 characters without spaces at either end\n'
+            '  fix: rename it'
         ),
     ),
     'toml syntax': (
@@ -327,8 +330,8 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
     'duplicate camera': (
         put("dataset.toml", '"cam2"', '"cam1"'),
         (
-            "{at}/rig/dataset.toml: camera 'cam1' is there 2 times.\n"
-            '  fix: give each camera a name of its own'
+            "{at}/rig/dataset.toml: camera 'cam1' is there twice.\n"
+            '  fix: remove one, or give each camera a name of its own'
         ),
     ),
     'name no text': (
@@ -563,8 +566,9 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
     'long name': (
         put("observations.csv", "p2,cam1", "p" * 300 + ",cam1"),
         (
-            "{at}/rig/observations.csv, line 4: point 'pppppppppppppppppppppppppppppppppppppppppppppppppppppppppppp' is not a name.\n"
-            '  fix: every row needs a printable point name of at most 200 characters'
+            "{at}/rig/observations.csv, line 4: point 'pppppppppppppppppppppppppppppppppppppppppppppppppppppppppppp' is not usable.\n"
+            '  why: names are printable text of at most 200 characters without spaces at either end\n'
+            '  fix: rename it'
         ),
     ),
     'no toml': (
@@ -633,8 +637,9 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
     'half view': (
         WIDE.replace("10,20", "10,"),
         (
-            '{at}/w.csv, line 2: only one of u_cam1 and v_cam1 is there.\n'
-            '  fix: a missing view leaves both empty'
+            "{at}/w.csv, line 2, camera 'cam1': u = 10, v = nan.\n"
+            '  why: a view has both u and v, finite, or neither\n'
+            '  fix: correct the value, or leave both u and v empty (NaN) where the view is missing'
         ),
     ),
     'no position': (
@@ -654,24 +659,25 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
     'empty name': (
         WIDE.replace("\np2", "\n"),
         (
-            "{at}/w.csv, line 3: point '' is not a name.\n"
-            '  fix: every row needs a printable point name of at most 200 characters'
+            "{at}/w.csv, line 3: point '' is not usable.\n"
+            '  why: names are printable text of at most 200 characters without spaces at either end\n'
+            '  fix: rename it'
         ),
     ),
     'sd zero': (
         WIDE.replace("20,.1", "20,0"),
         (
-            '{at}/w.csv, line 2: sd_u_cam1 and sd_v_cam1 must be greater than zero.\n'
-            '  why: they are standard uncertainties\n'
-            '  fix: leave the cell empty where no uncertainty is stated'
+            "{at}/w.csv, line 2, camera 'cam1': sd_u = 0, sd_v = nan.\n"
+            '  why: a standard uncertainty is greater than zero and finite\n'
+            '  fix: correct the value, or leave it empty (NaN) where no uncertainty is stated'
         ),
     ),
     'sd negative': (
         WIDE.replace("3,.1", "3,-.1"),
         (
-            '{at}/w.csv, line 2: sd_x = -0.1 must be at least zero.\n'
-            '  why: it is a standard uncertainty\n'
-            '  fix: leave the cell empty where no uncertainty is stated'
+            '{at}/w.csv, line 2: sd_x = -0.1.\n'
+            '  why: a standard uncertainty is at least zero and finite\n'
+            '  fix: correct the value, or leave it empty (NaN) where no uncertainty is stated'
         ),
     ),
     'text': (
@@ -755,7 +761,7 @@ PARQUET_MISTAKES: dict[str, tuple[str, Callable[[Any], Any], str]] = {
         "u_cam1 = '[1.0]' is not a number",
     ),
     "numbers as names": ("point", lambda t: t.set_column(0, "point", [[1, 2, 3]]), "row 1: point = '1' is not text"),
-    "null names": ("point", lambda t: t.set_column(0, "point", [["a", None, "c"]]), "row 2: point '' is not a name"),
+    "null names": ("point", lambda t: t.set_column(0, "point", [["a", None, "c"]]), "row 2: point '' is not usable"),
     "missing": ("x", lambda t: t.drop_columns(["u_cam1"]), "the column 'u_cam1' is missing"),
     "twice": ("x", lambda t: t.append_column("x", [[1.0, 2.0, 3.0]]), "the column 'x' is there 2 times"),
     "no z": ("x", lambda t: t.drop_columns(["z"]), "x, y and z must all be there"),

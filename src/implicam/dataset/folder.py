@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from implicam.dataset.model import (
     POINT_COLUMNS,
@@ -22,15 +20,17 @@ from implicam.dataset.model import (
     KnownPositions,
     Names,
     Observations,
-    check_inside,
+    check_name,
+    check_unique,
+    check_views,
 )
 from implicam.dataset.tables import (
-    Row,
+    Columns,
+    NumberColumn,
     description_from_toml,
-    name_in,
     naming,
-    number,
     parse_toml,
+    read_columns,
     read_table,
     read_toml,
 )
@@ -41,18 +41,23 @@ DESCRIPTION, POINTS, VIEWS, IMAGES = "dataset.toml", "points.csv", "observations
 TRUTH = "truth.toml"
 """What only a simulated rig has beside its data; its photographs can be taken again."""
 
-_NO_VIEW = "leave both u and v empty where the view is missing, or remove the row"
-_NO_SD = "leave the cell empty where no uncertainty is stated"
+_SD_NUMBER = NumberColumn("leave the cell empty where no uncertainty is stated", missing=("",))
+_POSITION_NUMBER = NumberColumn("a known point needs its position: add it, or remove the point")
+_PIXEL_NUMBER = NumberColumn(
+    "leave both u and v empty where the view is missing, or remove the row", missing=("", "nan")
+)
+_POINT_NUMBERS = {**dict.fromkeys("xyz", _POSITION_NUMBER), **dict.fromkeys(SD_POINT, _SD_NUMBER)}
+_VIEW_NUMBERS = {**dict.fromkeys("uv", _PIXEL_NUMBER), **dict.fromkeys(SD_VIEW, _SD_NUMBER)}
 
 
 def read_folder(path: Path) -> Dataset:
     """Read a dataset folder; every mistake is a DatasetError naming file, line, value and cure."""
     name, unit, cameras, extra = read_description(path)
-    points = read_points(path / POINTS) if (path / POINTS).exists() else None
-    observations, missing = _read_observations(path / VIEWS, cameras, points)
+    table = read_known(path)
+    observations, missing = _read_observations(path, cameras, table and table[0])
     notes = (f"{missing} rows of {VIEWS} have no pixels: views that are missing.",) if missing else ()
     with naming(path / DESCRIPTION):
-        return Dataset(name, unit, observations, points.known if points else None, extra, notes)
+        return Dataset(name, unit, observations, table and table[1], extra, notes)
 
 
 def read_description(path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
@@ -63,183 +68,79 @@ def read_description(path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str
 
 def read_known(path: Path) -> tuple[list[str], KnownPositions] | None:
     """The names and positions in the folder's points.csv, in its order; None where there is none."""
-    if not (path / POINTS).exists():
-        return None
-    points = read_points(path / POINTS)
-    return points.names, points.known
+    return read_points(path / POINTS) if (path / POINTS).exists() else None
 
 
-@dataclass(frozen=True)
-class _Points:
-    path: Path
-    names: list[str]
-    known: KnownPositions
-
-
-def read_points(path: Path) -> _Points:
-    """The table points.csv: names, and known positions in their order."""
+def read_points(path: Path) -> tuple[list[str], KnownPositions]:
+    """The names and positions in a table with the columns of points.csv, in its order."""
     header, rows = read_table(path, POINT_COLUMNS)
-    at = {column: i for i, column in enumerate(header)}
-    extra_columns = [c for c in header if c not in (*POINT_COLUMNS, *SD_POINT)]
-    names: dict[str, int] = {}
-    shots, xyz, sd = [], [], []
-    extra: dict[str, list[str]] = {c: [] for c in extra_columns}
-    for line, row in rows:
-        place = f"{path}, line {line}"
-        name = name_in(row[at["point"]], "point", place)
-        if name in names:
-            raise DatasetError(
-                f"{place}: point {name!r} is there twice (first on line {names[name]}).",
-                fix="remove one, or give each point a name of its own",
-            )
-        names[name] = line
-        shots.append(name_in(row[at["shot"]], "shot", place))
-        xyz.append(
-            [
-                number(
-                    row[at[c]],
-                    place,
-                    c,
-                    cure_nan="a known point needs its position: add it, or remove the point",
-                )
-                for c in "xyz"
-            ]
-        )
-        sd.append([_sd(row, at, c, place, zero=True) for c in SD_POINT])
-        for c in extra_columns:
-            extra[c].append(row[at[c]])
-    if not names:
+    table = read_columns(path, header, rows, ("point", "shot"), _POINT_NUMBERS)
+    if not table.n:
         raise DatasetError(
             f"{path} has a header and no rows.",
             fix="add the known positions, or delete the file if they are unknown",
         )
-    n = len(names)
+    names = table.texts["point"]
+    check_unique(names, "point", table.place)
     with naming(path):
-        known = KnownPositions(
-            np.array(shots, dtype=np.str_),
-            np.reshape(xyz, (n, 3)),
-            np.reshape(sd, (n, 3)),
-            {c: np.array(values, dtype=np.str_) for c, values in extra.items()},
-        )
-    return _Points(path, list(names), known)
+        return names, table.known_positions(names, [c for c in header if c not in (*POINT_COLUMNS, *SD_POINT)])
 
 
-def _read_observations(path: Path, cameras: tuple[Camera, ...], points: _Points | None) -> tuple[Observations, int]:
+def _read_observations(
+    path: Path, cameras: tuple[Camera, ...], points: Sequence[str] | None
+) -> tuple[Observations, int]:
     """The observations, and how many rows of the table are views that are missing."""
-    header, rows = read_table(path, VIEW_COLUMNS)
-    index, views = _view_rows(path, header, rows, cameras, points)
-    if not views.lines:
-        raise DatasetError(f"{path} has a header and no rows.", fix="add one row per view: point,camera,u,v")
-    n, c = len(index), len(cameras)
-    i, j = np.array(views.point), np.array(views.camera)
-    uv, sd = np.full((n, c, 2), np.nan), np.full((n, c, 2), np.nan)
-    uv[i, j] = views.uv
-    if views.sd:
-        sd[i, j] = views.sd
-    lines = np.zeros((n, c), dtype=np.int64)
-    lines[i, j] = views.lines
-    check_inside(uv, cameras, lambda p, k: f"{path}, line {lines[p, k]}")
-    extra = {column: _spread(values, i, j, (n, c)) for column, values in views.extra.items()}
-    with naming(path):
-        return Observations(np.array(list(index), dtype=np.str_), cameras, uv, sd, extra), views.missing
+    header, rows = read_table(path / VIEWS, VIEW_COLUMNS)
+    table = read_columns(path / VIEWS, header, rows, ("point", "camera"), _VIEW_NUMBERS)
+    names, row_of = _match_views(table, cameras, path / POINTS, points)
+    pixels = table.stack(("u", "v"))
+    given = ~np.isnan(pixels).all(axis=1)
+    if not given.any():
+        raise DatasetError(f"{path / VIEWS} has a header and no rows.", fix="add one row per view: point,camera,u,v")
+    i, k = np.array(list(row_of)).T  # of each row, in the table's order
+    uv, sd = np.full((2, len(names), len(cameras), 2), np.nan)
+    uv[i, k], sd[i, k] = pixels, table.stack(SD_VIEW)
+    check_views(uv, sd, cameras, lambda point, camera: table.place(row_of[point, camera]))
+    extra = {}
+    for column in header:
+        if column not in (*VIEW_COLUMNS, *SD_VIEW):
+            text = np.array(table.texts[column], dtype=np.str_)
+            extra[column] = np.full(uv.shape[:2], "", dtype=text.dtype)
+            extra[column][i[given], k[given]] = text[given]
+    with naming(path / VIEWS):
+        return Observations(np.array(names, dtype=np.str_), cameras, uv, sd, extra), int((~given).sum())
 
 
-class _Views:
-    """The columns of observations.csv as they are read."""
-
-    def __init__(self, extra_columns: Iterable[str]) -> None:
-        self.missing = 0
-        self.lines: list[int] = []
-        self.point: list[int] = []
-        self.camera: list[int] = []
-        self.uv: list[list[float]] = []
-        self.sd: list[list[float]] = []
-        self.extra: dict[str, list[str]] = {c: [] for c in extra_columns}
-
-
-def _view_rows(
-    path: Path, header: list[str], rows: Iterable[Row], cameras: tuple[Camera, ...], points: _Points | None
-) -> tuple[dict[str, int], _Views]:
-    at = {column: i for i, column in enumerate(header)}
-    views = _Views(c for c in header if c not in (*VIEW_COLUMNS, *SD_VIEW))
+def _match_views(
+    table: Columns, cameras: Sequence[Camera], known: Path, points: Sequence[str] | None
+) -> tuple[list[str], dict[tuple[int, int], int]]:
+    """The points of the table, and (number of the point, number of the camera) -> row, in the table's order."""
     camera_index = {camera.name: k for k, camera in enumerate(cameras)}
-    index = {name: i for i, name in enumerate(points.names)} if points else {}
-    seen: dict[tuple[int, int], int] = {}
-    in_file = f"{path}, line "  # formatted once: a table may have a million rows
-    stated = [c for c in SD_VIEW if c in at]
-    for line, row in rows:
-        place = f"{in_file}{line}"
-        i = _point_index(row[at["point"]].strip(), index, points, place)
-        k = _camera_index(row[at["camera"]].strip(), camera_index, place)
-        if (i, k) in seen:
+    index = {name: i for i, name in enumerate(points or ())}
+    row_of: dict[tuple[int, int], int] = {}
+    for row, (point, camera) in enumerate(zip(table.texts["point"], table.texts["camera"], strict=True)):
+        place = table.place(row)
+        if point not in index:
+            check_name(point, "point", place)
+            if points:
+                raise DatasetError(
+                    f"{place}: point {point!r} has no known position in {known.name}{did_you_mean(point, index)}.",
+                    fix=f"add it to {known}, remove this row, or measure it from a dataset without {known.name}",
+                )
+            index[point] = len(index)
+        if camera not in camera_index:
             raise DatasetError(
-                f"{place}: point {row[at['point']]!r} is seen twice by camera {row[at['camera']]!r} "
-                f"(first on line {seen[i, k]}).",
+                f"{place}: camera {camera!r} is not in dataset.toml{did_you_mean(camera, camera_index)}.",
+                fix=f"the cameras are {', '.join(camera_index)}; correct the row or add a [[cameras]] table",
+            )
+        view = index[point], camera_index[camera]
+        if view in row_of:
+            raise DatasetError(
+                f"{place}: point {point!r} is seen twice by camera {camera!r} (first at {table.place(row_of[view])}).",
                 fix="keep one of the two rows",
             )
-        seen[i, k] = line
-        if _no_pixels(row[at["u"]], row[at["v"]]):
-            views.missing += 1
-            continue
-        views.lines.append(line)
-        views.point.append(i)
-        views.camera.append(k)
-        views.uv.append([number(row[at[c]], place, c, cure_nan=_NO_VIEW) for c in "uv"])
-        if stated:
-            views.sd.append([_sd(row, at, c, place, zero=False) for c in SD_VIEW])
-        for c, values in views.extra.items():
-            values.append(row[at[c]])
-    return index, views
-
-
-def _no_pixels(u: str, v: str) -> bool:
-    """Whether a row says that the view is missing."""
-    return u.strip().lower() in _NOTHING and v.strip().lower() in _NOTHING
-
-
-_NOTHING = ("", "nan")
-
-
-def _point_index(name: str, index: dict[str, int], points: _Points | None, place: str) -> int:
-    if name not in index:
-        name = name_in(name, "point", place)
-        if points:
-            raise DatasetError(
-                f"{place}: point {name!r} has no known position in {points.path.name}{did_you_mean(name, index)}.",
-                fix=f"add it to {points.path}, remove this row, or measure it from a dataset without points.csv",
-            )
-        index[name] = len(index)
-    return index[name]
-
-
-def _camera_index(name: str, cameras: dict[str, int], place: str) -> int:
-    if name not in cameras:
-        raise DatasetError(
-            f"{place}: camera {name!r} is not in dataset.toml{did_you_mean(name, cameras)}.",
-            fix=f"the cameras are {', '.join(cameras)}; correct the row or add a [[cameras]] table",
-        )
-    return cameras[name]
-
-
-def _sd(row: list[str], at: Mapping[str, int], column: str, place: str, *, zero: bool) -> float:
-    text = row[at[column]].strip() if column in at else ""
-    if text == "":
-        return float("nan")
-    value = number(text, place, column, cure_nan=_NO_SD)
-    if value < 0 or (value == 0 and not zero):
-        raise DatasetError(
-            f"{place}: {column} = {text!r} must be {'at least' if zero else 'greater than'} zero.",
-            why="it is a standard uncertainty",
-            fix=_NO_SD,
-        )
-    return value
-
-
-def _spread(values: list[str], i: NDArray[Any], j: NDArray[Any], shape: tuple[int, int]) -> Names:
-    text = np.array(values, dtype=np.str_)
-    table = np.full(shape, "", dtype=text.dtype)
-    table[i, j] = text
-    return table
+        row_of[view] = row
+    return list(index), row_of
 
 
 def write_folder(

@@ -7,7 +7,7 @@ positions are in the dataset's own world frame and length unit. Missing is NaN.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date, time
 from typing import Any
@@ -28,15 +28,15 @@ WIDE_TABLE = "wide_table"  # what the description of a wide table says of its co
 _CAMERA_KEYS, _DATASET_KEYS = ("name", "width", "height"), ("name", "length_unit", "cameras", WIDE_TABLE)
 
 # A text column is as wide as its longest text in every row, so one runaway cell would cost gigabytes.
-MAX_NAME, MAX_TEXT = 200, 1000
-MAX_IMAGE_SIZE = 1_000_000
-MAX_DEPTH = 50
+MAX_NAME_CHARACTERS, MAX_CELL_CHARACTERS = 200, 1000
+MAX_IMAGE_SIZE_PX = 1_000_000
+MAX_TOML_DEPTH = 50
 
-# A centroid may lie a little outside: half of the ball is still in the image.
-OUTSIDE_SHARE, OUTSIDE_PIXELS = 0.02, 2.0
+OUTSIDE_MARGIN_SHARE, OUTSIDE_MARGIN_PX = 0.02, 2.0
+"""How far outside its image a centre may lie, for half of the ball is still in it: share of the longer side, and px."""
 
-MANY_OUTSIDE = 3
-"""Views of a camera outside of its image from which on it is no slip of one of them."""
+MIN_VIEWS_OUTSIDE = 3
+"""Views outside the image of one camera that have a common cause."""
 
 TRUTH_COLUMNS = (
     "true_x", "true_y", "true_z", "limit_sd_x", "limit_sd_y", "limit_sd_z",
@@ -66,7 +66,7 @@ class Camera:
         for what, size in (("width", self.width), ("height", self.height)):
             if size is None:
                 _refuse_misspelt(what, self.extra, f"camera {self.name!r}")
-            elif isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= MAX_IMAGE_SIZE:
+            elif isinstance(size, bool) or not isinstance(size, int) or not 1 <= size <= MAX_IMAGE_SIZE_PX:
                 raise DatasetError(
                     f"camera {self.name!r} has {what} = {size!r}; it must be a whole number of pixels.",
                     fix=f"give the {what} of its images, for example {what} = 1280",
@@ -97,30 +97,15 @@ class Observations:
     def __post_init__(self) -> None:
         points = _text(self.points)
         n, c = len(points), len(self.cameras)
-        _check_unique(points, "point")
-        _check_unique([camera.name for camera in self.cameras], "camera")
+        check_unique(points.tolist(), "point")
+        check_unique([camera.name for camera in self.cameras], "camera")
         if not self.cameras:
             raise DatasetError("there is no camera.", fix="keep at least one")
         uv = _array(self.uv, (n, c, 2), "uv")
 
-        def place(i: int, k: int) -> str:
-            return f"point {str(points[i])!r}, camera {self.cameras[k].name!r}"
-
-        for i, k in np.argwhere(np.isinf(uv).any(axis=2) | (np.isnan(uv[..., 0]) != np.isnan(uv[..., 1])))[:1]:
-            raise DatasetError(
-                f"{place(i, k)}: u = {uv[i, k, 0]:g}, v = {uv[i, k, 1]:g}.",
-                why="a view has both u and v, finite, or neither (NaN)",
-                fix="correct the value, or leave the view out",
-            )
-        check_inside(uv, self.cameras, place)
         sd = _array(self.sd, (n, c, 2), "sd")
+        check_views(uv, sd, self.cameras, lambda i, k: f"point {str(points[i])!r}")
         sd[np.isnan(uv)] = np.nan
-        for i, k in np.argwhere(((sd <= 0) | np.isinf(sd)).any(axis=2))[:1]:
-            raise DatasetError(
-                f"{place(i, k)}: sd_u = {sd[i, k, 0]:g}, sd_v = {sd[i, k, 1]:g}.",
-                why="a standard uncertainty is greater than zero and finite, or not stated (NaN)",
-                fix="correct the value, or leave it out",
-            )
         extra = _columns(self.extra, (n, c), (*VIEW_COLUMNS, *SD_VIEW))
         _freeze(self, points=points, cameras=tuple(self.cameras), uv=uv, sd=sd, extra=extra)
 
@@ -180,8 +165,7 @@ class KnownPositions:
         if not np.isfinite(xyz).all():
             raise DatasetError("a known position must be finite.")
         sd = _array(self.sd, (n, 3), "sd")
-        if (sd < 0).any() or np.isinf(sd).any():
-            raise DatasetError("sd_x, sd_y and sd_z must be finite and not negative, or not stated (NaN).")
+        check_position_sd(sd, lambda i: f"known position {i + 1}")
         extra = _columns(self.extra, (n,), (*POINT_COLUMNS, *SD_POINT))
         _freeze(self, shots=shots, xyz=xyz, sd=sd, extra=extra)
 
@@ -426,48 +410,90 @@ def _index(index: ArrayLike) -> NDArray[Any]:
     return i if i.size else i.astype(i.dtype if i.dtype.kind == "b" else np.intp)  # [] is no list of floats
 
 
-def check_name(name: object, what: str) -> None:
-    """Refuse what could not stand in every form of a dataset."""
-    if not (isinstance(name, str) and name.isprintable() and name == name.strip() and 0 < len(name) <= MAX_NAME):
+def check_name(name: object, what: str, place: str = "") -> None:
+    """Refuse what could not stand in every form of a dataset; `place` says where it stands."""
+    if not (
+        isinstance(name, str) and name.isprintable() and name == name.strip() and 0 < len(name) <= MAX_NAME_CHARACTERS
+    ):
         raise DatasetError(
-            f"{what} {str(name)[:60]!r} is not usable.",
-            why=f"names are printable text of at most {MAX_NAME} characters without spaces at either end",
+            f"{place}{': ' * bool(place)}{what} {str(name)[:60]!r} is not usable.",
+            why=f"names are printable text of at most {MAX_NAME_CHARACTERS} characters without spaces at either end",
             fix="rename it",
         )
 
 
-def _check_unique(names: Sequence[str] | Names, what: str) -> None:
-    seen: set[str] = set()
-    for name in names.tolist() if isinstance(names, np.ndarray) else names:
-        check_name(name, what)
-        if name in seen:
-            raise DatasetError(f"{what} {name!r} is there twice.", fix=f"give each {what} a name of its own")
-        seen.add(name)
+def check_unique(names: Iterable[str], what: str, place: Callable[[int], str] | None = None) -> None:
+    """Refuse names that are not usable or not unique; `place(i)` says where the i-th stands."""
+    first: dict[str, int] = {}
+    for i, name in enumerate(names):
+        check_name(name, what, place(i) if place else "")
+        if name in first:
+            raise DatasetError(
+                f"{place(i)}: {what} {name!r} is there twice (first at {place(first[name])})."
+                if place
+                else f"{what} {name!r} is there twice.",
+                fix=f"remove one, or give each {what} a name of its own",
+            )
+        first[name] = i
 
 
-def check_inside(uv: Floats, cameras: Sequence[Camera], place: Callable[[int, int], str]) -> None:
-    """Refuse pixels far outside the image; `place(point, camera)` says where the value stands."""
+def check_views(uv: Floats, sd: Floats, cameras: Sequence[Camera], place: Callable[[int, int], str]) -> None:
+    """Refuse pixels that are infinite, half missing or far outside the image, and impossible uncertainties.
+
+    Args:
+        uv: (n, cameras, 2) pixels, NaN where the view is missing.
+        sd: (n, cameras, 2) their standard uncertainties in pixels, NaN where not stated; not looked at without a view.
+        cameras: The cameras of the second axis.
+        place: Says where the view (point, camera) stands, without its camera.
+
+    Raises:
+        DatasetError: For the first such view.
+    """
+
+    def view(i: int, k: int) -> str:
+        return f"{place(i, k)}, camera {cameras[k].name!r}"
+
+    for i, k in np.argwhere(np.isinf(uv).any(axis=2) | (np.isnan(uv[..., 0]) != np.isnan(uv[..., 1])))[:1]:
+        raise DatasetError(
+            f"{view(i, k)}: u = {uv[i, k, 0]:g}, v = {uv[i, k, 1]:g}.",
+            why="a view has both u and v, finite, or neither",
+            fix="correct the value, or leave both u and v empty (NaN) where the view is missing",
+        )
     for k, camera in enumerate(cameras):
         if camera.width is None or camera.height is None:
             continue
         size = np.array([camera.width, camera.height], dtype=np.float64)
-        margin = OUTSIDE_PIXELS + OUTSIDE_SHARE * size.max()
-        outside = (uv[:, k] < -0.5 - margin) | (uv[:, k] > size - 0.5 + margin)
-        for i in np.flatnonzero(outside.any(axis=1))[:1]:
-            u, v = uv[i, k]
+        margin = OUTSIDE_MARGIN_PX + OUTSIDE_MARGIN_SHARE * size.max()
+        outside = ((uv[:, k] < -0.5 - margin) | (uv[:, k] > size - 0.5 + margin)).any(axis=1)
+        for i in np.flatnonzero(outside)[:1]:
             why = "u is the column and v the row, counted from 0 at the centre of the top-left pixel"
-            many, seen = int(outside.any(axis=1).sum()), int((~np.isnan(uv[:, k, 0])).sum())
-            if many >= MANY_OUTSIDE:
+            if outside.sum() >= MIN_VIEWS_OUTSIDE:
                 why += (
-                    f"; {many} of its {seen} views are outside: are its u and v exchanged, are these the pixels of "
-                    "another camera, or were its pictures resized or cropped?"
+                    f"; {outside.sum()} of its {(~np.isnan(uv[:, k, 0])).sum()} views are outside: are its u and v "
+                    "exchanged, are these the pixels of another camera, or were its pictures resized or cropped?"
                 )
             raise DatasetError(
-                f"{place(int(i), k)}: pixel u = {u:g}, v = {v:g} is far outside the {camera.width} x {camera.height} "
-                f"image of {camera.name!r}.",
+                f"{view(int(i), k)}: pixel u = {uv[i, k, 0]:g}, v = {uv[i, k, 1]:g} is far outside the "
+                f"{camera.width} x {camera.height} image.",
                 why=why,
                 fix="correct the value, remove the row, or correct width and height in dataset.toml",
             )
+    for i, k in np.argwhere((((sd <= 0) | np.isinf(sd)) & ~np.isnan(uv)).any(axis=2))[:1]:
+        raise DatasetError(
+            f"{view(i, k)}: sd_u = {sd[i, k, 0]:g}, sd_v = {sd[i, k, 1]:g}.",
+            why="a standard uncertainty is greater than zero and finite",
+            fix="correct the value, or leave it empty (NaN) where no uncertainty is stated",
+        )
+
+
+def check_position_sd(sd: Floats, place: Callable[[int], str]) -> None:
+    """Refuse standard uncertainties (n, 3) of positions below zero or infinite; `place(i)` says where a row stands."""
+    for i, k in np.argwhere((sd < 0) | np.isinf(sd))[:1]:
+        raise DatasetError(
+            f"{place(i)}: {SD_POINT[k]} = {sd[i, k]:g}.",
+            why="a standard uncertainty is at least zero and finite",
+            fix="correct the value, or leave it empty (NaN) where no uncertainty is stated",
+        )
 
 
 def _columns(extra: Mapping[str, ArrayLike], shape: tuple[int, ...], taken: Sequence[str]) -> dict[str, Names]:
@@ -483,10 +509,10 @@ def _columns(extra: Mapping[str, ArrayLike], shape: tuple[int, ...], taken: Sequ
             readable = b"\0" not in "".join(cells).encode()
         except UnicodeEncodeError:
             readable = False
-        if not readable or max(map(len, cells), default=0) > MAX_TEXT:
+        if not readable or max(map(len, cells), default=0) > MAX_CELL_CHARACTERS:
             raise DatasetError(
                 f"the column {name!r} holds something else than text.",
-                why=f"a cell has zero bytes, half a character, or more than {MAX_TEXT} characters",
+                why=f"a cell has zero bytes, half a character, or more than {MAX_CELL_CHARACTERS} characters",
                 fix="shorten or leave out the column",
             )
     return columns
@@ -520,7 +546,7 @@ def _described(extra: Mapping[str, Any], taken: Sequence[str], whose: str) -> di
 
 def plain(value: Any, depth: int = 0) -> Any:
     """A copy made of what TOML knows; ValueError for anything else."""
-    if depth > MAX_DEPTH:
+    if depth > MAX_TOML_DEPTH:
         raise ValueError("it is nested too deeply")
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()

@@ -7,19 +7,83 @@ import difflib
 import math
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from implicam.dataset.model import MAX_NAME, MAX_TEXT, WIDE_TABLE, Camera, check_name, plain
+import numpy as np
+
+from implicam.dataset.model import (
+    MAX_CELL_CHARACTERS,
+    SD_POINT,
+    WIDE_TABLE,
+    Camera,
+    Floats,
+    KnownPositions,
+    check_name,
+    check_position_sd,
+    check_unique,
+    plain,
+)
 from implicam.errors import DatasetError
 
 MAX_LINE_BYTES = 1 << 18  # no line of a table is longer; a longer one means that the file is something else
 MAX_TOML_BYTES = 1 << 19
-MAX_TOML_DOTS = 500  # in one line; tomllib takes quadratic time for a key of many parts
+MAX_TOML_LINE_DOTS = 500  # tomllib takes quadratic time for a key of many parts
 
 Row = tuple[int, list[str]]
+
+
+class NumberColumn(NamedTuple):
+    """The cure where a number is missing, and the texts (small letters) that say that none is meant to be there."""
+
+    cure_nan: str
+    missing: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Columns:
+    """A table of n rows by columns: texts and numbers (n,), NaN where missing; `place(i)` says where row i stands."""
+
+    texts: Mapping[str, list[str]]
+    numbers: Mapping[str, Floats]
+    n: int
+    place: Callable[[int], str]
+
+    def stack(self, columns: Sequence[str]) -> Floats:
+        """(n, columns) numbers, NaN in a column that is not there."""
+        return np.stack([self.numbers.get(column, np.full(self.n, np.nan)) for column in columns], axis=1)
+
+    def known_positions(self, points: Sequence[str], extra: Iterable[str]) -> KnownPositions:
+        """Positions, uncertainties and extra columns of the points, each a shot of its own where there is no column."""
+        shots = self.texts.get("shot", points)
+        for i, shot in enumerate(shots):
+            check_name(shot, "shot", self.place(i))
+        sd = self.stack(SD_POINT)
+        check_position_sd(sd, self.place)
+        texts = {column: np.array(self.texts[column], dtype=np.str_) for column in extra}
+        return KnownPositions(np.array(shots, dtype=np.str_), self.stack("xyz"), sd, texts)
+
+
+def read_columns(
+    path: Path, header: Sequence[str], rows: Iterable[Row], names: Sequence[str], numbers: Mapping[str, NumberColumn]
+) -> Columns:
+    """The rows of a table by columns: names lose the spaces around them, all other text stays as it is."""
+    columns: dict[str, list[Any]] = {column: [] for column in header}
+    lines, in_file = list[int](), f"{path}, line "  # formatted once: a table may have a million rows
+    for line, row in rows:
+        lines.append(line)
+        for column, text in zip(header, row, strict=True):
+            if column in numbers:
+                value: str | float = number(text, f"{in_file}{line}", column, **numbers[column]._asdict())
+            else:
+                value = text.strip() if column in names else text
+            columns[column].append(value)
+    values = {column: np.array(columns[column], dtype=np.float64) for column in header if column in numbers}
+    texts = {column: columns[column] for column in header if column not in numbers}
+    return Columns(texts, values, len(lines), lambda i: f"{in_file}{lines[i]}")
 
 
 def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[list[str], Iterator[Row]]:
@@ -153,11 +217,11 @@ def _checked_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]
                 why="a decimal comma splits a number in two" if len(row) > width else "the row may be cut off",
                 fix="give every column one cell; use decimal points",
             )
-        if max(map(len, row)) > MAX_TEXT:
+        if max(map(len, row)) > MAX_CELL_CHARACTERS:
             raise DatasetError(
                 f"{path}, line {line}: a cell has {max(map(len, row))} characters: {max(row, key=len)[:40]!r}...",
                 why="a quote may be missing" if any("\n" in cell for cell in row) else "",
-                fix=f"shorten it to {MAX_TEXT} characters",
+                fix=f"shorten it to {MAX_CELL_CHARACTERS} characters",
             )
         yield line, row
 
@@ -165,21 +229,19 @@ def _checked_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]
 def name_in(text: str, what: str, place: str) -> str:
     """A name without the spaces around it, or an error that names the place."""
     name = text.strip()
-    if name == "" or not name.isprintable() or len(name) > MAX_NAME:
-        raise DatasetError(
-            f"{place}: {what} {name[:60]!r} is not a name.",
-            fix=f"every row needs a printable {what} name of at most {MAX_NAME} characters",
-        )
+    check_name(name, what, place)
     return name
 
 
-NO_VALUE = ("", "-", "--", "n/a", "na", "#n/a", "none", "null", "missing")
+NO_VALUE_WORDS = ("", "-", "--", "n/a", "na", "#n/a", "none", "null", "missing")
 """What people and spreadsheets write where there is no value; refused, with the cure that belongs to it."""
 
 
-def number(text: str, place: str, column: str, *, cure_nan: str) -> float:
-    """A finite number, or an error that names the place, the value and the cure."""
+def number(text: str, place: str, column: str, *, cure_nan: str, missing: Sequence[str] = ()) -> float:
+    """A finite number, NaN for a text in `missing`, or an error that names the place, the value and the cure."""
     text = text.strip()
+    if text.lower() in missing:
+        return math.nan
     try:
         if "_" in text or not text.isascii():
             raise ValueError
@@ -192,7 +254,7 @@ def number(text: str, place: str, column: str, *, cure_nan: str) -> float:
             fix="write it with a decimal point"
             if comma
             else cure_nan
-            if text.lower() in NO_VALUE
+            if text.lower() in NO_VALUE_WORDS
             else "correct the value or remove the row",
         ) from None
     if not math.isfinite(value):
@@ -232,8 +294,8 @@ def parse_toml(text: str) -> dict[str, Any]:
     if len(text) > MAX_TOML_BYTES:
         raise ValueError(f"it is {len(text):,} characters long")
     for line, content in enumerate(text.split("\n"), 1):
-        if content.count(".") > MAX_TOML_DOTS:
-            raise ValueError(f"more than {MAX_TOML_DOTS} dots in one line (at line {line}); break it into several")
+        if content.count(".") > MAX_TOML_LINE_DOTS:
+            raise ValueError(f"more than {MAX_TOML_LINE_DOTS} dots in one line (at line {line}); break it into several")
     try:
         table: dict[str, Any] = plain(tomllib.loads(text))
     except RecursionError:
@@ -255,11 +317,8 @@ def description_from_toml(table: dict[str, Any], path: Path) -> tuple[str, str, 
             fix='add, for each camera, [[cameras]] with name = "cam1", width = 1280, height = 800',
         )
     made = tuple(_camera(dict(c), path) for c in cameras)
-    for camera, times in Counter(camera.name for camera in made).items():
-        if times > 1:
-            raise DatasetError(
-                f"{path}: camera {camera!r} is there {times} times.", fix="give each camera a name of its own"
-            )
+    with naming(path):
+        check_unique([camera.name for camera in made], "camera")
     return name, unit, made, extra
 
 

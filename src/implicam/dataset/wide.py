@@ -8,7 +8,7 @@ without it still reads: name from the file, cameras from the columns, image size
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,17 +25,18 @@ from implicam.dataset.model import (
     Dataset,
     Floats,
     KnownPositions,
-    Names,
     Observations,
-    check_inside,
     check_name,
+    check_unique,
+    check_views,
 )
 from implicam.dataset.tables import (
+    Columns,
+    NumberColumn,
     description_from_toml,
-    name_in,
     naming,
-    number,
     parse_toml,
+    read_columns,
     read_table,
     read_toml,
     require_file,
@@ -102,6 +103,8 @@ def _layout(header: list[str], description: dict[str, Any] | None, path: Path, u
             f"{path}, line 1: there are no camera columns.", fix="name them u_cam1,v_cam1,u_cam2,v_cam2, ..."
         )
     columns = set(header)
+    if len(columns & set("xyz")) not in (0, 3):
+        raise DatasetError(f"{path}, line 1: x, y and z must all be there, or none.", fix="add the missing column")
     for column in (f"{q}_{camera.name}" for camera in cameras for q in "uv"):
         if column not in columns:
             raise DatasetError(f"{path}, line 1: the column {column!r} is missing.", fix="every camera needs u_ and v_")
@@ -144,77 +147,34 @@ def _cameras_named(header: Iterable[str]) -> list[str]:
     return [column[2:] for column in columns if column.startswith("u_") and column[2:] in second]
 
 
-Cells = Mapping[str, NDArray[Any]]
-
-
-def _assemble(cells: Cells, layout: _Layout, n: int, place: Callable[[int], str]) -> Dataset:
-    """A dataset from number columns (NaN where empty) and text columns."""
-    nan = np.full(n, np.nan)
-    text = np.full(n, "")
+def _assemble(table: Columns, layout: _Layout) -> Dataset:
+    """A dataset from the columns of a wide table."""
     cameras = layout.cameras
 
-    def views(first: str, second: str) -> Floats:
-        columns = [[cells.get(f"{q}_{c.name}", nan) for q in (first, second)] for c in cameras]
-        return np.array(columns, dtype=np.float64).reshape(len(cameras), 2, n).transpose(2, 0, 1)
+    def views(columns: tuple[str, str]) -> Floats:
+        names = [f"{column}_{camera.name}" for camera in cameras for column in columns]
+        return table.stack(names).reshape(table.n, len(cameras), 2)
 
-    uv = views("u", "v")
-    half = np.isnan(uv[..., 0]) != np.isnan(uv[..., 1])
-    for i, k in np.argwhere(half)[:1]:
-        raise DatasetError(
-            f"{place(i)}: only one of u_{cameras[k].name} and v_{cameras[k].name} is there.",
-            fix="a missing view leaves both empty",
-        )
-    check_inside(uv, cameras, lambda i, k: place(i))
-    sd = views(*SD_VIEW)
-    for i, k in np.argwhere(((sd <= 0) & ~half[..., None] & ~np.isnan(uv)).any(axis=2))[:1]:
-        raise DatasetError(
-            f"{place(i)}: sd_u_{cameras[k].name} and sd_v_{cameras[k].name} must be greater than zero.",
-            why="they are standard uncertainties",
-            fix="leave the cell empty where no uncertainty is stated",
-        )
-    points = cells.get("point", np.array([f"p{i + 1:04d}" for i in range(n)]))
-    _check_points(points, place)
+    uv, sd = views(("u", "v")), views(SD_VIEW)
+    check_views(uv, sd, cameras, lambda i, k: table.place(i))
+    points = table.texts.get("point", [f"p{i + 1:04d}" for i in range(table.n)])
+    check_unique(points, "point", table.place)
+    empty = [""] * table.n
     view_extra = {
-        key: np.stack([cells.get(f"{key}_{c.name}", text) for c in cameras], axis=1).astype(np.str_)
+        key: np.array([table.texts.get(f"{key}_{c.name}", empty) for c in cameras], dtype=np.str_).T
         for key in layout.view_extra
     }
-    observations = Observations(points, cameras, uv, sd, view_extra)
-    known = _known(cells, layout, points, place) if "x" in cells else None
-    return Dataset(layout.name, layout.unit, observations, known, layout.extra)
-
-
-def _check_points(points: Names, place: Callable[[int], str]) -> None:
-    first: dict[str, int] = {}
-    for i, name in enumerate(points.tolist()):
-        name_in(name, "point", place(i))
-        if name in first:
+    observations = Observations(np.array(points, dtype=np.str_), cameras, uv, sd, view_extra)
+    known = None
+    if "x" in table.numbers:
+        for i in np.flatnonzero(np.isnan(table.stack("xyz")).any(axis=1))[:1]:
             raise DatasetError(
-                f"{place(i)}: point {name!r} is there twice (first at {place(first[name])}).",
-                fix="remove one, or give each point a name of its own",
+                f"{table.place(i)}: point {points[i]!r} has no known position.",
+                fix="fill in x, y and z, remove the row, or leave the columns x, y, z out altogether to measure the "
+                "points",
             )
-        first[name] = i
-
-
-def _known(cells: Cells, layout: _Layout, points: Names, place: Callable[[int], str]) -> KnownPositions:
-    xyz = np.stack([cells[axis] for axis in "xyz"], axis=1)
-    for i in np.flatnonzero(np.isnan(xyz).any(axis=1))[:1]:
-        raise DatasetError(
-            f"{place(i)}: point {str(points[i])!r} has no known position.",
-            fix="fill in x, y and z, remove the row, or leave the columns x, y, z out altogether to measure the points",
-        )
-    nan = np.full(len(points), np.nan)
-    sd = np.stack([cells.get(c, nan) for c in SD_POINT], axis=1)
-    for i, k in np.argwhere(sd < 0)[:1]:
-        raise DatasetError(
-            f"{place(i)}: {SD_POINT[k]} = {sd[i, k]:g} must be at least zero.",
-            why="it is a standard uncertainty",
-            fix="leave the cell empty where no uncertainty is stated",
-        )
-    extra = {c: cells[c].astype(np.str_) for c in layout.point_extra}
-    shots = cells.get("shot", points)
-    for i, shot in enumerate(shots.tolist()):
-        name_in(shot, "shot", place(i))
-    return KnownPositions(shots, xyz, sd, extra)
+        known = table.known_positions(points, layout.point_extra)
+    return Dataset(layout.name, layout.unit, observations, known, layout.extra)
 
 
 def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
@@ -222,31 +182,12 @@ def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
     header, rows = read_table(path, (), _EXAMPLE)
     sidecar = _sidecar(path)
     layout = _layout(header, read_toml(sidecar) if sidecar.exists() else None, path, unit)
-    for axis in "xyz":
-        if ("x" in header) != (axis in header):
-            raise DatasetError(f"{path}, line 1: x, y and z must all be there, or none.", fix="add the missing column")
-    numeric = set(layout.numbers()) & set(header)
-    columns: dict[str, list[Any]] = {column: [] for column in header}
-    is_number = [(column, column in numeric, column in ("point", "shot")) for column in header]
-    lines = []
-    in_file = f"{path}, line "
-    for line, row in rows:
-        lines.append(line)
-        for (column, numerical, name), text in zip(is_number, row, strict=True):
-            value = _optional(text, in_file, line, column) if numerical else text.strip() if name else text
-            columns[column].append(value)
-    if not lines:
+    numbers = dict.fromkeys(layout.numbers(), NumberColumn("leave the cell empty where there is no value", ("", "nan")))
+    table = read_columns(path, header, rows, ("point", "shot"), numbers)
+    if not table.n:
         raise DatasetError(f"{path} has a header and no rows.", fix="add one row per point")
-    table = {c: np.array(v, dtype=np.float64 if c in numeric else np.str_) for c, v in columns.items()}
     with naming(path):
-        return _assemble(table, layout, len(lines), lambda i: f"{path}, line {lines[i]}")
-
-
-def _optional(text: str, in_file: str, line: int, column: str) -> float:
-    text = text.strip()
-    if text == "" or text.lower() == "nan":  # in a wide table this is how a missing view is written
-        return float("nan")
-    return number(text, f"{in_file}{line}", column, cure_nan="leave the cell empty where there is no value")
+        return _assemble(table, layout)
 
 
 def _columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
@@ -333,26 +274,32 @@ def read_parquet(path: Path) -> Dataset:
         if times > 1:
             raise DatasetError(f"{path}: the column {column[:60]!r} is there {times} times.", fix="leave one out")
     layout = _layout(table.column_names, description, path, None)
-    if "x" in columns and not {"y", "z"} <= set(columns):
-        raise DatasetError(f"{path}: x, y and z must all be there, or none.", fix="add the missing column")
     numeric = set(layout.numbers())
-    typed = {c: _typed(v, c, c in numeric, path) for c, v in columns.items()}
+    numbers = {c: _numbers(v, c, path) for c, v in columns.items() if c in numeric}
+    texts = {c: _texts(v, c, path) for c, v in columns.items() if c not in numeric}
     with naming(path):
-        return _assemble(typed, layout, table.num_rows, lambda i: f"{path}, row {i + 1}")
+        return _assemble(Columns(texts, numbers, table.num_rows, lambda i: f"{path}, row {i + 1}"), layout)
 
 
-def _typed(values: list[Any], column: str, numerical: bool, path: Path) -> NDArray[Any]:
-    """A column of Parquet as numbers (NaN where there is none) or text (empty where there is none)."""
-    wanted: type | tuple[type, ...] = (int, float) if numerical else str
+def _numbers(values: list[Any], column: str, path: Path) -> Floats:
+    """A column of Parquet as numbers, NaN where there is none."""
+    _check_types(values, (int, float), "a number", column, path)
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _texts(values: list[Any], column: str, path: Path) -> list[str]:
+    """A column of Parquet as text, empty where there is none."""
+    _check_types(values, str, "text", column, path)
+    return [value or "" for value in values]
+
+
+def _check_types(values: list[Any], wanted: type | tuple[type, ...], what: str, column: str, path: Path) -> None:
     for i, value in enumerate(values):
         if value is not None and (not isinstance(value, wanted) or isinstance(value, bool)):
             raise DatasetError(
-                f"{path}, row {i + 1}: {column} = {str(value)[:60]!r} is not {'a number' if numerical else 'text'}.",
+                f"{path}, row {i + 1}: {column} = {str(value)[:60]!r} is not {what}.",
                 fix="convert the column, or leave it out",
             )
-    if numerical:
-        return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-    return np.array([value or "" for value in values], dtype=np.str_)
 
 
 def write_parquet(data: Dataset, path: Path) -> None:

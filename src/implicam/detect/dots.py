@@ -99,8 +99,8 @@ class Dots(DetectorBase):
 
         DatasetError names file, line and cure.
         """
-        table = read_points(Path(layout))
-        return cls(tuple(table.names), table.known, _read_labels(Path(labels), table.names), polarity)
+        points, known = read_points(Path(layout))
+        return cls(tuple(points), known, _read_labels(Path(labels), points), polarity)
 
     @classmethod
     def from_options(
