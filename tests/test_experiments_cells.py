@@ -418,8 +418,8 @@ def test_a_cell_that_kills_its_workers_fails_alone(
 @pytest.mark.slow
 def test_a_cluster_without_workers_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr(workers, "LOOK_SECONDS", 0.1)
-    monkeypatch.setattr(workers, "LONELY_SECONDS", 0.5)
+    monkeypatch.setattr(workers, "POLL_SECONDS", 0.1)
+    monkeypatch.setattr(workers, "NO_WORKER_SECONDS", 0.5)
     with (
         distributed.LocalCluster(n_workers=0, protocol="tcp", dashboard_address=":0", silence_logs=60) as empty,
         pytest.raises(ImplicamError, match="has had no worker") as caught,

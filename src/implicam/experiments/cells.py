@@ -21,7 +21,7 @@ from typing import Any
 from implicam.calibration_file import package_version
 from implicam.errors import ImplicamError, UsageError
 from implicam.experiments.stored import Stored, Values, canonical, decode, failure_file, result_file, write_result
-from implicam.experiments.workers import DaskCluster, LocalProcesses, Task, attempts
+from implicam.experiments.workers import DaskCluster, LocalProcesses, Task, compute_all
 from implicam.files import write_text
 from implicam.progress import Progress, silent
 from implicam.threads import cores
@@ -62,7 +62,7 @@ class Cell:
                 fix="give numbers, text, lists and dicts; a NumPy number by float(...) or int(...)",
             ) from error
         object.__setattr__(self, "options", plain)
-        object.__setattr__(self, "work", _dotted(self.work))
+        object.__setattr__(self, "work", _dotted_name(self.work))
 
     @property
     def task(self) -> Task:
@@ -70,7 +70,7 @@ class Cell:
         return Task(str(self.work), self.name, canonical(self.options))
 
 
-def _dotted(work: str | Work) -> str:
+def _dotted_name(work: str | Work) -> str:
     """The name by which another process finds the function; UsageError where it could not."""
     name = work if isinstance(work, str) else f"{work.__module__}:{getattr(work, '__qualname__', '')}"
     try:
@@ -119,34 +119,34 @@ def run(
     it at any time: what is done is kept. Two runs on one folder may compute a cell twice, and do no other harm.
     UsageError for two cells of one name; ImplicamError where the folder cannot be written, or there is no scheduler.
     """
-    _check(cells, jobs, scheduler)
+    _check_arguments(cells, jobs, scheduler)
     folder = Path(folder)
-    there, notes = _there(cells, folder)
-    missing = [cell.task for cell in cells if cell.name not in there]
-    already, failures = len(there), dict[str, str]()
+    stored, notes = _read_stored(cells, folder)
+    missing = [cell.task for cell in cells if cell.name not in stored]
+    already, failures = len(stored), dict[str, str]()
     what = f"computing {', '.join(sorted({cell.name.partition('/')[0] for cell in cells})[:3])}"
     progress(what, already, len(cells))
     if missing:
-        _make(folder)
-        with closing(attempts(_workers(len(missing), jobs, scheduler), missing)) as all_done:
+        _make_folder(folder)
+        with closing(compute_all(_workers(len(missing), jobs, scheduler), missing)) as all_done:
             for done in all_done:
                 if done.failure:
                     failures[done.name] = done.failure
                     write_text(failure_file(folder, done.name), f"{done.failure}\n\n{done.trace}")
                 else:
                     write_result(folder, done.name, done.content)
-                    there[done.name] = decode(done.content)
-                progress(what, len(there) + len(failures), len(cells))
-    return _results(cells, there, failures, already, notes)
+                    stored[done.name] = decode(done.content)
+                progress(what, len(stored) + len(failures), len(cells))
+    return _collect(cells, stored, failures, already, notes)
 
 
-def computed(cells: Sequence[Cell], folder: str | Path) -> Results:
-    """The results that are there, and count; computes nothing."""
-    there, notes = _there(cells, Path(folder))
-    return _results(cells, there, {}, len(there), notes)
+def load_results(cells: Sequence[Cell], folder: str | Path) -> Results:
+    """The results that are stored, and count; computes nothing."""
+    stored, notes = _read_stored(cells, Path(folder))
+    return _collect(cells, stored, {}, len(stored), notes)
 
 
-def _check(cells: Sequence[Cell], jobs: int | None, scheduler: str | None) -> None:
+def _check_arguments(cells: Sequence[Cell], jobs: int | None, scheduler: str | None) -> None:
     same = Counter(cell.name.casefold() for cell in cells)  # some file systems take upper for lower case
     twice = [cell.name for cell in cells if same[cell.name.casefold()] > 1]
     if twice:
@@ -161,7 +161,7 @@ def _check(cells: Sequence[Cell], jobs: int | None, scheduler: str | None) -> No
         raise UsageError("give a number of processes or a scheduler, not both.", why="a cluster has its own workers")
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     """Before the work: a place for its results."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -177,39 +177,39 @@ def _workers(count: int, jobs: int | None, scheduler: str | None) -> LocalProces
     return DaskCluster(scheduler) if scheduler is not None else LocalProcesses(min(count, jobs or cores()))
 
 
-def _there(cells: Sequence[Cell], folder: Path) -> tuple[dict[str, Stored], list[str]]:
+def _read_stored(cells: Sequence[Cell], folder: Path) -> tuple[dict[str, Stored], list[str]]:
     """The results that count, and notes on those that do not."""
-    there, notes, other = dict[str, Stored](), list[str](), 0
+    stored, notes, other = dict[str, Stored](), list[str](), 0
     for cell in cells:
         path = result_file(folder, cell.name)
         if not path.exists():
             continue
         try:
-            stored = decode(path)
+            result = decode(path)
         except ImplicamError as error:
             notes.append(f"{path} is damaged and was computed again: {error.why}")
             continue
-        if (stored.work, stored.options) == (cell.work, cell.task.options):
-            there[cell.name] = stored
+        if (result.work, result.options) == (cell.work, cell.task.options):
+            stored[cell.name] = result
         else:
             other += 1
     if other:
         notes.append(f"{other} results in {folder} were of other options or other work and were computed again")
-    return there, notes
+    return stored, notes
 
 
-def _results(
-    cells: Sequence[Cell], there: Mapping[str, Stored], failures: Mapping[str, str], already: int, notes: list[str]
+def _collect(
+    cells: Sequence[Cell], stored: Mapping[str, Stored], failures: Mapping[str, str], already: int, notes: list[str]
 ) -> Results:
     ours = package_version()
-    versions = Counter(stored.version for stored in there.values() if stored.version != ours)
+    versions = Counter(result.version for result in stored.values() if result.version != ours)
     notes += [
         f"{count} results were computed by implicam {version}; this is {ours}" for version, count in versions.items()
     ]
-    names = [cell.name for cell in cells if cell.name in there]
+    names = [cell.name for cell in cells if cell.name in stored]
     return Results(
-        values={name: there[name].values for name in names},
-        seconds={name: there[name].seconds for name in names},
+        values={name: stored[name].values for name in names},
+        seconds={name: stored[name].seconds for name in names},
         failures={cell.name: failures[cell.name] for cell in cells if cell.name in failures},
         already=already,
         notes=tuple(notes),

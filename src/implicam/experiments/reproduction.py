@@ -15,7 +15,7 @@ from typing import Any
 from implicam.errors import DatasetError, ImplicamError, import_extra
 from implicam.experiments import active, ball, board, tables
 from implicam.experiments.account import markdown
-from implicam.experiments.cells import Cell, Results, computed, run
+from implicam.experiments.cells import Cell, Results, load_results, run
 from implicam.experiments.evidence import Row
 from implicam.experiments.findings import verdicts
 from implicam.experiments.pictures import draw
@@ -114,9 +114,9 @@ def _whole_before(
     cells = {}
     for name in names:
         found = _CELLS[name](source, plan)
-        if found and len(computed(found, place).values) == len(found):
+        if found and len(load_results(found, place).values) == len(found):
             cells[name] = found
-    return cells, computed([cell for found in cells.values() for cell in found], place)
+    return cells, load_results([cell for found in cells.values() for cell in found], place)
 
 
 def _rows(cells: Sequence[Cell], values: Mapping[str, Values]) -> list[Row]:

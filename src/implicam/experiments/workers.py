@@ -11,30 +11,29 @@ from __future__ import annotations
 
 import json
 import pkgutil
-import queue
 import re
 import sys
 import threading
 import time
 import traceback
 import warnings
-from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import CancelledError, Executor, Future
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
-from typing import NamedTuple, Protocol
+from itertools import islice
+from typing import Any, NamedTuple, Protocol
 
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.experiments.stored import encode
 from implicam.threads import at_most
 
 CONNECT_SECONDS = 10
-LOOK_SECONDS = 5  # waiting for results, look so often whether any can come
-LONELY_SECONDS = 120  # without any worker, before a cluster is given up
+POLL_SECONDS = 5  # waiting for results, ask so often whether any can come
+NO_WORKER_SECONDS = 120  # before a cluster is given up
 
 _ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:[0-9]{1,5}")
-_ONE_AT_A_TIME = threading.Lock()
+_ONE_CELL_AT_A_TIME = threading.Lock()
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
 )
@@ -59,23 +58,23 @@ class Attempt(NamedTuple):
 
 def attempt(task: Task) -> Attempt:
     """Compute one cell in this process; never raises an error of the cell's own."""
-    with _ONE_AT_A_TIME, _one_thread():
+    with _ONE_CELL_AT_A_TIME, _one_thread():
         start = time.perf_counter()
         try:
             values = pkgutil.resolve_name(task.work)(**json.loads(task.options))
             return Attempt(task.name, encode(task.work, task.options, time.perf_counter() - start, values))
         except (Exception, SystemExit) as error:
-            return Attempt(task.name, failure=str(_explained(task, error)), trace=traceback.format_exc())
+            return Attempt(task.name, failure=str(_explain(task, error)), trace=traceback.format_exc())
 
 
-def _explained(task: Task, error: BaseException) -> ImplicamError:
+def _explain(task: Task, error: BaseException) -> ImplicamError:
     fix = f"read the traceback in {task.name}.failed.txt; the next run tries this cell again"
     if isinstance(error, ImplicamError):
         return ImplicamError(f"{task.name}: {error.what}", why=error.why, fix=error.fix or fix)
     place = traceback.extract_tb(error.__traceback__)[-1]
-    said = " ".join(str(error).split())[:500]
+    message = " ".join(str(error).split())[:500]
     return ImplicamError(
-        f"{task.name}: {type(error).__name__}{': ' * bool(said)}{said}",
+        f"{task.name}: {type(error).__name__}{': ' * bool(message)}{message}",
         why=f"raised in {place.name}, {place.filename}:{place.lineno}",
         fix=fix,
     )
@@ -101,13 +100,13 @@ def _one_thread() -> Iterator[None]:
 class Workers(Protocol):
     """Processes that compute.
 
-    at_once: tasks that they are given at a time. death: what a future raises where its process died. alone: how often
-    a task that may have been the cause is tried alone.
+    at_once: how many tasks they are given at a time. death: what a future raises where its process died. retries: how
+    often a task that may have been the cause is tried alone.
     """
 
     at_once: int
     death: type[Exception]
-    alone: int
+    retries: int
 
     def submit(self, task: Task) -> Future[Attempt]:
         """Start `attempt(task)` somewhere."""
@@ -119,58 +118,54 @@ class Workers(Protocol):
         """Stop what still runs."""
 
 
-def attempts(workers: Workers, tasks: Sequence[Task]) -> Generator[Attempt, None, None]:
+def compute_all(workers: Workers, tasks: Sequence[Task]) -> Generator[Attempt, None, None]:
     """Compute all tasks; the attempts in the order in which they end. Close it to stop the workers early."""
     suspects: list[Task] = []
     try:
-        for task, done in _finished(workers, tasks):
+        for task, done in _compute(workers, tasks):
             if done is None:
                 suspects.append(task)
             else:
                 yield done
         for task in suspects:
-            yield _alone(workers, task)
+            yield _compute_alone(workers, task)
     finally:
         workers.close()
 
 
-def _finished(workers: Workers, tasks: Sequence[Task]) -> Iterator[tuple[Task, Attempt | None]]:
+def _compute(workers: Workers, tasks: Sequence[Task]) -> Iterator[tuple[Task, Attempt | None]]:
     """Each task and what came of it; None where its process died."""
-    waiting, running = deque(tasks), dict[Future[Attempt], Task]()
-    ended: queue.SimpleQueue[Future[Attempt]] = queue.SimpleQueue()
-    while waiting or running:
-        while waiting and len(running) < workers.at_once:
-            task = waiting.popleft()
-            future = workers.submit(task)
-            running[future] = task
-            future.add_done_callback(ended.put)
-        future = _next(ended, workers)
-        task = running.pop(future)
-        try:
-            done = future.result()
-        except workers.death:
-            done = None
-        except CancelledError as error:
-            raise ImplicamError(
-                "what was being computed was cancelled.",
-                why="the scheduler is gone, or somebody has cancelled it there",
-                fix="start the scheduler again and run again; what is done is kept",
-            ) from error
-        del future  # a cluster keeps a result, and computes it again after a death, while somebody holds its future
-        yield task, done
-
-
-def _next(ended: queue.SimpleQueue[Future[Attempt]], workers: Workers) -> Future[Attempt]:
+    waiting, running = iter(tasks), dict[Future[Attempt], Task]()
     while True:
-        with suppress(queue.Empty):
-            return ended.get(timeout=LOOK_SECONDS)
-        workers.check()
+        running |= {workers.submit(task): task for task in islice(waiting, workers.at_once - len(running))}
+        if not running:
+            return
+        ended, _ = wait(running, timeout=POLL_SECONDS, return_when=FIRST_COMPLETED)
+        if not ended:
+            workers.check()
+        while ended:  # a cluster keeps a result, and computes it again after a death, while somebody holds its future
+            future = ended.pop()
+            yield running.pop(future), _result(future, workers.death)
+            del future
 
 
-def _alone(workers: Workers, task: Task) -> Attempt:
+def _result(future: Future[Attempt], death: type[Exception]) -> Attempt | None:
+    try:
+        return future.result()
+    except death:
+        return None
+    except CancelledError as error:
+        raise ImplicamError(
+            "what was being computed was cancelled.",
+            why="the scheduler is gone, or somebody has cancelled it there",
+            fix="start the scheduler again and run again; what is done is kept",
+        ) from error
+
+
+def _compute_alone(workers: Workers, task: Task) -> Attempt:
     """Compute one task while nothing else runs; where its process dies whatever we do, it has failed."""
-    for _ in range(workers.alone):
-        for _, done in _finished(workers, [task]):
+    for _ in range(workers.retries):
+        for _, done in _compute(workers, [task]):
             if done is not None:
                 return done
     error = ImplicamError(
@@ -182,43 +177,36 @@ def _alone(workers: Workers, task: Task) -> Attempt:
 
 
 class LocalProcesses:
-    """So many processes on this machine. A cell whose process dies three times, twice of them alone, has failed."""
+    """So many processes on this machine, by joblib. A cell whose process dies three times, twice of them alone, has
+    failed."""
 
     death: type[Exception] = BrokenProcessPool
-    alone = 2
+    retries = 2
 
     def __init__(self, jobs: int) -> None:
         self._loky = import_extra("joblib.externals.loky", "paper", "computing cells side by side")
         self.at_once = jobs
-        self._pool = self._new_pool()
         # loky replaces a process whose memory has grown, loses nothing by it, and says so as if something were wrong.
         # It does so in a thread of its own, so that the filter has to stand as long as the processes do.
         self._warnings = ExitStack()
         self._warnings.enter_context(warnings.catch_warnings())
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
 
-    def _new_pool(self) -> Executor:
-        pool: Executor = self._loky.ProcessPoolExecutor(self.at_once, env=_ONE_THREAD)
-        return pool
-
     def submit(self, task: Task) -> Future[Attempt]:
-        """Start `attempt(task)`, in a new pool where the old one is broken."""
-        with suppress(self.death):
-            return self._pool.submit(attempt, task)
-        self._end_pool()
-        self._pool = self._new_pool()
-        return self._pool.submit(attempt, task)
+        """Start `attempt(task)`; where a process has died, in new ones."""
+        future: Future[Attempt] = self._pool().submit(attempt, task)
+        return future
 
     def check(self) -> None:
-        """Nothing to see: the pool itself notices when a process dies."""
+        """Nothing to see: loky itself notices when a process dies."""
 
     def close(self) -> None:
         """End the processes, whatever they do."""
-        self._end_pool()
+        self._pool().shutdown(wait=True, kill_workers=True)
         self._warnings.close()
 
-    def _end_pool(self) -> None:
-        self._pool.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
+    def _pool(self) -> Any:
+        return self._loky.get_reusable_executor(self.at_once, timeout=None, env=_ONE_THREAD)
 
 
 class DaskCluster:
@@ -229,7 +217,7 @@ class DaskCluster:
     over at once, so that a cluster that adapts sees how much there is.
     """
 
-    at_once, alone = sys.maxsize, 1
+    at_once, retries = sys.maxsize, 1
 
     def __init__(self, address: str) -> None:
         distributed = import_extra("distributed", "cluster", "computing cells on a Dask cluster")
@@ -240,7 +228,7 @@ class DaskCluster:
                 fix="give the address that `dask scheduler` prints",
             )
         self.death: type[Exception] = distributed.scheduler.KilledWorker
-        self._address, self._lonely = address, 0
+        self._address, self._polls_without_worker = address, 0
         try:
             self._client = distributed.Client(address, set_as_default=False, timeout=CONNECT_SECONDS)
         except OSError as error:
@@ -258,13 +246,13 @@ class DaskCluster:
 
     def check(self) -> None:
         """A cluster without workers would keep us waiting for ever; for a while, they may be starting."""
-        there = False
+        has_workers = False
         with suppress(OSError, ValueError):  # the scheduler does not answer
-            there = bool(self._client.nthreads())
-        self._lonely = 0 if there else self._lonely + 1
-        if self._lonely * LOOK_SECONDS > LONELY_SECONDS:
+            has_workers = bool(self._client.nthreads())
+        self._polls_without_worker = 0 if has_workers else self._polls_without_worker + 1
+        if self._polls_without_worker * POLL_SECONDS > NO_WORKER_SECONDS:
             raise ImplicamError(
-                f"the Dask scheduler at {self._address} has had no worker for {LONELY_SECONDS} s.",
+                f"the Dask scheduler at {self._address} has had no worker for {NO_WORKER_SECONDS} s.",
                 why="none was started, or all have died",
                 fix=f"start some with `dask worker {self._address}` and run again; what is done is kept",
             )
