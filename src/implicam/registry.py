@@ -9,11 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from importlib.metadata import entry_points
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from implicam.errors import UsageError, did_you_mean
 
 Part = TypeVar("Part")
+
+
+class Option(NamedTuple):
+    """An option of the command line that a part brings with it.
+
+    Attributes:
+        help: what `--help` says of it.
+        metavar: what stands for its value there.
+        minimum: the least value, of a number.
+    """
+
+    help: str
+    metavar: str = "NAME"
+    minimum: float | None = None
 
 
 class Registry(Mapping[str, Part]):

@@ -63,33 +63,6 @@ Unit = Annotated[
 Method = Annotated[
     str | None, typer.Option("--method", metavar="NAME", help=f"Calibration method (default {DEFAULT_METHOD}).")
 ]
-Kernel = Annotated[
-    str | None, typer.Option("--kernel", metavar="NAME", help="inverse-gp: squared-exponential or matern-5/2.")
-]
-Preset = Annotated[
-    str | None,
-    typer.Option(
-        "--preset",
-        metavar="NAME",
-        help='inverse-gp: smooth; "plain", the paper\'s model; "paper", its own software.',
-    ),
-]
-Lens = Annotated[
-    str | None,
-    typer.Option(
-        "--lens",
-        metavar="NAME",
-        help="forward-gp: auto, central or none; explicit: auto, brown-conrady, kannala-brandt.",
-    ),
-]
-Boards = Annotated[
-    Path | None,
-    typer.Option("--boards", metavar="DATASET", help="explicit: learn the cameras from these pictures of a board."),
-]
-Align = Annotated[
-    str | None,
-    typer.Option("--align", metavar="NAME", help="explicit: known points match boards by name (points), or icp."),
-]
 Cameras = Annotated[
     str | None, typer.Option("--cameras", metavar="LIST", help="Use only these cameras, separated by commas.")
 ]

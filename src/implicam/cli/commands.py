@@ -6,7 +6,9 @@ Every help text ends with an example that a test runs.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,21 +22,16 @@ import implicam.cli.detect
 import implicam.cli.paper
 import implicam.cli.simulate  # noqa: F401  the six register their commands
 from implicam import calibration_file
-from implicam.calibrators import DEFAULT_METHOD, Calibration, Explicit, InverseGP, calibrator, load_calibration
+from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards
 from implicam.cli import show
 from implicam.cli.app import (
     CALIBRATION_SUFFIX,
     EXAMPLES,
-    Align,
-    Boards,
     Cameras,
     Json,
-    Kernel,
     LeaveOut,
-    Lens,
     Method,
-    Preset,
     Report,
     Seed,
     Unit,
@@ -49,43 +46,15 @@ from implicam.cli.app import (
     need_plotly,
     read,
 )
+from implicam.cli.options import OptionsOfParts, calibrator_from_options, options_of_calibrators
 from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import must_be_no_folder, toml_text
 from implicam.formatting import decimal_number
-from implicam.lenses import LENSES
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
 __all__ = ["EXAMPLES", "app"]
-
-
-@dataclass(frozen=True)
-class _Wanted:
-    """A method and its options, as far as they were given."""
-
-    method: str | None
-    lens: str | None
-    kernel: str | None
-    preset: str | None
-    seed: int
-    boards: Path | None = None
-    align: str | None = None
-
-    @property
-    def given(self) -> bool:
-        return any((self.method, self.lens, self.kernel, self.preset, self.boards, self.align))
-
-    def calibrator(self) -> Any:
-        options = {"lens": self.lens, "kernel": self.kernel, "preset": self.preset, "align": self.align}
-        boards = None if self.boards is None else read_dataset(self.boards)
-        return calibrator(self.method or self._likely(), **options, boards=boards, seed=self.seed)
-
-    def _likely(self) -> str:
-        """The method that is meant where only its options are given."""
-        if self.boards or self.align or self.lens in LENSES:
-            return Explicit.method
-        return InverseGP.method if (self.kernel or self.preset) and not self.lens else DEFAULT_METHOD
 
 
 @command("demo")
@@ -119,16 +88,10 @@ def demo_command(
         show.line(f"  {key:<12}{path}")
 
 
-@command("calibrate")
-def calibrate_command(
+def _calibrate(
     dataset: Annotated[Path, typer.Argument(help="Known points and what the cameras saw of them.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The calibration file to write.")],
     method: Method = None,
-    lens: Lens = None,
-    kernel: Kernel = None,
-    preset: Preset = None,
-    boards: Boards = None,
-    align: Align = None,
     points: Annotated[int | None, typer.Option(min=1, metavar="N", help="Use so many points, drawn at random.")] = None,
     cameras: Cameras = None,
     without: Without = None,
@@ -136,17 +99,18 @@ def calibrate_command(
     seed: Seed = 0,
     force: Annotated[bool, typer.Option("--force", help="Write the file even if it is not usable.")] = False,
     json: Json = False,
+    **options: Any,
 ) -> None:
     """Learn the rig from known points; points kept back with --points are there for `implicam evaluate`."""
     must_be_calibration(output)
     data = read(dataset, unit, cameras, without)
     if points is not None and points != len(data):
         data, _ = data.split(points, seed=seed)
-    wanted = _Wanted(method, lens, kernel, preset, seed, boards, align)
-    if data.known is None and has_boards(data) and not wanted.given:
-        wanted = replace(wanted, method=Explicit.method)  # nothing else can be made of boards
+    if data.known is None and has_boards(data) and not _any_given(method, options):
+        method = Explicit.method  # nothing else can be made of boards
+    made = calibrator_from_options(method, seed, options)
     with show.progress(json) as progress:
-        calibration = wanted.calibrator().fit(data, progress)
+        calibration = made.fit(data, progress)
         verdict = judge(calibration, progress)
     written = force or verdict.word != NOT_USABLE
     if written:
@@ -154,6 +118,13 @@ def calibrate_command(
     _tell_calibration(calibration, verdict, output if written else None, json)
     if not written:
         raise typer.Exit(1)
+
+
+calibrate_command = command("calibrate")(OptionsOfParts(_calibrate, "method", options_of_calibrators))
+
+
+def _any_given(method: str | None, options: Mapping[str, Any]) -> bool:
+    return method is not None or any(value is not None for value in options.values())
 
 
 def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path | None, json: bool) -> None:
@@ -236,8 +207,7 @@ def _typical(sd: Any) -> list[float]:
     return np.median(measured, axis=0).tolist() if len(measured) else [math.nan] * 3
 
 
-@command("evaluate")
-def evaluate_command(
+def _evaluate(
     file: Annotated[Path, typer.Argument(help="A calibration; with --cv or --leave-out, also known points.")],
     dataset: Annotated[Path | None, typer.Argument(help="Known points that the calibration has not seen.")] = None,
     cv: Annotated[
@@ -246,20 +216,16 @@ def evaluate_command(
     leave_out: LeaveOut = None,
     report: Report = None,
     method: Method = None,
-    lens: Lens = None,
-    kernel: Kernel = None,
-    preset: Preset = None,
-    boards: Boards = None,
-    align: Align = None,
     cameras: Cameras = None,
     without: Without = None,
     unit: Unit = None,
     seed: Seed = 0,
     json: Json = False,
+    **options: Any,
 ) -> None:
     """Judge errors and error bars against known positions: rmse, coverage, NEES, NLL, CRPS, by region."""
-    wanted = _Wanted(method, lens, kernel, preset, seed, boards, align)
-    _check_evaluate(dataset, cv, leave_out, wanted.given)
+    given = _any_given(method, options)
+    _check_evaluate(dataset, cv, leave_out, given)
     if report is not None:
         need_plotly()
         must_be_no_folder(report)
@@ -268,7 +234,8 @@ def evaluate_command(
         if dataset is not None:
             evaluation = evaluate(load_calibration(file), read(dataset, unit, cameras, without))
         else:
-            fit, data = _fit_and_data(file, wanted, cameras, without, unit)
+            make = partial(calibrator_from_options, method, seed, options)
+            fit, data = _fit_and_data(file, make, cameras, without, unit, given)
             if cv is not None:
                 evaluation = cross_validate(fit, data, cv, seed=seed, progress=progress)
             else:
@@ -294,15 +261,18 @@ def _check_evaluate(dataset: Path | None, cv: int | None, leave_out: str | None,
         raise _own_options()
 
 
+evaluate_command = command("evaluate")(OptionsOfParts(_evaluate, "method", options_of_calibrators))
+
+
 def _fit_and_data(
-    path: Path, wanted: _Wanted, cameras: str | None, without: str | None, unit: str | None
+    path: Path, make: Callable[[], Calibrator], cameras: str | None, without: str | None, unit: str | None, given: bool
 ) -> tuple[Any, Dataset]:
     if path.suffix.lower() == CALIBRATION_SUFFIX:
-        if wanted.given:
+        if given:
             raise _own_options()
         fitted = load_calibration(path)
         return fitted.refit, chosen(fitted.data, cameras, without)
-    return wanted.calibrator().fit, read(path, unit, cameras, without)
+    return make().fit, read(path, unit, cameras, without)
 
 
 def _own_options() -> UsageError:

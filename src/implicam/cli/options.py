@@ -5,9 +5,14 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, get_args
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
+
+from implicam.calibrators import CALIBRATORS, Calibrator, calibrator, method_for, options_of
+from implicam.dataset import read_dataset
+from implicam.registry import Option
 
 Options = Mapping[str, Mapping[str, inspect.Parameter]]
 
@@ -36,6 +41,24 @@ class OptionsOfParts:
         own = list(inspect.signature(self._function, eval_str=True).parameters.values())[:-1]
         place = [parameter.name for parameter in own].index(self._position) + 1
         return inspect.Signature([*own[:place], *_merged(self._options()), *own[place:]])
+
+
+def options_of_calibrators() -> Options:
+    """Method -> option -> the field of its calibrator; a dataset is a path here."""
+    return {method: {name: _parameter(method, name) for name in options_of(method)} for method in CALIBRATORS}
+
+
+def _parameter(method: str, name: str) -> inspect.Parameter:
+    about = options_of(method)[name].metadata
+    kind = Path if about["is_dataset"] else get_type_hints(CALIBRATORS[method].calibrator)[name]
+    described: Any = Annotated[kind | None, Option(about["help"], about["metavar"])]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=described)
+
+
+def calibrator_from_options(method: str | None, seed: int, options: Mapping[str, Any]) -> Calibrator:
+    """The calibrator that the options of a command line mean; those that were not given are None."""
+    read = {name: read_dataset(value) if isinstance(value, Path) else value for name, value in options.items()}
+    return calibrator(method or method_for(**read), seed=seed, **read)
 
 
 def _merged(options: Options) -> list[inspect.Parameter]:

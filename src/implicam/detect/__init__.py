@@ -9,9 +9,10 @@ from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
 from implicam.detect.dots import Dots
 from implicam.detect.folder import Correct, DetectionRun, detect_folder
-from implicam.detect.model import Detected, Detector, DetectorBase, Option, View
+from implicam.detect.model import Detected, Detector, DetectorBase, View
 from implicam.detect.registry import TARGETS, detector_from_options, options_of
 from implicam.detect.silhouette import centred, outline_shift
+from implicam.registry import Option
 
 __all__ = [
     "TARGETS",

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from implicam.calibrators import PredictsPixels, load_calibration
 from implicam.dataset import Dataset, Floats
 from implicam.detect.edge import Edge, Rough, fit_edge, rough_edge
-from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
+from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.silhouette import centred
 from implicam.errors import ImageError, UsageError
 from implicam.images import Grey, opencv, read_picture
+from implicam.registry import Option
 
 MIN_RADIUS_PX = 4.0
 """Least radius in pixels of a ball whose edge can be told from its inside."""

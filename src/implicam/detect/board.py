@@ -21,11 +21,12 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.detect.grid import Grid, grow, join
-from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
+from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.numbering import END, MORE, Numbering, numberings, sides
 from implicam.detect.seeds import from_libcbdetect, from_opencv, from_saddles, in_original, resized, saddles
 from implicam.errors import UsageError
 from implicam.images import Grey, opencv
+from implicam.registry import Option
 
 MAX_SEARCH_PIXELS = 2_500_000
 """Pixels beyond which the search is done in a smaller picture; corners are always fitted in the original."""

@@ -19,10 +19,11 @@ from implicam.dataset import Floats
 from implicam.detect.board import MAX_SEARCH_PIXELS, corner_name, size_of_board, unusable
 from implicam.detect.corners import Corners, fit_corners
 from implicam.detect.grid import MAX_ASTRAY_SQUARES, Places, places_from
-from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
+from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import in_original, resized
 from implicam.errors import UsageError, did_you_mean
 from implicam.images import Grey, eight_bit, opencv
+from implicam.registry import Option
 
 MIN_CORNERS = 6
 """Corners from which their neighbourhood can be checked."""

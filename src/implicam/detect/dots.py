@@ -27,11 +27,12 @@ from implicam.dataset import Floats, KnownPositions
 from implicam.dataset.folder import POINTS, read_points
 from implicam.dataset.tables import name_in, number, read_table
 from implicam.detect.blobs import find_spots, measure_spots, scale_shown
-from implicam.detect.model import Detected, DetectorBase, Option, View, nothing
+from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.gp.kernels import Kernel
 from implicam.gp.linalg import cholesky, solve, solve_lower
 from implicam.images import Grey
+from implicam.registry import Option
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]

@@ -74,14 +74,6 @@ def nothing(reason: str, **more: Any) -> Detected:
     return Detected(reason=reason, **more)
 
 
-class Option(NamedTuple):
-    """An option of `implicam detect`: what `--help` says of it, what stands for its value there, the least value."""
-
-    help: str
-    metavar: str = "NAME"
-    minimum: float | None = None
-
-
 class Detector(Protocol):
     """Finds one kind of target; a frozen value, so that its options can be written beside its results.
 
