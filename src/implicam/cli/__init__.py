@@ -1,7 +1,7 @@
 """The command line: thin. Each command reads, calls the library, prints.
 
-Exit codes: 0 fine, 1 failed, 2 wrong usage. Errors are three lines (what, why, fix); `--debug`, anywhere on the line,
-adds the traceback.
+Exit codes: 0 fine, 1 failed, 2 wrong usage. Errors are three lines (what, why, fix). Anywhere on the line, `--debug`
+adds the traceback, and `--verbose` shows what a command does as it goes.
 """
 
 from __future__ import annotations
@@ -9,20 +9,24 @@ from __future__ import annotations
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import NoReturn
 
 from implicam.errors import ImplicamError, UsageError
+from implicam.logs import log_to_stream
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run `implicam ...` and exit."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
-    given = [word for word in given if word != "--debug"]
+    verbose = "--verbose" in given
+    given = [word for word in given if word not in ("--debug", "--verbose")]
     from implicam.cli.commands import app  # late: `import implicam.cli` stays cheap
 
     try:
-        app(given, prog_name="implicam")
+        with log_to_stream(sys.stderr) if verbose else nullcontext():
+            app(given, prog_name="implicam")
     except ImplicamError as error:
         _fail(str(error), 2 if isinstance(error, UsageError) else 1, debug)
     except Exception as error:

@@ -12,13 +12,14 @@ import typer
 
 from implicam.calibrators import load_calibration
 from implicam.cli import show
-from implicam.cli.app import Json, Seed, command, must_not_replace
+from implicam.cli.app import LOG, Json, Seed, command, command_line, must_not_replace
 from implicam.dataset import Floats
 from implicam.dataset.folder import csv_text
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.files import write_text
 from implicam.formatting import decimal_number, percent
 from implicam.images import opencv
+from implicam.logs import log_to_file
 
 RULES = "random, sobol, variance, excess, integrated, d-optimal"
 Room = Annotated[
@@ -270,7 +271,10 @@ def acquire_command(
     opencv()  # what is missing is said before anything is begun
     if not unattended:
         import_extra("viser", "viewer", "the page of implicam acquire")
-    with open_session(folder, None if setup == before else setup, say=show.say) as controller:
+    with (
+        open_session(folder, None if setup == before else setup, say=show.say) as controller,
+        log_to_file(folder / LOG, command_line()),
+    ):
         if not unattended:
             from implicam.viewer import serve
 

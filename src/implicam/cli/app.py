@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 
+from implicam.calibration_file import package_version
 from implicam.calibrators import DEFAULT_METHOD
 from implicam.dataset import Dataset, read_dataset
 from implicam.errors import UsageError, import_extra
@@ -21,7 +24,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Start with: implicam demo      Any command: --debug shows the traceback of an error.",
+    epilog="Start with: implicam demo.  Any command: --verbose tells what it does, --debug the traceback of an error.",
 )
 
 EXAMPLES = {
@@ -42,6 +45,15 @@ EXAMPLES = {
     "info": "implicam info my-rig.implicam",
 }
 """Command -> an example, in an order in which they can be run."""
+
+LOG = "implicam.log"
+"""The file in which a long command tells what it does, in the folder that it writes to."""
+
+
+def command_line() -> str:
+    """What was typed, for a log."""
+    return f"implicam {package_version()}: {shlex.join(sys.argv[1:])}"
+
 
 CALIBRATION_SUFFIX = ".implicam"
 FILE_SUFFIXES = (".csv", ".parquet", ".npz")

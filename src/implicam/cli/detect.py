@@ -9,12 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from implicam.cli import show
-from implicam.cli.app import Json, command
+from implicam.cli.app import LOG, Json, command, command_line
 from implicam.cli.options import OptionsOfParts
 from implicam.dataset.folder import IMAGES
 from implicam.detect import TARGETS, DetectionRun, detect_folder, detector_from_options, options_of
+from implicam.detect.folder import DETECTIONS
 from implicam.errors import UsageError
 from implicam.images import PATTERN
+from implicam.logs import log_to_file
 
 
 def _options() -> dict[str, dict[str, inspect.Parameter]]:
@@ -42,7 +44,7 @@ def _detect(
     if not dataset.is_dir():
         raise UsageError(f"{dataset} is not a folder.", fix="give the folder that holds images/<camera>/<shot>.png")
     detector = detector_from_options(target, dataset, **options)
-    with show.progress(json) as progress:
+    with log_to_file(dataset / DETECTIONS / LOG, command_line()), show.progress(json) as progress:
         run = detect_folder(
             dataset, detector, unit=unit, pictures=pictures, pattern=pattern, overlays=overlays, restart=restart,
             progress=progress,

@@ -11,9 +11,10 @@ import typer
 from rich.table import Table
 
 from implicam.cli import show
-from implicam.cli.app import Json, Seed, command, must_be_folder
+from implicam.cli.app import LOG, Json, Seed, command, command_line, must_be_folder
 from implicam.errors import UsageError
 from implicam.formatting import decimal_number
+from implicam.logs import log_to_file
 
 
 class Experiment(StrEnum):
@@ -63,7 +64,7 @@ def paper_command(
     chosen = EXPERIMENTS if experiment is Experiment.all else (experiment.value,)
     source = Source.of(data, seed)
     try:
-        with show.progress(json) as progress:
+        with log_to_file(output / LOG, command_line()), show.progress(json) as progress:
             made = reproduce(chosen, output, source, plan, jobs=jobs, scheduler=scheduler, progress=progress)
     except KeyboardInterrupt:
         show.say(f"interrupted; what was done is kept in {output / 'cells'}: the same command goes on from there")

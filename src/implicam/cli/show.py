@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import sys
 from collections import Counter
@@ -33,10 +34,11 @@ from implicam.detect.folder import DetectionRun
 from implicam.evaluation import Evaluation
 from implicam.formatting import decimal_number, json_safe, percent
 from implicam.measurement import Measurement
-from implicam.progress import Progress, silent
+from implicam.progress import Progress
 from implicam.verdict import Verdict
 
 MOST_NOTES = 6
+_LOG = logging.getLogger(__name__)
 err = Console(stderr=True, highlight=False)
 
 
@@ -47,9 +49,9 @@ def out(width: int | None = None) -> Console:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Progress]:
-    """A progress bar on stderr with the time left; nothing where nobody watches."""
+    """A progress bar on stderr with the time left, where there is a terminal; each step is logged."""
     if quiet or not err.is_terminal:
-        yield silent
+        yield _log_step
         return
     times = (TimeElapsedColumn(), TimeRemainingColumn())
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times)
@@ -57,11 +59,16 @@ def progress(quiet: bool = False) -> Iterator[Progress]:
         tasks: dict[str, Any] = {}
 
         def step(what: str, done: int, total: int) -> None:
+            _log_step(what, done, total)
             if what not in tasks:
                 tasks[what] = bars.add_task(escape(what), total=total)
             bars.update(tasks[what], completed=done, total=total)
 
         yield step
+
+
+def _log_step(what: str, done: int, total: int) -> None:
+    _LOG.info("%s: %d of %d", what, done, total)
 
 
 def emit_json(value: Any) -> None:

@@ -9,6 +9,7 @@ at any time from any thread: it is a frozen value that is replaced, never change
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -33,6 +34,8 @@ from implicam.images import blank
 from implicam.progress import Progress, silent
 from implicam.session.detections import Look, reject_implausible
 from implicam.session.journal import Session
+
+_LOG = logging.getLogger(__name__)
 
 CALIBRATION, REPORT = "calibration.implicam", "report.html"
 
@@ -344,6 +347,7 @@ class SessionController:
     @contextmanager
     def _working(self, phase: str, message: str) -> Iterator[None]:
         before = self.state
+        _LOG.info("%s: %s", phase, message)
         self._show(phase=phase, message=message)
         try:
             yield

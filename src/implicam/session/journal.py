@@ -13,6 +13,7 @@ written again where they do not say what the database says.
 from __future__ import annotations
 
 import json
+import logging
 import re
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,6 +41,8 @@ from implicam.session.database import (
     read_accepted,
     read_cameras,
 )
+
+_LOG = logging.getLogger(__name__)
 
 __all__ = ["Event", "Session", "Skipped"]
 
@@ -187,6 +190,7 @@ class Session:
     def log(self, what: str, /, **more: Any) -> None:
         """Keep an event with its time."""
         text = json_text(more, f"the event {what!r}")
+        _LOG.info("%s %s", what, text)
         with self._lock, self._database.transaction():
             self._database.run("INSERT INTO events (time, what, more) VALUES (?, ?, ?)", now(), what, text)
 

@@ -5,6 +5,7 @@ The order of docs/method.md, section "Fit".
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -37,6 +38,8 @@ from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.normal_equations import CameraFailedError
 from implicam.rig_model.posterior import Posterior
 from implicam.threads import side_by_side
+
+_LOG = logging.getLogger(__name__)
 
 AUTO = "auto"
 """The kind of each camera is chosen by the data."""
@@ -157,6 +160,8 @@ def _fit_from_start(
     cameras = tuple(started)
     mine, settings = training.of_cameras(cameras), training.settings
     models = tuple(lens_only_model(start, image) for start, image in zip(started.values(), mine.images, strict=True))
+    for c, start in started.items():
+        _LOG.info("%s starts from %d of %d views", training.names[c], start.inliers.sum(), len(start.inliers))
     progress("fitting", 1, 3)
     guess = before.hyperparameters if before is not None and before.cameras == cameras else None
     inliers = tuple(start.inliers for start in started.values())
@@ -173,6 +178,7 @@ def _fit_from_start(
             limit = settings.max_squared_mahalanobis
             judged = update_inliers(state.posterior, mine.points, mine.camera_views, state.inliers, limit)
         changed = float(np.mean(np.concatenate(judged) != np.concatenate(state.inliers)))
+        _LOG.info("round %d: %.1f %% of the views changed sides%s", number, 100 * changed, ", settled" * state.settled)
         if state.settled and not changed:
             break
         progress("fitting", 2, 3)
