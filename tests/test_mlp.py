@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from implicam.calibrators import MLP, MLPCalibration, load_calibration
-from implicam.calibrators.mlp_network import HIDDEN, Network, draw_masks, layer_shapes
+from implicam.calibrators.mlp_network import HIDDEN, SLOPE, Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import (
     CHECK_EVERY,
-    Backpropagation,
     Examples,
     _Batch,
     _Masks,
-    forward,
+    gradients,
     initial_weights,
     train,
 )
@@ -171,37 +170,28 @@ def test_masks_switch_off_the_share_and_keep_the_mean() -> None:
 # the training
 
 
-def test_its_gradients_are_those_of_autograd() -> None:
-    """In float64, with masks and without; the losses of the three networks apart, so that none gets another's slope."""
+def test_its_gradients_are_those_of_the_chain_rule() -> None:
+    """In float64, with masks and without: NumPy, one network at a time, so that none gets another's slope."""
     rng = np.random.default_rng(0)
     starts = [initial_weights(4, rng) for _ in range(3)]
-    parameters = [torch.tensor(np.stack(arrays)) for arrays in zip(*starts, strict=True)]
-    X, Y = torch.tensor(rng.normal(size=(3, 7, 4))), torch.tensor(rng.normal(size=(3, 7, 3)))
-    masks = [torch.tensor((rng.random((3, 7, width)) >= 0.3) / 0.7) for width in HIDDEN]
-    written = [torch.full_like(parameter, torch.nan) for parameter in parameters]
-    gradients = Backpropagation(torch, parameters, written, 7)
-    for given in (masks, (), masks):
-        gradients(X, Y, given)
+    parameters = [torch.tensor(np.stack(arrays)).requires_grad_() for arrays in zip(*starts, strict=True)]
+    X, Y = rng.normal(size=(3, 7, 4)), rng.normal(size=(3, 7, 3))
+    masks = [(rng.random((3, 7, width)) >= 0.3) / 0.7 for width in HIDDEN]
+    for given in (masks, [np.ones_like(mask) for mask in masks]):
+        tensors = [torch.tensor(mask) for mask in given] if given is masks else ()
+        found = gradients(torch, parameters, torch.tensor(X), torch.tensor(Y), tensors)
         for i in range(3):
-            theirs = [parameter[i].clone().requires_grad_() for parameter in parameters]
-            hidden = X[i]
-            for layer, (weight, bias) in enumerate(zip(theirs[::2], theirs[1::2], strict=True)):
-                hidden = hidden @ weight + bias
-                if layer < len(HIDDEN):
-                    hidden = torch.nn.functional.leaky_relu(hidden) * (given[layer][i] if given else 1)
-            torch.nn.functional.mse_loss(hidden, Y[i]).backward()
-            np.testing.assert_allclose(gradients.outputs[-1][i], hidden.detach(), rtol=0, atol=1e-13)
-            for found, expected in zip(written, theirs, strict=True):
-                np.testing.assert_allclose(found[i], expected.grad, rtol=0, atol=1e-14)
-
-
-def test_the_prediction_is_not_overwritten_by_the_next() -> None:
-    parameters = [torch.tensor(a[None]) for a in initial_weights(4, np.random.default_rng(0))]
-    X = torch.tensor(np.random.default_rng(1).normal(size=(1, 7, 4)))
-    first = forward(torch, parameters, X)[-1]
-    before = first.clone()
-    forward(torch, parameters, -X)
-    np.testing.assert_array_equal(first, before)
+            weights, biases = starts[i][::2], starts[i][1::2]
+            inputs, factors = [X[i]], []
+            for weight, bias, mask in zip(weights, biases, given, strict=False):
+                sums = inputs[-1] @ weight + bias
+                factors.append(np.where(sums > 0, 1, SLOPE) * mask[i])
+                inputs.append(sums * factors[-1])
+            slope = 2 / 21 * (inputs[-1] @ weights[-1] + biases[-1] - Y[i])
+            for layer in reversed(range(len(weights))):
+                np.testing.assert_allclose(found[2 * layer][i], inputs[layer].T @ slope, rtol=0, atol=1e-14)
+                np.testing.assert_allclose(found[2 * layer + 1][i, 0], slope.sum(axis=0), rtol=0, atol=1e-14)
+                slope = slope @ weights[layer].T * (factors[layer - 1] if layer else 1)
 
 
 def test_a_network_that_stays_is_not_disturbed_by_others_that_leave() -> None:

@@ -6,9 +6,6 @@ stopping on points kept aside, the best weights restored. In trials on other sim
 learning rates from 3e-4 to 1e-2, constant or falling as a cosine, weight decay of 0.01, batches of 32 points and 10 to
 20 % of the points kept aside changed the error by a few percent or made it worse; initial weights after He doubled it.
 The dropout of 0.2 costs most: without it the error is two to three times smaller where there are many points.
-
-The gradients are written out, into memory that every step uses again. PyTorch's autograd takes new memory in each step:
-with 50 networks of 157 points a step was then 25 % longer.
 """
 
 from __future__ import annotations
@@ -118,53 +115,32 @@ def _layers(lines: Any, inputs: int) -> list[Any]:
     ]
 
 
-def forward(
-    torch: Any, parameters: Sequence[Any], X: Any, masks: Sequence[Any] = (), into: Sequence[Any] = (None,) * LAYERS
-) -> list[Any]:
-    """Outputs (networks, n, units) of every layer for X (networks, n, d), of the hidden ones times their masks.
+def forward(torch: Any, parameters: Sequence[Any], X: Any, masks: Sequence[Any] = ()) -> Any:
+    """Outputs of every network.
 
-    masks: one (networks, n, units) for each hidden layer, or none. into: memory for the outputs.
+    Args:
+        torch: The module.
+        parameters: Weight (networks, inputs, outputs), bias (networks, 1, outputs), weight, ... of the layers.
+        X: Standardised inputs (networks, n, d).
+        masks: The factors (networks, n, units) of each hidden layer, zero or positive; or none.
+
+    Returns:
+        Standardised outputs (networks, n, 3).
     """
-    outputs: list[Any] = []
     for layer in range(LAYERS):
-        X = torch.baddbmm(parameters[2 * layer + 1], X, parameters[2 * layer], out=into[layer])
+        X = torch.baddbmm(parameters[2 * layer + 1], X, parameters[2 * layer])
         if layer < len(HIDDEN):
-            torch.nn.functional.leaky_relu_(X, SLOPE)
-            if masks:
-                X.mul_(masks[layer])
-        outputs.append(X)
-    return outputs
+            # a leaky ReLU of m x is m times that of x where m >= 0: in this order both can be done in place
+            X = torch.nn.functional.leaky_relu_(X.mul_(masks[layer]) if masks else X, SLOPE)
+    return X
 
 
-class Backpropagation:
-    """Gradients of every network's mean squared error on n points, written into tensors shaped as `parameters`."""
-
-    def __init__(self, torch: Any, parameters: Sequence[Any], gradients: Sequence[Any], n: int) -> None:
-        self.torch, self.parameters, self.gradients = torch, parameters, gradients
-        biases = parameters[1::2]
-        self.outputs, self.slopes = ([b.new_empty(len(b), n, b.shape[2]) for b in biases] for _ in range(2))
-
-    def __call__(self, X: Any, Y: Any, masks: Sequence[Any]) -> None:
-        """X (networks, n, d), Y (networks, n, 3); masks as `forward` takes them."""
-        predicted = forward(self.torch, self.parameters, X, masks, self.outputs)[-1]
-        slope = self.torch.sub(predicted, Y, out=self.slopes[-1]).mul_(2 / Y[0].numel())
-        for layer in reversed(range(LAYERS)):
-            below = self.outputs[layer - 1] if layer else X
-            self.torch.bmm(below.transpose(1, 2), slope, out=self.gradients[2 * layer])
-            self.torch.sum(slope, 1, keepdim=True, out=self.gradients[2 * layer + 1])
-            if layer:
-                slope = self._through(layer, slope, masks)
-
-    def _through(self, layer: int, slope: Any, masks: Sequence[Any]) -> Any:
-        """From the slope at the sums of `layer` to the slope at the sums of the layer below."""
-        below, weight = self.slopes[layer - 1], self.parameters[2 * layer]
-        self.torch.bmm(slope, weight.transpose(1, 2), out=below)
-        if masks:
-            below.mul_(masks[layer - 1])
-        # a leaky ReLU keeps the sign, so its output tells its slope; where a mask made that 0, `below` is 0 as well
-        return self.torch.ops.aten.leaky_relu_backward.grad_input(
-            below, self.outputs[layer - 1], SLOPE, True, grad_input=below
-        )
+def gradients(torch: Any, parameters: Sequence[Any], X: Any, Y: Any, masks: Sequence[Any] = ()) -> tuple[Any, ...]:
+    """Gradients of every network's mean squared error, shaped as `parameters`; Y is (networks, n, 3), the rest as in
+    `forward`."""
+    predicted = forward(torch, parameters, X, masks)
+    # a network's weights are in no loss but its own
+    return torch.autograd.grad(torch.nn.functional.mse_loss(predicted, Y, reduction="sum") / Y[0].numel(), parameters)
 
 
 class _Masks:
@@ -216,7 +192,10 @@ class _Batch:
         self.weights, weights.grad = weights, self.torch.zeros_like(weights)
         self.optimiser = self.torch.optim.Adam([weights], lr=LEARNING_RATE, fused=True)
         self.parameters = _layers(weights, inputs)
-        self.gradients = Backpropagation(self.torch, self.parameters, _layers(weights.grad, inputs), n)
+        for parameter in self.parameters:
+            parameter.requires_grad_()
+        numbers = sum(fan_out * (fan_in + 1) for fan_in, fan_out in layer_shapes(inputs))
+        self.filling = weights.new_zeros(len(weights), weights.shape[1] - numbers)
         self.masks = _Masks(self.torch, [self.streams[i] for i in self.running], n, self.dropout)
 
     def train(self, epochs: int, patience: int) -> Iterator[int]:
@@ -239,13 +218,15 @@ class _Batch:
     def _step(self) -> None:
         """One step of each running network on all its points."""
         X, Y = self.training
-        self.gradients(X, Y, self.masks.draw())
+        found = gradients(self.torch, self.parameters, X, Y, self.masks.draw())
+        self.torch.cat([*(one.flatten(1) for one in found), self.filling], 1, out=self.weights.grad)
         self.optimiser.step()
 
     def _check(self, epoch: int, patience: int) -> None:
         """Note the weights that do better than before on the points kept aside, and stop who has not for too long."""
         X, Y = self.checking
-        losses = _mean_squares(forward(self.torch, self.parameters, X)[-1], Y).numpy()
+        with self.torch.no_grad():
+            losses = ((forward(self.torch, self.parameters, X) - Y) ** 2).mean(dim=(1, 2)).numpy()
         better = losses < self.losses[self.running]
         improved = self.running[better]
         self.losses[improved], self.epochs[improved] = losses[better], epoch
@@ -261,8 +242,3 @@ class _Batch:
         state = self.optimiser.state[self.weights]
         self._prepare(self.weights[which])
         self.optimiser.state[self.weights] = {name: x[which] if x.ndim else x for name, x in state.items()}
-
-
-def _mean_squares(predicted: Any, Y: Any) -> Any:
-    """(networks,) mean squared error over points and axes."""
-    return ((predicted - Y) ** 2).mean(dim=(1, 2))
