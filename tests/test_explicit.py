@@ -16,7 +16,7 @@ from implicam.calibrators.explicit import Explicit, ExplicitCalibration, calibra
 from implicam.calibrators.explicit.adjust import spreads
 from implicam.calibrators.explicit.align import icp
 from implicam.calibrators.explicit.boards import Boards, boards_of
-from implicam.calibrators.explicit.network import Network, calibrate_network
+from implicam.calibrators.explicit.camera_groups import CameraGroup, calibrate_largest_group
 from implicam.coverage import assess
 from implicam.dataset import Dataset, KnownPositions, Observations, arrays_from_dataset
 from implicam.errors import CalibrationFileError, DatasetError, FitError, UsageError
@@ -54,18 +54,18 @@ def fisheyes() -> tuple[Rig, Dataset]:
 
 
 @cache
-def network() -> Network:
-    return calibrate_network(boards_of(fisheyes()[1]), "auto")
+def largest_group() -> CameraGroup:
+    return calibrate_largest_group(boards_of(fisheyes()[1]), "auto")
 
 
 def points(rig: Rig, n: int, seed: int, **options: Any) -> Dataset:
     return simulate(rig, random_positions(rig, n, np.random.default_rng(seed)), seed=seed, **options)
 
 
-def test_the_network_finds_where_the_cameras_are() -> None:
+def test_the_group_knows_where_the_cameras_are() -> None:
     rig, _ = fisheyes()
     first = rig.cameras[0].camera_from_world
-    found = network()
+    found = largest_group()
     sd = np.sqrt(np.diag(found.root.T @ found.root))
     starts = found.bundle.starts
     for c, camera in enumerate(rig.cameras):
@@ -86,7 +86,7 @@ def test_pairs_agree_with_opencvs_multiview_calibration() -> None:
     """cv2.calibrateMultiview keeps intrinsics, wants metres, one lens family and whole boards: poses for our lenses."""
     rig = build_rig("bar6", seed=4, lens_error=0.0, cameras="2R")
     data = simulate_boards(rig, [("cam2", "cam3")] * 12, seed=5)
-    ours = calibrate_network(boards_of(data), "brown-conrady").bundle
+    ours = calibrate_largest_group(boards_of(data), "brown-conrady").bundle
     lenses = [camera.lens for camera in ours.cameras]
     uv = data.observations.uv.reshape(12, 88, 2, 2).transpose(2, 0, 1, 3)
     flat = np.column_stack([np.arange(88) % 11, np.arange(88) // 11, np.zeros(88)]).astype(np.float32) * 0.01329
@@ -118,7 +118,7 @@ def test_a_camera_that_cannot_be_joined_is_left_out_with_the_reason() -> None:
     uv[both, 3] = np.nan  # cam5 never at the same time as another
     uv[np.flatnonzero(np.isfinite(uv[:, 2, 0]))[88 * 2 :], 2] = np.nan  # cam4, at the other end, in two pictures only
     hidden = replace(data, observations=replace(data.observations, uv=uv, sd=np.full(uv.shape, np.nan), extra={}))
-    found = calibrate_network(boards_of(hidden), "auto")
+    found = calibrate_largest_group(boards_of(hidden), "auto")
     names = rig_names(rig)
     reasons = {names[c]: why for c, why in found.uncalibrated}
     assert "no board at the same time" in reasons["cam5"]
@@ -145,7 +145,7 @@ def test_pictures_of_other_instants_name_the_camera() -> None:
         uv[shots == s, 3] = picture
     mixed = replace(data, observations=replace(data.observations, uv=uv, sd=np.full(uv.shape, np.nan), extra={}))
     with pytest.raises(FitError, match="the cameras contradict each other: cam") as caught:
-        calibrate_network(boards_of(mixed), "auto")
+        calibrate_largest_group(boards_of(mixed), "auto")
     assert "same instants" in caught.value.fix
 
 
@@ -657,4 +657,4 @@ def test_evaluate_takes_it_like_any_other() -> None:
     rig, _ = pair()
     overall = evaluate(from_boards(), points(rig, 50, 9)).coverage.overall
     assert overall.n == 50
-    assert spreads(network().bundle).max() < 0.25
+    assert spreads(largest_group().bundle).max() < 0.25

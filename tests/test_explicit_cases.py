@@ -14,7 +14,7 @@ import pytest
 from implicam.calibrators import load_calibration
 from implicam.calibrators.explicit import Explicit, ExplicitCalibration, rig_of
 from implicam.calibrators.explicit.boards import boards_of
-from implicam.calibrators.explicit.network import Network, calibrate_network
+from implicam.calibrators.explicit.camera_groups import CameraGroup, calibrate_largest_group
 from implicam.calibrators.explicit.zhang import calibrate_camera
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
 from implicam.errors import FitError
@@ -70,12 +70,12 @@ def in_the_room(count: int, seed: int, noise: float = 0.2, sd: float = 0.0) -> D
     return Dataset("room", "mm", seen, KnownPositions(names, told, np.full(xyz.shape, sd if sd else np.nan)))
 
 
-def pose_error(network: Network) -> float:
+def pose_error(group: CameraGroup) -> float:
     """Squared error of the second camera's pose in its own covariance: 6 is right."""
-    pose = network.bundle.cameras[1].pose
+    pose = group.bundle.cameras[1].pose
     turn = vector_from_rotation(POSES[1].rotation @ pose.rotation.T)
     off = np.concatenate([turn, POSES[1].translation - pose.translation])
-    return float(off @ np.linalg.solve((network.root.T @ network.root)[-6:, -6:], off))
+    return float(off @ np.linalg.solve((group.root.T @ group.root)[-6:, -6:], off))
 
 
 # pixels that are not square
@@ -142,7 +142,7 @@ def test_boards_find_pixels_of_any_shape_as_opencv_does() -> None:
     """Truth: fx 195, fy 231, centre (134.5, 89.5), baseline 90 mm, 4 degrees. cv2 has fewer unknowns, no prior."""
     data = read_dataset(CASES / "nonsquare-boards")
     boards = boards_of(data)
-    found = calibrate_network(boards, "auto").bundle
+    found = calibrate_largest_group(boards, "auto").bundle
     for c, camera in enumerate(found.cameras):
         views = boards.of_camera(c)
         flat, seen = ([getattr(view, what).astype(np.float32) for view in views] for what in ("xyz", "uv"))
@@ -162,7 +162,9 @@ def test_one_camera_stretched_to_the_size_of_the_other() -> None:
     data = held(3)
     uv = data.observations.uv.copy()
     uv[:, 0, 1] *= 0.679
-    found = calibrate_network(boards_of(with_uv(data, uv, (Camera("ir", 1280, 489), Camera("cam2", *SIZE)))), "auto")
+    found = calibrate_largest_group(
+        boards_of(with_uv(data, uv, (Camera("ir", 1280, 489), Camera("cam2", *SIZE)))), "auto"
+    )
     assert [found.choices[c].pixels for c in range(2)] == ["stretched", "square"]
     lens = found.bundle.cameras[0].lens
     assert lens.fy / lens.fx == pytest.approx(0.679, abs=0.002)
@@ -218,16 +220,16 @@ def test_neither_camera_is_to_blame() -> None:
 ])  # fmt: skip
 def test_error_bars_hold_what_moved_between_two_pictures(moved: float, doubted: bool) -> None:
     """Six rigs; without the boards' own movement in the covariance 0.3 mm made this 55 instead of 6."""
-    found = [calibrate_network(boards_of(held(seed, moved=moved)), "brown-conrady") for seed in range(6)]
-    assert 2.5 < np.mean([pose_error(network) for network in found]) < 11
-    assert all(bool(network.doubts) == doubted for network in found)
+    found = [calibrate_largest_group(boards_of(held(seed, moved=moved)), "brown-conrady") for seed in range(6)]
+    assert 2.5 < np.mean([pose_error(group) for group in found]) < 11
+    assert all(bool(group.doubts) == doubted for group in found)
 
 
 def test_cameras_of_one_rig_may_have_noise_of_their_own() -> None:
     data = held(1)
     uv = data.observations.uv.copy()
     uv[:, 1] += np.random.default_rng(0).normal(scale=0.3, size=uv[:, 1].shape)
-    found = calibrate_network(boards_of(with_uv(data, uv)), "brown-conrady")
+    found = calibrate_largest_group(boards_of(with_uv(data, uv)), "brown-conrady")
     assert not found.doubts
     np.testing.assert_allclose(found.bundle.noise, [0.05, 0.304], rtol=0.15)
 
@@ -242,7 +244,7 @@ def test_a_video_that_starts_one_picture_late() -> None:
     uv = shot_by_shot(held(3))
     uv[:, :, 1] = np.roll(uv[:, :, 1], 1, axis=0)
     with pytest.raises(FitError, match=r"cam1 and cam2: alone 0\.\d+ px, together \d+ px") as caught:
-        calibrate_network(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
+        calibrate_largest_group(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
     assert "same instants" in caught.value.fix
 
 
@@ -251,13 +253,13 @@ def test_corners_counted_from_the_other_end_in_some_pictures() -> None:
     uv = shot_by_shot(held(3))
     uv[::2, :, 1] = uv[::2, ::-1, 1]
     with pytest.raises(FitError, match="alone 0"):
-        calibrate_network(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
+        calibrate_largest_group(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
 
 
 def test_two_pictures_exchanged_among_eleven() -> None:
     uv = shot_by_shot(held(3))
     uv[[0, 1], :, 1] = uv[[1, 0], :, 1]
-    found = calibrate_network(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
+    found = calibrate_largest_group(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
     assert {row // 18 for row, _, _ in found.wrong} == {0, 1}
     assert not found.doubts
     assert pose_error(found) < 20
@@ -274,7 +276,7 @@ def test_a_webcam_that_flips_its_pictures(counted_anew: bool) -> None:
     if counted_anew:
         uv[:, :, 1] = uv[:, :, 1].reshape(-1, 3, 6, 2)[:, :, ::-1].reshape(-1, 18, 2)
     with pytest.raises(FitError, match="the pictures of one of cam1 and cam2 are mirrored"):
-        calibrate_network(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
+        calibrate_largest_group(boards_of(with_uv(held(3), uv.reshape(-1, 2, 2))), "auto")
 
 
 def flipped(data: Dataset, cameras: list[int], axis: int) -> Dataset:

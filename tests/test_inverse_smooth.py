@@ -10,7 +10,7 @@ import pytest
 
 from implicam.calibrators import InverseGP, InverseGPCalibration, load_calibration
 from implicam.calibrators.inverse_maps import SmoothMap, is_principal
-from implicam.calibrators.pixel_cloud import FAR, PixelCloud
+from implicam.calibrators.pixel_cloud import MAX_DISTANCE_RATIO, PixelCloud
 from implicam.dataset import Dataset, read_dataset
 from implicam.evaluation import evaluate
 from implicam.gp import Kernel, Kriging, LengthscalePrior, Smoothness, most_probable
@@ -165,7 +165,7 @@ def test_farness_is_that_of_the_farthest_known_point_and_knows_no_units() -> Non
     pixels, new = (d.observations.uv[d.observations.seen.all(axis=1)].reshape(-1, 12) for d in (known, others))
     far = PixelCloud.of(pixels).farness(new)
     assert np.median(far) < 1
-    assert far.max() < FAR
+    assert far.max() < MAX_DISTANCE_RATIO
     np.testing.assert_allclose(PixelCloud.of(3 * pixels + 7).farness(3 * new + 7), far, rtol=1e-6)
 
 

@@ -15,7 +15,7 @@ import pytest
 from implicam.calibrators import MLP, MLPCalibration, load_calibration
 from implicam.calibrators.mlp_network import HIDDEN, SLOPE, Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import (
-    CHECK_EVERY,
+    CHECK_EVERY_EPOCHS,
     Examples,
     _Batch,
     _Masks,
@@ -233,7 +233,7 @@ def test_training_is_the_usual_loop_of_torch() -> None:
         optimiser.step()
         with torch.no_grad():
             losses.append(torch.nn.functional.mse_loss(model(X[check]), Y[check]).item())
-    assert ours.epoch == CHECK_EVERY * (1 + int(np.argmin(losses[CHECK_EVERY - 1 :: CHECK_EVERY])))
+    assert ours.epoch == CHECK_EVERY_EPOCHS * (1 + int(np.argmin(losses[CHECK_EVERY_EPOCHS - 1 :: CHECK_EVERY_EPOCHS])))
     assert ours.loss == pytest.approx(losses[ours.epoch - 1], rel=1e-3)
 
 
@@ -300,7 +300,7 @@ def test_it_stops_early_and_restores_the_best_weights() -> None:
 def test_no_weight_is_fitted_to_the_points_kept_for_early_stopping() -> None:
     run = examples()
     other = run._replace(Y=np.where(run.held_out[:, None], 50.0, run.Y), X=np.where(run.held_out[:, None], -1.0, run.X))
-    (a,), (b,) = (train([r], 0.2, silent, epochs=CHECK_EVERY) for r in (run, other))
+    (a,), (b,) = (train([r], 0.2, silent, epochs=CHECK_EVERY_EPOCHS) for r in (run, other))
     same_network(a.network, b.network)
     assert b.loss > 100 * a.loss
 

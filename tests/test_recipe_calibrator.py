@@ -28,7 +28,7 @@ from implicam.calibrators import (
     Unused,
     calibrator,
 )
-from implicam.calibrators.inverse_gp import blind_reasons, lattice_note, pixels_of, seen_by_all
+from implicam.calibrators.inverse_gp import lattice_note, missing_view_reasons, pixels_of, seen_by_all
 from implicam.calibrators.protocol import finite_column, option, per_axis
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.dataset.requirements import require_points, same_cameras
@@ -95,7 +95,7 @@ class AffineCalibration(CalibrationBase):
         xyz = np.column_stack([np.ones(n), (uv - self.offset) / self.scale]) @ self.slopes
         cov = np.tile(self.errors.T @ self.errors / max(1, len(self.errors) - len(self.slopes)), (n, 1, 1))
         cov[~seen.all(axis=1)] = np.nan
-        reasons = blind_reasons(seen, observations.camera_names, self.method)
+        reasons = missing_view_reasons(seen, observations.camera_names, self.method)
         no_p_value = np.full(n, np.nan)
         return Measurement(observations.points, xyz, cov, seen.sum(axis=1), no_p_value, reasons, self.data.length_unit)
 

@@ -21,31 +21,31 @@ from implicam.errors import FitError
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-FLAT = 1e-3
+MAX_FLAT_EXTENT_RATIO = 1e-3
 """Points whose extent in one direction is less than this part of the largest are taken as flat (or a line)."""
 
-FEWEST = 6
+MIN_POINTS = 6
 """Known points that fix the 11 numbers of a camera matrix."""
 
-ENOUGH = 120
+MAX_RESECTION_POINTS = 120
 """Points beyond which a rough resection gains nothing."""
 
-UNDETERMINED = 1e-14
+MIN_EIGENVALUE_RATIO = 1e-14
 """The second-smallest eigenvalue, as a part of the largest, below which the null space is not one vector."""
 
-SUBSETS_OF_LINEAR = 40
+LINEAR_SUBSETS = 40
 """Random subsets of seven points that a linear resection tries: with a fifth of wrong views eight of them hold none."""
 
-FAR_OUT = 4.0
+MAX_PIXEL_DISTANCE_RATIO = 4.0
 """Times the distance from the middle that three quarters of the pixels keep: what is farther off is a wild view."""
 
-PINHOLE_TO = 1.2
+MAX_PINHOLE_ANGLE_RAD = 1.2
 """Radians off the axis beyond which no lens is a pinhole."""
 
-SUSPECT, FEW_SUSPECTS = 6.0, 0.08
+SUSPECT_ERROR_RATIO, MAX_SUSPECT_SHARE = 6.0, 0.08
 """Errors so many times the median are suspect; a larger part of suspects asks for random subsets."""
 
-POOR = 0.05
+POOR_ERROR_RATIO = 0.05
 """A median error that is this part of the median distance from the middle is no fit: it asks for them, too."""
 
 
@@ -109,7 +109,7 @@ def register(source: Floats, target: Floats) -> tuple[Pose, float]:
     """
     pair = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
     a, b = source[pair], target[pair]
-    if len(a) < 3 or min(_extents(a)[1], _extents(b)[1]) < FLAT:
+    if len(a) < 3 or min(_extents(a)[1], _extents(b)[1]) < MAX_FLAT_EXTENT_RATIO:
         raise FitError(
             f"{len(a)} pairs of points do not fix a rigid motion.",
             why="it takes three that are not on one line",
@@ -150,7 +150,7 @@ def resect_robustly(xyz: Floats, uv: Floats, *, subsets: bool = True) -> tuple[F
         p = resect(xyz[inliers], uv[inliers])
         error = _linear_error(p, xyz, uv)
         inside = error <= 4 * np.median(error[inliers])
-        if inside.sum() < FEWEST + 1 or (inside == inliers).all():
+        if inside.sum() < MIN_POINTS + 1 or (inside == inliers).all():
             break
         inliers = inside
     return p, np.asarray(inliers, dtype=np.bool_)
@@ -161,8 +161,8 @@ def _of_best_subset(xyz: Floats, uv: Floats) -> Bools:
     rng = np.random.default_rng(0)
     best, inliers = np.inf, np.ones(len(xyz), dtype=np.bool_)
     starts = [np.arange(len(xyz))]
-    if len(xyz) >= 2 * FEWEST:
-        starts += [rng.choice(len(xyz), FEWEST + 1, replace=False) for _ in range(SUBSETS_OF_LINEAR)]
+    if len(xyz) >= 2 * MIN_POINTS:
+        starts += [rng.choice(len(xyz), MIN_POINTS + 1, replace=False) for _ in range(LINEAR_SUBSETS)]
     for rows in starts:
         try:
             error = _linear_error(resect(xyz[rows], uv[rows]), xyz, uv)
@@ -234,7 +234,7 @@ def resect_affine(xyz: Floats, uv: Floats) -> tuple[Floats, Floats, Bools]:
         found = np.linalg.lstsq(_homogeneous(xyz[inliers]), uv[inliers], rcond=None)[0]
         error = np.linalg.norm(_homogeneous(xyz) @ found - uv, axis=1)
         inside = error <= 3 * np.median(error)
-        if inside.sum() < FEWEST or (inside == inliers).all() or _extents(xyz[inside])[2] < FLAT:
+        if inside.sum() < MIN_POINTS or (inside == inliers).all() or _extents(xyz[inside])[2] < MAX_FLAT_EXTENT_RATIO:
             break
         inliers = inside
     A, b = np.asarray(found[:3].T, dtype=np.float64), np.asarray(found[3], dtype=np.float64)
@@ -305,19 +305,19 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, su
     pinhole model for a ladder of focal lengths about `middle` (where the axis meets the image; else the middle of the
     pixels), a linear resection follows, and the best wins. Views far off are then left out and it is done again; where
     that is not enough, it starts from random `subsets` (RANSAC) too, which bears a third of wrong detections. At most
-    `ENOUGH` points are used, drawn at random but always the same. Fails as `resect`.
+    `MAX_RESECTION_POINTS` points are used, drawn at random but always the same. Fails as `resect`.
     """
     there = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
     rows = np.flatnonzero(there)
-    if len(rows) > ENOUGH:
-        rows = np.sort(np.random.default_rng(0).choice(rows, ENOUGH, replace=False))
+    if len(rows) > MAX_RESECTION_POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_RESECTION_POINTS, replace=False))
     _check_spread(xyz[rows])
     middle = np.quantile(uv[rows], (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
     points, offset = xyz[rows], uv[rows] - middle
     found, errors, keep = _trimmed(points, offset, np.ones(len(rows), dtype=np.bool_))
     bad = float(np.median(errors))
-    tolerable = POOR * float(np.median(np.linalg.norm(offset, axis=1)))
-    doubtful = bool(bad > tolerable or np.mean(errors > max(SUSPECT * bad, tolerable)) > FEW_SUSPECTS)
+    tolerable = POOR_ERROR_RATIO * float(np.median(np.linalg.norm(offset, axis=1)))
+    doubtful = bool(bad > tolerable or np.mean(errors > max(SUSPECT_ERROR_RATIO * bad, tolerable)) > MAX_SUSPECT_SHARE)
     if subsets and doubtful:
         for start in _by_subsets(points, offset):
             again = _trimmed(points, offset, start)
@@ -337,8 +337,8 @@ def resect_any_pixels(
     rms: in pixels of u. Where that ratio is 1, it is `resect_any_lens`."""
     there = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
     rows = np.flatnonzero(there)
-    if len(rows) > ENOUGH:
-        rows = np.sort(np.random.default_rng(0).choice(rows, ENOUGH, replace=False))
+    if len(rows) > MAX_RESECTION_POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_RESECTION_POINTS, replace=False))
     _check_spread(xyz[rows])
     middle = np.quantile(uv[rows], (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
 
@@ -358,7 +358,7 @@ def _trimmed(xyz: Floats, offset: Floats, keep: Bools) -> tuple[_Candidate, Floa
     for _ in range(4):
         found, errors = _best_lens(xyz, lenses, keep)
         inside = errors <= 2.5 * np.median(errors)
-        if inside.sum() < 2 * FEWEST or _extents(xyz[inside])[2] < FLAT or (inside == keep).all():
+        if inside.sum() < 2 * MIN_POINTS or _extents(xyz[inside])[2] < MAX_FLAT_EXTENT_RATIO or (inside == keep).all():
             break
         keep = inside
     return found, errors, keep
@@ -467,13 +467,14 @@ def candidate_rays(offset: Floats, every: int = 1) -> tuple[Floats, Bools, Float
     """A ladder of lenses: focal lengths (k,) in pixels, pinhole or equidistant (k,), and the unit rays (k, n, 3) that
     pixels (n, 2) off the middle then look along; every: only one rung in so many."""
     radius = np.linalg.norm(offset, axis=1)
-    outermost = float(radius[radius <= FAR_OUT * np.quantile(radius, 0.75)].max()) or 1.0  # no wild view decides
+    plausible = radius <= MAX_PIXEL_DISTANCE_RATIO * np.quantile(radius, 0.75)  # no wild view decides
+    outermost = float(radius[plausible].max()) or 1.0
     widest = np.geomspace(0.03, 2.5, 40)[::every]  # radians at the outermost point
     bent = outermost / widest[:, None]
     theta = radius / bent
     sideways = offset / bent[..., None] * np.sinc(theta / np.pi)[..., None]
     equidistant = np.concatenate([sideways, np.cos(theta)[..., None]], axis=2)
-    straight = outermost / np.tan(widest[widest < PINHOLE_TO, None])
+    straight = outermost / np.tan(widest[widest < MAX_PINHOLE_ANGLE_RAD, None])
     flat = np.concatenate([offset / straight[..., None], np.ones((len(straight), len(offset), 1))], axis=2)
     rays = np.concatenate([equidistant, flat / np.linalg.norm(flat, axis=2, keepdims=True)])
     focal = np.concatenate([bent, straight])[:, 0]
@@ -492,7 +493,7 @@ def _linear_cameras(points: Floats, rays: Floats) -> tuple[Floats, Bools]:
     across = np.sum(rays**2, axis=2)[..., None, None] * np.eye(3) - rays[..., :, None] * rays[..., None, :]
     normal = (across.reshape(k, n, 9).swapaxes(1, 2) @ outer).reshape(k, 3, 3, 4, 4).swapaxes(2, 3).reshape(k, 12, 12)
     values, vectors = np.linalg.eigh(normal)
-    determined = values[:, 1] >= UNDETERMINED * values[:, -1]
+    determined = values[:, 1] >= MIN_EIGENVALUE_RATIO * values[:, -1]
     return vectors[:, :, 0].reshape(k, 3, 4), np.asarray(determined, dtype=np.bool_)
 
 
@@ -510,14 +511,14 @@ def _seen(xyz: Floats, uv: Floats) -> tuple[Floats, Floats]:
 
 
 def _check_spread(xyz: Floats) -> None:
-    if len(xyz) < FEWEST:
+    if len(xyz) < MIN_POINTS:
         raise FitError(
-            f"{len(xyz)} known points are seen; a camera needs at least {FEWEST}.", fix="show it more known points"
+            f"{len(xyz)} known points are seen; a camera needs at least {MIN_POINTS}.", fix="show it more known points"
         )
-    if _extents(xyz)[2] < FLAT:
+    if _extents(xyz)[2] < MAX_FLAT_EXTENT_RATIO:
         raise FitError(
             f"the {len(xyz)} known points lie on one plane, which does not fix a camera.",
-            why=f"their smallest extent is less than {FLAT:g} of their largest",
+            why=f"their smallest extent is less than {MAX_FLAT_EXTENT_RATIO:g} of their largest",
             fix="add points at another depth",
         )
 

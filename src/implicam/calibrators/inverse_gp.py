@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_principal, learn_smooth
-from implicam.calibrators.pixel_cloud import FAR, FAR_FROM_A_PLANE, PixelCloud
+from implicam.calibrators.pixel_cloud import MAX_DISTANCE_RATIO, MAX_DISTANCE_RATIO_OF_PLANE, PixelCloud
 from implicam.calibrators.position_processes import PositionProcess, PositionProcesses
 from implicam.calibrators.protocol import (
     Arrays,
@@ -49,11 +49,11 @@ PRESETS = ("smooth", "plain", "paper")
 FORMER_PRESETS = {"standardised": "plain"}
 """Name in earlier versions -> name now."""
 AXES = "xyz"
-EXTENT = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
-THIN = 0.25
+UNIFORM_EXTENT_SDS = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
+MAX_THIN_ERROR_RATIO = 0.25
 """Errors of known points across their plane, over their thickness, at which little is learned of that direction."""
-SUSPECT = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
-LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
+SUSPECT_ERROR_SDS = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
+MIN_LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class InverseGP(CalibratorBase):
         default="smooth", metadata=option('smooth; "plain", the paper\'s model; "paper", its own software')
     )
     seed: int = 0
-    shortest_lengthscale: float = EXTENT
+    shortest_lengthscale: float = UNIFORM_EXTENT_SDS
 
     method: ClassVar[str] = "inverse-gp"
 
@@ -276,7 +276,7 @@ class InverseGPCalibration(CalibrationBase):
         others keep their row, with a reason."""
         observations = same_cameras(self.used.observations, observations)
         seen = observations.seen
-        reason = blind_reasons(seen, observations.camera_names, self.method).astype(object)
+        reason = missing_view_reasons(seen, observations.camera_names, self.method).astype(object)
         complete = np.flatnonzero(seen.all(axis=1))
         n = len(observations)
         xyz, cov = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
@@ -354,16 +354,16 @@ class InverseGPCalibration(CalibrationBase):
     def farthest(self) -> float:
         """How far pixels may be and still be measured: less where the known positions are nearly in one plane."""
         thickness, error = self._thickness
-        return FAR if error < THIN * thickness else FAR_FROM_A_PLANE
+        return MAX_DISTANCE_RATIO if error < MAX_THIN_ERROR_RATIO * thickness else MAX_DISTANCE_RATIO_OF_PLANE
 
     def _thin_note(self) -> list[str]:
         """A note on known points that are no thicker than what the pixels tell of them."""
         thickness, error = self._thickness
-        if error < THIN * thickness:
+        if error < MAX_THIN_ERROR_RATIO * thickness:
             return []
         unit = self.data.length_unit
         errors = self.map.leave_one_out()[0] * self.positions.scale
-        if (np.sqrt(np.mean(errors**2, axis=0)) > THIN * np.std(self._usable.xyz, axis=0)).all():
+        if (np.sqrt(np.mean(errors**2, axis=0)) > MAX_THIN_ERROR_RATIO * np.std(self._usable.xyz, axis=0)).all():
             return [
                 "The pixels tell little of any coordinate of the known positions: they are too few, or some are wrong."
             ]
@@ -378,7 +378,7 @@ class InverseGPCalibration(CalibrationBase):
         errors, variances = self.map.leave_one_out()
         worst = np.max(np.abs(errors) / np.sqrt(variances), axis=1)
         names = self.used.points[self.used.observations.seen.all(axis=1)]
-        found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > SUSPECT]
+        found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > SUSPECT_ERROR_SDS]
         if not found:
             return []
         more = f" and {len(found) - 5} more" if len(found) > 5 else ""
@@ -472,7 +472,7 @@ def scalings(arrays: Arrays, data: Dataset) -> tuple[Scaling, Scaling]:
     return pixels, positions
 
 
-def blind_reasons(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> Names:
+def missing_view_reasons(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> Names:
     """(n,) why a point was not measured, from seen (n, cameras); empty where every camera saw it."""
     reasons = ["" if row.all() else why_not_all_seen(row, names, method) for row in seen]
     return np.array(reasons, dtype=np.str_)
@@ -502,7 +502,7 @@ def lattice_note(data: Dataset, method: str) -> list[str]:
     lattice = [
         f"{axis} has {len(np.unique(values))} values"
         for axis, values in zip(AXES, data.xyz.T, strict=True)
-        if len(np.unique(values)) <= len(values) / LATTICE_REPEATS
+        if len(np.unique(values)) <= len(values) / MIN_LATTICE_REPEATS
     ]
     if not lattice:
         return []

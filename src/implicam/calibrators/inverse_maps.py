@@ -20,18 +20,18 @@ from implicam.threads import blas_threads, cores, side_by_side
 
 DEGREES_OF_FREEDOM = 3
 """Of a position, and so of the pixels of any number of cameras."""
-EVERY_BASIS = 100
+MAX_POINTS_FOR_BOTH_BASES = 100
 """Up to so many points both bases are tried, for both cost little; beyond, principal axes were always as good."""
-MEDIAN_ALONG_AXES, MEDIAN_PER_PIXEL = 6.0, 12.0
+MEDIAN_AXIS_LENGTHSCALE_SDS, MEDIAN_PIXEL_LENGTHSCALE_SDS = 6.0, 12.0
 """Median lengthscales: in standard deviations of a principal component, and of a pixel coordinate. A map that is
 linear up to a tenth over the image has about the first; the second only says the same of more coordinates."""
-COMMON_SD, OWN_SD = 1.0, 0.5
+COMMON_LOG_LENGTHSCALE_SD, OWN_LOG_LENGTHSCALE_SD = 1.0, 0.5
 """Prior sd of the log lengthscales: of all together, and of each beside."""
-LEAST_RESIDUALS = 8
+MIN_RESIDUALS = 8
 """The mean is not given a function more unless so many points are left to learn the covariance from."""
 
 
-SMALL = 3000
+MAX_POINTS_ON_ONE_THREAD = 3000
 """Points up to which several BLAS threads may lose more by waiting for each other than they gain."""
 
 
@@ -176,7 +176,7 @@ def _principal(X: Floats, spread: Floats) -> tuple[Floats, Floats]:
 def _mean_axes(X: Floats, spread: Floats) -> Floats:
     """(d, q) what the mean is linear in: up to three principal components, of unit size; fewer with few points."""
     directions, sd = _principal(X, spread)
-    q = min(DEGREES_OF_FREEDOM, int(np.sum(sd > 1e-9 * sd[0])), max(0, len(X) - 1 - LEAST_RESIDUALS))
+    q = min(DEGREES_OF_FREEDOM, int(np.sum(sd > 1e-9 * sd[0])), max(0, len(X) - 1 - MIN_RESIDUALS))
     return directions[:, :q] / sd[:q]
 
 
@@ -191,12 +191,14 @@ def _bases(X: Floats, spread: Floats, shortest: float) -> list[tuple[Floats, Len
     unit[:q] = sd[:q]
     leading = np.arange(d) < q
     rest = ~leading
-    covariance = np.diag(np.where(leading, COMMON_SD**2, OWN_SD**2)) + COMMON_SD**2 * np.outer(rest, rest)
+    covariance = np.diag(
+        np.where(leading, COMMON_LOG_LENGTHSCALE_SD**2, OWN_LOG_LENGTHSCALE_SD**2)
+    ) + COMMON_LOG_LENGTHSCALE_SD**2 * np.outer(rest, rest)
     principal = directions / np.maximum(unit, 1e-9 * sd[0])
-    found = [(principal, LengthscalePrior(np.full(d, MEDIAN_ALONG_AXES), covariance, shortest))]
-    if len(X) <= EVERY_BASIS:
-        alike = COMMON_SD**2 * np.ones((d, d)) + OWN_SD**2 * np.eye(d)
-        found.append((np.eye(d), LengthscalePrior(np.full(d, MEDIAN_PER_PIXEL), alike, shortest)))
+    found = [(principal, LengthscalePrior(np.full(d, MEDIAN_AXIS_LENGTHSCALE_SDS), covariance, shortest))]
+    if len(X) <= MAX_POINTS_FOR_BOTH_BASES:
+        alike = COMMON_LOG_LENGTHSCALE_SD**2 * np.ones((d, d)) + OWN_LOG_LENGTHSCALE_SD**2 * np.eye(d)
+        found.append((np.eye(d), LengthscalePrior(np.full(d, MEDIAN_PIXEL_LENGTHSCALE_SDS), alike, shortest)))
     return found
 
 
@@ -232,7 +234,7 @@ def learn_smooth(
 
 def few_threads(points: int) -> AbstractContextManager[None]:
     """One BLAS thread for matrices of so few points, on which several only wait for each other (threads.py)."""
-    return blas_threads(1 if points <= SMALL else cores())
+    return blas_threads(1 if points <= MAX_POINTS_ON_ONE_THREAD else cores())
 
 
 def is_principal(basis: Floats) -> bool:

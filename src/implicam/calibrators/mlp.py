@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from implicam.calibrators.inverse_gp import (
     Scaling,
-    blind_reasons,
     flat_note,
     lattice_note,
+    missing_view_reasons,
     pixels_of,
     scaling_arrays,
     scalings,
@@ -40,12 +40,12 @@ from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import blas_threads
 
-HELD_OUT = 0.15
+HELD_OUT_SHARE = 0.15
 """Share of the known points kept for early stopping, at least one."""
-PASSES = 200
+DROPOUT_PASSES = 200
 """Passes with dropout: a standard deviation is then known to 5 %."""
-MOST_DROPOUT = 0.9  # with more, many passes have no unit at work in the last layer
-WITHIN_95 = 1.959964  # standard deviations of a normal distribution
+MAX_DROPOUT = 0.9  # with more, many passes have no unit at work in the last layer
+INTERVAL_95_SDS = 1.959964  # standard deviations of a normal distribution
 SPLIT, SPREAD = 0, 3  # streams of random numbers of one seed; mlp_training.py has others
 
 
@@ -62,9 +62,9 @@ class MLP(CalibratorBase):
     method: ClassVar[str] = "mlp"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.dropout <= MOST_DROPOUT:
+        if not 0 <= self.dropout <= MAX_DROPOUT:
             raise UsageError(
-                f"dropout is {self.dropout!r}; it must be between 0 and {MOST_DROPOUT}.",
+                f"dropout is {self.dropout!r}; it must be between 0 and {MAX_DROPOUT}.",
                 why="it is the probability that a hidden unit is switched off",
                 fix="the paper has 0.2",
             )
@@ -129,7 +129,7 @@ def _split(n: int, seed: int) -> NDArray[np.bool_]:
     """(n,) which points are kept for early stopping."""
     held_out = np.zeros(n, dtype=np.bool_)
     order = np.random.default_rng([seed, SPLIT]).permutation(n)
-    held_out[order[: max(1, round(HELD_OUT * n))]] = True
+    held_out[order[: max(1, round(HELD_OUT_SHARE * n))]] = True
     return held_out
 
 
@@ -167,7 +167,7 @@ class MLPCalibration(CalibrationBase):
             cov,
             seen.sum(axis=1),
             np.full(n, np.nan),  # a map from all pixels to a position cannot ask whether the views agree
-            blind_reasons(seen, observations.camera_names, self.method),
+            missing_view_reasons(seen, observations.camera_names, self.method),
             self.data.length_unit,
         )
 
@@ -182,7 +182,7 @@ class MLPCalibration(CalibrationBase):
             squares = np.mean(self._held_out_errors**2, axis=0)
             return np.broadcast_to(np.diag(squares), (len(uv), 3, 3))
         rng = np.random.default_rng([self.calibrator.seed, SPREAD])
-        masks = draw_masks(rng, PASSES, self.calibrator.dropout)
+        masks = draw_masks(rng, DROPOUT_PASSES, self.calibrator.dropout)
         with blas_threads(1):
             spread = self.network.spread(self.pixels.apply(uv), masks)
         return spread * np.multiply.outer(self.positions.scale, self.positions.scale)
@@ -204,7 +204,7 @@ class MLPCalibration(CalibrationBase):
     @property
     def _coverage(self) -> float:
         """Share of the held-out coordinates within their 95 % interval."""
-        return float(np.mean(np.abs(self._held_out_errors) <= WITHIN_95 * self._held_out_sds))
+        return float(np.mean(np.abs(self._held_out_errors) <= INTERVAL_95_SDS * self._held_out_sds))
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration: always what its error bars are worth."""

@@ -22,13 +22,13 @@ from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.progress import Progress
 
-EPOCHS = 5000
+MAX_EPOCHS = 5000
 """At most; with dropout most networks have found their best weights within 1000."""
-PATIENCE = 1000
+PATIENCE_EPOCHS = 1000
 """Epochs without better weights after which a network stops."""
-CHECK_EVERY = 10
+CHECK_EVERY_EPOCHS = 10
 LAYERS = len(HIDDEN) + 1
-ALIGNED = 16
+ALIGNED_NUMBERS = 16
 """Numbers of a network are filled up to a multiple of this, the longest vector of a processor. Adam's fused step works
 on vectors and rounds the rest at the end differently: a network would depend on its place in the batch."""
 LEARNING_RATE = 1e-3
@@ -58,7 +58,12 @@ class Trained(NamedTuple):
 
 
 def train(
-    runs: Sequence[Examples], dropout: float, progress: Progress, *, epochs: int = EPOCHS, patience: int = PATIENCE
+    runs: Sequence[Examples],
+    dropout: float,
+    progress: Progress,
+    *,
+    epochs: int = MAX_EPOCHS,
+    patience: int = PATIENCE_EPOCHS,
 ) -> list[Trained]:
     """Train one network for each run; those of the same size as one batch.
 
@@ -102,7 +107,7 @@ def initial_weights(inputs: int, rng: np.random.Generator) -> list[Floats]:
 def _in_line(arrays: Sequence[Floats]) -> Floats:
     """(numbers,) of one network's weight, bias, weight, ..., filled up with zeros; `_layers` is the way back."""
     line = np.concatenate([array.ravel() for array in arrays])
-    return np.pad(line, (0, -len(line) % ALIGNED))
+    return np.pad(line, (0, -len(line) % ALIGNED_NUMBERS))
 
 
 def _layers(lines: Any, inputs: int) -> list[Any]:
@@ -140,7 +145,9 @@ def gradients(torch: Any, parameters: Sequence[Any], X: Any, Y: Any, masks: Sequ
     `forward`."""
     predicted = forward(torch, parameters, X, masks)
     # a network's weights are in no loss but its own
-    return torch.autograd.grad(torch.nn.functional.mse_loss(predicted, Y, reduction="sum") / Y[0].numel(), parameters)
+    loss = torch.nn.functional.mse_loss(predicted, Y, reduction="sum") / Y[0].numel()
+    found: tuple[Any, ...] = torch.autograd.grad(loss, parameters)
+    return found
 
 
 class _Masks:
@@ -202,7 +209,7 @@ class _Batch:
         """Train until every network has stopped; yields the epochs at which it looks."""
         for epoch in range(1, epochs + 1):
             self._step()
-            if epoch % CHECK_EVERY == 0 or epoch == epochs:
+            if epoch % CHECK_EVERY_EPOCHS == 0 or epoch == epochs:
                 self._check(epoch, patience)
                 yield epoch
             if not len(self.running):

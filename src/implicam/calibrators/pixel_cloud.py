@@ -14,15 +14,15 @@ import numpy as np
 
 from implicam.dataset import Floats
 
-FAR = 8.0
+MAX_DISTANCE_RATIO = 8.0
 """So many times as far as the farthest known point is from the others: nothing learned says what is there. In 36
 simulated rigs no point within the volume of 17 to 157 known points was beyond 6.6."""
-FAR_FROM_A_PLANE = 2.0
+MAX_DISTANCE_RATIO_OF_PLANE = 2.0
 """The same where known positions lie nearly in one plane: across it nothing is learned but noise."""
-LEADING = 2
-MARGIN = 8
+LEADING_COMPONENTS = 2
+MIN_SPARE_POINTS = 8
 """Points to spare before the sheet may be curved."""
-ROUNDING = 1e-9
+ROUNDING_SDS = 1e-9
 """Of the pixels' spread: differences below it are rounding."""
 
 
@@ -49,8 +49,8 @@ class PixelCloud:
         spread = np.sqrt(np.mean(X.var(axis=0)))
         directions = np.asarray(np.linalg.svd((X - offset) / spread)[2].T / spread)
         Z = (X - offset) @ directions
-        q = min(LEADING, d - 1)
-        degree = 2 if n >= _terms(Z[:1, :q], 2).shape[1] + MARGIN else 1
+        q = min(LEADING_COMPONENTS, d - 1)
+        degree = 2 if n >= _terms(Z[:1, :q], 2).shape[1] + MIN_SPARE_POINTS else 1
         B = _terms(Z[:, :q], degree)
         Q, _ = np.linalg.qr(B)
         residual = Z[:, q:] - Q @ (Q.T @ Z[:, q:])
@@ -65,9 +65,9 @@ class PixelCloud:
         """(k,) how far pixels (k, d) are off, in that of the farthest known point from all others."""
         Z = (X - self.offset) @ self.directions
         B = _terms(Z[:, : self.leading], self.degree)
-        told = 1.0 + np.einsum("ij,jk,ik->i", B, self.inverse, B)
+        variance_ratio = 1.0 + np.einsum("ij,jk,ik->i", B, self.inverse, B)
         off = np.linalg.norm((Z[:, self.leading :] - B @ self.coefficients) @ self.whiten, axis=1)
-        return np.asarray(off / np.sqrt(told) / self.farthest)
+        return np.asarray(off / np.sqrt(variance_ratio) / self.farthest)
 
 
 def _terms(T: Floats, degree: int) -> Floats:
@@ -78,12 +78,12 @@ def _terms(T: Floats, degree: int) -> Floats:
     return np.column_stack(columns)
 
 
-def _whitening(covariance: Floats, told: int) -> Floats:
-    """(r, r) that gives the scatter unit variance in its `told` largest directions; the others, of which few points
+def _whitening(covariance: Floats, directions: int) -> Floats:
+    """(r, r) that gives the scatter unit variance in so many of its largest directions; the others, of which few points
     know little, share the mean of theirs."""
     values, vectors = np.linalg.eigh(covariance)
-    values = np.maximum(values, ROUNDING**2)
-    least = max(0, len(values) - told)
+    values = np.maximum(values, ROUNDING_SDS**2)
+    least = max(0, len(values) - directions)
     if least:
         values[:least] = np.mean(values[:least])
     return np.asarray(vectors / np.sqrt(values))

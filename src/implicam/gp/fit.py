@@ -27,10 +27,11 @@ from implicam.gp.linalg import cholesky, factor_in_place, invert_in_place, solve
 from implicam.threads import side_by_side
 
 LONGEST, SHORTEST = 1e6, 0.05  # default lengthscale bounds, in standard deviations of an input
-ALIVE = 30.0  # beyond this a lengthscale has next to no gradient: a search must not start there
-NOISIEST = 10.0  # largest noise-to-signal ratio
-SUBSET = 80
-FEW, SEVERAL = 100, 300  # points: every search costs next to nothing; one on all data costs little
+MAX_START_LENGTHSCALE_SDS = 30.0  # beyond this a lengthscale has next to no gradient: a search must not start there
+MAX_NOISE_RATIO = 10.0  # largest noise-to-signal ratio
+SEARCH_SUBSET_POINTS = 80
+MAX_POINTS_FOR_FULL_SEARCH = 100  # every search costs next to nothing
+MAX_POINTS_FOR_ONE_FULL_SEARCH = 300  # one search on all data costs little
 _FAILED = 1e12
 
 
@@ -172,9 +173,9 @@ def maximise_each(
 
 
 def _ways(n: int) -> tuple[str, ...]:
-    if n <= FEW:
+    if n <= MAX_POINTS_FOR_FULL_SEARCH:
         return "from_short", "from_subset"  # the longer first, so that the last ones to end are short
-    return ("from_short",) if n <= SEVERAL else ("from_subset",)
+    return ("from_short",) if n <= MAX_POINTS_FOR_ONE_FULL_SEARCH else ("from_subset",)
 
 
 def _best(fits: list[Fit]) -> Fit:
@@ -216,11 +217,11 @@ class _Search:
         n, d = X.shape
         self.X, self.y, self.shape, self.d = X, y, shape, d
         self.all_data = ProfiledLikelihood(X, y, shape)
-        self.subset = np.random.default_rng(seed).permutation(n)[:SUBSET]
+        self.subset = np.random.default_rng(seed).permutation(n)[:SEARCH_SUBSET_POINTS]
         # Below this ratio rounding, about n times 1e-16, would make the Cholesky fail.
         quietest = max(1e-12, 20 * n * np.finfo(float).eps)
         self.low = np.append(np.full(d, np.log(shortest)), np.log(quietest))
-        self.high = np.append(np.full(d, np.log(LONGEST)), np.log(NOISIEST))
+        self.high = np.append(np.full(d, np.log(LONGEST)), np.log(MAX_NOISE_RATIO))
         self.evaluations: dict[int, int] = {}
         self.converged = True
 
@@ -263,7 +264,7 @@ class _Search:
     ) -> tuple[Floats, float]:
         start = np.clip(theta, self.low, self.high)
         if revive:
-            start[: self.d] = np.minimum(start[: self.d], max(np.log(ALIVE), self.low[0]))
+            start[: self.d] = np.minimum(start[: self.d], max(np.log(MAX_START_LENGTHSCALE_SDS), self.low[0]))
         unwhiten = self._whitening(start, len(likelihood.y)) if whiten else np.eye(self.d + 1)
 
         def whitened(z: Floats) -> tuple[float, Floats]:

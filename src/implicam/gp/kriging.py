@@ -23,15 +23,15 @@ from implicam.errors import NumericalError
 from implicam.gp.kernels import SHAPES, Floats, Kernel, squared_distances
 from implicam.gp.linalg import cholesky, factor_in_place, invert_in_place, solve_lower
 
-FEW_POINTS = 100
+MAX_POINTS_FOR_FULL_SEARCH = 100
 """Beyond so many points the search begins on a part of them."""
 STARTS = ((0.0, -7.0), (0.7, -12.0))
 """Where a search begins: every lengthscale so many prior sd above its median, and the log of rho."""
-LOUDEST = 9.0
+MAX_LOG_RHO = 9.0
 """Largest log of rho: beyond, nothing but the mean is learned."""
-LEAST_CURVATURE = 0.25
+MIN_CURVATURE = 0.25
 """Of the log posterior, in prior standard deviations: a direction is never less certain than twice its prior."""
-STEP = 1e-3
+DIFFERENCE_STEP_SDS = 1e-3
 """Of the finite differences of the gradient, whose unit is a prior standard deviation."""
 _FAILED = 1e12
 
@@ -143,8 +143,8 @@ def most_probable(
     starts = (
         [np.append(np.full(d, t), max(log_rho, quietest)) for t, log_rho in STARTS] if anew or start is None else []
     )
-    if starts and n > FEW_POINTS:
-        part = np.random.default_rng(seed).permutation(n)[:FEW_POINTS]
+    if starts and n > MAX_POINTS_FOR_FULL_SEARCH:
+        part = np.random.default_rng(seed).permutation(n)[:MAX_POINTS_FOR_FULL_SEARCH]
         few = RestrictedPosterior(X[part], Y[part], H[part], shape, prior)
         starts = [_descend(few, starts, quietest)[0]]
     if start is not None:
@@ -160,7 +160,7 @@ def most_probable(
 def _descend(posterior: RestrictedPosterior, starts: Sequence[Floats], quietest: float) -> tuple[Floats, float]:
     """The best of searches from several starts."""
     d = posterior.X.shape[1]
-    bounds = [(-12.0, 12.0)] * d + [(quietest, LOUDEST)]
+    bounds = [(-12.0, 12.0)] * d + [(quietest, MAX_LOG_RHO)]
     options = {"ftol": 1e-8, "gtol": 1e-3, "maxcor": 20, "maxiter": 200}
     found = [minimize(posterior, s, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for s in starts]
     best = min(found, key=lambda one: float(one.fun))
@@ -179,17 +179,17 @@ def _curvature(posterior: RestrictedPosterior, theta: Floats) -> Floats:
     rows = []
     for k in range(len(theta)):
         away = theta.copy()
-        away[k] += STEP
+        away[k] += DIFFERENCE_STEP_SDS
         value, there = posterior(away)
-        rows.append((there - here) / STEP if value < _FAILED else np.zeros(len(theta)))
+        rows.append((there - here) / DIFFERENCE_STEP_SDS if value < _FAILED else np.zeros(len(theta)))
     H = np.array(rows)
     return np.asarray(0.5 * (H + H.T))
 
 
 def _root_of_inverse(curvature: Floats) -> Floats:
-    """C with C C^T the inverse, no direction less certain than LEAST_CURVATURE allows."""
+    """C with C C^T the inverse, no direction less certain than MIN_CURVATURE allows."""
     values, vectors = np.linalg.eigh(curvature)
-    return np.asarray(vectors / np.sqrt(np.maximum(values, LEAST_CURVATURE)))
+    return np.asarray(vectors / np.sqrt(np.maximum(values, MIN_CURVATURE)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from implicam.gp.kernels import Floats, Kernel
 from implicam.gp.linalg import address, cholesky, routine, solve_lower
 
-DRAWN = 1000
+MAX_DRAWN = 1000
 """Points of many among which the inducing points are looked for; drawn at random but always the same."""
 
 _DPSTRF = routine("dpstrf", 9)
@@ -34,7 +34,7 @@ class LowRank:
     @classmethod
     def of(cls, kernel: Kernel, X: Floats, tolerance: float) -> LowRank:
         """Enough of the points X (n, d) as inducing points to leave less than `tolerance` of the variance at any."""
-        drawn = X if len(X) <= DRAWN else X[np.random.default_rng(0).choice(len(X), DRAWN, replace=False)]
+        drawn = X if len(X) <= MAX_DRAWN else X[np.random.default_rng(0).choice(len(X), MAX_DRAWN, replace=False)]
         pivots, _ = pivoted_cholesky(kernel(drawn, drawn), tolerance)
         return cls(kernel, drawn[pivots])
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from implicam.dataset import Dataset, Observations
 from implicam.dataset.requirements import require_points, require_volume
-from implicam.geometry import FAR_OUT, Floats
+from implicam.geometry import MAX_PIXEL_DISTANCE_RATIO, Floats
 from implicam.rig_model.camera import Image
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
@@ -119,7 +119,7 @@ def _declared(data: Dataset, frame: Frame) -> ShotErrors | None:
 def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
     """The lowest and highest (2,) of pixels (n, 2), wild ones aside."""
     away = np.linalg.norm(uv - np.median(uv, axis=0), axis=1)
-    inside = uv[away <= FAR_OUT * np.quantile(away, 0.75)]
+    inside = uv[away <= MAX_PIXEL_DISTANCE_RATIO * np.quantile(away, 0.75)]
     return inside.min(axis=0), inside.max(axis=0)
 
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from implicam.calibrators.explicit import saved
 from implicam.calibrators.explicit.align import MATCHING
 from implicam.calibrators.explicit.boards import boards_of, has_boards
+from implicam.calibrators.explicit.camera_groups import CameraGroups, calibrate_groups
 from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_boards_alone, fit_to_points
 from implicam.calibrators.explicit.from_boards import fit_to_boards
 from implicam.calibrators.explicit.lenses import AUTO
-from implicam.calibrators.explicit.network import Groups, calibrate_groups
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -94,7 +94,7 @@ class Explicit(CalibratorBase):
                 fitted = fit_to_boards(data, self._groups(data, progress), self.boards, self.align, progress)
         return ExplicitCalibration(self, data, fitted)
 
-    def _groups(self, data: Dataset, progress: Progress) -> Groups:
+    def _groups(self, data: Dataset, progress: Progress) -> CameraGroups:
         """The cameras from the boards: adjusted once for all known points of the same cameras in the same unit."""
         key = (data.length_unit, data.observations.camera_names)
         if key not in self._adjusted:
@@ -107,7 +107,7 @@ class Explicit(CalibratorBase):
         return self._adjusted[key]
 
     @cached_property
-    def _adjusted(self) -> dict[tuple[str, tuple[str, ...]], Groups]:
+    def _adjusted(self) -> dict[tuple[str, tuple[str, ...]], CameraGroups]:
         return {}
 
 

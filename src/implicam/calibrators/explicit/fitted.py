@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from implicam.calibrators.explicit.boards import boards_of
+from implicam.calibrators.explicit.camera_groups import CameraGroup, calibrate_largest_group
 from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
-from implicam.calibrators.explicit.network import Network, calibrate_network
 from implicam.calibrators.explicit.pixels import told
 from implicam.dataset import Dataset, KnownPositions, Observations, without_copies
 from implicam.dataset.requirements import same_cameras
@@ -90,27 +90,27 @@ def _pixel_notes(data: Dataset, fitted: FitResult, choices: Mapping[int, Choice]
 
 def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple[Dataset, Fitted]:
     """Cameras in the frame of the first; and the data with the positions that the boards have there."""
-    network = calibrate_network(boards_of(data), family, progress)
-    placed = _placed(data, network)
-    posterior = network_posterior(network, network.bundle.cameras, network.root)
+    group = calibrate_largest_group(boards_of(data), family, progress)
+    placed = _placed(data, group)
+    posterior = group_posterior(group, group.bundle.cameras, group.root)
     measured = FittedRig(
-        data.observations, data.length_unit, WORLD_FRAME, network.cameras, posterior, misfit_adds=True
+        data.observations, data.length_unit, WORLD_FRAME, group.cameras, posterior, misfit_adds=True
     ).measure(placed.observations)
-    first = data.observations.camera_names[network.cameras[0]]
+    first = data.observations.camera_names[group.cameras[0]]
     fitted = Fitted(
         data.observations,
         WORLD_FRAME,
-        network.cameras,
+        group.cameras,
         posterior,
-        tuple(network.choices[c] for c in network.cameras),
+        tuple(group.choices[c] for c in group.cameras),
         (measured.xyz - placed.xyz)[measured.measured],
         measured.sd[measured.measured],
-        wrong_corners(network, data),
+        wrong_corners(group, data),
         (),
         (
             f"Positions are in the frame of {first}: x right, y down, z forward. Known points bring them into a world "
             "of your own: implicam calibrate POINTS --method explicit --boards BOARDS.",
-            *network_notes(network, data.observations, data),
+            *group_notes(group, data.observations, data),
         ),
         alone=True,
     )
@@ -135,23 +135,23 @@ def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
     return trained
 
 
-def _placed(data: Dataset, network: Network) -> Dataset:
+def _placed(data: Dataset, group: CameraGroup) -> Dataset:
     """The corners that a calibrated camera saw, where the adjustment puts them."""
     xyz = np.full((len(data), 3), np.nan)
-    for view in network.bundle.views.each:
-        xyz[view.rows] = network.bundle.boards.pose(view.board).apply(view.xyz)
+    for view in group.bundle.views.each:
+        xyz[view.rows] = group.bundle.boards.pose(view.board).apply(view.xyz)
     there = np.isfinite(xyz).all(axis=1)
-    known = KnownPositions(network.shots[there], xyz[there], np.full((int(there.sum()), 3), np.nan))
+    known = KnownPositions(group.shots[there], xyz[there], np.full((int(there.sum()), 3), np.nan))
     return replace(data.select(there), known=known)
 
 
-def network_posterior(network: Network, cameras: Sequence[CentralCamera], root: Floats) -> Posterior:
-    """Cameras of a network, wherever they have been moved to, with the root of their covariance."""
+def group_posterior(group: CameraGroup, cameras: Sequence[CentralCamera], root: Floats) -> Posterior:
+    """Cameras of a group, wherever they have been moved to, with the root of their covariance."""
     none = [np.ones(camera.size, dtype=np.bool_) for camera in cameras]  # only a fit asks which views started it
     models = tuple(
         lens_only_model(InitialCamera(camera, prior, inliers), image, float(noise))
         for camera, prior, inliers, image, noise in zip(
-            cameras, network.bundle.priors, none, network.images, network.bundle.noise, strict=True
+            cameras, group.bundle.priors, none, group.images, group.bundle.noise, strict=True
         )
     )
     return posterior_of(models, root)
@@ -167,42 +167,42 @@ def posterior_of(models: tuple[CameraModel, ...], root: Floats) -> Posterior:
     return Posterior(models, tuple(parts), np.hstack(parts), (), 0.0)
 
 
-def wrong_corners(network: Network, boards: Dataset) -> tuple[Rejected, ...]:
+def wrong_corners(group: CameraGroup, boards: Dataset) -> tuple[Rejected, ...]:
     """The corners of boards that are not used, the farthest first."""
     names, points = boards.observations.camera_names, boards.points
-    found = [Rejected(str(points[row]), names[c], off) for row, c, off in network.wrong]
+    found = [Rejected(str(points[row]), names[c], off) for row, c, off in group.wrong]
     return tuple(sorted(found, key=lambda view: -np.nan_to_num(view.residual, nan=np.inf)))
 
 
-def network_notes(network: Network, trained: Observations, boards: Dataset) -> list[str]:
+def group_notes(group: CameraGroup, trained: Observations, boards: Dataset) -> list[str]:
     """What is to be said of the boards: cameras that contradict each other, wrong corners, lenses hardly fixed."""
     names = trained.camera_names
-    notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in network.uncalibrated]
-    moved = np.sqrt(6) * network.bundle.slack  # along three axes, in either picture
+    notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in group.uncalibrated]
+    moved = np.sqrt(6) * group.bundle.slack  # along three axes, in either picture
     notes += [
         f"{names[one.pair[0]]} and {names[one.pair[1]]} contradict each other on the {one.boards} boards that both saw"
         f": alone {one.alone:.2g} px, together {one.together:.2g} px, as if boards had moved by about {moved:.1g} "
         f"{boards.length_unit} from one picture to the other. The pictures are not of the same instants, or a camera "
         "or the rig moved between them. The error bars allow for it; what moves while it is measured is off by more."
-        for one in network.doubts
+        for one in group.doubts
     ]
-    if network.wrong:
-        worst = wrong_corners(network, boards)[:MAX_NAMED_IN_NOTE]
+    if group.wrong:
+        worst = wrong_corners(group, boards)[:MAX_NAMED_IN_NOTE]
         named = ", ".join(f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in worst)
-        more = f" and {len(network.wrong) - MAX_NAMED_IN_NOTE} more" if len(network.wrong) > MAX_NAMED_IN_NOTE else ""
-        count = f"{len(network.wrong)} corner{'s' * (len(network.wrong) != 1)}"
+        more = f" and {len(group.wrong) - MAX_NAMED_IN_NOTE} more" if len(group.wrong) > MAX_NAMED_IN_NOTE else ""
+        count = f"{len(group.wrong)} corner{'s' * (len(group.wrong) != 1)}"
         notes.append(f"{count} not used, far from where the others predict them: {named}{more}.")
-    return [*notes, *_lens_notes(network, trained)]
+    return [*notes, *_lens_notes(group, trained)]
 
 
-def _lens_notes(network: Network, trained: Observations) -> list[str]:
+def _lens_notes(group: CameraGroup, trained: Observations) -> list[str]:
     """Lenses that the boards hardly fix, noise that is not what the views state, an adjustment that did not settle."""
-    notes, bundle = [], network.bundle
-    sd = np.sqrt(np.sum(network.root**2, axis=0))
+    notes, bundle = [], group.bundle
+    sd = np.sqrt(np.sum(group.root**2, axis=0))
     stated = stated_noise(trained)
-    for number, c in enumerate(network.cameras):
+    for number, c in enumerate(group.cameras):
         name, lens = trained.camera_names[c], bundle.cameras[number].lens
-        notes += told(name, bundle.cameras[number], network.images[number], network.choices[c].pixels)
+        notes += told(name, bundle.cameras[number], group.images[number], group.choices[c].pixels)
         loose = float(sd[bundle.starts[number]] / lens.fx)
         if loose > MAX_UNKNOWN_FOCAL_PART:
             notes.append(
@@ -213,7 +213,7 @@ def _lens_notes(network: Network, trained: Observations) -> list[str]:
                 f"{name}: corners are off by {bundle.noise[number]:.2g} px, and they state {stated[c]:.2g} px: "
                 "their sd is wrong, or no lens model holds this lens."
             )
-    if not network.converged:
+    if not group.converged:
         notes.append("The bundle adjustment had not settled when it was stopped: look for wrong pictures.")
     return notes
 

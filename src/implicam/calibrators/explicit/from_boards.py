@@ -14,17 +14,17 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from implicam.calibrators.explicit.align import MATCHING, Alignment, Known, align, in_frame, in_world
+from implicam.calibrators.explicit.camera_groups import CameraGroup, CameraGroups
 from implicam.calibrators.explicit.fitted import (
     WORLD_FRAME,
     Fitted,
     by_cameras_of,
-    network_notes,
-    network_posterior,
+    group_notes,
+    group_posterior,
     posterior_of,
     wrong_corners,
 )
 from implicam.calibrators.explicit.lenses import Choice
-from implicam.calibrators.explicit.network import Groups, Network
 from implicam.calibrators.explicit.place import place
 from implicam.dataset import Dataset, Names, Observations, without_copies
 from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes
@@ -49,7 +49,7 @@ class Part(NamedTuple):
     notes: tuple[str, ...]
 
 
-def fit_to_boards(data: Dataset, groups: Groups, boards: Dataset, how: str, progress: Progress) -> Fitted:
+def fit_to_boards(data: Dataset, groups: CameraGroups, boards: Dataset, how: str, progress: Progress) -> Fitted:
     """FitError where fewer than two cameras get a place in the world."""
     copied, copies_told = copied_points(data), point_copy_notes(data)
     data = without_copies(data)
@@ -58,15 +58,15 @@ def fit_to_boards(data: Dataset, groups: Groups, boards: Dataset, how: str, prog
     names = trained.camera_names
     uncalibrated = list(groups.uncalibrated)
     parts: list[Part] = []
-    several = [network for network in groups.networks if len(network.cameras) > 1]
-    lone = [network for network in groups.networks if len(network.cameras) == 1]
+    several = [group for group in groups.groups if len(group.cameras) > 1]
+    lone = [group for group in groups.groups if len(group.cameras) == 1]
     failure: FitError | None = None
-    for network in several:
+    for group in several:
         try:
-            parts.append(_aligned(data, trained, network, boards, how, frame))
+            parts.append(_aligned(data, trained, group, boards, how, frame))
         except FitError as error:
             failure = error
-            uncalibrated += [(c, error.what) for c in network.cameras]
+            uncalibrated += [(c, error.what) for c in group.cameras]
     if lone and how != MATCHING[0]:
         uncalibrated += [
             (n.cameras[0], "it saw no board at the same time as the others, and icp places none") for n in lone
@@ -119,29 +119,29 @@ def _together(parts: Sequence[Part], trained: Observations, frame: Frame, notes:
     )
 
 
-def _aligned(data: Dataset, trained: Observations, network: Network, boards: Dataset, how: str, frame: Frame) -> Part:
+def _aligned(data: Dataset, trained: Observations, group: CameraGroup, boards: Dataset, how: str, frame: Frame) -> Part:
     """A group of cameras that boards join, by the known points that it measures."""
-    known, bundle = data.positions, network.bundle
-    posterior = network_posterior(network, bundle.cameras, network.root)
-    in_rig = FittedRig(trained, data.length_unit, WORLD_FRAME, network.cameras, posterior, misfit_adds=True)
+    known, bundle = data.positions, group.bundle
+    posterior = group_posterior(group, bundle.cameras, group.root)
+    in_rig = FittedRig(trained, data.length_unit, WORLD_FRAME, group.cameras, posterior, misfit_adds=True)
     uv, noise = in_rig.views(data.observations)
     found = locate(posterior, uv, noise)
     uv[found.left_out] = np.nan
     points = Known(known.xyz, np.nan_to_num(known.sd), known.shots)
-    alignment = align(posterior.models, network.root, uv, noise, found.xyz, points, how)
-    cameras, root = in_frame(*in_world(bundle.cameras, network.root, alignment), frame.offset, frame.scale)
+    alignment = align(posterior.models, group.root, uv, noise, found.xyz, points, how)
+    cameras, root = in_frame(*in_world(bundle.cameras, group.root, alignment), frame.offset, frame.scale)
     return Part(
-        network.cameras,
-        network_posterior(network, cameras, root).models,
+        group.cameras,
+        group_posterior(group, cameras, root).models,
         root,
-        tuple(network.choices[c] for c in network.cameras),
+        tuple(group.choices[c] for c in group.cameras),
         alignment.errors,
         alignment.sds,
-        wrong_corners(network, boards),
+        wrong_corners(group, boards),
         _not_used(data, in_rig.measure(data.observations).reason, alignment),
         (
             *_moved_notes(in_rig, found.left_out, np.asarray(np.isfinite(uv).all(axis=2))),
-            *network_notes(network, trained, boards),
+            *group_notes(group, trained, boards),
             *_alignment_notes(alignment, data.length_unit),
         ),
     )
@@ -150,7 +150,7 @@ def _aligned(data: Dataset, trained: Observations, network: Network, boards: Dat
 def _placed(
     data: Dataset,
     trained: Observations,
-    networks: Sequence[Network],
+    groups: Sequence[CameraGroup],
     boards: Dataset,
     frame: Frame,
     progress: Progress,
@@ -158,9 +158,9 @@ def _placed(
     """Cameras that saw their boards alone, by the known points; and why not the others."""
     mine = data.with_cameras(trained.camera_names)
     training = TrainingData.of("central", mine, frame, shots_off=False)
-    fitted = place(training, {network.cameras[0]: network for network in networks}, progress)
+    fitted = place(training, {group.cameras[0]: group for group in groups}, progress)
     uncalibrated = list(fitted.uncalibrated)
-    by_camera = {network.cameras[0]: network for network in networks}
+    by_camera = {group.cameras[0]: group for group in groups}
     if not fitted.cameras:
         none = np.zeros((0, 3))
         return Part((), (), np.zeros((0, 0)), (), none, none, (), (), ()), uncalibrated
@@ -168,7 +168,7 @@ def _placed(
     posterior, names = fitted.posterior, trained.camera_names
     root = posterior.joint if posterior.joint is not None else np.asarray(block_diag(*posterior.alone))
     used = [by_camera[c] for c in fitted.cameras]
-    notes = [note for network in used for note in network_notes(network, trained, boards)]
+    notes = [note for group in used for note in group_notes(group, trained, boards)]
     told = (
         f"{', '.join(names[c] for c in fitted.cameras)}: the lens is from boards that no other camera saw, the "
         "place from known points."
@@ -178,9 +178,9 @@ def _placed(
             fitted.cameras,
             posterior.models,
             root,
-            tuple(network.choices[c] for network, c in zip(used, fitted.cameras, strict=True)),
+            tuple(group.choices[c] for group, c in zip(used, fitted.cameras, strict=True)),
             *diagnosis.leave_one_out,
-            (*(view for network in used for view in wrong_corners(network, boards)), *diagnosis.rejected),
+            (*(view for group in used for view in wrong_corners(group, boards)), *diagnosis.rejected),
             diagnosis.unused,
             (told, *diagnosis.notes(), *notes),
         ),

@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from implicam.calibrators.explicit.camera_groups import CameraGroup
 from implicam.calibrators.explicit.from_points import refined
-from implicam.calibrators.explicit.network import Network
+from implicam.calibrators.explicit.start import MAX_MIRRORED_RATIO, MIRROR_FROM_HALF_SIDES, median_pixel_error
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, poses_from_rays
 from implicam.progress import Progress
@@ -37,9 +38,6 @@ MIN_RELATIVE_WIDTH = 0.02
 MAX_ERROR_HALF_SIDES = 0.02
 """Median error of the best place, in half the longer side of the image, beyond which it is none."""
 
-MAX_MIRRORED_RATIO, MIRROR_FROM_HALF_SIDES = 0.3, 2e-3
-"""A mirror is looked for where more than so much of half the longer side is left; it must leave so many times less."""
-
 MAX_SQUARES_AS_GOOD = 9.0
 """Squared residuals, in the noise, that a second place may have more than the first and be as good."""
 
@@ -47,18 +45,18 @@ RANDOM_SUBSETS = 30
 """Random sets of five points; with a third of the views wrong, four of them are clean."""
 
 
-def place(training: TrainingData, networks: Mapping[int, Network], progress: Progress) -> FitResult:
-    """The cameras of networks of one camera, by number, placed by the training data; there may be none."""
+def place(training: TrainingData, groups: Mapping[int, CameraGroup], progress: Progress) -> FitResult:
+    """The cameras of groups of one camera, by number, placed by the training data; there may be none."""
     stated = training.stated.copy()
     started: dict[int, InitialCamera] = {}
     uncalibrated: list[tuple[int, str]] = []
     images = list(training.images)
-    for c, network in networks.items():
-        seen, images[c] = training.camera_views[c], network.images[0]
+    for c, group in groups.items():
+        seen, images[c] = training.camera_views[c], group.images[0]
         if not np.isfinite(stated[c]):
-            stated[c] = network.bundle.noise[0]  # until the residuals of the known points say more
+            stated[c] = group.bundle.noise[0]  # until the residuals of the known points say more
         try:
-            started[c] = _placed(network, training.points[seen.rows], seen.uv)
+            started[c] = _placed(group, training.points[seen.rows], seen.uv)
         except FitError as error:
             uncalibrated.append((c, error.what))
     training = replace(training, stated=stated, images=tuple(images))
@@ -68,14 +66,14 @@ def place(training: TrainingData, networks: Mapping[int, Network], progress: Pro
     return refined(training, started, uncalibrated, progress)
 
 
-def _placed(network: Network, points: Floats, uv: Floats) -> InitialCamera:
-    """The camera of a network of one, in the place from which it sees points (n, 3) at uv (n, 2)."""
-    known, sd, half = network.bundle.cameras[0], float(network.bundle.noise[0]), network.images[0].half
+def _placed(group: CameraGroup, points: Floats, uv: Floats) -> InitialCamera:
+    """The camera of a group of one, in the place from which it sees points (n, 3) at uv (n, 2)."""
+    known, sd, half = group.bundle.cameras[0], float(group.bundle.noise[0]), group.images[0].half
     rays, valid = known.lens.ray_from_pixel(uv)
     _check_spread(points[valid])
-    prior = _prior(network)
+    prior = _prior(group)
     found = _best(known, prior, points, uv, rays, valid, sd)
-    left = _median(found[0][0], points, uv) if found else np.inf
+    left = median_pixel_error(found[0][0], points, uv) if found else np.inf
     if left > max(RigModelSettings.max_start_error_medians * sd, MIRROR_FROM_HALF_SIDES * half):
         _check_mirror(known, prior, points, uv, rays, valid, sd, left)
     if not found:
@@ -104,7 +102,7 @@ def _check_mirror(
     """FitError where known points seen in a mirror would fit."""
     other = points * np.array([1.0, 1.0, -1.0])
     found = _best(known, prior, other, uv, rays, valid, sd)
-    mirrored = _median(found[0][0], other, uv) if found else np.inf
+    mirrored = median_pixel_error(found[0][0], other, uv) if found else np.inf
     if mirrored < MAX_MIRRORED_RATIO * left:
         raise FitError(
             f"it sees the known points as in a mirror: as they are {left:.3g} px are left, mirrored {mirrored:.2g} px. "
@@ -122,12 +120,12 @@ def _check_spread(points: Floats) -> None:
         raise FitError(f"its {len(points)} known points lie on one line, which does not place it.")
 
 
-def _prior(network: Network) -> Prior:
+def _prior(group: CameraGroup) -> Prior:
     """What the boards say of the lens; nothing of the pose."""
-    camera = network.bundle.cameras[0]
+    camera = group.bundle.cameras[0]
     p = camera.size - 6
     precision = np.zeros((camera.size, camera.size))
-    root = network.root[:, :p]
+    root = group.root[:, :p]
     scale = np.sqrt(np.sum(root**2, axis=0))
     precision[:p, :p] = np.linalg.inv((root / scale).T @ (root / scale)) / scale[:, None] / scale
     return Prior(camera.parameters, precision)
@@ -139,7 +137,7 @@ def _best(
     """Places, the best first, and the views (n,) that agree with each: from all points, and from a few of them where
     all do not agree."""
     found = [_refined(replace(known, pose=pose), prior, points, uv, valid, sd) for pose in _poses(points, rays, valid)]
-    off = min((_median(camera, points, uv) for camera, _ in found), default=np.inf)
+    off = min((median_pixel_error(camera, points, uv) for camera, _ in found), default=np.inf)
     good = np.flatnonzero(valid)
     if off > RigModelSettings.max_start_error_medians * sd and len(good) > MIN_POINTS + 1:
         rng = np.random.default_rng(0)
@@ -153,16 +151,11 @@ def _best(
                 near = valid & (error <= np.nanquantile(error, 0.6))
                 if near.sum() >= MIN_POINTS:
                     found.append(_refined(camera, prior, points, uv, np.asarray(near), sd))
-    return sorted(found, key=lambda one: _median(one[0], points, uv))
+    return sorted(found, key=lambda one: median_pixel_error(one[0], points, uv))
 
 
 def _poses(points: Floats, rays: Floats, some: Bools) -> list[Pose]:
     return poses_from_rays(points[some], rays[some])[:4]
-
-
-def _median(camera: CentralCamera, points: Floats, uv: Floats) -> float:
-    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    return float(np.median(np.where(np.isfinite(error), error, np.inf)))
 
 
 def _refined(
@@ -170,7 +163,7 @@ def _refined(
 ) -> tuple[CentralCamera, Bools]:
     """Levenberg-Marquardt on the views kept, and again without those far off the others."""
     for _ in range(4):
-        usual = max(sd, _median(camera, points[inliers], uv[inliers]))
+        usual = max(sd, median_pixel_error(camera, points[inliers], uv[inliers]))
         if not np.isfinite(usual):
             break
         fitted = levenberg_marquardt(camera, prior, points[inliers], uv[inliers], usual)

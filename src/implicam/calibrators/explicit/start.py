@@ -181,7 +181,7 @@ def _log_evidence(one: _Candidate, points: Floats, uv: Floats, image: Image) -> 
 
 def _check_mirror(found: _Candidate, points: Floats, uv: Floats, image: Image) -> None:
     """MirroredError where the picture turned left to right fits far better than it does as it is."""
-    left = _median(found, points, uv)
+    left = median_pixel_error(found.camera, points, uv)
     if left < MIRROR_FROM_HALF_SIDES * image.half:
         return
     turned = np.column_stack([2 * image.centre[0] - uv[:, 0], uv[:, 1]])
@@ -189,7 +189,7 @@ def _check_mirror(found: _Candidate, points: Floats, uv: Floats, image: Image) -
         other = _resected(points, turned, image)
     except FitError:
         return
-    mirrored = _median(other, points, turned)
+    mirrored = median_pixel_error(other.camera, points, turned)
     if mirrored < MAX_MIRRORED_RATIO * left:
         raise MirroredError(
             f"its pictures are mirrored, or the known positions are: as they are {left:.3g} px are left, mirrored "
@@ -197,9 +197,11 @@ def _check_mirror(found: _Candidate, points: Floats, uv: Floats, image: Image) -
         )
 
 
-def _median(one: _Candidate, points: Floats, uv: Floats) -> float:
-    error = np.linalg.norm(one.camera.pixel(points) - uv, axis=1)
-    return float(np.median(np.nan_to_num(error, nan=np.inf)))
+def median_pixel_error(camera: CentralCamera, points: Floats, uv: Floats) -> float:
+    """Median distance in px of points (n, 3), where a camera sees them, from uv (n, 2); a point it cannot see is
+    infinitely far."""
+    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
+    return float(np.median(np.where(np.isfinite(error), error, np.inf)))
 
 
 def _sd(camera: CentralCamera, points: Floats, uv: Floats, image: Image) -> float:

@@ -51,8 +51,10 @@ MAX_RESIDUAL_HALF_SIDES = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
-    """cameras: numbers of those calibrated, as in bundle; blind: number and reason of the others; root: of the
+class CameraGroup:
+    """Cameras adjusted together.
+
+    cameras: numbers of those calibrated, as in bundle; uncalibrated: number and reason of the others; root: of the
     covariance of the cameras' unknowns; wrong: corners not used (row, camera number, pixels off); images: of those
     calibrated; shots: (n,) of each row of the dataset; doubts: pairs of cameras that fit alone and not together."""
 
@@ -69,22 +71,22 @@ class Network:
 
 
 @dataclass(frozen=True, eq=False)
-class Groups:
-    """Cameras that boards join, a network for each group, the largest first; blind: number and reason of the cameras
-    without a lens."""
+class CameraGroups:
+    """The groups of cameras that boards join, the largest first; uncalibrated: number and reason of the cameras without
+    a lens."""
 
-    networks: tuple[Network, ...]
+    groups: tuple[CameraGroup, ...]
     uncalibrated: tuple[tuple[int, str], ...]
 
 
-def calibrate_groups(boards: Boards, family: str, progress: Progress = silent) -> Groups:
+def calibrate_groups(boards: Boards, family: str, progress: Progress = silent) -> CameraGroups:
     """Every camera that saw enough boards, in the groups that shared boards join; a group may be one camera."""
     singles, choices, uncalibrated = _singles(boards, family, progress)
-    networks = [_network(boards, singles, choices, poses, progress) for poses in _joined(boards, singles)]
-    return Groups(tuple(networks), tuple(sorted(uncalibrated)))
+    groups = [_adjust_group(boards, singles, choices, poses, progress) for poses in _joined(boards, singles)]
+    return CameraGroups(tuple(groups), tuple(sorted(uncalibrated)))
 
 
-def calibrate_network(boards: Boards, family: str, progress: Progress = silent) -> Network:
+def calibrate_largest_group(boards: Boards, family: str, progress: Progress = silent) -> CameraGroup:
     """The largest group of cameras that shared boards join. FitError where it is fewer than two cameras."""
     singles, choices, uncalibrated = _singles(boards, family, progress)
     groups = _joined(boards, singles)
@@ -98,17 +100,17 @@ def calibrate_network(boards: Boards, family: str, progress: Progress = silent) 
             fix="show every camera the board in ten places or more, and in half of them to two cameras at once; or "
             "give known points that join them: implicam calibrate POINTS --boards BOARDS",
         )
-    return _network(boards, singles, choices, poses, progress, uncalibrated)
+    return _adjust_group(boards, singles, choices, poses, progress, uncalibrated)
 
 
-def _network(
+def _adjust_group(
     boards: Boards,
     singles: Mapping[int, OneCamera],
     choices: Mapping[int, Choice],
     poses: Mapping[int, Pose],
     progress: Progress,
     uncalibrated: Sequence[tuple[int, str]] = (),
-) -> Network:
+) -> CameraGroup:
     """Cameras, joined at first_from_camera, adjusted together.
 
     The noise is one for all until the adjustment has settled: a noise for each would let the boards follow one of two
@@ -131,7 +133,7 @@ def _network(
         _check(boards, cameras, found, half)
         found, wrong = _refined(boards, cameras, found, progress)
         found = loosened(found, progress)
-    return Network(
+    return CameraGroup(
         cameras,
         tuple(sorted(uncalibrated)),
         {c: choices[c] for c in cameras},
