@@ -307,12 +307,7 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, su
     that is not enough, it starts from random `subsets` (RANSAC) too, which bears a third of wrong detections. At most
     `MAX_RESECTION_POINTS` points are used, drawn at random but always the same. Fails as `resect`.
     """
-    there = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
-    rows = np.flatnonzero(there)
-    if len(rows) > MAX_RESECTION_POINTS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_RESECTION_POINTS, replace=False))
-    _check_spread(xyz[rows])
-    middle = np.quantile(uv[rows], (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
+    rows, middle = _rows_and_middle(xyz, uv, middle)
     points, offset = xyz[rows], uv[rows] - middle
     found, errors, keep = _trimmed(points, offset, np.ones(len(rows), dtype=np.bool_))
     bad = float(np.median(errors))
@@ -329,18 +324,22 @@ def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, su
     return Resection(found.camera_from_world, found.focal, found.pinhole, rms, inliers, doubtful)
 
 
+def _rows_and_middle(xyz: Floats, uv: Floats, middle: Floats | None) -> tuple[NDArray[np.intp], Floats]:
+    """The points that a rough resection uses, by number, and the middle of their pixels where none is given."""
+    rows = np.flatnonzero(np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1))
+    if len(rows) > MAX_RESECTION_POINTS:
+        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_RESECTION_POINTS, replace=False))
+    _check_spread(xyz[rows])
+    return rows, np.quantile(uv[rows], (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
+
+
 def resect_any_pixels(
     xyz: Floats, uv: Floats, *, middle: Floats | None = None, aspects: Sequence[float] = (1.0,)
 ) -> tuple[Resection, float]:
     """As `resect_any_lens` for pixels that need not be square: what fits best, and its ratio fy / fx out of `aspects`.
 
     rms: in pixels of u. Where that ratio is 1, it is `resect_any_lens`."""
-    there = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
-    rows = np.flatnonzero(there)
-    if len(rows) > MAX_RESECTION_POINTS:
-        rows = np.sort(np.random.default_rng(0).choice(rows, MAX_RESECTION_POINTS, replace=False))
-    _check_spread(xyz[rows])
-    middle = np.quantile(uv[rows], (0.05, 0.95), axis=0).mean(axis=0) if middle is None else middle
+    rows, middle = _rows_and_middle(xyz, uv, middle)
 
     def off(aspect: float) -> float:
         offset = (uv[rows] - middle) / np.array([1.0, aspect])
