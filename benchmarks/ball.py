@@ -28,7 +28,7 @@ import numpy as np
 from implicam.calibrators import ForwardGP
 from implicam.dataset import Observations
 from implicam.detect.ball import Ball
-from implicam.detect.edge import Ellipse, through
+from implicam.detect.edge import Ellipse, fit_ellipse
 from implicam.detect.model import View
 from implicam.detect.silhouette import centred
 from implicam.files import write_text
@@ -54,7 +54,7 @@ def true_middle(camera, ball, n=90):
     around = ball.radius * np.sqrt(1 - sine**2) * (np.cos(t) * a + np.sin(t) * np.cross(axis, a))
     pixels = camera.pixel_from_world(ball.centre - ball.radius * sine * axis + around)[0]
     middle = pixels.mean(axis=0)
-    return through(pixels, Ellipse(middle, np.eye(2) / np.linalg.norm(pixels - middle, axis=1).mean())).centre
+    return fit_ellipse(pixels, Ellipse(middle, np.eye(2) / np.linalg.norm(pixels - middle, axis=1).mean())).centre
 
 
 def looked_at(studio, detector, take=None):
@@ -134,7 +134,7 @@ def background_of(studio):
 
     def take(camera, shot):
         rng = np.random.default_rng([studio.seed, 9, camera, shot])
-        return studio._exposed(studio._looks[camera].blurred[PAD:-PAD, PAD:-PAD].copy(), camera, rng)
+        return studio._expose(studio._looks[camera].blurred[PAD:-PAD, PAD:-PAD].copy(), camera, rng)
 
     return take
 

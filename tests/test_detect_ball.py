@@ -10,7 +10,7 @@ pytest.importorskip("cv2")
 
 from implicam.calibrators import ForwardGP
 from implicam.detect.ball import Ball, Template
-from implicam.detect.edge import Ellipse, fit_edge, rough_edge, through
+from implicam.detect.edge import Ellipse, find_rough_edge, fit_edge, fit_ellipse
 from implicam.detect.model import Detected, View
 from implicam.detect.silhouette import centred, outline_shift
 from implicam.errors import ImageError, UsageError
@@ -71,7 +71,7 @@ def test_the_centre_of_a_drawn_disc_is_exact(radius, blur):
 @pytest.mark.parametrize(("long", "short", "angle"), [(14, 11, 0.4), (24, 15, -1.1), (40, 30, 2.0)])
 def test_the_centre_of_a_drawn_ellipse_is_exact(long, short, angle):
     centre = np.array([48.3, 51.85])
-    rough = rough_edge(drawn(100, centre, long, short, angle), np.round(centre) + np.array([1, -1]), 0.9 * long)
+    rough = find_rough_edge(drawn(100, centre, long, short, angle), np.round(centre) + np.array([1, -1]), 0.9 * long)
     edge = fit_edge(drawn(100, centre, long, short, angle), rough.ellipse)
     assert np.abs(edge.ellipse.centre - centre).max() < 0.002
     assert edge.ellipse.axes == (pytest.approx(long, abs=0.05), pytest.approx(short, abs=0.05))
@@ -134,15 +134,15 @@ def test_uneven_light_and_a_stem_do_not_pull_the_centre():
 def test_no_edge_where_there_is_none():
     rng = np.random.default_rng(0)
     flat = rng.normal(0.5, 0.02, (60, 60)).astype(np.float32)
-    assert rough_edge(flat, np.array([30.0, 30]), 10, step=0.2) is None
-    assert rough_edge(np.zeros((60, 60), np.float32), np.array([30.0, 30]), 10, step=0.2) is None
+    assert find_rough_edge(flat, np.array([30.0, 30]), 10, step=0.2) is None
+    assert find_rough_edge(np.zeros((60, 60), np.float32), np.array([30.0, 30]), 10, step=0.2) is None
     light = drawn(60, (30, 30), 10.0, inner=OUTER, outer=INNER)  # a light disc is no dark one
-    assert rough_edge(light, np.array([30.0, 30]), 10, step=0.2) is None
+    assert find_rough_edge(light, np.array([30.0, 30]), 10, step=0.2) is None
 
 
 def test_through_recovers_an_ellipse():
     points = outline(31.0, 22.0, 0.7, 48) + np.array([100.25, -7.5])
-    ellipse = through(points, start(points.mean(axis=0) + 1, 25.0))
+    ellipse = fit_ellipse(points, start(points.mean(axis=0) + 1, 25.0))
     assert ellipse.centre == pytest.approx([100.25, -7.5], abs=1e-6)
     assert ellipse.axes == (pytest.approx(31, abs=1e-5), pytest.approx(22, abs=1e-5))
     assert ellipse.radius == pytest.approx(np.sqrt(31 * 22), abs=1e-5)
@@ -171,7 +171,7 @@ def tangent_circle(camera, ball, n=90):
 def true_outline(camera, ball):
     pixels = tangent_circle(camera, ball)
     middle = pixels.mean(axis=0)
-    return through(pixels, start(middle, np.linalg.norm(pixels - middle, axis=1).mean()))
+    return fit_ellipse(pixels, start(middle, np.linalg.norm(pixels - middle, axis=1).mean()))
 
 
 def studio(seed, n, covered=0.0, cameras=None, **optics):

@@ -12,7 +12,7 @@ from implicam.detect.charuco import Charuco
 from implicam.detect.corners import fit_corners
 from implicam.detect.grid import grow
 from implicam.detect.model import Detected, View
-from implicam.detect.numbering import numberings
+from implicam.detect.numbering import find_numberings
 from implicam.detect.seeds import from_libcbdetect
 from implicam.errors import UsageError
 from implicam.images import opencv
@@ -191,7 +191,7 @@ def test_every_reading_of_a_part_keeps_the_colours():
     truth = corners_of(8, 11, h).reshape(8, 11, 2)
     for rows, columns in ((slice(0, 4), slice(0, 5)), (slice(3, 7), slice(2, 9)), (slice(2, 8), slice(5, 8))):
         part = grow(picture, truth[rows, columns], 0)  # it must not grow
-        ways = numberings(part, ("unknown",) * 4, 8, 11)
+        ways = find_numberings(part, ("unknown",) * 4, 8, 11)
         shape = (part.rows, part.columns)
         readings = [(*(int(x[0, 0]) for x in way.of(shape)), way.turns) for way in ways]
         assert (rows.start, columns.start, 0) in readings

@@ -10,7 +10,7 @@ from scipy import ndimage
 pytest.importorskip("cv2")
 
 from implicam.dataset import KnownPositions, read_dataset
-from implicam.detect.blobs import find_spots, measure_spots, scale_shown
+from implicam.detect.blobs import find_scale, find_spots, measure_spots
 from implicam.detect.dots import Dots, _Camera
 from implicam.detect.model import Detected, View
 from implicam.errors import DatasetError, UsageError
@@ -48,7 +48,7 @@ def lattice(n, pitch, rng):
 
 
 def measured(picture, uv):
-    scale, _ = scale_shown(picture, np.rint(uv[:6]), 8.0)
+    scale, _ = find_scale(picture, np.rint(uv[:6]), 8.0)
     found, _ = find_spots(picture, scale)
     nearest = np.argmin(np.linalg.norm(found[None] - uv[:, None], axis=2), axis=1)
     return measure_spots(picture, found[nearest], scale)

@@ -745,11 +745,11 @@ def board(rows=8, columns=11, step=40.0) -> Detected:
 
 
 def test_rows_of_a_board_are_joined_and_no_row_to_the_next():
-    from implicam.detect.overlay import _rows
+    from implicam.detect.overlay import _join_rows
     from implicam.drawing import SKY
 
     found = board()
-    chains = _rows(found.points, found.uv)
+    chains = _join_rows(found.points, found.uv)
     assert [len(chain) for chain in chains] == [11] * 8
     whole = replace(found, uv=found.uv + 0.25)  # drawn twice as large, its lines lie on rows of pixels
     canvas = overlay(np.full((480, 640), 128, np.uint8), Result(View("c", "s"), Path("x"), whole))
@@ -758,8 +758,8 @@ def test_rows_of_a_board_are_joined_and_no_row_to_the_next():
     holes = np.ones(88, bool)
     holes[[3, 14]] = False
     part = Detected(tuple(np.array(found.points)[holes]), found.uv[holes], found.sd[holes])
-    assert [len(chain) for chain in _rows(part.points, part.uv)] == [3, 7, 3, 7] + [11] * 6
-    assert _rows(("a", "b"), found.uv[:2]) == []
+    assert [len(chain) for chain in _join_rows(part.points, part.uv)] == [3, 7, 3, 7] + [11] * 6
+    assert _join_rows(("a", "b"), found.uv[:2]) == []
 
 
 def test_states_are_told_apart():

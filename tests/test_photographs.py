@@ -130,7 +130,7 @@ def test_corners_of_a_covered_board_are_hidden_where_the_bar_is():
     for s, shot in enumerate(board.shots):
         rows = np.flatnonzero(board.target.shots == shot)
         grey, clean = board.picture(0, s), bare.picture(0, s)
-        cover = board._cover(0, s)
+        cover = board._place_cover(0, s)
         for row in rows:
             u, v = np.rint(uv[row, 0]).astype(int)
             clear = cover.distance(uv[row, 0])

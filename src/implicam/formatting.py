@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,3 +72,15 @@ def json_default(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     raise TypeError(f"a value of type {type(value).__name__} has no form in JSON")
+
+
+def list_some(names: Sequence[str], most: int = 5, total: int | None = None) -> str:
+    """The first few names of a list, with commas, and how many more there are.
+
+    Args:
+        names: all of them, or as many as are told.
+        most: how many are told.
+        total: how many there are, where `names` are not all.
+    """
+    more = (len(names) if total is None else total) - min(len(names), most)
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

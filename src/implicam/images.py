@@ -55,7 +55,7 @@ def read_picture(path: Path) -> Grey:
     for is not done: pixels are those of the sensor.
     """
     cv2 = opencv()
-    data = _bytes(path)
+    data = _read_bytes(path)
     image = None
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -73,14 +73,14 @@ def read_picture(path: Path) -> Grey:
             why=f"{len(data):,} bytes, and no PNG, JPEG or TIFF",
             fix="export it again as PNG, JPEG or TIFF",
         )
-    return _grey(image, path)
+    return _to_grey(image, path)
 
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 _BEGINNINGS = (_PNG, _JPEG, b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
-def _bytes(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -113,7 +113,7 @@ def _ends_jpeg(data: bytes) -> bool:
     return False
 
 
-def _grey(image: NDArray[Any], path: Path) -> Grey:
+def _to_grey(image: NDArray[Any], path: Path) -> Grey:
     cv2 = opencv()
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(
@@ -182,11 +182,11 @@ def find_pictures(folder: Path, pattern: str = PATTERN, cameras: Sequence[str] =
     ends. Hidden files and folders are left out. UsageError for a pattern without both; ImageError where two files claim
     one place.
     """
-    expression = _expression(pattern, cameras)
+    expression = _compile_pattern(pattern, cameras)
     if not folder.is_dir():
         raise ImageError(f"there is no folder {folder}.", fix="put the pictures of each camera into images/<camera>/")
     found: dict[str, dict[str, Path]] = {}
-    for path in sorted(_files(folder, pattern.count("/"))):
+    for path in sorted(_walk_pictures(folder, pattern.count("/"))):
         match = expression.fullmatch(path.relative_to(folder).with_suffix("").as_posix())
         if match is None:
             continue
@@ -208,7 +208,7 @@ def find_pictures(folder: Path, pattern: str = PATTERN, cameras: Sequence[str] =
     return {camera: {shot: found[camera][shot] for shot in in_order(found[camera])} for camera in in_order(found)}
 
 
-def _files(folder: Path, depth: int) -> Iterator[Path]:
+def _walk_pictures(folder: Path, depth: int) -> Iterator[Path]:
     """The pictures so many folders down, behind links to folders on other disks too."""
     for place, folders, names in os.walk(folder, followlinks=True):
         here = Path(place)
@@ -232,7 +232,7 @@ def in_order(names: Sequence[str] | dict[str, Any]) -> list[str]:
     return sorted(names, key=key)
 
 
-def _expression(pattern: str, cameras: Sequence[str]) -> re.Pattern[str]:
+def _compile_pattern(pattern: str, cameras: Sequence[str]) -> re.Pattern[str]:
     for word in ("{camera}", "{shot}"):
         if pattern.count(word) != 1:
             raise UsageError(

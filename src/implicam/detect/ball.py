@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from implicam.calibrators import PredictsPixels, load_calibration
 from implicam.dataset import Dataset, Floats
-from implicam.detect.edge import Edge, Rough, fit_edge, rough_edge
+from implicam.detect.edge import Edge, Rough, find_rough_edge, fit_edge
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.silhouette import centred
 from implicam.errors import ImageError, UsageError
@@ -84,8 +84,8 @@ class Template:
     def from_click(cls, path: Path, u: float, v: float) -> Template:
         """Learn it from one click on the ball at pixel (u, v) of a picture."""
         picture = read_picture(path)
-        rough = [rough_edge(picture, np.array([u, v]), radius) for radius in (5, 8, 12, 18, 27, 40, 60)]
-        edges = [edge for one in rough if one and (edge := _ball(picture, one))]
+        rough = [find_rough_edge(picture, np.array([u, v]), radius) for radius in (5, 8, 12, 18, 27, 40, 60)]
+        edges = [edge for one in rough if one and (edge := _fit_ball(picture, one))]
         near = [e for e in edges if np.linalg.norm(e.ellipse.centre - [u, v]) < 1.2 * e.ellipse.radius]
         if not near:
             raise ImageError(
@@ -94,7 +94,7 @@ class Template:
                 fix="click on the middle of the ball, in a picture that shows all of it before its plate",
             )
         best = max(near, key=lambda e: e.outer - e.inner)
-        return cls._cropped(picture, best)
+        return cls._crop(picture, best)
 
     @classmethod
     def from_words(cls, text: str) -> Template:
@@ -115,7 +115,7 @@ class Template:
         return cls.from_click(path, (picture.shape[1] - 1) / 2, (picture.shape[0] - 1) / 2)
 
     @classmethod
-    def _cropped(cls, picture: Grey, edge: Edge) -> Template:
+    def _crop(cls, picture: Grey, edge: Edge) -> Template:
         radius = edge.ellipse.radius
         u, v = np.rint(edge.ellipse.centre).astype(int)
         height, width = picture.shape
@@ -182,11 +182,11 @@ class Ball(DetectorBase):
     def detect(self, picture: Grey, view: View) -> Detected:
         """The likeliest ball, with its edge; others that it might be stay beside it."""
         looked = 1 - picture if self.bright else picture
-        found = self._balls(looked)
+        found = self._find_balls(looked)
         if not found:
             return nothing("no ball: nowhere is there a dark disc with a whole edge before something light")
-        made = [_detected(edge, view) for edge in found]
-        return _chosen(made)
+        made = [_detection_of(edge, view) for edge in found]
+        return _choose(made)
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
         """Drop what is at the same place in shot after shot of a camera, and choose again."""
@@ -194,8 +194,8 @@ class Ball(DetectorBase):
         views = {camera: [view for view in found if view.camera == camera] for camera in cameras}
         moving: dict[View, Detected] = {}
         for own in views.values():
-            furniture = _furniture([_all(found[view]) for view in own])
-            moving |= {view: _without(found[view], furniture) for view in own}
+            furniture = _find_furniture([_all_candidates(found[view]) for view in own])
+            moving |= {view: _drop_furniture(found[view], furniture) for view in own}
         steps = {camera: [moving[v].notes["step"] for v in own if len(moving[v])] for camera, own in views.items()}
         every = [step for own in steps.values() for step in own]
         usual = {
@@ -203,7 +203,7 @@ class Ball(DetectorBase):
             for camera, own in steps.items()
             if every
         }
-        return {view: _if_usual(moving[view], usual.get(view.camera, 0.0)) for view in found}
+        return {view: _drop_if_faint(moving[view], usual.get(view.camera, 0.0)) for view in found}
 
     def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
         """The ball's middle for that of its outline."""
@@ -214,26 +214,26 @@ class Ball(DetectorBase):
             f"give its radius with --radius, in {data.length_unit}, and it is corrected"
         ]
 
-    def _balls(self, picture: Grey) -> list[Edge]:
+    def _find_balls(self, picture: Grey) -> list[Edge]:
         """Different balls, the likeliest first."""
         bright = float(np.quantile(picture[::4, ::4], 0.999))
         rough: list[Rough] = []
-        for centre, radius in self._places(picture):
-            if not any(_overlap(centre, one) for one in rough):
-                one = rough_edge(picture, centre, radius, step=MIN_STEP_BRIGHTNESS * bright)
-                if one is not None and not any(_overlap(one.ellipse.centre, other) for other in rough):
+        for centre, radius in self._find_places(picture):
+            if not any(_overlaps(centre, one) for one in rough):
+                one = find_rough_edge(picture, centre, radius, step=MIN_STEP_BRIGHTNESS * bright)
+                if one is not None and not any(_overlaps(one.ellipse.centre, other) for other in rough):
                     rough.append(one)
         rough.sort(key=lambda one: -one.quality)
         good: list[Edge] = []
         for one in rough[:MAX_EDGES_FITTED]:
             if good and one.quality < MIN_RIVAL_QUALITY_RATIO * rough[0].quality:
                 break
-            edge = _ball(picture, one)
-            if edge is not None and self._fits(edge, bright):
+            edge = _fit_ball(picture, one)
+            if edge is not None and self._is_plausible(edge, bright):
                 good.append(edge)
         return sorted(good, key=_score, reverse=True)
 
-    def _fits(self, edge: Edge, bright: float) -> bool:
+    def _is_plausible(self, edge: Edge, bright: float) -> bool:
         """Whether a ball has a radius that was asked for, and its plate is white."""
         size = self.smallest <= edge.ellipse.radius <= self.largest
         return (
@@ -242,27 +242,27 @@ class Ball(DetectorBase):
             and edge.outer - edge.inner > MIN_STEP_BRIGHTNESS * bright
         )
 
-    def _places(self, picture: Grey) -> list[tuple[Floats, float]]:
+    def _find_places(self, picture: Grey) -> list[tuple[Floats, float]]:
         """Where the picture is like the template: centres and rough radii, the likeliest first."""
         if self.template is not None:
-            return _like_template(picture, self.template)
+            return _match_template(picture, self.template)
         cv2 = opencv()
         places: list[tuple[float, Floats, float]] = []
         small, scale = picture, 1.0
         while TEMPLATE_RADII_PX[0] * scale < self.largest and min(small.shape) > 24:
             for disc in TEMPLATE_RADII_PX:
                 if self.smallest <= 1.1 * disc * scale and disc * scale <= 1.2 * self.largest:
-                    places += _peaks(small, _disc(disc), disc, scale)
+                    places += _find_peaks(small, _draw_disc(disc), disc, scale)
             small, scale = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), 2 * scale
         places.sort(key=lambda place: -place[0])
-        return [(centre, radius) for _, centre, radius in _apart(places)]
+        return [(centre, radius) for _, centre, radius in _keep_apart(places)]
 
 
-def _overlap(centre: Floats, other: Rough) -> bool:
+def _overlaps(centre: Floats, other: Rough) -> bool:
     return float(np.linalg.norm(centre - other.ellipse.centre)) < other.ellipse.radius
 
 
-def _ball(picture: Grey, rough: Rough) -> Edge | None:
+def _fit_ball(picture: Grey, rough: Rough) -> Edge | None:
     """The edge of a ball, or None where it is not whole, round and clear."""
     edge = fit_edge(picture, rough.ellipse)
     if edge is None:
@@ -286,7 +286,7 @@ def _score(edge: Edge) -> float:
     return float((edge.outer - edge.inner) * edge.support**2 * np.sqrt(short / long))
 
 
-def _detected(edge: Edge, view: View) -> Detected:
+def _detection_of(edge: Edge, view: View) -> Detected:
     notes = {
         "score": _score(edge),
         "step": edge.outer - edge.inner,
@@ -298,7 +298,7 @@ def _detected(edge: Edge, view: View) -> Detected:
     return Detected((view.shot,), edge.ellipse.centre[None], sd, outlines=(edge.ellipse.points(),), notes=notes)
 
 
-def _chosen(made: list[Detected]) -> Detected:
+def _choose(made: list[Detected]) -> Detected:
     """The first of several, unless the second is as good."""
     best, rest = made[0], tuple(made[1:4])
     if rest and rest[0].notes["score"] > MIN_RIVAL_SCORE_RATIO * best.notes["score"]:
@@ -308,49 +308,50 @@ def _chosen(made: list[Detected]) -> Detected:
     return replace(best, others=rest)
 
 
-def _all(found: Detected) -> list[Detected]:
+def _all_candidates(found: Detected) -> list[Detected]:
     return [*([replace(found, others=())] if len(found) else []), *found.others]
 
 
-def _furniture(shots: list[list[Detected]]) -> Floats:
+def _find_furniture(shots: list[list[Detected]]) -> Floats:
     """(k, 3) places and radii where something is found in many shots of a camera, while the ball is elsewhere."""
     uvr = np.array([[*ball.uv[0], ball.notes["radius_px"]] for balls in shots for ball in balls]).reshape(-1, 3)
     shot = np.array([s for s, balls in enumerate(shots) for _ in balls], dtype=np.int64)
     looked_at = len(set(shot.tolist()))
     places = []
     while len(uvr):
-        near = _same(uvr, uvr[0])
+        near = _match_place(uvr, uvr[0])
         times = len(set(shot[near].tolist()))
         # A ball that never moves in any shot is a person's test of repeatability, not furniture.
-        if times >= max(MIN_STILL_SHOTS, 0.1 * looked_at) and (times < 0.8 * looked_at or _elsewhere(shot, near)):
+        ball_elsewhere = times < 0.8 * looked_at or _is_mostly_elsewhere(shot, near)
+        if times >= max(MIN_STILL_SHOTS, 0.1 * looked_at) and ball_elsewhere:
             places.append(np.median(uvr[near], axis=0))
         uvr, shot = uvr[~near], shot[~near]
     return np.array(places).reshape(-1, 3)
 
 
-def _same(uvr: Floats, place: Floats) -> NDArray[np.bool_]:
+def _match_place(uvr: Floats, place: Floats) -> NDArray[np.bool_]:
     """Which of (k, 3) places and radii are this one."""
     near = np.linalg.norm(uvr[:, :2] - place[:2], axis=1) < SAME_PLACE_PX
     return np.asarray(near & (np.abs(uvr[:, 2] / place[2] - 1) < SAME_SIZE_RADII), dtype=np.bool_)
 
 
-def _elsewhere(shot: NDArray[np.int64], near: NDArray[np.bool_]) -> bool:
+def _is_mostly_elsewhere(shot: NDArray[np.int64], near: NDArray[np.bool_]) -> bool:
     """Whether most shots show a ball at another place too."""
     return len(set(shot[~near].tolist())) > 0.5 * len(set(shot.tolist()))
 
 
-def _without(found: Detected, furniture: Floats) -> Detected:
-    balls = _all(found)
-    moving = [b for b in balls if not _same(furniture, np.array([*b.uv[0], b.notes["radius_px"]])).any()]
+def _drop_furniture(found: Detected, furniture: Floats) -> Detected:
+    balls = _all_candidates(found)
+    moving = [b for b in balls if not _match_place(furniture, np.array([*b.uv[0], b.notes["radius_px"]])).any()]
     if len(moving) == len(balls):
         return found
     if not moving:
         u, v = balls[0].uv[0]
         return nothing(f"no ball: what looks like one at ({u:.0f}, {v:.0f}) is there in shot after shot")
-    return _chosen(moving)
+    return _choose(moving)
 
 
-def _if_usual(found: Detected, usual: float) -> Detected:
+def _drop_if_faint(found: Detected, usual: float) -> Detected:
     if not len(found) or found.notes["step"] >= MIN_USUAL_STEP_RATIO * usual:
         return found
     u, v = found.uv[0]
@@ -358,7 +359,7 @@ def _if_usual(found: Detected, usual: float) -> Detected:
 
 
 @lru_cache
-def _disc(radius: float) -> Grey:
+def _draw_disc(radius: float) -> Grey:
     """A dark disc on a light ground, drawn with soft edges."""
     reach = int(np.ceil(1.75 * radius + 1))
     x = np.arange(-reach, reach + 1)
@@ -366,7 +367,7 @@ def _disc(radius: float) -> Grey:
     return np.clip(distance - radius + 0.5, 0, 1).astype(np.float32)
 
 
-def _peaks(picture: Grey, template: Grey, radius: float, scale: float) -> list[tuple[float, Floats, float]]:
+def _find_peaks(picture: Grey, template: Grey, radius: float, scale: float) -> list[tuple[float, Floats, float]]:
     """Score, centre and radius, in full pixels, of the places most like a template in a picture made smaller."""
     cv2 = opencv()
     if min(picture.shape) <= max(template.shape):
@@ -388,7 +389,7 @@ def _peaks(picture: Grey, template: Grey, radius: float, scale: float) -> list[t
 _COMPASS = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 
 
-def _apart(places: list[tuple[float, Floats, float]]) -> list[tuple[float, Floats, float]]:
+def _keep_apart(places: list[tuple[float, Floats, float]]) -> list[tuple[float, Floats, float]]:
     """The best of those that are about the same place and size."""
     kept: list[tuple[float, Floats, float]] = []
     for place in places:
@@ -400,7 +401,7 @@ def _apart(places: list[tuple[float, Floats, float]]) -> list[tuple[float, Float
     return kept
 
 
-def _like_template(picture: Grey, template: Template) -> list[tuple[Floats, float]]:
+def _match_template(picture: Grey, template: Template) -> list[tuple[Floats, float]]:
     """Where a picture is like a crop, from a third to three times its size, the likeliest first."""
     cv2 = opencv()
     size = max(template.picture.shape)
@@ -409,6 +410,6 @@ def _like_template(picture: Grey, template: Template) -> list[tuple[Floats, floa
         shrink = min(1.0, 24 / (size * zoom))  # enough pixels to tell one thing from another
         small = cv2.resize(picture, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
         drawn = cv2.resize(template.picture, None, fx=zoom * shrink, fy=zoom * shrink, interpolation=cv2.INTER_AREA)
-        places += _peaks(small, drawn, template.radius * zoom * shrink, 1 / shrink)
+        places += _find_peaks(small, drawn, template.radius * zoom * shrink, 1 / shrink)
     places.sort(key=lambda place: -place[0])
-    return [(centre, radius) for _, centre, radius in _apart(places)]
+    return [(centre, radius) for _, centre, radius in _keep_apart(places)]

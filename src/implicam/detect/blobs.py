@@ -83,7 +83,7 @@ def laplacian(picture: Grey, sigma: float) -> Grey:
     return np.asarray(-(sigma**2) * cv2.Laplacian(smooth, cv2.CV_32F, borderType=cv2.BORDER_REPLICATE))
 
 
-def scale_shown(picture: Grey, uv: Floats, largest: float) -> tuple[float, Floats]:
+def find_scale(picture: Grey, uv: Floats, largest: float) -> tuple[float, Floats]:
     """The scale in pixels, at most `largest`, of the spots that pixels uv (n, 2) show, and their answers (n,) to it.
 
     An answer is negative where the spot is dark, NaN outside the picture. It is one scale for all: specks of noise and
@@ -92,7 +92,7 @@ def scale_shown(picture: Grey, uv: Floats, largest: float) -> tuple[float, Float
     sigmas = MIN_SCALE_PX * SCALE_FACTOR ** np.arange(
         0, 1 + np.log(max(largest / MIN_SCALE_PX, 1.0)) / np.log(SCALE_FACTOR)
     )
-    answers = np.array([_answers_near(picture, u, v, sigmas) for u, v in uv]).reshape(-1, len(sigmas))
+    answers = np.array([_strongest_answers(picture, u, v, sigmas) for u, v in uv]).reshape(-1, len(sigmas))
     clear = np.sign(answers) * np.maximum(np.abs(answers) - MIN_RESPONSE_NOISES * _answer_noise(picture, sigmas), 0)
     inside = np.isfinite(answers[:, 0])
     height = np.abs(answers[inside]).max(axis=1, keepdims=True)
@@ -101,7 +101,7 @@ def scale_shown(picture: Grey, uv: Floats, largest: float) -> tuple[float, Float
     return float(sigmas[best]), answers[:, best]
 
 
-def _answers_near(picture: Grey, u: float, v: float, sigmas: Floats) -> Floats:
+def _strongest_answers(picture: Grey, u: float, v: float, sigmas: Floats) -> Floats:
     """The strongest answer, of either sign, to each scale within `MAX_CLICK_PX` of a pixel."""
     reach = int(np.ceil(4 * sigmas[-1] + MAX_CLICK_PX + 2))
     left, top = max(round(u) - reach, 0), max(round(v) - reach, 0)
@@ -130,13 +130,13 @@ def find_spots(picture: Grey, sigma: float) -> tuple[Floats, Floats]:
     v, u = np.nonzero((answer == around) & (answer > least))
     inside = (u > 1) & (v > 1) & (u < picture.shape[1] - 2) & (v < picture.shape[0] - 2)
     u, v = u[inside], v[inside]
-    across, along = _bends(answer, u, v)
+    across, along = _principal_curvatures(answer, u, v)
     round_enough = (across > 0) & (along < MAX_ELONGATION**2 * across)
     uv = np.column_stack([u, v]).astype(np.float64)[round_enough]
     return uv, answer[v, u].astype(np.float64)[round_enough]
 
 
-def _bends(answer: Grey, u: NDArray[np.intp], v: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _principal_curvatures(answer: Grey, u: NDArray[np.intp], v: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """The smaller and the larger principal curvature (n,) of the answer: a ridge bends one way only."""
     f = answer.astype(np.float64) if answer.size < 1 << 16 else answer
     uu = 2 * f[v, u] - f[v, u - 1] - f[v, u + 1]
@@ -150,7 +150,7 @@ def measure_spots(picture: Grey, uv: Floats, sigma: float) -> Spots:
     """Measure the bright spots of about the scale `sigma` near pixels uv (n, 2)."""
     windows = [_Window.of(picture, float(u), float(v), sigma) for u, v in uv]
     good = [window for window in windows if window is not None]
-    share = _shared_noise(good)
+    share = _estimate_shared_noise(good)
     empty = np.full(5, np.nan)
     rows = [empty if window is None else (*window.uv, *window.sd(share), window.area) for window in windows]
     table = np.array(rows, dtype=np.float64).reshape(-1, 5)
@@ -158,7 +158,7 @@ def measure_spots(picture: Grey, uv: Floats, sigma: float) -> Spots:
     return Spots(table[:, :2], table[:, 2:4], table[:, 4])
 
 
-def _shared_noise(windows: list[_Window]) -> float:
+def _estimate_shared_noise(windows: list[_Window]) -> float:
     """Noise variance per brightness: the median over the spots, of which most are sound."""
     found = [float(np.sum(w.residual**2 - w.noise**2) / np.sum(w.bright[w.core])) for w in windows]
     return max(float(np.median(found)), 0.0) if found else 0.0
@@ -188,16 +188,16 @@ class _Window:
         ring = grey[(far > half - 2.5) & (far <= half + 0.5) & ~outside]
         if len(ring) < len(grey):
             return None
-        level, noise = _level(ring)
+        level, noise = _estimate_background(ring)
         bright = grey - level
-        found = _weights(bright, far, sigma, noise)
+        found = _weigh_pixels(bright, far, sigma, noise)
         if found is None or (found[0][outside] > 0).any():
             return None
         weight, slope, raised = found
-        return cls._measured(bright - raised, weight, slope, np.stack([x, y], axis=2).astype(np.float64), noise, at)
+        return cls._measure(bright - raised, weight, slope, np.stack([x, y], axis=2).astype(np.float64), noise, at)
 
     @classmethod
-    def _measured(
+    def _measure(
         cls, bright: Floats, weight: Floats, slope: Floats, xy: Floats, noise: float, at: NDArray[np.int64]
     ) -> _Window | None:
         mass = weight * bright
@@ -214,7 +214,7 @@ class _Window:
         pull = direct + np.stack([ndimage.gaussian_filter(rim[..., k], SMOOTHING_PX) for k in range(2)], axis=2)
         core = weight > 0
         distance = np.sqrt(np.einsum("ijk,kl,ijl->ij", d, np.linalg.inv(spread), d) * np.sqrt(narrow * wide))
-        residual = _about_profile(bright[core], distance[core])
+        residual = _residuals_about_profile(bright[core], distance[core])
         return cls(centre + at, float(weight.sum()), bright, pull / total, noise, core, residual)
 
     def sd(self, share: float) -> Floats:
@@ -226,7 +226,7 @@ class _Window:
         return np.asarray(np.sqrt(spread + MIN_SD_PX**2), dtype=np.float64)
 
 
-def _level(ring: Floats) -> tuple[float, float]:
+def _estimate_background(ring: Floats) -> tuple[float, float]:
     """The background and its noise, without the bright or dark things that may lie in the ring."""
     middle = float(np.median(ring))
     off = np.abs(ring - middle)
@@ -235,7 +235,7 @@ def _level(ring: Floats) -> tuple[float, float]:
     return float(sound.mean()), float(np.hypot(sound.std(), step / np.sqrt(12)))
 
 
-def _weights(bright: Floats, far: Floats, sigma: float, noise: float) -> tuple[Floats, Floats, float] | None:
+def _weigh_pixels(bright: Floats, far: Floats, sigma: float, noise: float) -> tuple[Floats, Floats, float] | None:
     """Weights of the pixels (k, k), the slope of the weight with the smoothed brightness, and what the background is
     brighter than `bright` says: it is raised until the spot stands alone, beside a brighter thing or on a slope."""
     smooth = ndimage.gaussian_filter(bright, SMOOTHING_PX)
@@ -262,7 +262,7 @@ def _weights(bright: Floats, far: Floats, sigma: float, noise: float) -> tuple[F
     return None
 
 
-def _about_profile(values: Floats, distance: Floats) -> Floats:
+def _residuals_about_profile(values: Floats, distance: Floats) -> Floats:
     """What is left of values (n,) when their dependence on the distance from the middle is taken away.
 
     The dependence is linear between knots a pixel apart. Each residual is scaled for what its own value pulled the

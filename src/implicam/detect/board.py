@@ -22,8 +22,8 @@ import numpy as np
 from implicam.dataset import Floats
 from implicam.detect.grid import Grid, grow, join
 from implicam.detect.model import Detected, DetectorBase, View, nothing
-from implicam.detect.numbering import END, MORE, Numbering, numberings, sides
-from implicam.detect.seeds import from_libcbdetect, from_opencv, from_saddles, in_original, resized, saddles
+from implicam.detect.numbering import END, MORE, Numbering, find_numberings, find_sides
+from implicam.detect.seeds import find_saddles, from_libcbdetect, from_opencv, from_saddles, resize, to_original_pixels
 from implicam.errors import UsageError
 from implicam.images import Grey, opencv
 from implicam.registry import Option
@@ -78,7 +78,7 @@ class Board(DetectorBase):
         square: Annotated[float | None, Option("edge of a square", "MM", 0)] = None,
     ) -> Board:
         """As the command line says it."""
-        rows, columns = size_of_board(board, described, "--board 8x11 (inner corners, rows x columns)")
+        rows, columns = parse_board_size(board, described, "--board 8x11 (inner corners, rows x columns)")
         return cls(rows, columns, float(square or 1.0))
 
     def options(self) -> dict[str, Any]:
@@ -87,10 +87,10 @@ class Board(DetectorBase):
 
     def detect(self, picture: Grey, view: View) -> Detected:
         """The corners of the board in one picture, or why they cannot be given."""
-        unfit = unusable(picture)
+        unfit = explain_unusable(picture)
         if unfit:
             return nothing(unfit)
-        grids = self._grids(picture)
+        grids = self._find_grids(picture)
         if not grids:
             return nothing(
                 f"no checkerboard was found (looked for {self.rows} x {self.columns} inner corners). Show the board "
@@ -98,22 +98,22 @@ class Board(DetectorBase):
             )
         return self._read(picture, grids, view)
 
-    def _grids(self, picture: Grey) -> list[Grid]:
+    def _find_grids(self, picture: Grey) -> list[Grid]:
         """All checkerboards in the picture, the one with the most corners first."""
         grids: list[Grid] = []
         limit, grown = max(self.rows, self.columns) + 3, 0
-        for seed in self._seeds(picture, grids):
+        for seed in self._find_seeds(picture, grids):
             grid = grow(picture, seed[:limit, :limit], limit)
             if grid is not None:
-                _enlist(grids, grid)
+                _add_grid(grids, grid)
                 grown += 1
             if grown == MAX_TIMES_FOUND:
                 break
-        return self._together(picture, sorted(grids, key=lambda grid: -grid.count), limit)
+        return self._join_parts(picture, sorted(grids, key=lambda grid: -grid.count), limit)
 
-    def _together(self, picture: Grey, grids: list[Grid], limit: int) -> list[Grid]:
+    def _join_parts(self, picture: Grey, grids: list[Grid], limit: int) -> list[Grid]:
         """The parts of a board that something covers, joined where that is certain."""
-        if not grids or self._whole(grids[0]):
+        if not grids or self._is_whole(grids[0]):
             return grids
         first, rest = grids[0], []
         for grid in grids[1:]:
@@ -124,7 +124,7 @@ class Board(DetectorBase):
                 first = both
         return [first, *rest]
 
-    def _seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
+    def _find_seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
         """Seeds for as long as the grids found so far (the list grows meanwhile) do not hold a whole board."""
         scale = min(1.0, 0.5 ** np.ceil(np.log2(max(picture.size / MAX_SEARCH_PIXELS, 1)) / 2))
         for seeds in (
@@ -134,26 +134,26 @@ class Board(DetectorBase):
             lambda: from_libcbdetect(picture, scale),
         ):
             yield from seeds()
-            if any(self._whole(grid) or self._too_large(grid) for grid in grids):
+            if any(self._is_whole(grid) or self._is_too_large(grid) for grid in grids):
                 return
 
-    def _too_large(self, grid: Grid) -> bool:
+    def _is_too_large(self, grid: Grid) -> bool:
         shape, board = sorted((grid.rows, grid.columns)), sorted((self.rows, self.columns))
         return shape[0] > board[0] or shape[1] > board[1]
 
-    def _whole(self, grid: Grid) -> bool:
+    def _is_whole(self, grid: Grid) -> bool:
         return grid.count == self.rows * self.columns
 
     def _read(self, picture: Grey, grids: list[Grid], view: View) -> Detected:
         """Number the largest grid that may be the board."""
-        ends = [sides(picture, grid) for grid in grids]
-        ways = [numberings(grid, end, self.rows, self.columns) for grid, end in zip(grids, ends, strict=True)]
+        ends = [find_sides(picture, grid) for grid in grids]
+        ways = [find_numberings(grid, end, self.rows, self.columns) for grid, end in zip(grids, ends, strict=True)]
         fitting = [k for k in range(len(grids)) if ways[k]]
         if not fitting or (fitting[0] > 0 and len(ways[fitting[0]]) > 1):
-            return nothing(self._misfit(grids[0], ends[0]), outlines=(_outline(grids[0]),))
+            return nothing(self._explain_misfit(grids[0], ends[0]), outlines=(_hull_of(grids[0]),))
         first = fitting[0]
-        grid, possible = grids[first], [self._named(grids[first], way, view) for way in ways[first]]
-        outline = (_outline(grid),)
+        grid, possible = grids[first], [self._name_corners(grids[first], way, view) for way in ways[first]]
+        outline = (_hull_of(grid),)
         if len(possible) > 1:
             return nothing(
                 f"{grid.count} of the board's {self.rows * self.columns} corners are seen, and it is not certain "
@@ -169,14 +169,14 @@ class Board(DetectorBase):
                 return nothing(
                     f"two checkerboards are in view, of {grid.count} and {grids[k].count} corners, and either may be "
                     "the board. Take the other one away, or cover it.",
-                    outlines=(*outline, _outline(grids[k])),
+                    outlines=(*outline, _hull_of(grids[k])),
                 )
-        return replace(possible[0], reason=self._missing(len(possible[0])), outlines=outline)
+        return replace(possible[0], reason=self._explain_missing(len(possible[0])), outlines=outline)
 
-    def _named(self, grid: Grid, way: Numbering, view: View) -> Detected:
+    def _name_corners(self, grid: Grid, way: Numbering, view: View) -> Detected:
         """The corners under their names, in the order of their numbers."""
         row, column = way.of((grid.rows, grid.columns))
-        there = grid.there
+        there = grid.occupied
         number = (row * self.columns + column)[there]
         order = np.argsort(number)
         uv, sd = grid.uv[there][order], grid.corners.sd[there.ravel()][order]
@@ -185,15 +185,15 @@ class Board(DetectorBase):
     def _may_be_hidden_part(self, grid: Grid, way: Numbering, other: Grid) -> bool:
         """Whether another grid lies about where corners of the board are missing, so that it need be no other board."""
         row, column = way.of((grid.rows, grid.columns))
-        known = np.column_stack([row[grid.there], column[grid.there]]).astype(np.float64)
-        h, _ = opencv().findHomography(grid.uv[grid.there].reshape(-1, 1, 2), known.reshape(-1, 1, 2), 0)
-        if h is None or self._whole(grid):
+        known = np.column_stack([row[grid.occupied], column[grid.occupied]]).astype(np.float64)
+        h, _ = opencv().findHomography(grid.uv[grid.occupied].reshape(-1, 1, 2), known.reshape(-1, 1, 2), 0)
+        if h is None or self._is_whole(grid):
             return False
-        place = np.hstack([other.uv[other.there], np.ones((other.count, 1))]) @ h.T
+        place = np.hstack([other.uv[other.occupied], np.ones((other.count, 1))]) @ h.T
         place = place[:, :2] / place[:, 2:]
         return bool(((place > -1.5) & (place < np.array([self.rows, self.columns]) + 0.5)).all())
 
-    def _misfit(self, grid: Grid, ends: tuple[str, str, str, str]) -> str:
+    def _explain_misfit(self, grid: Grid, ends: tuple[str, str, str, str]) -> str:
         """Why no grid can be the board."""
         size = f"{grid.rows} x {grid.columns}"
         whole = all(end == END for end in ends)
@@ -210,12 +210,12 @@ class Board(DetectorBase):
             f"{self.columns}. Give the size that the board has, or take this one out of the picture."
         )
 
-    def _missing(self, found: int) -> str:
+    def _explain_missing(self, found: int) -> str:
         total = self.rows * self.columns
         return "" if found == total else f"{total - found} of the board's {total} corners are hidden or not clear."
 
 
-def size_of_board(text: str | None, described: Mapping[str, Any], example: str) -> tuple[int, int]:
+def parse_board_size(text: str | None, described: Mapping[str, Any], example: str) -> tuple[int, int]:
     """Rows and columns from "8x11", or, where that is None, from what dataset.toml says; `example` is the cure."""
     rows, columns = described.get("rows"), described.get("columns")
     if text is not None:
@@ -233,7 +233,7 @@ def corner_name(shot: str, number: int) -> str:
     return f"{shot}-c{number + 1:03d}"
 
 
-def unusable(picture: Grey) -> str:
+def explain_unusable(picture: Grey) -> str:
     """Why a picture cannot show anything; empty where it can."""
     if picture.ndim != 2 or min(picture.shape, default=0) < 16:
         return f"the picture is too small: {' x '.join(map(str, picture.shape[::-1]))} pixels."
@@ -248,29 +248,29 @@ def unusable(picture: Grey) -> str:
 
 def _saddle_seeds(picture: Grey, scale: float, grids: list[Grid]) -> Iterator[Floats]:
     """Seeds from the saddle points that no grid has yet, as long as each lets a grid grow."""
-    small = resized(picture, scale)
+    small = resize(picture, scale)
 
     def taken(uv: Floats) -> bool:
-        return any(_inside(grid, in_original(uv, small, picture)) for grid in grids)
+        return any(_is_inside(grid, to_original_pixels(uv, small, picture)) for grid in grids)
 
-    for seed in from_saddles(saddles(np.asarray(small, dtype=np.float32)), taken):
-        yield in_original(seed, small, picture)
+    for seed in from_saddles(find_saddles(np.asarray(small, dtype=np.float32)), taken):
+        yield to_original_pixels(seed, small, picture)
 
 
-def _inside(grid: Grid, uv: Floats) -> bool:
+def _is_inside(grid: Grid, uv: Floats) -> bool:
     """Whether a pixel is within a square or so of the grid's corners."""
-    return float(np.nanmin(np.linalg.norm(grid.uv - uv, axis=2))) < 0.8 * _step(grid)
+    return float(np.nanmin(np.linalg.norm(grid.uv - uv, axis=2))) < 0.8 * _largest_step(grid)
 
 
-def _step(grid: Grid) -> float:
+def _largest_step(grid: Grid) -> float:
     steps = [np.linalg.norm(np.diff(grid.uv, axis=axis), axis=2).ravel() for axis in (0, 1)]
     return float(np.nanmax(np.concatenate(steps)))
 
 
-def _enlist(grids: list[Grid], grid: Grid) -> None:
+def _add_grid(grids: list[Grid], grid: Grid) -> None:
     """Add a grid to the list; of two that share corners, the one with more stays, then the one that fits better."""
     for k, known in enumerate(grids):
-        if _shares(known, grid):
+        if _share_corners(known, grid):
             if (grid.count, -_rms_misfit(grid)) > (known.count, -_rms_misfit(known)):
                 grids[k] = grid
             return
@@ -281,12 +281,12 @@ def _rms_misfit(grid: Grid) -> float:
     return float(np.sqrt(np.nanmean(grid.corners.misfit**2)))
 
 
-def _shares(a: Grid, b: Grid) -> bool:
-    apart = np.linalg.norm(a.uv[a.there][:, None] - b.uv[b.there][None], axis=2)
+def _share_corners(a: Grid, b: Grid) -> bool:
+    apart = np.linalg.norm(a.uv[a.occupied][:, None] - b.uv[b.occupied][None], axis=2)
     return bool(apart.min() < 1.0)
 
 
-def _outline(grid: Grid) -> Floats:
+def _hull_of(grid: Grid) -> Floats:
     """The grid's hull, closed, (k, 2) pixels."""
-    hull = opencv().convexHull(grid.uv[grid.there].astype(np.float32))[:, 0]
+    hull = opencv().convexHull(grid.uv[grid.occupied].astype(np.float32))[:, 0]
     return np.asarray(np.vstack([hull, hull[:1]]), dtype=np.float64)

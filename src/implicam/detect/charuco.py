@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
-from implicam.detect.board import MAX_SEARCH_PIXELS, corner_name, size_of_board, unusable
+from implicam.detect.board import MAX_SEARCH_PIXELS, corner_name, explain_unusable, parse_board_size
 from implicam.detect.corners import Corners, fit_corners
-from implicam.detect.grid import MAX_ASTRAY_SQUARES, Places, places_from
+from implicam.detect.grid import MAX_ASTRAY_SQUARES, Places, predict_places
 from implicam.detect.model import Detected, DetectorBase, View, nothing
-from implicam.detect.seeds import in_original, resized
+from implicam.detect.seeds import resize, to_original_pixels
 from implicam.errors import UsageError, did_you_mean
 from implicam.images import Grey, eight_bit, opencv
 from implicam.registry import Option
@@ -87,7 +87,7 @@ class Charuco(DetectorBase):
         dictionary: Annotated[str | None, Option("OpenCV's name, such as DICT_5X5_100")] = None,
     ) -> Charuco:
         """As the command line says it."""
-        rows, columns = size_of_board(board, described, "--board 9x12 (squares, rows x columns)")
+        rows, columns = parse_board_size(board, described, "--board 9x12 (squares, rows x columns)")
         if not square or not marker:
             raise UsageError(
                 "a ChArUco board needs --square and --marker.", fix="measure both edges on the printed board, in mm"
@@ -100,16 +100,16 @@ class Charuco(DetectorBase):
 
     def detect(self, picture: Grey, view: View) -> Detected:
         """The corners of the board in one picture, or why they cannot be given."""
-        unfit = unusable(picture)
+        unfit = explain_unusable(picture)
         if unfit:
             return nothing(unfit)
-        seen = self._seen(picture, 1.0)
+        seen = self._read_markers(picture, 1.0)
         if len(seen.ids) < self._total and picture.size <= MAX_SEARCH_PIXELS:
-            again = self._seen(picture, 2.0)  # small markers are read better when they are made larger
+            again = self._read_markers(picture, 2.0)  # small markers are read better when they are made larger
             seen = again if len(again.ids) > len(seen.ids) else seen
         if seen.reason:
             return nothing(seen.reason)
-        corners, there = self._corners(picture, seen)
+        corners, there = self._fit_all_corners(picture, seen)
         number = np.flatnonzero(there)
         if len(number) < MIN_CORNERS:
             return nothing(
@@ -134,37 +134,37 @@ class Charuco(DetectorBase):
         aruco = opencv().aruco
         return aruco.getPredefinedDictionary(getattr(aruco, self.dictionary))
 
-    def _seen(self, picture: Grey, scale: float) -> _Seen:
+    def _read_markers(self, picture: Grey, scale: float) -> _Seen:
         """What OpenCV reads, and whether the markers lie as on this board."""
         cv2 = opencv()
         board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, self._dictionary())
         board.setLegacyPattern(self.legacy)
         reader = cv2.aruco.CharucoDetector(board)
-        image = resized(eight_bit(picture), scale)
+        image = resize(eight_bit(picture), scale)
         try:
             corners, ids, outlines, names = reader.detectBoard(image)
         except cv2.error as error:
-            return _nothing_seen(f"OpenCV could not read the ChArUco board: {error}")
+            return _refuse(f"OpenCV could not read the ChArUco board: {error}")
         if names is None or len(names) == 0:
-            return _nothing_seen(
+            return _refuse(
                 f"no marker of {self.dictionary} was read. Show the board sharp and near (a marker needs a dozen "
                 "pixels), and check that it was printed from this dictionary."
             )
         names = names.ravel()
         middle = np.array([np.mean(outline.reshape(-1, 2), axis=0) for outline in outlines], dtype=np.float64)
         if len(np.unique(names)) < len(names):
-            return _nothing_seen("the same marker is seen twice: two ChArUco boards are in view. Take one away.")
-        if not self._in_their_places(board, names, middle):
-            return _nothing_seen(
+            return _refuse("the same marker is seen twice: two ChArUco boards are in view. Take one away.")
+        if not self._lie_in_their_places(board, names, middle):
+            return _refuse(
                 f"the markers do not lie as on a ChArUco board of {self.rows} x {self.columns} squares. Give the size "
                 "that the board has (rows x columns of squares), or legacy for one printed with OpenCV before 4.6."
             )
         if corners is None or ids is None or len(ids) == 0:
-            return _nothing_seen(f"{len(names)} markers were read, but no corner lies between two. Show more of it.")
-        uv = in_original(corners.reshape(-1, 2).astype(np.float64), image, picture)
+            return _refuse(f"{len(names)} markers were read, but no corner lies between two. Show more of it.")
+        uv = to_original_pixels(corners.reshape(-1, 2).astype(np.float64), image, picture)
         return _Seen(ids.ravel().astype(np.intp), uv, "")
 
-    def _in_their_places(self, board: Any, names: NDArray[np.int32], middle: Floats) -> bool:
+    def _lie_in_their_places(self, board: Any, names: NDArray[np.int32], middle: Floats) -> bool:
         """Whether the markers' middles (n, 2) are where their neighbours say that this board has them."""
         of = {int(name): np.mean(points, axis=0)[1::-1] for name, points in zip(board.getIds(), board.getObjPoints())}  # noqa: B905
         known = np.array([name in of for name in names.tolist()])
@@ -173,11 +173,11 @@ class Charuco(DetectorBase):
         if known.sum() < MIN_CORNERS:
             return True
         nodes = np.array([of[int(name)] for name in names[known]], dtype=np.float64) / self.square
-        places = places_from(nodes, middle[known], nodes)
-        off = _squares(middle[known] - places.uv, places)
+        places = predict_places(nodes, middle[known], nodes)
+        off = _in_squares(middle[known] - places.uv, places)
         return bool(np.mean(np.abs(off).max(axis=1) > MAX_MARKER_OFF_SQUARES) < 0.2)
 
-    def _corners(self, picture: Grey, seen: _Seen) -> tuple[Corners, NDArray[np.bool_]]:
+    def _fit_all_corners(self, picture: Grey, seen: _Seen) -> tuple[Corners, NDArray[np.bool_]]:
         """All corners of the board, fitted; and (n,) which of them are clear."""
         nodes = np.argwhere(np.ones((self.rows - 1, self.columns - 1), dtype=np.bool_)).astype(np.float64)
         start = np.full((len(nodes), 2), np.nan)
@@ -188,12 +188,12 @@ class Charuco(DetectorBase):
             before = there
             if there.sum() < MIN_CORNERS:
                 break
-            places = places_from(nodes[there], start[there], nodes)
+            places = predict_places(nodes[there], start[there], nodes)
             near = np.linalg.norm(nodes[:, None] - nodes[there], axis=2).min(axis=1) < 1.5
             start = np.where(near[:, None] & ~there[:, None], places.uv, start)
             corners = fit_corners(picture, start, places.right, places.down, bare=(1 - self.marker / self.square) / 2)
-            there = _sound(corners, nodes)
-            there &= _placed(corners, nodes, there)
+            there = _find_sound(corners, nodes)
+            there &= _find_in_place(corners, nodes, there)
             start = np.where(there[:, None], corners.uv, np.nan)
             if (there == before).all():
                 break
@@ -208,11 +208,11 @@ class _Seen(NamedTuple):
     reason: str
 
 
-def _nothing_seen(reason: str) -> _Seen:
+def _refuse(reason: str) -> _Seen:
     return _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), reason)
 
 
-def _sound(corners: Corners, nodes: Floats) -> NDArray[np.bool_]:
+def _find_sound(corners: Corners, nodes: Floats) -> NDArray[np.bool_]:
     """Which corners (n,) look like corners: little left over, and bright and dark in turn as their neighbours."""
     with np.errstate(invalid="ignore"):
         good = (corners.misfit < MAX_RESIDUAL_HEIGHTS) & np.isfinite(corners.uv).all(axis=1)
@@ -223,17 +223,17 @@ def _sound(corners: Corners, nodes: Floats) -> NDArray[np.bool_]:
     return np.asarray(good, dtype=np.bool_)
 
 
-def _placed(corners: Corners, nodes: Floats, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _find_in_place(corners: Corners, nodes: Floats, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which corners (n,) are where those that are `there` say; their own say left out."""
     if there.sum() < MIN_CORNERS:
         return np.zeros_like(there)
-    places = places_from(nodes[there], corners.uv[there], nodes)
+    places = predict_places(nodes[there], corners.uv[there], nodes)
     with np.errstate(invalid="ignore"):
-        off = np.abs(_squares(corners.uv - places.uv, places)).max(axis=1)
+        off = np.abs(_in_squares(corners.uv - places.uv, places)).max(axis=1)
     return np.asarray(off < MAX_ASTRAY_SQUARES / 2, dtype=np.bool_)
 
 
-def _squares(off: Floats, places: Places) -> Floats:
+def _in_squares(off: Floats, places: Places) -> Floats:
     """Differences in pixels (n, 2) as parts of the steps right and down there."""
     steps = np.stack([places.right, places.down], axis=2)
     return np.asarray(np.einsum("nij,nj->ni", np.linalg.pinv(steps), off), dtype=np.float64)

@@ -68,6 +68,10 @@ class Corners:
     def __getitem__(self, rows: Bools | NDArray[np.intp]) -> Corners:
         return Corners(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
+    def __setitem__(self, rows: Bools | NDArray[np.intp], others: Corners) -> None:
+        for name in self.__dataclass_fields__:
+            getattr(self, name)[rows] = getattr(others, name)
+
 
 def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare: float = 1.0) -> Corners:
     """Fit the corners near pixels uv (n, 2).
@@ -77,22 +81,15 @@ def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare:
     """
     uv, right, down = (np.asarray(x, dtype=np.float64) for x in (uv, right, down))
     out = Corners.unknown(len(uv))
-    half = int(
-        np.ceil(np.clip(0.9 * np.nanmax(_lengths(right, down), initial=MIN_WINDOW_PX), MIN_WINDOW_PX, MAX_WINDOW_PX))
-    )
+    longest = np.nanmax(np.linalg.norm([right, down], axis=2), initial=MIN_WINDOW_PX)
+    half = int(np.ceil(np.clip(0.9 * longest, MIN_WINDOW_PX, MAX_WINDOW_PX)))
     with np.errstate(invalid="ignore"):
         inside = np.isfinite(uv + right + down).all(axis=1)
         inside &= ((uv >= half + 0.5) & (uv <= np.array(picture.shape)[::-1] - half - 1.5)).all(axis=1)
     for rows in np.array_split(np.flatnonzero(inside), max(1, int(inside.sum()) // 256)):
         if len(rows):
-            found = _Windows(picture, uv[rows], right[rows], down[rows], half, bare).fitted()
-            for name in out.__dataclass_fields__:
-                getattr(out, name)[rows] = getattr(found, name)
+            out[rows] = _Windows(picture, uv[rows], right[rows], down[rows], half, bare).fit()
     return out
-
-
-def _lengths(right: Floats, down: Floats) -> Floats:
-    return np.asarray(np.maximum(np.linalg.norm(right, axis=1), np.linalg.norm(down, axis=1)), dtype=np.float64)
 
 
 class _Windows:
@@ -110,18 +107,18 @@ class _Windows:
         self.half, self.bare = half, bare
         self.start = uv - corner
 
-    def fitted(self) -> Corners:
+    def fit(self) -> Corners:
         n = len(self.start)
         parameters = np.hstack([self.start, self.angle, np.full((n, 1), np.log(0.8))])
-        weight = self._weight(parameters)
-        error, parameters, linear, jacobian = self._evaluated(parameters, weight)
+        weight = self._choose_window(parameters)
+        error, parameters, linear, jacobian = self._evaluate(parameters, weight)
         damping = np.full(n, 1e-3)
         for turn in range(MAX_ROUNDS):
             if turn == 2:  # the window follows the corner, but not for ever: what moves does not converge
-                weight = self._weight(parameters)
-                error, parameters, linear, jacobian = self._evaluated(parameters, weight)
-            trial = self._bounded(parameters - self._step(linear[1], jacobian, weight, damping))
-            tried = self._evaluated(trial, weight)
+                weight = self._choose_window(parameters)
+                error, parameters, linear, jacobian = self._evaluate(parameters, weight)
+            trial = self._limit(parameters - self._solve_step(linear[1], jacobian, weight, damping))
+            tried = self._evaluate(trial, weight)
             better = tried[0] < error
             damping = np.where(better, damping / 5, damping * 5)
             pick = (better[:, None], better[:, None], better[:, None, None])
@@ -132,9 +129,9 @@ class _Windows:
             linear = (np.where(pick[0], tried[2][0], linear[0]), np.where(pick[1], tried[2][1], linear[1]))
             if turn > 3 and np.all(change < 2e-4):
                 break
-        return self._result(parameters, linear, jacobian, weight)
+        return self._collect(parameters, linear, jacobian, weight)
 
-    def _weight(self, parameters: Floats) -> Floats:
+    def _choose_window(self, parameters: Floats) -> Floats:
         """(n, pixels) 1 in the window, 0 outside; the window is point-symmetric about the corner, as the model is."""
         d = self.offset - parameters[:, None, :2]
         inverse = np.linalg.pinv(self.steps)
@@ -147,7 +144,7 @@ class _Windows:
             inside &= (squares < bare).any(axis=2)
         return np.asarray(inside, dtype=np.float64)
 
-    def _evaluated(self, parameters: Floats, weight: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats], Floats]:
+    def _evaluate(self, parameters: Floats, weight: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats], Floats]:
         """Sum of squares (n,), the parameters, (mean and height (n, 2), residuals (n, pixels)), Jacobian.
 
         Mean and height enter linearly and are solved for each time (variable projection, Golub & Pereyra 1973); the
@@ -163,7 +160,7 @@ class _Windows:
             shape.append(erf(x / np.sqrt(2)))
             slope.append(np.exp(-0.5 * x * x) * np.sqrt(2 / np.pi))
         product = -shape[0] * shape[1]  # below the one edge and left of the other is not between the two steps
-        mean, height = _line(product, self.grey, weight)
+        mean, height = _fit_lines(product, self.grey, weight)
         residual = (mean[:, None] + height[:, None] * product - self.grey) * weight
         jacobian = np.empty((*product.shape, 7))
         a, b = -slope[0] * shape[1], -slope[1] * shape[0]
@@ -176,7 +173,7 @@ class _Windows:
         jacobian[..., 5], jacobian[..., 6] = 1, product
         return np.sum(residual**2, axis=1), parameters, (np.column_stack([mean, height]), residual), jacobian
 
-    def _step(self, residual: Floats, jacobian: Floats, weight: Floats, damping: Floats) -> Floats:
+    def _solve_step(self, residual: Floats, jacobian: Floats, weight: Floats, damping: Floats) -> Floats:
         weighted = jacobian * weight[..., None]
         normal = weighted.swapaxes(1, 2) @ jacobian
         diagonal = np.einsum("nii->ni", normal)
@@ -185,12 +182,12 @@ class _Windows:
         step: Floats = np.linalg.solve(normal, gradient[..., None])[:, :5, 0]
         return np.clip(step, -0.7, 0.7)
 
-    def _bounded(self, parameters: Floats) -> Floats:
+    def _limit(self, parameters: Floats) -> Floats:
         parameters[:, :2] = self.start + np.clip(parameters[:, :2] - self.start, -self.half / 2, self.half / 2)
         parameters[:, 4] = np.clip(parameters[:, 4], np.log(0.25), np.log(4.0))
         return parameters
 
-    def _result(self, parameters: Floats, linear: tuple[Floats, Floats], jacobian: Floats, weight: Floats) -> Corners:
+    def _collect(self, parameters: Floats, linear: tuple[Floats, Floats], jacobian: Floats, weight: Floats) -> Corners:
         (mean, height), residual = linear[0].T, linear[1]
         weighted = jacobian * weight[..., None]
         normal = weighted.swapaxes(1, 2) @ jacobian
@@ -208,7 +205,7 @@ class _Windows:
         return Corners(uv, sd, mean, height, misfit, np.exp(parameters[:, 4]), turned)
 
 
-def _line(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def _fit_lines(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Weighted straight lines y = a + b x, one a row: a (n,), b (n,)."""
     total = np.maximum(weight.sum(axis=1), 1e-12)
     mx, my = (weight * x).sum(axis=1) / total, (weight * y).sum(axis=1) / total

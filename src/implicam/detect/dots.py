@@ -26,9 +26,10 @@ from scipy.spatial import cKDTree
 from implicam.dataset import Floats, KnownPositions
 from implicam.dataset.folder import POINTS, read_points
 from implicam.dataset.tables import name_in, number, read_table
-from implicam.detect.blobs import find_spots, measure_spots, scale_shown
+from implicam.detect.blobs import find_scale, find_spots, measure_spots
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.errors import DatasetError, UsageError, did_you_mean
+from implicam.formatting import list_some
 from implicam.gp.kernels import Kernel
 from implicam.gp.linalg import cholesky, solve, solve_lower
 from implicam.images import Grey
@@ -134,11 +135,11 @@ class Dots(DetectorBase):
         if not len(rows):
             shots = sorted(set(self.known.shots.tolist()))
             return nothing(
-                f"the layout has no shot {view.shot!r}{did_you_mean(view.shot, shots)}; it has {_listed(shots)}: "
+                f"the layout has no shot {view.shot!r}{did_you_mean(view.shot, shots)}; it has {list_some(shots)}: "
                 "name the picture after one of them, or correct the layout's column shot"
             )
         names = [self.points[row] for row in rows]
-        marks = self._marks(view, names)
+        marks = self._labels_of(view, names)
         if len(marks) < MIN_LABELS:
             return nothing(
                 f"{len(marks)} labelled dots for camera {view.camera!r} in shot {view.shot!r}, but it takes "
@@ -148,7 +149,7 @@ class Dots(DetectorBase):
         if isinstance(search, str):
             return nothing(search)
         search.grow()
-        doubt = search.doubt()
+        doubt = search.explain_doubt()
         return nothing(doubt) if doubt else search.result()
 
     def _rows(self, view: View) -> Ints:
@@ -157,7 +158,7 @@ class Dots(DetectorBase):
             return np.arange(len(shots))
         return np.flatnonzero(shots == view.shot)
 
-    def _marks(self, view: View, names: Sequence[str]) -> dict[int, tuple[float, float]]:
+    def _labels_of(self, view: View, names: Sequence[str]) -> dict[int, tuple[float, float]]:
         marks = {**self.labels.get(View(view.camera, ""), {}), **self.labels.get(view, {})}
         index = {name: i for i, name in enumerate(names)}
         return {index[name]: uv for name, uv in marks.items() if name in index}
@@ -215,7 +216,7 @@ class _Camera:
     @classmethod
     def fit(cls, xyz: Floats, uv: Floats, sd: Floats) -> _Camera:
         """With the most probable of a few departures; with few dots, one per cent of the target's size."""
-        first = cls.condition(xyz, uv, sd, _affine(xyz, uv), 0.01, 1.0, 0.001)
+        first = cls.condition(xyz, uv, sd, _fit_affine(xyz, uv), 0.01, 1.0, 0.001)
         if len(xyz) < MIN_DOTS_FOR_DEPARTURE:
             return first
         some = np.random.default_rng(0).permutation(len(xyz))[:MAX_DOTS_FOR_DEPARTURE]
@@ -242,10 +243,10 @@ class _Camera:
         turns: int = 5,
     ) -> _Camera:
         noise = np.repeat(sd**2 + slack**2, 2)
-        prior = _prior(theta)
+        prior = _prior_covariance(theta)
         for turn in range(turns):
             image, J = _project(theta, xyz)
-            K = J @ prior @ J.T + np.kron(_smooth(bend, reach)(xyz, xyz), np.eye(2))
+            K = J @ prior @ J.T + np.kron(_smooth_kernel(bend, reach)(xyz, xyz), np.eye(2))
             K[np.diag_indices_from(K)] += noise
             L = cholesky(np.asfortranarray(K))
             rest = (uv - image).ravel() + J @ theta
@@ -258,7 +259,7 @@ class _Camera:
     def predict(self, xyz: Floats) -> _Prediction:
         image, J = _project(self.theta, xyz)
         known = _project(self.theta, self.xyz)[1]
-        smooth = np.kron(_smooth(self.bend, self.reach)(self.xyz, xyz), np.eye(2))
+        smooth = np.kron(_smooth_kernel(self.bend, self.reach)(self.xyz, xyz), np.eye(2))
         K = known @ self.prior @ J.T + smooth
         v = solve_lower(self.L, K)
         prior = np.einsum("ij,jk,ik->i", J, self.prior, J) + self.bend**2
@@ -286,7 +287,7 @@ ALONG_PRIOR_SD, ACROSS_PRIOR_SD = 0.2, 0.06
 along the line of sight; and across it, which is what an axis that does not meet the target does."""
 
 
-def _prior(theta: Floats) -> Floats:
+def _prior_covariance(theta: Floats) -> Floats:
     """Prior covariance (11, 11) of the numbers of a camera; its line of sight is that of theta."""
     sight = np.cross(theta[:3], theta[4:7])
     sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
@@ -308,11 +309,11 @@ def _project(theta: Floats, xyz: Floats) -> tuple[Floats, Floats]:
     return uv, J.reshape(2 * n, 11)
 
 
-def _smooth(bend: float, reach: float) -> Kernel:
+def _smooth_kernel(bend: float, reach: float) -> Kernel:
     return Kernel("squared-exponential", bend**2, np.full(3, reach))
 
 
-def _affine(xyz: Floats, uv: Floats) -> Floats:
+def _fit_affine(xyz: Floats, uv: Floats) -> Floats:
     one = np.hstack([xyz, np.ones((len(xyz), 1))])
     normal = one.T @ one + 1e-6 * len(xyz) * np.eye(4)
     return np.concatenate([*np.linalg.solve(normal, one.T @ uv).T, np.zeros(3)])
@@ -346,24 +347,24 @@ class _Search:
         rows, uv = rows[inside], uv[inside]
         if len(rows) < MIN_LABELS:
             return (
-                f"the labels {_listed(outside)} lie outside the picture, which is {picture.shape[1]} x "
+                f"the labels {list_some(outside)} lie outside the picture, which is {picture.shape[1]} x "
                 f"{picture.shape[0]} pixels: correct them, or check that this is the picture they belong to"
             )
         picture = 1 - picture if polarity == "dark" else picture
-        sigma, answers = scale_shown(picture, uv, _largest(xyz, rows, uv))
+        sigma, answers = find_scale(picture, uv, _largest_scale(xyz, rows, uv))
         if polarity == "auto" and np.nansum(answers) < 0:
             picture = 1 - picture
         search = cls(picture, sigma, names, xyz)
-        search._label(rows, uv)
+        search._match_labels(rows, uv)
         if len(search.labelled) < MIN_LABELS:
             return (
-                f"no dot where the labels {_listed([names[row] for row in search.lost])} are, and it takes "
+                f"no dot where the labels {list_some([names[row] for row in search.lost])} are, and it takes "
                 f"{MIN_LABELS} labels that lie on dots: click within two pixels of dots that this picture shows, "
                 "and check that it is sharp and not turned"
             )
         return search
 
-    def _near(self, uv: Floats, within: float) -> list[int]:
+    def _find_near(self, uv: Floats, within: float) -> list[int]:
         """The spots near a pixel that are not much fainter than the brightest of them, as measured."""
         found = [] if self.tree is None else self.tree.query_ball_point(uv, within + self.sigma)
         self._measure(found)
@@ -379,9 +380,9 @@ class _Search:
         for i, k in enumerate(new):
             self.measured[k] = (found.uv[i], found.sd[i], float(found.area[i]))
 
-    def _label(self, rows: Ints, uv: Floats) -> None:
+    def _match_labels(self, rows: Ints, uv: Floats) -> None:
         for row, pixel in zip(rows, uv, strict=True):
-            near = self._near(pixel, max(MAX_CLICK_PX, self.sigma * np.sqrt(2)))
+            near = self._find_near(pixel, max(MAX_CLICK_PX, self.sigma * np.sqrt(2)))
             near = [k for k in near if k not in self.to]
             if near:
                 self.meant[int(row)] = self.to[row] = max(near, key=lambda k: self.answer[k])
@@ -404,7 +405,7 @@ class _Search:
         rows = np.flatnonzero(self.to >= 0)
         uv = np.array([self.measured[k][0] for k in self.to[rows]])
         sd = np.array([np.sqrt(np.mean(self.measured[k][1] ** 2)) for k in self.to[rows]])
-        middle, scale = _frame(self.xyz[rows], uv)
+        middle, scale = _find_frame(self.xyz[rows], uv)
         if len(rows) > MAX_DOTS_FOR_DEPARTURE:
             some = np.sort(np.random.default_rng(0).permutation(len(rows))[:MAX_DOTS_FOR_DEPARTURE])
             rows, uv, sd = rows[some], uv[some], sd[some]
@@ -415,7 +416,7 @@ class _Search:
         self.apart = cKDTree(self.uv).query(self.uv, k=2)[0][:, 1]
         self.sure = MIN_SDS_TO_NEXT * self.sd < MAX_OFF_TO_NEXT * self.apart
 
-    def _distance(self) -> Floats:
+    def _distances(self) -> Floats:
         """(n,) pixels from what the others say of a dot to where it is; NaN where it is not matched."""
         out = np.full(len(self.to), np.nan)
         for row in np.flatnonzero(self.to >= 0):
@@ -424,7 +425,7 @@ class _Search:
 
     def _drop(self) -> None:
         """Forget the matches that the others contradict."""
-        distance = self._distance()
+        distance = self._distances()
         matched = self.to >= 0
         if matched.sum() < MIN_DOTS_FOR_DEPARTURE:
             return
@@ -442,38 +443,38 @@ class _Search:
         """Match the dots whose places are known well enough, each with the spot that is nearest to it and no other."""
         pairs: list[tuple[float, int, int]] = []
         taken = set(self.to[self.to >= 0].tolist())
-        for row in np.flatnonzero((self.to < 0) & self.sure & self._inside()):
+        for row in np.flatnonzero((self.to < 0) & self.sure & self._is_inside()):
             within = min(MAX_OFF_TO_NEXT * self.apart[row], 2 * MIN_SDS_TO_NEXT * self.sd[row] + self.tolerated)
-            free = [k for k in self._near(self.uv[row], within) if k not in taken]
+            free = [k for k in self._find_near(self.uv[row], within) if k not in taken]
             pairs += [(float(np.linalg.norm(self.measured[k][0] - self.uv[row])), int(row), k) for k in free]
         for _, at, k in sorted(pairs):
             if self.to[at] < 0 and k not in taken:
                 self.to[at] = k
                 taken.add(k)
 
-    def _displaced(self) -> Floats:
+    def _displacements(self) -> Floats:
         """(n,) pixels that matched dots are off by, where that is far more than usual."""
-        distance = self._distance()
+        distance = self._distances()
         usual = float(np.nanmedian(distance))
         with np.errstate(invalid="ignore"):
             far = distance > np.maximum(MAX_ASTRAY_RATIO * usual, 2 * MIN_SDS_TO_NEXT * self.sd)
         return np.where(far, distance, 0.0)
 
-    def _inside(self) -> Bools:
+    def _is_inside(self) -> Bools:
         height, width = self.picture.shape
         return np.asarray(((self.uv > -0.5) & (self.uv < (width - 0.5, height - 0.5))).all(axis=1), dtype=np.bool_)
 
-    def doubt(self) -> str:
+    def explain_doubt(self) -> str:
         """Why the labels cannot be right, or nothing: they agree with each other, and the other dots with them."""
-        inside = self._inside()
+        inside = self._is_inside()
         sought = inside & self.sure
         share = float(np.mean(self.to[sought] >= 0)) if sought.any() else 0.0
-        scatter = float(np.nanmedian(self._distance() / self.apart))
+        scatter = float(np.nanmedian(self._distances() / self.apart))
         against = [self.names[row] for row, spot in self.meant.items() if self.to[row] != spot]
         outvoted = share >= 0.95 and bool(self.sure[inside].all()) and 3 * len(against) <= len(self.meant)
         if share >= 0.6 and scatter <= MAX_SCATTER_TO_NEXT and (not against or outvoted):
             return ""
-        which = f", least of all {_listed(against)}" if against and len(against) < len(self.meant) else ""
+        which = f", least of all {list_some(against)}" if against and len(against) < len(self.meant) else ""
         return (
             f"the labels do not fit the layout and the dots seen{which}: {(self.to[sought] >= 0).sum()} of "
             f"{sought.sum()} dots were where they should be. Check that each label has the name of its dot and the "
@@ -481,22 +482,24 @@ class _Search:
         )
 
     def result(self) -> Detected:
-        rows = _rows(self.to >= 0)
+        rows = np.flatnonzero(self.to >= 0).tolist()
         kept = self.to[rows]
         uv, sd = (np.array([self.measured[k][part] for k in kept]).reshape(-1, 2) for part in (0, 1))
-        odd = _odd_sizes(uv, np.array([self.measured[k][2] for k in kept]))
-        missing = {self.names[row]: self.uv[row].tolist() for row in _rows((self.to < 0) & self._inside())}
+        odd = _offsets_by_size(uv, np.array([self.measured[k][2] for k in kept]))
+        missing = {
+            self.names[row]: self.uv[row].tolist() for row in np.flatnonzero((self.to < 0) & self._is_inside()).tolist()
+        }
         return Detected(
             tuple(self.names[row] for row in rows),
             uv,
-            np.hypot(sd, np.hypot(odd, self._displaced()[rows])[:, None]),
-            self._reason(),
+            np.hypot(sd, np.hypot(odd, self._displacements()[rows])[:, None]),
+            self._explain(),
             notes={"labelled": [self.names[row] for row in self.labelled], "missing": missing, "scale": self.sigma},
         )
 
-    def _reason(self) -> str:
+    def _explain(self) -> str:
         gone = self.to < 0
-        inside = self._inside()
+        inside = self._is_inside()
         off = gone & inside & np.isin(np.arange(len(gone)), list(self.off))
         unsure = gone & inside & ~self.sure & ~off
         counts = {
@@ -508,7 +511,9 @@ class _Search:
         parts = [f"{which.sum()} {text}" for text, which in counts.items() if which.any()]
         said = [f"{gone.sum()} of {len(gone)} dots not found: {'; '.join(parts)}"] if parts else []
         if self.lost:
-            said.append(f"no dot where the labels {_listed([self.names[row] for row in self.lost])} are: correct them")
+            said.append(
+                f"no dot where the labels {list_some([self.names[row] for row in self.lost])} are: correct them"
+            )
         return ". ".join(said)
 
 
@@ -516,14 +521,14 @@ MIN_BRIGHTNESS_RATIO = 0.3
 """Of the brightest spot near a prediction: fainter ones beside it are not meant."""
 
 
-def _frame(xyz: Floats, uv: Floats) -> tuple[Floats, float]:
+def _find_frame(xyz: Floats, uv: Floats) -> tuple[Floats, float]:
     """Where the middle of the target is in pixels, and pixels per unit, both roughly."""
     spread = xyz - xyz.mean(axis=0)
     scale = np.sqrt(np.sum((uv - uv.mean(axis=0)) ** 2) / max(float(np.sum(spread**2)), 1e-12))
     return uv.mean(axis=0), float(scale)
 
 
-def _largest(xyz: Floats, rows: Ints, uv: Floats) -> float:
+def _largest_scale(xyz: Floats, rows: Ints, uv: Floats) -> float:
     """The largest scale in pixels that dots can have: a quarter of the way from one to the next."""
     pixels = (
         (np.column_stack([xyz, np.ones(len(xyz))]))
@@ -533,7 +538,7 @@ def _largest(xyz: Floats, rows: Ints, uv: Floats) -> float:
     return float(np.clip(np.median(cKDTree(pixels).query(pixels, k=2)[0][:, 1]) / 4, 1.5, 16.0))
 
 
-def _odd_sizes(uv: Floats, area: Floats) -> Floats:
+def _offsets_by_size(uv: Floats, area: Floats) -> Floats:
     """(n,) pixels that dots of other size than their neighbours' may be off: where a part f of a disc of radius R is
     hidden or added at its rim, its centroid moves by up to f R, by half of that as a standard deviation."""
     neighbours = cKDTree(uv).query(uv, k=min(9, len(uv)))[1]
@@ -541,11 +546,3 @@ def _odd_sizes(uv: Floats, area: Floats) -> Floats:
     usual = 1.4826 * float(np.median(np.abs(ratio)))
     part = np.minimum(np.maximum(np.abs(ratio) - 2 * usual, 0), 1)
     return np.asarray(0.5 * part * np.sqrt(area / np.pi), dtype=np.float64)
-
-
-def _rows(where: Bools) -> list[int]:
-    return [int(row) for row in np.flatnonzero(where)]
-
-
-def _listed(names: Sequence[str], most: int = 6) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -72,20 +72,20 @@ class Ellipse(NamedTuple):
         return np.asarray(self.centre + circle @ np.linalg.inv(self.shape).T, dtype=np.float64)
 
 
-def through(points: Floats, start: Ellipse) -> Ellipse:
+def fit_ellipse(points: Floats, start: Ellipse) -> Ellipse:
     """The ellipse nearest to points (n, 2), by least squares of the distances."""
     ellipse = start
     for _ in range(20):
-        distance, slope = _distance(points, ellipse)
+        distance, slope = _signed_distance(points, ellipse)
         change: Floats = -np.linalg.lstsq(slope, distance)[0].astype(np.float64)
-        ellipse = _changed(ellipse, change)
+        ellipse = _change_ellipse(ellipse, change)
         if np.abs(change[:2]).max() < 1e-7:
             break
     return ellipse
 
 
-def _changed(ellipse: Ellipse, change: Floats) -> Ellipse:
-    """Centre and shape changed by (5,): the derivatives of `_distance`."""
+def _change_ellipse(ellipse: Ellipse, change: Floats) -> Ellipse:
+    """Centre and shape changed by (5,): the derivatives of `_signed_distance`."""
     shape = ellipse.shape + np.array([[change[2], change[3]], [change[3], change[4]]])
     return Ellipse(ellipse.centre + change[:2], shape)
 
@@ -110,16 +110,16 @@ class Rough(NamedTuple):
     quality: float
 
 
-def rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.0) -> Rough | None:
+def find_rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.0) -> Rough | None:
     """The edge of a disc, darker than what is around it, near `centre` (2,) with about this radius, to a pixel or so.
 
     None where there is none on most sides, or where it is darker by less than `step` grey values.
     """
     for _ in range(3):
-        points, rise = _steepest(picture, centre, radius)
+        points, rise = _find_steepest_rise(picture, centre, radius)
         if np.mean(rise > 0.6 * step) < 0.6:  # no ellipse can be better than that
             return None
-        found = _robust_ellipse(points, centre, radius)
+        found = _fit_robust_ellipse(points, centre, radius)
         if found is None or np.linalg.norm(found[0].centre - centre) > radius:
             return None
         ellipse, on_it = found
@@ -133,7 +133,7 @@ def rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.
     return Rough(ellipse, part * float(np.median(rise)))
 
 
-def _steepest(picture: Grey, centre: Floats, radius: float) -> tuple[Floats, Floats]:
+def _find_steepest_rise(picture: Grey, centre: Floats, radius: float) -> tuple[Floats, Floats]:
     """Where the picture brightens most along each spoke, (SPOKES, 2), between half and 1.6 times the radius; and by how
     much (SPOKES,) from a pixel before to a pixel behind."""
     step = max(0.25, radius / 40)
@@ -156,7 +156,7 @@ def _steepest(picture: Grey, centre: Floats, radius: float) -> tuple[Floats, Flo
     return centre + r[places][:, None] * out, np.asarray(high - low, dtype=np.float64)
 
 
-def _robust_ellipse(points: Floats, centre: Floats, radius: float) -> tuple[Ellipse, Bools] | None:
+def _fit_robust_ellipse(points: Floats, centre: Floats, radius: float) -> tuple[Ellipse, Bools] | None:
     """The ellipse through most of the points, and (n,) which those are: iteratively reweighted, about the centre."""
     p = (points - centre) / radius
     basis = np.column_stack([p[:, 0] ** 2, 2 * p[:, 0] * p[:, 1], p[:, 1] ** 2, p])
@@ -200,34 +200,34 @@ def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
     ellipse, kept = start, np.ones(SECTORS, dtype=np.bool_)
     band = fit = None
     for _ in range(3):
-        band = _band(picture, ellipse, 3 * blur + OUTWARD_PX)
+        band = _cut_band(picture, ellipse, 3 * blur + OUTWARD_PX)
         if band is None:
             return None
-        fit = _gauss_newton(band, ellipse, blur, kept[_sector(band.uv, ellipse)])
+        fit = _gauss_newton(band, ellipse, blur, kept[_sector_of(band.uv, ellipse)])
         if fit is None:
             return None
         settled = 0.8 < fit.blur / blur < 1.25  # else the band was too narrow, or needlessly wide
         ellipse, blur = fit.ellipse, fit.blur
-        worse = _sector_rms(band.grey - _model(band.uv, fit)[0], _sector(band.uv, ellipse))
+        worse = _sector_rms(band.grey - _evaluate_model(band.uv, fit)[0], _sector_of(band.uv, ellipse))
         again = worse <= ODD_SECTOR_RATIO * max(float(np.median(worse)), 0.004)
         if again.mean() < 0.4 or (settled and (again == kept).all()):
             break
         kept = again
     assert band is not None
     assert fit is not None
-    return _judged(band, fit, kept)
+    return _judge(band, fit, kept)
 
 
-def _judged(band: _Band, fit: _Fit, kept: Bools) -> Edge | None:
+def _judge(band: _Band, fit: _Fit, kept: Bools) -> Edge | None:
     """Levels and covariance of what was found."""
-    use = kept[_sector(band.uv, fit.ellipse)]
-    model, J, step = _model(band.uv[use], fit)
+    use = kept[_sector_of(band.uv, fit.ellipse)]
+    model, J, step = _evaluate_model(band.uv[use], fit)
     residual = band.grey[use] - model
     if len(J) < 2 * J.shape[1]:
         return None
-    JW = J / _variance(fit.noise, step)[:, None]
+    JW = J / _noise_variance(fit.noise, step)[:, None]
     try:
-        covariance = np.linalg.inv(JW.T @ J + np.diag(_precision(fit)))
+        covariance = np.linalg.inv(JW.T @ J + np.diag(_prior_precision(fit)))
     except np.linalg.LinAlgError:
         return None
     rms = float(np.sqrt(np.mean(residual**2)))
@@ -237,7 +237,7 @@ def _judged(band: _Band, fit: _Fit, kept: Bools) -> Edge | None:
     )
 
 
-def _band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:
+def _cut_band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:
     """The pixels within `width` of the ellipse; None where it is not wholly in the picture."""
     reach = ellipse.axes[0] + width + 1
     low = np.floor(ellipse.centre - reach).astype(int)
@@ -247,13 +247,13 @@ def _band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:
         return None
     v, u = np.mgrid[low[1] : high[1], low[0] : high[0]]
     uv = np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)
-    distance = _distance(uv, ellipse)[0]
+    distance = _signed_distance(uv, ellipse)[0]
     near = (distance < width) & (distance > -min(width, 0.8 * ellipse.axes[1]))
     grey = picture[low[1] : high[1], low[0] : high[0]].ravel()[near]
     return _Band(uv[near], grey.astype(np.float64))
 
 
-def _distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
+def _signed_distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
     """Signed distance (n,) from the ellipse, right to first order near it; its derivative (n, 5) by the centre and by
     the shape's numbers (0, 0), (0, 1), (1, 1)."""
     p = uv - ellipse.centre
@@ -268,11 +268,11 @@ def _distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
     return (size - 1) / steep, np.column_stack([-slope, by_shape]) / steep[:, None]
 
 
-def _model(uv: Floats, fit: _Fit) -> tuple[Floats, Floats, Floats]:
+def _evaluate_model(uv: Floats, fit: _Fit) -> tuple[Floats, Floats, Floats]:
     """Grey values (n,), their derivative (n, GEOMETRY_NUMBERS + 2 LIGHT_NUMBERS), and how far outside each pixel is,
     0 to 1."""
-    d, by_ellipse = _distance(uv, fit.ellipse)
-    around = _around(uv, fit.ellipse)
+    d, by_ellipse = _signed_distance(uv, fit.ellipse)
+    around = _wave_basis(uv, fit.ellipse)
     z = d / fit.blur
     step, density = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
     inner = np.column_stack([around, around[:, :LIGHT_SLOPES] * np.minimum(d, 0)[:, None]])
@@ -286,7 +286,7 @@ def _model(uv: Floats, fit: _Fit) -> tuple[Floats, Floats, Floats]:
     return J[:, GEOMETRY_NUMBERS:] @ fit.light, J, step
 
 
-def _around(uv: Floats, ellipse: Ellipse) -> Floats:
+def _wave_basis(uv: Floats, ellipse: Ellipse) -> Floats:
     """(n, 1 + 2 LIGHT_WAVES) 1 and cos, sin of 1, 2, ... times the angle around the centre."""
     q = (uv - ellipse.centre) @ ellipse.shape
     turn = (q[:, 0] + 1j * q[:, 1]) / np.maximum(np.hypot(*q.T), 1e-9)
@@ -294,7 +294,7 @@ def _around(uv: Floats, ellipse: Ellipse) -> Floats:
     return np.column_stack([np.ones(len(q)), np.stack([powers.real, powers.imag], axis=2).reshape(len(q), -1)])
 
 
-def _precision(fit: _Fit) -> Floats:
+def _prior_precision(fit: _Fit) -> Floats:
     """(GEOMETRY_NUMBERS + 2 LIGHT_NUMBERS,) of the prior: the light is nearly even inside, less so outside, and
     never jumps."""
     jump = abs(fit.light[LIGHT_NUMBERS] - fit.light[0]) + 1e-3
@@ -304,14 +304,14 @@ def _precision(fit: _Fit) -> Floats:
     return np.concatenate([np.zeros(GEOMETRY_NUMBERS), inner**-2, outer**-2])
 
 
-def _variance(noise: Floats, step: Floats) -> Floats:
+def _noise_variance(noise: Floats, step: Floats) -> Floats:
     return np.asarray(noise[0] ** 2 * (1 - step) + noise[1] ** 2 * step, dtype=np.float64)
 
 
 def _gauss_newton(band: _Band, start: Ellipse, blur: float, use: Bools) -> _Fit | None:
     """The most probable edge and light, given the pixels to be used; None where it runs away."""
     uv, grey = band.uv[use], band.grey[use]
-    outside = _distance(uv, start)[0] > 0
+    outside = _signed_distance(uv, start)[0] > 0
     if outside.sum() < 2 * LIGHT_NUMBERS or (~outside).sum() < 10:
         return None
     light = np.zeros(2 * LIGHT_NUMBERS)
@@ -319,34 +319,35 @@ def _gauss_newton(band: _Band, start: Ellipse, blur: float, use: Bools) -> _Fit 
     fit = _Fit(start, blur, light, np.full(2, 0.1 * abs(light[LIGHT_NUMBERS] - light[0]) + 1e-3))
     weight = np.ones(len(uv))
     for iteration in range(15):
-        model, J, step = _model(uv, fit)
+        model, J, step = _evaluate_model(uv, fit)
         residual = grey - model
         if iteration >= 2:  # a first fit knows what is odd
-            fit = fit._replace(noise=_noise(residual, step))
-            weight = np.maximum(1 - residual**2 / (25 * _variance(fit.noise, step)), 0) ** 2
-        JW = J * (weight / _variance(fit.noise, step))[:, None]
-        precision = _precision(fit)
+            fit = fit._replace(noise=_estimate_noise(residual, step))
+            weight = np.maximum(1 - residual**2 / (25 * _noise_variance(fit.noise, step)), 0) ** 2
+        JW = J * (weight / _noise_variance(fit.noise, step))[:, None]
+        precision = _prior_precision(fit)
         pull = precision * np.concatenate([np.zeros(GEOMETRY_NUMBERS), fit.light])
         try:
             change = np.linalg.solve(JW.T @ J + np.diag(precision), JW.T @ residual - pull)
         except np.linalg.LinAlgError:
             return None
-        fit = _moved(fit, change, start)
-        if not _sane(fit.ellipse, start):
+        fit = _apply_change(fit, change, start)
+        if not _is_sane(fit.ellipse, start):
             return None
         if iteration > 3 and np.abs(change[:2]).max() < 2e-3 * fit.blur:
             break
     return fit
 
 
-def _moved(fit: _Fit, change: Floats, start: Ellipse) -> _Fit:
+def _apply_change(fit: _Fit, change: Floats, start: Ellipse) -> _Fit:
     damp = min(1.0, 0.3 * start.radius / max(float(np.linalg.norm(change[:2])), 1e-9))
     blur = float(np.clip(fit.blur + damp * change[5], 0.6 * fit.blur, 1.6 * fit.blur))
     blur = float(np.clip(blur, 0.3, 0.5 * start.radius))
-    return _Fit(_changed(fit.ellipse, damp * change[:5]), blur, fit.light + damp * change[GEOMETRY_NUMBERS:], fit.noise)
+    light = fit.light + damp * change[GEOMETRY_NUMBERS:]
+    return _Fit(_change_ellipse(fit.ellipse, damp * change[:5]), blur, light, fit.noise)
 
 
-def _noise(residual: Floats, step: Floats) -> Floats:
+def _estimate_noise(residual: Floats, step: Floats) -> Floats:
     """(2,) standard deviation inside and outside, bearing outliers; never less than the sensor's steps."""
     sides = (residual[step < 0.5], residual[step >= 0.5])
     taken = LIGHT_NUMBERS + GEOMETRY_NUMBERS / 2  # what the fit has explained away
@@ -355,7 +356,7 @@ def _noise(residual: Floats, step: Floats) -> Floats:
     )
 
 
-def _sane(ellipse: Ellipse, start: Ellipse) -> bool:
+def _is_sane(ellipse: Ellipse, start: Ellipse) -> bool:
     """Still an ellipse, near where it started."""
     if not (np.isfinite(ellipse.centre).all() and np.linalg.eigvalsh(ellipse.shape)[0] > 0):
         return False
@@ -363,7 +364,7 @@ def _sane(ellipse: Ellipse, start: Ellipse) -> bool:
     return near and 0.5 < ellipse.radius / start.radius < 2
 
 
-def _sector(uv: Floats, ellipse: Ellipse) -> NDArray[np.int64]:
+def _sector_of(uv: Floats, ellipse: Ellipse) -> NDArray[np.int64]:
     p = uv - ellipse.centre
     return np.floor((np.arctan2(p[:, 1], p[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
 

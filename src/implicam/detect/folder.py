@@ -27,12 +27,13 @@ from implicam.dataset import Camera, Dataset, KnownPositions, Observations, fold
 from implicam.dataset.folder import DESCRIPTION, IMAGES, VIEWS, csv_text, read_description, read_known
 from implicam.dataset.model import check_name
 from implicam.dataset.tables import parse_toml
-from implicam.detect.journal import Entry, Looked, look_at_all
+from implicam.detect.journal import Entry, Looked, detect_all
 from implicam.detect.model import Detector, View, nothing
 from implicam.detect.overlay import Result
 from implicam.detect.sheets import draw
 from implicam.errors import DatasetError, ImageError, UsageError, did_you_mean
 from implicam.files import replacing, toml_text, write_text
+from implicam.formatting import list_some
 from implicam.images import PATTERN, find_pictures, in_order, one_thread_each
 from implicam.progress import Progress, silent
 
@@ -102,27 +103,25 @@ def detect_folder(
     """
     rig = _Rig.of(Path(dataset), unit, Path(dataset) / pictures, pattern)
     with one_thread_each():
-        looked = look_at_all(
-            rig.pictures, detector, rig.path / DETECTIONS / JOURNAL, restart=restart, progress=progress
-        )
+        looked = detect_all(rig.pictures, detector, rig.path / DETECTIONS / JOURNAL, restart=restart, progress=progress)
         rig = rig.with_sizes(looked.sizes)
-        results, notes = _settled(rig, detector, looked)
-        data, more = _gathered(rig, results)
+        results, notes = _settle(rig, detector, looked)
+        data, more = _gather(rig, results)
         folder = rig.path / DETECTIONS
-        write_text(folder / SUMMARY, _summary(rig, results))
+        write_text(folder / SUMMARY, _summary_csv(rig, results))
         if data is not None:
             data, said = (correct or detector.correct)(data)
-            more += [*said, *_written(rig, data)]
+            more += [*said, *_write(rig, data)]
         sheets, undrawn = draw(folder, results, progress, redraw=restart) if overlays else ((), ())
     if data is None:
-        raise _nothing_at_all(rig, results, sheets)
+        raise _nothing_found_error(rig, results, sheets)
     return DetectionRun(
         rig.path / VIEWS,
         folder / SUMMARY,
         data,
         tuple(results),
-        tuple(_counts(results)),
-        tuple(_reasons(results)),
+        tuple(_count_by_camera(results)),
+        tuple(_count_reasons(results)),
         (*rig.notes, *notes, *more, *undrawn),
         looked.resumed,
         looked.seconds,
@@ -147,12 +146,12 @@ class _Rig:
     def of(cls, path: Path, unit: str | None, pictures: Path, pattern: str) -> _Rig:
         described = read_description(path) if (path / DESCRIPTION).exists() else None
         found = find_pictures(pictures, pattern, [camera.name for camera in described[2]] if described else ())
-        name, said, cameras, extra = described or _made_up(path, unit, found)
+        name, said, cameras, extra = described or _describe_folder(path, unit, found)
         if unit not in (None, said):
             raise UsageError(
                 f"{path / DESCRIPTION} is in {said!r}, not in {unit!r}.", fix="leave out --unit, or correct the file"
             )
-        usable, notes = _usable({camera.name for camera in cameras}, found, path)
+        usable, notes = _choose_usable({camera.name for camera in cameras}, found, path)
         return cls(path, name, said, cameras, extra, read_known(path), usable, tuple(notes))
 
     def with_sizes(self, sizes: Mapping[str, tuple[int, int]]) -> _Rig:
@@ -174,20 +173,20 @@ class _Rig:
         return int(np.count_nonzero(self.known[1].shots == view.shot)) or None
 
 
-def _made_up(
+def _describe_folder(
     path: Path, unit: str | None, found: Mapping[str, Mapping[str, Path]]
 ) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
     """The description of a dataset that has none: its cameras are the folders of pictures."""
     if unit is None:
         raise UsageError(
             f"{path} has no {DESCRIPTION}, so the length unit is not known.",
-            why=f"one is made from the folders of pictures, {_some(list(found))}, but no picture says the unit",
+            why=f"one is made from the folders of pictures, {list_some(list(found))}, but no picture says the unit",
             fix="add --unit mm (or another), or write dataset.toml yourself; see docs/formats.md",
         )
     return path.resolve().name, unit, tuple(Camera(name) for name in found), {}
 
 
-def _usable(
+def _choose_usable(
     cameras: set[str], found: Mapping[str, Mapping[str, Path]], path: Path
 ) -> tuple[dict[View, Path], list[str]]:
     """The pictures of the rig's cameras with usable names, and what there is to say about the others."""
@@ -208,13 +207,13 @@ def _usable(
     if not usable:
         raise ImageError(
             f"none of the pictures in {path} belongs to a camera of {DESCRIPTION}.",
-            why=f"there are pictures of {_some(list(found))}, and the cameras are {_some(sorted(cameras))}",
+            why=f"there are pictures of {list_some(list(found))}, and the cameras are {list_some(sorted(cameras))}",
             fix=f"give the folders the cameras' names, or correct {DESCRIPTION}",
         )
-    return usable, notes + _missing(cameras, usable)
+    return usable, notes + _note_missing(cameras, usable)
 
 
-def _missing(cameras: Iterable[str], usable: Iterable[View]) -> list[str]:
+def _note_missing(cameras: Iterable[str], usable: Iterable[View]) -> list[str]:
     """Which cameras, and which shots of a camera, have no picture."""
     shots: dict[str, set[str]] = {camera: set() for camera in cameras}
     for view in usable:
@@ -227,16 +226,18 @@ def _missing(cameras: Iterable[str], usable: Iterable[View]) -> list[str]:
             notes.append(f"camera {camera!r} has no picture.")
         elif lacking:
             plural = "s" if len(lacking) > 1 else ""
-            notes.append(f"camera {camera!r} has no picture of the shot{plural} {_some(lacking)}, which others have.")
+            notes.append(
+                f"camera {camera!r} has no picture of the shot{plural} {list_some(lacking)}, which others have."
+            )
     return notes
 
 
-def _settled(rig: _Rig, detector: Detector, looked: Looked) -> tuple[list[Result], list[str]]:
+def _settle(rig: _Rig, detector: Detector, looked: Looked) -> tuple[list[Result], list[str]]:
     """The results in the order of the pictures, after the detector's second look; and a note per unusable picture."""
     problems = dict(looked.problems)
     cameras = {camera.name: camera for camera in rig.cameras}
     for view, entry in looked.entries.items():
-        reason = _wrong_size(cameras[view.camera], entry)
+        reason = _explain_wrong_size(cameras[view.camera], entry)
         if reason:
             problems[view] = reason
     found = {
@@ -247,22 +248,22 @@ def _settled(rig: _Rig, detector: Detector, looked: Looked) -> tuple[list[Result
         Result(view, path, nothing(problems[view]) if view in problems else settled[view], rig.expected(view))
         for view, path in rig.pictures.items()
     ]
-    return results, _unusable(rig, problems)
+    return results, _note_problems(rig, problems)
 
 
-def _unusable(rig: _Rig, problems: Mapping[View, str]) -> list[str]:
+def _note_problems(rig: _Rig, problems: Mapping[View, str]) -> list[str]:
     """A note for every problem, with the files that have it."""
     files: dict[str, list[str]] = {}
     for view, path in rig.pictures.items():
         if view in problems:
             files.setdefault(problems[view], []).append(rig.relative(path))
-    notes = [f"{_some(names)}: {problem}." for problem, names in files.items()]
+    notes = [f"{list_some(names)}: {problem}." for problem, names in files.items()]
     if len(notes) <= MAX_NOTES:
         return notes
     return [*notes[:MAX_NOTES], f"{len(notes) - MAX_NOTES} more such problems are named in {DETECTIONS}/{SUMMARY}."]
 
 
-def _wrong_size(camera: Camera, entry: Entry) -> str:
+def _explain_wrong_size(camera: Camera, entry: Entry) -> str:
     if camera.width in (None, entry.width) and camera.height in (None, entry.height):
         return ""
     turned = (camera.height, camera.width) == (entry.width, entry.height)
@@ -272,9 +273,9 @@ def _wrong_size(camera: Camera, entry: Entry) -> str:
     )
 
 
-def _gathered(rig: _Rig, results: Sequence[Result]) -> tuple[Dataset | None, list[str]]:
+def _gather(rig: _Rig, results: Sequence[Result]) -> tuple[Dataset | None, list[str]]:
     """All that was found as a dataset, None where that is nothing; and notes about points that are left out."""
-    names = rig.known[0] if rig.known else list(_names(results))
+    names = rig.known[0] if rig.known else list(_order_names(results))
     rows = {name: i for i, name in enumerate(names)}
     columns = {camera.name: k for k, camera in enumerate(rig.cameras)}
     uv = np.full((len(rows), len(columns), 2), np.nan)
@@ -293,11 +294,12 @@ def _gathered(rig: _Rig, results: Sequence[Result]) -> tuple[Dataset | None, lis
                 uv[i, k], sd[i, k] = result.found.uv[j], result.found.sd[j]
     notes = []
     if unknown:
-        named = _some([f"{name!r}{did_you_mean(name, rows)}" for name in list(unknown)[:MAX_NAMES]], len(unknown))
+        hints = [f"{name!r}{did_you_mean(name, rows)}" for name in list(unknown)[:MAX_NAMES]]
+        named = list_some(hints, total=len(unknown))
         notes.append(f"points without a known position in points.csv are left out: {named}.")
     if twice:
         notes.append(
-            f"found again by the same camera in another shot, where the first counts: {_some(list(twice))}. "
+            f"found again by the same camera in another shot, where the first counts: {list_some(list(twice))}. "
             "A point that moves needs a name in each shot."
         )
     if np.isnan(uv).all():
@@ -306,7 +308,7 @@ def _gathered(rig: _Rig, results: Sequence[Result]) -> tuple[Dataset | None, lis
     return Dataset(rig.name, rig.unit, observations, rig.known[1] if rig.known else None, rig.extra), notes
 
 
-def _names(results: Iterable[Result]) -> dict[str, None]:
+def _order_names(results: Iterable[Result]) -> dict[str, None]:
     """The points found, shot by shot, within a shot as people count."""
     shots: dict[str, dict[str, None]] = {}
     for result in results:
@@ -314,7 +316,7 @@ def _names(results: Iterable[Result]) -> dict[str, None]:
     return dict.fromkeys(name for shot in in_order(shots) for name in in_order(shots[shot]))
 
 
-def _written(rig: _Rig, data: Dataset) -> list[str]:
+def _write(rig: _Rig, data: Dataset) -> list[str]:
     """Write observations.csv, and dataset.toml where there is none; what a person wrote is kept beside it."""
     files = folder_files(data)
     if not (rig.path / DESCRIPTION).exists():
@@ -322,9 +324,9 @@ def _written(rig: _Rig, data: Dataset) -> list[str]:
     target, record = rig.path / VIEWS, rig.path / DETECTIONS / WRITTEN
     new, old = _sha256(files[VIEWS].encode()), _sha256(target.read_bytes()) if target.exists() else ""
     notes = []
-    ours = [old] if old in (*_ours(record), new) else []
+    ours = [old] if old in (*_read_own_sums(record), new) else []
     if old and not ours:
-        kept = _kept(target)
+        kept = _keep_copy(target)
         notes.append(f"the {VIEWS} that was there is kept as {kept.name}: detect had not written it.")
     # Both sums first: killed between the two, the next run still knows which file is its own.
     write_text(record, toml_text({"observations_sha256": [*ours, new]}))
@@ -332,7 +334,7 @@ def _written(rig: _Rig, data: Dataset) -> list[str]:
     return notes
 
 
-def _ours(record: Path) -> list[str]:
+def _read_own_sums(record: Path) -> list[str]:
     """The SHA-256 of what detect wrote before."""
     try:
         sums = parse_toml(record.read_text(encoding="utf-8")).get("observations_sha256", [])
@@ -341,7 +343,7 @@ def _ours(record: Path) -> list[str]:
     return list(map(str, sums)) if isinstance(sums, list) else []
 
 
-def _kept(target: Path) -> Path:
+def _keep_copy(target: Path) -> Path:
     """A copy under the first name that is free."""
     free = (target.with_name(f"{KEPT}{f'-{n}' if n > 1 else ''}.csv") for n in range(1, 1 << 31))
     kept = next(path for path in free if not path.exists())
@@ -354,7 +356,7 @@ def _sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _summary(rig: _Rig, results: Iterable[Result]) -> str:
+def _summary_csv(rig: _Rig, results: Iterable[Result]) -> str:
     rows = [
         (r.view.camera, r.view.shot, rig.relative(r.path), str(len(r.found)), str(r.expected or ""), r.found.reason)
         for r in results
@@ -362,13 +364,13 @@ def _summary(rig: _Rig, results: Iterable[Result]) -> str:
     return csv_text(("camera", "shot", "file", "found", "expected", "reason"), rows)
 
 
-def _counts(results: Sequence[Result]) -> Iterator[Count]:
+def _count_by_camera(results: Sequence[Result]) -> Iterator[Count]:
     for camera in dict.fromkeys(result.view.camera for result in results):
         points = [len(result.found) for result in results if result.view.camera == camera]
         yield Count(camera, len(points), sum(n > 0 for n in points), sum(points))
 
 
-def _reasons(results: Iterable[Result]) -> list[tuple[str, int]]:
+def _count_reasons(results: Iterable[Result]) -> list[tuple[str, int]]:
     """Reasons and how many pictures have them; those that differ in numbers only are one, told as the commonest."""
     kinds: dict[str, Counter[str]] = {}
     for result in results:
@@ -378,24 +380,18 @@ def _reasons(results: Iterable[Result]) -> list[tuple[str, int]]:
     return sorted(told, key=lambda item: -item[1])
 
 
-def _nothing_at_all(rig: _Rig, results: Sequence[Result], sheets: Sequence[Path]) -> ImageError:
-    found = list(_names(results))
+def _nothing_found_error(rig: _Rig, results: Sequence[Result], sheets: Sequence[Path]) -> ImageError:
+    found = list(_order_names(results))
     look = f"look at {sheets[0]}, and check" if sheets else "check"
     if found:
         return ImageError(
             f"none of the {len(found)} points found in the pictures of {rig.path} has a known position.",
-            why=f"points.csv names {_some(rig.known[0] if rig.known else [])}, and found were {_some(found)}",
+            why=f"points.csv names {list_some(rig.known[0] if rig.known else [])}, and found were {list_some(found)}",
             fix="give pictures and points the same names, or move points.csv away to measure unknown points",
         )
-    reasons = "; ".join(f"{count} x {text}" for text, count in _reasons(results)[:3])
+    reasons = "; ".join(f"{count} x {text}" for text, count in _count_reasons(results)[:3])
     return ImageError(
         f"nothing was found in any of the {len(results)} pictures of {rig.path}, so {VIEWS} is not written.",
         why=reasons or "the detector gave no reason",
         fix=f"{look} the kind of target and its options",
     )
-
-
-def _some(names: Sequence[str], total: int | None = None) -> str:
-    """The first few names, and how many more there are."""
-    more = (len(names) if total is None else total) - min(len(names), MAX_NAMES)
-    return ", ".join(names[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")

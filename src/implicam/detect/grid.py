@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from implicam.dataset import Floats
 from implicam.detect.corners import Bools, Corners, fit_corners
@@ -62,44 +63,44 @@ class Grid:
         return self.corners.uv.reshape(self.rows, self.columns, 2)
 
     @property
-    def there(self) -> Bools:
+    def occupied(self) -> Bools:
         """(rows, columns) where a corner was found."""
         return np.isfinite(self.uv[..., 0])
 
     @property
     def count(self) -> int:
         """How many corners were found."""
-        return int(self.there.sum())
+        return int(self.occupied.sum())
 
     @property
     def polarity(self) -> float:
         """+1 where the square right below and right of node (0, 0) is bright, -1 where it is dark."""
-        return float(np.sign(np.nansum(self._signed()))) or 1.0
+        return float(np.sign(np.nansum(self._signed_heights()))) or 1.0
 
-    def _signed(self) -> Floats:
+    def _signed_heights(self) -> Floats:
         i, j = np.indices((self.rows, self.columns))
         return np.asarray(self.corners.height.reshape(i.shape) * (1 - 2 * ((i + j) % 2)), dtype=np.float64)
 
-    def kept(self, keep: Bools) -> Grid:
+    def keep_only(self, keep: Bools) -> Grid:
         """The same grid with the corners where `keep` (rows, columns) is false taken out."""
-        return replace(self, corners=_merged(Corners.unknown(keep.size), self.corners, keep.ravel()))
+        return replace(self, corners=_merge_corners(Corners.unknown(keep.size), self.corners, keep.ravel()))
 
-    def turned(self, turns: int) -> Grid:
+    def turn(self, turns: int) -> Grid:
         """The same corners, counted from another end: turned by quarter turns."""
         index = np.rot90(np.arange(self.rows * self.columns).reshape(self.rows, self.columns), turns)
         corners = self.corners[index.ravel()]
         rows, columns = (self.rows, self.columns) if turns % 2 == 0 else (self.columns, self.rows)
         return Grid(rows, columns, replace(corners, height=corners.height * (-1) ** turns))
 
-    def padded(self, by: int) -> Grid:
+    def pad(self, by: int) -> Grid:
         """With empty rows and columns all round."""
         inner = np.zeros((self.rows + 2 * by, self.columns + 2 * by), dtype=np.bool_)
         inner[by : by + self.rows, by : by + self.columns] = True
-        return Grid(inner.shape[0], inner.shape[1], _spread(self.corners, inner.ravel()))
+        return Grid(inner.shape[0], inner.shape[1], _scatter_corners(self.corners, inner.ravel()))
 
-    def cropped(self) -> Grid:
+    def crop(self) -> Grid:
         """Without empty rows and columns at the rim."""
-        there = self.there
+        there = self.occupied
         rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
         if len(rows) == 0:
             return Grid(0, 0, self.corners[np.zeros(0, dtype=np.intp)])
@@ -109,8 +110,8 @@ class Grid:
 
     def places(self, nodes: Floats) -> Places:
         """Where the nodes (n, 2), (i, j), whole numbers or not, must be, from their nearest known neighbours."""
-        known = np.argwhere(self.there).astype(np.float64)
-        return places_from(known, self.uv[self.there], nodes)
+        known = np.argwhere(self.occupied).astype(np.float64)
+        return predict_places(known, self.uv[self.occupied], nodes)
 
 
 class Places(NamedTuple):
@@ -126,8 +127,8 @@ def grow(picture: Grey, seed: Floats, limit: int) -> Grid | None:
 
     limit: rows or columns beyond which it need not grow.
     """
-    grid = _seeded(picture, seed)
-    return None if grid is None else _grown_from(picture, grid, limit)
+    grid = _grid_from_seed(picture, seed)
+    return None if grid is None else _grow_from(picture, grid, limit)
 
 
 def join(picture: Grey, a: Grid, b: Grid, size: tuple[int, int], limit: int) -> Grid | None:
@@ -137,33 +138,33 @@ def join(picture: Grey, a: Grid, b: Grid, size: tuple[int, int], limit: int) -> 
     together they must not be larger than a board of `size` (rows, columns), upright or lying.
     """
     for turns in range(4):
-        turned = b.turned(turns)
-        shift = _shift(a, turned)
+        turned = b.turn(turns)
+        shift = _find_shift(a, turned)
         if shift is None:
             continue
-        again = _shift(turned, a)
+        again = _find_shift(turned, a)
         if again is None or (shift != -again).any() or a.polarity != turned.polarity * (-1) ** int(shift.sum()):
             return None
-        whole = _overlaid(a, turned, shift)
-        if whole is None or max(whole.there.shape) > max(size) or min(whole.there.shape) > min(size):
+        whole = _overlay_grids(a, turned, shift)
+        if whole is None or max(whole.occupied.shape) > max(size) or min(whole.occupied.shape) > min(size):
             return None
-        return _grown_from(picture, whole, limit)
+        return _grow_from(picture, whole, limit)
     return None
 
 
-def _shift(a: Grid, b: Grid) -> NDArray[np.intp] | None:
+def _find_shift(a: Grid, b: Grid) -> NDArray[np.intp] | None:
     """The node of `a` that node (0, 0) of `b` is, (2,), if all of b's are nodes of a's plane; else None."""
-    nodes = np.argwhere(a.there).astype(np.float64)
-    h, _ = opencv().findHomography(a.uv[a.there].reshape(-1, 1, 2), nodes.reshape(-1, 1, 2), 0)
+    nodes = np.argwhere(a.occupied).astype(np.float64)
+    h, _ = opencv().findHomography(a.uv[a.occupied].reshape(-1, 1, 2), nodes.reshape(-1, 1, 2), 0)
     if h is None:
         return None
-    place = np.hstack([b.uv[b.there], np.ones((b.count, 1))]) @ h.T
-    away = place[:, :2] / place[:, 2:] - np.argwhere(b.there)
+    place = np.hstack([b.uv[b.occupied], np.ones((b.count, 1))]) @ h.T
+    away = place[:, :2] / place[:, 2:] - np.argwhere(b.occupied)
     shift = np.rint(np.median(away, axis=0))
     return shift.astype(np.intp) if np.abs(away - shift).max() < MAX_ASKEW_SQUARES else None
 
 
-def _overlaid(a: Grid, b: Grid, shift: NDArray[np.intp]) -> Grid | None:
+def _overlay_grids(a: Grid, b: Grid, shift: NDArray[np.intp]) -> Grid | None:
     """Both in one grid; None where both have a corner."""
     low = np.minimum(shift, 0)
     high = np.maximum(np.add(shift, (b.rows, b.columns)), (a.rows, a.columns))
@@ -172,23 +173,23 @@ def _overlaid(a: Grid, b: Grid, shift: NDArray[np.intp]) -> Grid | None:
     for grid, at in ((a, -low), (b, shift - low)):
         box = np.zeros((rows, columns), dtype=np.bool_)
         box[at[0] : at[0] + grid.rows, at[1] : at[1] + grid.columns] = True
-        boxes.append(Grid(rows, columns, _spread(grid.corners, box.ravel())))
-    if (boxes[0].there & boxes[1].there).any():
+        boxes.append(Grid(rows, columns, _scatter_corners(grid.corners, box.ravel())))
+    if (boxes[0].occupied & boxes[1].occupied).any():
         return None
-    return Grid(rows, columns, _merged(boxes[0].corners, boxes[1].corners, boxes[1].there.ravel()))
+    return Grid(rows, columns, _merge_corners(boxes[0].corners, boxes[1].corners, boxes[1].occupied.ravel()))
 
 
-def _grown_from(picture: Grey, grid: Grid, limit: int) -> Grid | None:
+def _grow_from(picture: Grey, grid: Grid, limit: int) -> Grid | None:
     reach = 1
     while True:
-        larger = _extended(picture, grid, reach=reach, limit=limit)
+        larger = _extend(picture, grid, reach=reach, limit=limit)
         if larger.count == grid.count and reach == MAX_GAP_SQUARES:
-            return _checked(grid)
+            return _drop_wrong_corners(grid)
         reach = MAX_GAP_SQUARES if larger.count == grid.count else 1
         grid = larger
 
 
-def _seeded(picture: Grey, seed: Floats) -> Grid | None:
+def _grid_from_seed(picture: Grey, seed: Floats) -> Grid | None:
     rows, columns = seed.shape[:2]
     if rows < 3 or columns < 3 or np.isfinite(seed[..., 0]).sum() < 9:
         return None
@@ -196,20 +197,21 @@ def _seeded(picture: Grey, seed: Floats) -> Grid | None:
         seed = seed[:, ::-1]
     empty = replace(Corners.unknown(rows * columns), uv=seed.reshape(-1, 2))
     rough = Grid(rows, columns, empty)
-    nodes = np.argwhere(rough.there)
+    nodes = np.argwhere(rough.occupied)
     places = rough.places(nodes.astype(np.float64))
-    if not _checkered(picture, nodes, places._replace(uv=rough.uv[rough.there])):
+    if not _is_checkered(picture, nodes, places._replace(uv=rough.uv[rough.occupied])):
         return None
-    found = fit_corners(picture, rough.uv[rough.there], places.right, places.down)
-    good = _acceptable(found, nodes, places._replace(uv=rough.uv[rough.there]), None)
-    good &= _four_squares(picture, places._replace(uv=found.uv), found.mean, found.height)
-    grid = Grid(rows, columns, _spread(found, rough.there.ravel())).kept(_scattered(good, rough.there))
-    return grid.cropped() if grid.count >= 9 else None
+    found = fit_corners(picture, rough.uv[rough.occupied], places.right, places.down)
+    good = _judge_corners(found, nodes, places._replace(uv=rough.uv[rough.occupied]), None)
+    good &= _have_four_squares(picture, places._replace(uv=found.uv), found.mean, found.height)
+    grid = replace(rough, corners=_scatter_corners(found, rough.occupied.ravel()))
+    grid = grid.keep_only(_scatter(good, rough.occupied))
+    return grid.crop() if grid.count >= 9 else None
 
 
-def _checkered(picture: Grey, nodes: NDArray[np.intp], places: Places) -> bool:
+def _is_checkered(picture: Grey, nodes: NDArray[np.intp], places: Places) -> bool:
     """Whether the four squares about most rough corners are bright and dark in turn; saves fitting most seeds."""
-    squares = _quadrants(picture, places)
+    squares = _sample_quadrants(picture, places)
     crossed = (squares[0] + squares[3] - squares[1] - squares[2]) * (1 - 2 * (nodes.sum(axis=1) % 2))
     apart = np.minimum(squares[0], squares[3]) > np.maximum(squares[1], squares[2])
     apart |= np.maximum(squares[0], squares[3]) < np.minimum(squares[1], squares[2])
@@ -222,7 +224,7 @@ def _handedness(uv: Floats) -> float:
     return float(np.nanmedian(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]))
 
 
-def _acceptable(found: Corners, nodes: NDArray[np.intp], places: Places, grid: Grid | None) -> Bools:
+def _judge_corners(found: Corners, nodes: NDArray[np.intp], places: Places, grid: Grid | None) -> Bools:
     """Which of the corners fitted (n,) at nodes (n, 2) are corners of this checkerboard."""
     with np.errstate(invalid="ignore"):
         signed = found.height * (1 - 2 * (nodes.sum(axis=1) % 2))
@@ -241,12 +243,12 @@ def _acceptable(found: Corners, nodes: NDArray[np.intp], places: Places, grid: G
         return np.asarray(good & sound & (polarity * signed > MIN_HEIGHT_RATIO * usual), dtype=np.bool_)
 
 
-def _extended(picture: Grey, grid: Grid, *, reach: int, limit: int) -> Grid:
+def _extend(picture: Grey, grid: Grid, *, reach: int, limit: int) -> Grid:
     """The grid with the missing nodes up to `reach` squares from known ones that are found; across gaps (reach > 1)
     only where two neighbours are found too."""
-    wide = grid.padded(reach)
-    there = wide.there
-    near = _grown(there, reach) & ~there
+    wide = grid.pad(reach)
+    there = wide.occupied
+    near = ndimage.binary_dilation(there, iterations=reach) & ~there
     used_rows, used_columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
     if len(used_rows) >= limit:
         near[: used_rows[0]] = near[used_rows[-1] + 1 :] = False
@@ -256,93 +258,76 @@ def _extended(picture: Grey, grid: Grid, *, reach: int, limit: int) -> Grid:
         return grid
     nodes = np.argwhere(near)
     places = wide.places(nodes.astype(np.float64))
-    plausible = _four_squares(picture, places, *_levels(wide, nodes))
-    near, nodes, places = _scattered(plausible, near), nodes[plausible], Places(*(x[plausible] for x in places))
+    plausible = _have_four_squares(picture, places, *_expected_levels(wide, nodes))
+    near, nodes, places = _scatter(plausible, near), nodes[plausible], Places(*(x[plausible] for x in places))
     if len(nodes) == 0:
         return grid
     found = fit_corners(picture, places.uv, places.right, places.down)
-    good = _scattered(_acceptable(found, nodes, places, wide), near)
+    good = _scatter(_judge_corners(found, nodes, places, wide), near)
     if reach > 1:
-        good &= _neighbours(good) >= 2
-    corners = _merged(wide.corners, _spread(found, near.ravel()), good.ravel())
-    return Grid(wide.rows, wide.columns, corners).cropped()
+        good &= _count_neighbours(good) >= 2
+    corners = _merge_corners(wide.corners, _scatter_corners(found, near.ravel()), good.ravel())
+    return Grid(wide.rows, wide.columns, corners).crop()
 
 
-def _levels(grid: Grid, nodes: NDArray[np.intp]) -> tuple[Floats, Floats]:
+def _expected_levels(grid: Grid, nodes: NDArray[np.intp]) -> tuple[Floats, Floats]:
     """Mean and height (n,) that corners at nodes (n, 2) should have: those of the nearest known corner."""
-    known = np.argwhere(grid.there)
+    known = np.argwhere(grid.occupied)
     nearest = np.argmin(np.linalg.norm(nodes[:, None] - known[None], axis=2), axis=1)
     row = known[nearest] @ [grid.columns, 1]
     sign = 1 - 2 * (nodes.sum(axis=1) % 2)
     return grid.corners.mean[row], sign * grid.polarity * np.abs(grid.corners.height[row])
 
 
-def _four_squares(picture: Grey, places: Places, mean: Floats, height: Floats) -> Bools:
+def _have_four_squares(picture: Grey, places: Places, mean: Floats, height: Floats) -> Bools:
     """(n,) whether the four squares about the places have the colours of a checkerboard."""
     good = np.isfinite(height)
-    for sign, grey in zip((1, -1, -1, 1), _quadrants(picture, places), strict=True):
+    for sign, grey in zip((1, -1, -1, 1), _sample_quadrants(picture, places), strict=True):
         with np.errstate(invalid="ignore"):
             good &= sign * (grey - mean) * np.sign(height) > MIN_GREY_HEIGHTS * np.abs(height)
     return good
 
 
-def _quadrants(picture: Grey, places: Places) -> Floats:
+def _sample_quadrants(picture: Grey, places: Places) -> Floats:
     """(4, n) grey in the squares up left, up right, down left, down right of the places."""
-    turns = ((-1, -1), (-1, 1), (1, -1), (1, 1))
-    return np.stack(
-        [sample(picture, places.uv + QUADRANT_SQUARES * (j * places.right + i * places.down)) for i, j in turns]
-    )
+    ways = [j * places.right + i * places.down for i, j in ((-1, -1), (-1, 1), (1, -1), (1, 1))]
+    return np.stack([sample_bilinear(picture, places.uv + QUADRANT_SQUARES * way) for way in ways])
 
 
-def sample(picture: Grey, uv: Floats) -> Floats:
+def sample_bilinear(picture: Grey, uv: Floats) -> Floats:
     """Grey at pixels (n, 2), bilinear; NaN outside the picture."""
-    size = np.array(picture.shape)[::-1]
-    with np.errstate(invalid="ignore"):
-        inside = ((uv >= 0) & (uv < size - 1)).all(axis=1)
-    out = np.full(len(uv), np.nan)
-    at = np.floor(uv[inside]).astype(int)
-    u, v = at.T
-    a, b = (uv[inside] - at).T
-    above = (1 - a) * picture[v, u] + a * picture[v, u + 1]
-    below = (1 - a) * picture[v + 1, u] + a * picture[v + 1, u + 1]
-    out[inside] = (1 - b) * above + b * below
-    return out
+    at = np.where(np.isfinite(uv), uv, -1)[:, ::-1].T
+    grey = ndimage.map_coordinates(picture, at, output=np.float64, order=1, cval=np.nan)
+    return np.asarray(grey, dtype=np.float64)
 
 
-def _grown(there: Bools, by: int) -> Bools:
-    for _ in range(by):
-        wide = np.pad(there, 1)
-        there = there | wide[2:, 1:-1] | wide[:-2, 1:-1] | wide[1:-1, 2:] | wide[1:-1, :-2]
-    return there
+def _count_neighbours(there: Bools) -> Floats:
+    cross = ndimage.generate_binary_structure(2, 1).astype(np.float64)
+    return np.asarray(ndimage.convolve(there.astype(np.float64), cross, mode="constant") - there, dtype=np.float64)
 
 
-def _neighbours(there: Bools) -> Floats:
-    wide = np.pad(there.astype(np.float64), 1)
-    return wide[2:, 1:-1] + wide[:-2, 1:-1] + wide[1:-1, 2:] + wide[1:-1, :-2]
-
-
-def _checked(grid: Grid) -> Grid | None:
+def _drop_wrong_corners(grid: Grid) -> Grid | None:
     """Without the corners that are not where their neighbours say, or that something else cuts into; None if few."""
     for _ in range(4):
         if grid.count < 9:
             return None
-        nodes = np.argwhere(grid.there)
-        uv = grid.uv[grid.there]
+        nodes = np.argwhere(grid.occupied)
+        uv = grid.uv[grid.occupied]
         off = np.linalg.norm(grid.places(nodes.astype(np.float64)).uv - uv, axis=1)
-        misfit = grid.corners.misfit.reshape(grid.there.shape)[grid.there]
-        inner = _neighbours(grid.there)[grid.there] >= 3  # the others are extrapolated, which is less certain
+        misfit = grid.corners.misfit.reshape(grid.occupied.shape)[grid.occupied]
+        inner = _count_neighbours(grid.occupied)[grid.occupied] >= 3  # the others are extrapolated: less certain
         bound = np.where(inner, 5, 12) * (np.median(off[inner]) if inner.any() else np.median(off)) + 0.1
         good = (off < bound) & (misfit < np.maximum(3 * np.median(misfit), 0.1))
-        there = _scattered(good, grid.there)
-        there &= _neighbours(there) >= 1
-        there = _without_thin_rims(there)
+        there = _scatter(good, grid.occupied)
+        there &= _count_neighbours(there) >= 1
+        there = _drop_thin_rims(there)
         if there.sum() == grid.count:
             return grid
-        grid = grid.kept(there).cropped()
+        grid = grid.keep_only(there).crop()
     return grid if grid.count >= 9 else None
 
 
-def _without_thin_rims(there: Bools) -> Bools:
+def _drop_thin_rims(there: Bools) -> Bools:
     there = there.copy()
     changed = True
     while changed and there.any():
@@ -356,7 +341,7 @@ def _without_thin_rims(there: Bools) -> Bools:
     return there
 
 
-def places_from(known: Floats, uv: Floats, nodes: Floats) -> Places:
+def predict_places(known: Floats, uv: Floats, nodes: Floats) -> Places:
     """The homography through the nearest `NEIGHBOURS` known nodes, without the node itself, one for each node.
 
     Linear, with its denominator 1 at the node; a little of the plane's perspective is taken away (a ridge) where the
@@ -373,7 +358,7 @@ def places_from(known: Floats, uv: Floats, nodes: Floats) -> Places:
     middle = pixels[pick].mean(axis=1)
     scale = np.sqrt(np.mean((pixels[pick] - middle[:, None]) ** 2, axis=(1, 2))) + 1e-9
     y = (pixels[pick] - middle[:, None]) / scale[:, None, None]
-    h = _homographies(x, y, weight)
+    h = _fit_homographies(x, y, weight)
     at = h[:, [2, 5]]
     right = h[:, [1, 4]] - at * h[:, 7:8]
     down = h[:, [0, 3]] - at * h[:, 6:7]
@@ -381,7 +366,7 @@ def places_from(known: Floats, uv: Floats, nodes: Floats) -> Places:
     return Places(middle + s * at, s * right, s * down)
 
 
-def _homographies(x: Floats, y: Floats, weight: Floats) -> Floats:
+def _fit_homographies(x: Floats, y: Floats, weight: Floats) -> Floats:
     """(n, 8) of y = (h0 x0 + h1 x1 + h2, h3 x0 + h4 x1 + h5) / (1 + h6 x0 + h7 x1), from points (n, k, 2)."""
     n, k = weight.shape
     rows = np.zeros((n, 2 * k, 8))
@@ -398,23 +383,20 @@ def _homographies(x: Floats, y: Floats, weight: Floats) -> Floats:
     return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
 
 
-def _scattered(values: Bools, where: Bools) -> Bools:
+def _scatter(values: Bools, where: Bools) -> Bools:
     out = np.zeros_like(where)
     out[where] = values
     return out
 
 
-def _spread(corners: Corners, where: Bools) -> Corners:
+def _scatter_corners(corners: Corners, where: Bools) -> Corners:
     """Corners (k,) put where `where` (n,) is true, NaN elsewhere."""
     out = Corners.unknown(len(where))
-    for name in Corners.__dataclass_fields__:
-        getattr(out, name)[where] = getattr(corners, name)
+    out[where] = corners
     return out
 
 
-def _merged(old: Corners, new: Corners, where: Bools) -> Corners:
-    parts = []
-    for name in Corners.__dataclass_fields__:
-        a, b = getattr(old, name), getattr(new, name)
-        parts.append(np.where(where[:, None] if a.ndim == 2 else where, b, a))
-    return Corners(*parts)
+def _merge_corners(old: Corners, new: Corners, where: Bools) -> Corners:
+    out = old[np.arange(len(where))]
+    out[where] = new[where]
+    return out

@@ -86,10 +86,10 @@ class Journal:
                 path.unlink(missing_ok=True)
             self.entries = _read(path)
             self._file = path.open("ab", buffering=0)
-            if not _ends_a_line(path):  # a kill may have left half a line: what comes next must not join it
+            if not _ends_with_newline(path):  # a kill may have left half a line: what comes next must not join it
                 self._file.write(b"\n")
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise self._write_error(error) from error
 
     def __enter__(self) -> Journal:
         return self
@@ -101,7 +101,7 @@ class Journal:
         """Write a line; the entry as it will be read again. TypeError or ValueError for what JSON cannot hold."""
         content = json.dumps({**key._asdict(), **entry.as_dict()}, default=json_default).encode()
         line = content[:-1] + _CHECK + str(zlib.crc32(content)).encode() + b"}\n"
-        read = _entry(line)
+        read = _parse_line(line)
         if read is None:
             raise ValueError("what was found cannot be written down")
         try:
@@ -109,10 +109,10 @@ class Journal:
                 if self._file.write(line) < len(line):
                     raise OSError("the disk took only a part of a line")
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise self._write_error(error) from error
         return read[1]
 
-    def _unwritable(self, error: OSError) -> ImplicamError:
+    def _write_error(self, error: OSError) -> ImplicamError:
         return ImplicamError(
             f"cannot write {self._path}.",
             why=str(error),
@@ -125,17 +125,17 @@ def _read(path: Path) -> dict[Key, Entry]:
     if not path.exists():
         return {}
     with path.open("rb") as file:
-        return dict(filter(None, map(_entry, file)))
+        return dict(filter(None, map(_parse_line, file)))
 
 
-def _ends_a_line(path: Path) -> bool:
+def _ends_with_newline(path: Path) -> bool:
     with path.open("rb") as file:
         size = file.seek(0, 2)
         file.seek(max(0, size - 1))
         return file.read(1) in (b"\n", b"")
 
 
-def _entry(line: bytes) -> tuple[Key, Entry] | None:
+def _parse_line(line: bytes) -> tuple[Key, Entry] | None:
     """A line's key and entry, or None where the line is not as it was written."""
     content, mark, check = line.rpartition(_CHECK)
     content += b"}"
@@ -168,7 +168,7 @@ class Looked:
         return {camera: max((n, size) for size, n in count.items())[1] for camera, count in counts.items()}
 
 
-def look_at_all(
+def detect_all(
     pictures: Mapping[View, Path], detector: Detector, path: Path, *, restart: bool, progress: Progress
 ) -> Looked:
     """Detect in each picture that the journal at `path` does not know yet, on all cores.
@@ -194,7 +194,7 @@ def look_at_all(
 
         new = []
         for view, file in pictures.items():
-            entry = _journalled(journal, view, file, options)
+            entry = _find_entry(journal, view, file, options)
             if entry is None:
                 new.append((view, file))
             else:
@@ -205,12 +205,12 @@ def look_at_all(
     return Looked(entries, problems, resumed, float(np.mean(seconds)) if seconds else float("nan"))
 
 
-def _journalled(journal: Journal, view: View, path: Path, options: str) -> Entry | None:
+def _find_entry(journal: Journal, view: View, path: Path, options: str) -> Entry | None:
     try:
         entry = journal.entries.get(Key.of(view, path, options))
     except OSError:
         return None  # reading it will say why
-    return None if entry is None or _fault(entry) else entry
+    return None if entry is None or _find_fault(entry) else entry
 
 
 def _look(path: Path, view: View, detector: Detector, journal: Journal, options: str) -> Entry:
@@ -230,7 +230,7 @@ def _look(path: Path, view: View, detector: Detector, journal: Journal, options:
         )
     try:
         entry = Entry(width, height, detector.detect(picture, view))
-        fault = _fault(entry)
+        fault = _find_fault(entry)
         if fault:
             raise ValueError(fault)
         return journal.add(key, entry)
@@ -242,7 +242,7 @@ def _look(path: Path, view: View, detector: Detector, journal: Journal, options:
         raise ImageError(f"the detector failed: {type(error).__name__}: {error}") from error
 
 
-def _fault(entry: Entry) -> str:
+def _find_fault(entry: Entry) -> str:
     """What is impossible in a detector's answer; empty where nothing is."""
     found, size = entry.found, np.array([entry.width, entry.height])
     if not (found.uv.shape == found.sd.shape == (len(found), 2)):

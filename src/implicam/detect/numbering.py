@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.detect.grid import Grid, sample
+from implicam.detect.grid import Grid, sample_bilinear
 from implicam.images import Grey
 
 Ints = NDArray[np.intp]
@@ -39,18 +39,18 @@ class Numbering(NamedTuple):
     def of(self, shape: tuple[int, int]) -> tuple[Ints, Ints]:
         """Row and column on the board, both of the grid's shape."""
         i, j = np.indices(shape)
-        r, c = _turned(i, j, shape, self.turns)
+        r, c = _turn(i, j, shape, self.turns)
         return (r + self.row).astype(np.intp), (c + self.column).astype(np.intp)
 
 
-def sides(picture: Grey, grid: Grid) -> tuple[str, str, str, str]:
+def find_sides(picture: Grey, grid: Grid) -> tuple[str, str, str, str]:
     """What follows the grid's outermost squares at the top, right, bottom, left: `END` (white), `MORE` squares, or
     `UNKNOWN`: covered, outside of the picture, or neither."""
-    top, right, bottom, left = (_side(picture, grid, side) for side in range(4))
+    top, right, bottom, left = (_judge_side(picture, grid, side) for side in range(4))
     return top, right, bottom, left
 
 
-def numberings(grid: Grid, ends: tuple[str, str, str, str], rows: int, columns: int) -> list[Numbering]:
+def find_numberings(grid: Grid, ends: tuple[str, str, str, str], rows: int, columns: int) -> list[Numbering]:
     """All the ways to read a grid as part of a board with so many inner corners; none where it cannot be one."""
     found = []
     for turns in range(4):
@@ -62,32 +62,32 @@ def numberings(grid: Grid, ends: tuple[str, str, str, str], rows: int, columns: 
                     ends[side] == UNKNOWN or touches[(side + turns) % 4] == (ends[side] == END) for side in range(4)
                 )
                 numbering = Numbering(turns, row, column)
-                if fits and _same_colours(grid, numbering):
+                if fits and _has_same_colours(grid, numbering):
                     found.append(numbering)
     return found
 
 
-def _same_colours(grid: Grid, numbering: Numbering) -> bool:
+def _has_same_colours(grid: Grid, numbering: Numbering) -> bool:
     """Whether the square after node (0, 0) has the colour that this reading gives it."""
     half = np.array(0.5)
-    r, c = _turned(half, half, (grid.rows, grid.columns), numbering.turns)
+    r, c = _turn(half, half, (grid.rows, grid.columns), numbering.turns)
     black = (np.floor(r) + numbering.row + np.floor(c) + numbering.column) % 2 == 0
     return bool(black == (grid.polarity < 0))
 
 
-def _turned(i: NDArray[Any], j: NDArray[Any], shape: tuple[int, int], turns: int) -> tuple[NDArray[Any], NDArray[Any]]:
+def _turn(i: NDArray[Any], j: NDArray[Any], shape: tuple[int, int], turns: int) -> tuple[NDArray[Any], NDArray[Any]]:
     rows, columns = shape
     return [(i, j), (j, rows - 1 - i), (rows - 1 - i, columns - 1 - j), (columns - 1 - j, i)][turns]
 
 
-def _side(picture: Grey, grid: Grid, side: int) -> str:
+def _judge_side(picture: Grey, grid: Grid, side: int) -> str:
     along, out = np.array([[0.0, 1.0], [1.0, 0.0]])[[side % 2, 1 - side % 2]]
     out = out if side in (BOTTOM, RIGHT) else -out
     start = np.array([grid.rows - 1 if side == BOTTOM else 0, grid.columns - 1 if side == RIGHT else 0], np.float64)
     length = grid.columns if side in (TOP, BOTTOM) else grid.rows
     nodes = start + np.arange(length)[:, None] * along
     i, j = nodes.astype(int).T
-    there = grid.there[i, j]
+    there = grid.occupied[i, j]
     first = np.flatnonzero(there[:-1] & there[1:])
     if len(first) < 4:
         return UNKNOWN
@@ -95,15 +95,15 @@ def _side(picture: Grey, grid: Grid, side: int) -> str:
     row = i[first] * grid.columns + j[first]
     mean, height = grid.corners.mean[row], np.abs(grid.corners.height[row])
     last, after = (
-        (sample(picture, grid.places(middle + depth * out).uv) - mean) / height
+        (sample_bilinear(picture, grid.places(middle + depth * out).uv) - mean) / height
         for depth in (WITHIN_SQUARES, BEYOND_SQUARES)
     )
     cell = np.floor(middle + out / 2).sum(axis=1)
     bright = grid.polarity * (1 - 2 * (cell % 2)) > 0
-    return _verdict(last, after, bright)
+    return _judge_greys(last, after, bright)
 
 
-def _verdict(last: NDArray[np.float64], after: NDArray[np.float64], bright: NDArray[np.bool_]) -> str:
+def _judge_greys(last: NDArray[np.float64], after: NDArray[np.float64], bright: NDArray[np.bool_]) -> str:
     """From the greys of the outermost squares and of what follows them, and which of the squares are to be bright."""
     with np.errstate(invalid="ignore"):
         dark_square = np.sum(~bright & (last < -MIN_GREY_HEIGHTS) & (after > MIN_GREY_HEIGHTS))

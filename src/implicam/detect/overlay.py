@@ -64,7 +64,7 @@ def overlay(grey: Pixels | None, result: Result) -> Pixels:
     grey: the picture as `eight_bit` gives it, None where it cannot be read.
     """
     if grey is None:
-        return _with_caption(_crossed_out(640, 400), result).pixels
+        return _add_caption(_draw_unreadable(640, 400), result).pixels
     height, width = grey.shape
     longest = max(width, height)
     scale = min(1.0, MAX_SIDE_PX / longest)
@@ -73,22 +73,22 @@ def overlay(grey: Pixels | None, result: Result) -> Pixels:
     whole = _Window(0, 0, width, height, scale)
     canvas = whole.draw(grey, result.found)
     _draw_loupe(canvas, grey, result.found, whole)
-    return _with_caption(canvas, result).pixels
+    return _add_caption(canvas, result).pixels
 
 
 def thumbnail(grey: Pixels | None, result: Result) -> Pixels:
     """A tile of a sheet: the neighbourhood of what was found, the whole picture small, and a caption below."""
     width, height = TILE_PX
     if grey is None:
-        inner = _crossed_out(width, height)
+        inner = _draw_unreadable(width, height)
     else:
         whole = _Window.fitting(0, 0, grey.shape[1], grey.shape[0])
-        window = _neighbourhood(result.found, grey.shape) or whole
+        window = _find_neighbourhood(result.found, grey.shape) or whole
         inner = window.draw(grey, result.found, names=False)
         if window is not whole:
             _draw_inset(inner, grey, window, window.place(result.found.uv))
     tile = drawing.blank(width + 8, height + 4 + TEXT_PX, drawing.WHITE)
-    tile.paste(_centred(inner, width, height), 4, 4)
+    tile.paste(_centre(inner, width, height), 4, 4)
     tile.border(4, STATES[result.state])
     right, top = tile.width - 10, tile.height - TEXT_PX
     tile.write(result.summary, (right, top + 17), 14, INK, "rs")
@@ -137,9 +137,9 @@ class _Window:
                 _draw_marks(canvas, self.place(drawing.finite_points(other.uv)), drawing.ORANGE)
             return canvas
         uv = self.place(found.uv)
-        chains = _rows(found.points, uv)
+        chains = _join_rows(found.points, uv)
         lines = [uv[chain] for chain in chains if len(chain) > 1]
-        canvas.stroke(lines, drawing.SKY, rim=int(_radius(uv) >= RIMMED_RADIUS_PX))
+        canvas.stroke(lines, drawing.SKY, rim=int(_ring_radius(uv) >= RIMMED_RADIUS_PX))
         _draw_marks(canvas, uv, drawing.VERMILLION)
         if chains:
             _write_numbers(canvas, found.points, uv, chains, few=not names)
@@ -148,7 +148,7 @@ class _Window:
         return canvas
 
 
-def _neighbourhood(found: Detected, shape: tuple[int, ...]) -> _Window | None:
+def _find_neighbourhood(found: Detected, shape: tuple[int, ...]) -> _Window | None:
     """The window of a tile's proportions around what was found; None where that is most of the picture."""
     if not len(found):
         return None
@@ -164,12 +164,12 @@ def _neighbourhood(found: Detected, shape: tuple[int, ...]) -> _Window | None:
     return _Window.fitting(int(left), int(top), int(np.ceil(width)), int(np.ceil(height)))
 
 
-def _rows(points: Sequence[str], uv: Floats) -> list[list[int]]:
+def _join_rows(points: Sequence[str], uv: Floats) -> list[list[int]]:
     """Runs of board corners that are next to each other, by their numbers; none for other points."""
     numbers = {int(match[1]): i for i, name in enumerate(points) if (match := _CORNER.fullmatch(name))}
     if len(numbers) < 4:
         return []
-    step = np.median(_to_nearest(uv)) if len(uv) > 1 else 0.0
+    step = np.median(_distances_to_nearest(uv)) if len(uv) > 1 else 0.0
     chains: list[list[int]] = []
     for number in sorted(numbers):
         before, i = numbers.get(number - 1), numbers[number]
@@ -180,7 +180,7 @@ def _rows(points: Sequence[str], uv: Floats) -> list[list[int]]:
     return chains
 
 
-def _to_nearest(uv: Floats) -> Floats:
+def _distances_to_nearest(uv: Floats) -> Floats:
     """(n,) how far each of the first 500 points is from the one nearest to it."""
     some = uv[:500]
     squares = ((some[:, None] - some[None]) ** 2).sum(axis=2)
@@ -188,15 +188,15 @@ def _to_nearest(uv: Floats) -> Floats:
     return np.asarray(np.sqrt(squares.min(axis=1)), dtype=np.float64)
 
 
-def _radius(uv: Floats) -> float:
+def _ring_radius(uv: Floats) -> float:
     """Of the ring around a point: rings of neighbours do not touch."""
-    apart = float(np.median(_to_nearest(uv))) if len(uv) > 1 else np.inf
+    apart = float(np.median(_distances_to_nearest(uv))) if len(uv) > 1 else np.inf
     return float(np.clip(0.25 * apart, 2.0, 8.0 if len(uv) <= MAX_NAMED_POINTS else 6.0))
 
 
 def _draw_marks(canvas: Canvas, uv: Floats, colour: drawing.Colour) -> None:
     """A ring around each point, with arms where there are few; a dot where points are too close for rings."""
-    radius = _radius(uv)
+    radius = _ring_radius(uv)
     rimmed = radius >= RIMMED_RADIUS_PX
     if rimmed:
         few = len(uv) <= MAX_NAMED_POINTS
@@ -208,7 +208,7 @@ def _draw_marks(canvas: Canvas, uv: Floats, colour: drawing.Colour) -> None:
 
 def _write_numbers(canvas: Canvas, points: Sequence[str], uv: Floats, chains: list[list[int]], *, few: bool) -> None:
     """The numbers of board corners before their rows, as far as they have space, and a ring around number 1."""
-    last, radius = np.full(2, np.inf), _radius(uv)
+    last, radius = np.full(2, np.inf), _ring_radius(uv)
     for chain in chains:
         number, start = int(points[chain[0]].rpartition("-c")[2]), uv[chain[0]]
         if number == 1:
@@ -225,7 +225,7 @@ def _write_numbers(canvas: Canvas, points: Sequence[str], uv: Floats, chains: li
 def _write_names(canvas: Canvas, points: Sequence[str], uv: Floats) -> None:
     """Names beside the points where they have space."""
     size = 11 if len(uv) > MAX_NAMED_POINTS else 14
-    if len(uv) > MAX_NAMED_POINTS and np.median(_to_nearest(uv)) < 14 + max(
+    if len(uv) > MAX_NAMED_POINTS and np.median(_distances_to_nearest(uv)) < 14 + max(
         drawing.text_width(name, size) for name in points
     ):
         return
@@ -235,7 +235,7 @@ def _write_names(canvas: Canvas, points: Sequence[str], uv: Floats) -> None:
 
 def _draw_loupe(canvas: Canvas, grey: Pixels, found: Detected, whole: _Window) -> None:
     """Where what was found is small in the picture: enlarged in the corner that is farthest from it."""
-    near = _neighbourhood(found, grey.shape)
+    near = _find_neighbourhood(found, grey.shape)
     if near is None or near.width > 0.3 * grey.shape[1] or near.height > 0.3 * grey.shape[0]:
         return
     scale = min(0.4 * canvas.width / near.width, 0.45 * canvas.height / near.height, 16.0)
@@ -271,7 +271,7 @@ def _draw_inset(tile: Canvas, grey: Pixels, window: _Window, uv: Floats) -> None
     tile.paste(small, int(left), int(top))
 
 
-def _with_caption(canvas: Canvas, result: Result) -> Canvas:
+def _add_caption(canvas: Canvas, result: Result) -> Canvas:
     """The canvas above a strip that says which picture this is, what was found, and what was not, why."""
     width, colour = max(canvas.width, 560), STATES[result.state]
     lines = drawing.wrap_text(result.found.reason, width - 24, 15, 5)
@@ -285,16 +285,16 @@ def _with_caption(canvas: Canvas, result: Result) -> Canvas:
     strip.write(name, (12, 25), 16, drawing.WHITE)
     for i, line in enumerate(lines):
         strip.write(line, (12, 48 + 22 * i), 15, drawing.ORANGE)
-    return Canvas(np.concatenate([_centred(canvas, width, canvas.height).pixels, strip.pixels]))
+    return Canvas(np.concatenate([_centre(canvas, width, canvas.height).pixels, strip.pixels]))
 
 
-def _centred(canvas: Canvas, width: int, height: int) -> Canvas:
+def _centre(canvas: Canvas, width: int, height: int) -> Canvas:
     page = drawing.blank(max(width, canvas.width), max(height, canvas.height), drawing.DARK)
     page.paste(canvas, (page.width - canvas.width) // 2, (page.height - canvas.height) // 2)
     return page
 
 
-def _crossed_out(width: int, height: int) -> Canvas:
+def _draw_unreadable(width: int, height: int) -> Canvas:
     """In place of a picture that cannot be read."""
     canvas = drawing.blank(width, height, (70, 70, 70))
     diagonals = np.array([[(0, 0), (width, height)], [(0, height), (width, 0)]], dtype=np.float64)

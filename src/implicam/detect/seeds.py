@@ -44,7 +44,7 @@ PATIENCE_SECONDS = 60.0
 def from_opencv(picture: Grey, scale: float) -> list[Floats]:
     """The board that `cv2.findChessboardCornersSB` sees in the picture shrunk or enlarged by `scale`."""
     cv2 = opencv()
-    image = resized(eight_bit(picture), scale)
+    image = resize(eight_bit(picture), scale)
     if min(image.shape) < 16:
         return []
     try:
@@ -53,10 +53,10 @@ def from_opencv(picture: Grey, scale: float) -> list[Floats]:
         return []
     if not found or meta is None or corners.size != 2 * meta.size:
         return []
-    return [in_original(corners.reshape(*meta.shape, 2).astype(np.float64), image, picture)]
+    return [to_original_pixels(corners.reshape(*meta.shape, 2).astype(np.float64), image, picture)]
 
 
-def resized(picture: NDArray[Any], scale: float) -> NDArray[Any]:
+def resize(picture: NDArray[Any], scale: float) -> NDArray[Any]:
     """The picture shrunk or enlarged."""
     cv2 = opencv()
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
@@ -64,7 +64,7 @@ def resized(picture: NDArray[Any], scale: float) -> NDArray[Any]:
     return out
 
 
-def in_original(uv: Floats, small: NDArray[Any], picture: NDArray[Any]) -> Floats:
+def to_original_pixels(uv: Floats, small: NDArray[Any], picture: NDArray[Any]) -> Floats:
     """Pixels (..., 2) of a picture that was resized, as pixels of the original."""
     factor = np.array(picture.shape[::-1]) / np.array(small.shape[::-1])
     return np.asarray((uv + 0.5) * factor - 0.5, dtype=np.float64)
@@ -78,7 +78,7 @@ def from_libcbdetect(picture: Grey, scale: float) -> list[Floats]:
     """
     if importlib.util.find_spec("libCBDetect") is None:
         return []
-    small = resized(picture, scale)
+    small = resize(picture, scale)
     with tempfile.TemporaryDirectory(prefix="implicam-") as folder:
         np.save(Path(folder) / "picture.npy", np.clip(small, 0, 1).astype(np.float64))
         command = [sys.executable, "-c", _LIBCBDETECT, folder]
@@ -89,7 +89,7 @@ def from_libcbdetect(picture: Grey, scale: float) -> list[Floats]:
             return []
     size = np.array(small.shape)[::-1]
     grid[~((grid > 0) & (grid < size)).all(axis=2)] = np.nan  # holes in its board
-    return [in_original(grid, small, picture)]
+    return [to_original_pixels(grid, small, picture)]
 
 
 _LIBCBDETECT = """
@@ -118,7 +118,7 @@ class Saddles(NamedTuple):
     bright: Floats
 
 
-def saddles(picture: Grey, blur: float = 1.5) -> Saddles:
+def find_saddles(picture: Grey, blur: float = 1.5) -> Saddles:
     """The saddle points of the picture blurred a little, where its Hessian has a determinant much below zero."""
     cv2 = opencv()
     smooth = cv2.GaussianBlur(picture, (0, 0), blur)
@@ -149,7 +149,7 @@ def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[F
         return
     given = 0
     for k in range(len(points.uv)):
-        seed = None if taken(points.uv[k]) else _square_about(points, k)
+        seed = None if taken(points.uv[k]) else _find_square_about(points, k)
         if seed is not None:
             yield seed
             given += 1
@@ -157,13 +157,13 @@ def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[F
                 return
 
 
-def _square_about(points: Saddles, k: int) -> Floats | None:
+def _find_square_about(points: Saddles, k: int) -> Floats | None:
     away = points.uv - points.uv[k]
     distance = np.linalg.norm(away, axis=1)
     other = np.abs(points.bright @ points.bright[k]) < 0.75  # from corner to corner bright and dark squares change over
     other &= distance > 0
     a, b = points.edges[k]
-    arms = [_next_along(away, distance, other, direction) for direction in (a, -a, b, -b)]
+    arms = [_find_next_along(away, distance, other, direction) for direction in (a, -a, b, -b)]
     if any(arm is None for arm in arms):
         return None
     ap, am, bp, bm = (points.uv[arm] for arm in arms if arm is not None)
@@ -185,7 +185,7 @@ def _square_about(points: Saddles, k: int) -> Floats | None:
     return seed
 
 
-def _next_along(away: Floats, distance: Floats, other: Bools, direction: Floats) -> int | None:
+def _find_next_along(away: Floats, distance: Floats, other: Bools, direction: Floats) -> int | None:
     """The nearest point in a direction, within 20 degrees."""
     ahead = np.flatnonzero(other & (away @ direction > 0.94 * distance))
     return int(ahead[np.argmin(distance[ahead])]) if len(ahead) else None

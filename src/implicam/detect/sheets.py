@@ -56,10 +56,10 @@ def draw(
 
     What is there and shows the same is left alone, unless `redraw`. What shows pictures that are gone is removed.
     """
-    before = {} if redraw else _drawn_before(folder / DRAWN)
+    before = {} if redraw else _read_drawn(folder / DRAWN)
     now: dict[str, str] = {}
     notes: list[str] = []
-    pages = _pages(results)
+    pages = _lay_out_pages(results)
     done = iter(range(1, len(results) + 1))
     for page in pages:
         now |= page.draw(folder, before, lambda: progress("drawing overlays", next(done), len(results)), notes)
@@ -94,7 +94,7 @@ class _Page:
             name, tile = _overlay_name(result), thumbnail(None, result)
             try:
                 new = wanted(name, digests[name])
-                grey = _readable(result.path) if new or whole else None
+                grey = _read_or_none(result.path) if new or whole else None
                 if new:
                     write_picture(folder / name, overlay(grey, result)[..., ::-1])
                 tile = thumbnail(grey, result) if whole else tile
@@ -111,7 +111,7 @@ class _Page:
         return {**digests, self.name: content}
 
 
-def _pages(results: Sequence[Result]) -> list[_Page]:
+def _lay_out_pages(results: Sequence[Result]) -> list[_Page]:
     pages = []
     cameras = list(dict.fromkeys(result.view.camera for result in results))
     for camera in cameras:
@@ -142,7 +142,7 @@ def _digest(result: Result) -> str:
     return hashlib.sha256(content.encode()).hexdigest()
 
 
-def _drawn_before(record: Path) -> dict[str, str]:
+def _read_drawn(record: Path) -> dict[str, str]:
     """{file: digest} of what earlier runs drew."""
     try:
         table = json.loads(record.read_bytes())
@@ -151,7 +151,7 @@ def _drawn_before(record: Path) -> dict[str, str]:
     return {str(name): str(digest) for name, digest in table.items()} if isinstance(table, dict) else {}
 
 
-def _readable(path: Path) -> Pixels | None:
+def _read_or_none(path: Path) -> Pixels | None:
     try:
         return eight_bit(read_picture(path))
     except ImageError:

@@ -13,7 +13,7 @@ import numpy as np
 
 from implicam.calibrators import ForwardGP, PredictsPixels
 from implicam.dataset import Dataset, Floats, Observations
-from implicam.detect.edge import Ellipse, through
+from implicam.detect.edge import Ellipse, fit_ellipse
 from implicam.errors import FitError, UsageError
 
 MAX_OFF_PX = 0.5
@@ -36,10 +36,10 @@ def centred(data: Dataset, radius: float, calibration: PredictsPixels | None = N
     if not (np.isfinite(radius) and radius > 0):
         raise UsageError(f"a ball has no radius {radius:g}.", fix=f"give it in {data.length_unit}, for example 8")
     if calibration is not None:
-        xyz = calibration.measure(_roughly(data.observations)).xyz
+        xyz = calibration.measure(_widen_error_bars(data.observations)).xyz
     else:
         try:
-            calibration, xyz = _own(data), data.xyz
+            calibration, xyz = _fit_own(data), data.xyz
         except FitError as error:
             return data, [f"the pixels are those of the ball's outline, not of its middle: {error.what}"]
     shift = outline_shift(calibration, xyz, radius, data.observations.camera_names)
@@ -52,16 +52,16 @@ def centred(data: Dataset, radius: float, calibration: PredictsPixels | None = N
         notes.append(f"the ball's middle is up to {size.max():.2g} px from the middle of its outline: corrected.")
     if (seen & ~usable).any():
         notes.append(f"{int((seen & ~usable).sum())} views could not be corrected: no position is known for them.")
-    return replace(data, observations=_with_outlines(data.observations, moved, seen)), notes
+    return replace(data, observations=_move_pixels(data.observations, moved, seen)), notes
 
 
-def _roughly(observations: Observations) -> Observations:
+def _widen_error_bars(observations: Observations) -> Observations:
     """The same, with error bars that allow for what is to be corrected: views must not contradict each other for it."""
     own = np.where(observations.seen[..., None], np.nan_to_num(observations.sd), np.nan)
     return replace(observations, sd=np.hypot(own, MAX_OFF_PX))
 
 
-def _own(data: Dataset) -> PredictsPixels:
+def _fit_own(data: Dataset) -> PredictsPixels:
     if data.known is None:
         raise FitError("there is no calibration yet; give one with --calibration once there is.")
     if len(data) < MIN_POINTS:
@@ -80,23 +80,23 @@ def outline_shift(calibration: PredictsPixels, xyz: Floats, radius: float, camer
             continue
         c = trained.index(name)
         centre, _ = calibration.lines_of_sight(name, np.zeros((1, 2)))
-        outline = calibration.predict(_outlines(xyz[there], centre, radius).reshape(-1, 3))[:, c]
+        outline = calibration.predict(_predict_outlines(xyz[there], centre, radius).reshape(-1, 3))[:, c]
         for i, curve, pixel in zip(
             np.flatnonzero(there), outline.reshape(-1, OUTLINE_POINTS, 2), middle[:, c], strict=True
         ):
             if np.isfinite(curve).all() and np.isfinite(pixel).all():
-                shift[i, k] = _middle(curve) - pixel
+                shift[i, k] = _fit_centre(curve) - pixel
     return shift
 
 
-def _middle(curve: Floats) -> Floats:
+def _fit_centre(curve: Floats) -> Floats:
     """Of the ellipse that fits an outline best: what the detector finds of it."""
     centre = curve.mean(axis=0)
     size = float(np.sqrt(np.mean(np.sum((curve - centre) ** 2, axis=1))))
-    return through(curve, Ellipse(centre, np.eye(2) / size)).centre
+    return fit_ellipse(curve, Ellipse(centre, np.eye(2) / size)).centre
 
 
-def _outlines(xyz: Floats, centre: Floats, radius: float) -> Floats:
+def _predict_outlines(xyz: Floats, centre: Floats, radius: float) -> Floats:
     """(n, OUTLINE_POINTS, 3) where the lines of sight from `centre` (3,) touch balls at xyz (n, 3): circles."""
     towards = xyz - centre
     distance = np.linalg.norm(towards, axis=1, keepdims=True)
@@ -111,7 +111,7 @@ def _outlines(xyz: Floats, centre: Floats, radius: float) -> Floats:
     return np.asarray(middle[:, None] + (radius * np.sqrt(1 - part**2))[:, None] * around, dtype=np.float64)
 
 
-def _with_outlines(observations: Observations, moved: Floats, seen: np.ndarray) -> Observations:
+def _move_pixels(observations: Observations, moved: Floats, seen: np.ndarray) -> Observations:
     extra = dict(observations.extra)
     for k, name in enumerate(("outline_u", "outline_v")):
         flat = [repr(float(x)) if s else "" for x, s in zip(observations.uv[..., k].ravel(), seen.ravel(), strict=True)]

@@ -20,13 +20,13 @@ def background(width: int, height: int, rng: np.random.Generator, *, clutter: bo
     coarse = rng.normal(scale=0.05, size=(height // 40 + 2, width // 40 + 2)).astype(np.float32)
     wall = wall + cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
     for _ in range(THINGS):
-        _thing(wall, rng)
+        _draw_thing(wall, rng)
     for _ in range(LOOK_ALIKES):
-        _look_alike(wall, rng)
+        _draw_look_alike(wall, rng)
     return np.asarray(np.clip(wall, 0.03, 0.95), np.float32)
 
 
-def _thing(wall: Grey, rng: np.random.Generator) -> None:
+def _draw_thing(wall: Grey, rng: np.random.Generator) -> None:
     """A cable, a box, a bracket."""
     cv2 = opencv()
     height, width = wall.shape
@@ -45,25 +45,25 @@ def _thing(wall: Grey, rng: np.random.Generator) -> None:
             cv2.polylines(wall, [box], True, grey, int(rng.integers(2, 6)), cv2.LINE_AA)
 
 
-def _look_alike(wall: Grey, rng: np.random.Generator) -> None:
+def _draw_look_alike(wall: Grey, rng: np.random.Generator) -> None:
     """A dark disc on a grey wall, a bright disc, a hole that is no circle, a white patch with nothing before it."""
     height, width = wall.shape
     at = rng.uniform((60, 60), (width - 60, height - 60))
     radius = float(rng.uniform(6, 22))
     kind = rng.integers(4)
     if kind == 0:
-        _spot(wall, at, (2.2 * radius, 2.2 * radius), float(rng.uniform(0.25, 0.45)), square=True)
-        _spot(wall, at, (radius, radius), float(rng.uniform(0.1, 0.2)))
+        _draw_spot(wall, at, (2.2 * radius, 2.2 * radius), float(rng.uniform(0.25, 0.45)), square=True)
+        _draw_spot(wall, at, (radius, radius), float(rng.uniform(0.1, 0.2)))
     elif kind == 1:
-        _spot(wall, at, (radius, radius), float(rng.uniform(0.55, 0.9)))
+        _draw_spot(wall, at, (radius, radius), float(rng.uniform(0.55, 0.9)))
     elif kind == 2:
-        _spot(wall, at, (3.5 * radius, 3 * radius), float(rng.uniform(0.6, 0.8)), square=True)
-        _spot(wall, at, (radius, float(rng.uniform(0.3, 0.45)) * radius), 0.1, angle=float(rng.uniform(0, 180)))
+        _draw_spot(wall, at, (3.5 * radius, 3 * radius), float(rng.uniform(0.6, 0.8)), square=True)
+        _draw_spot(wall, at, (radius, float(rng.uniform(0.3, 0.45)) * radius), 0.1, angle=float(rng.uniform(0, 180)))
     else:
-        _spot(wall, at, (3 * radius, 3 * radius), float(rng.uniform(0.6, 0.8)), square=True)
+        _draw_spot(wall, at, (3 * radius, 3 * radius), float(rng.uniform(0.6, 0.8)), square=True)
 
 
-def _spot(
+def _draw_spot(
     wall: Grey, at: np.ndarray, size: tuple[float, float], grey: float, *, angle: float = 0.0, square: bool = False
 ) -> None:
     """A filled ellipse, or a rectangle, half `size`; OpenCV draws on a grid of 1/16 pixel."""

@@ -53,13 +53,13 @@ def simulate(
     uv = true_uv + noise_sd[:, None] * to_pixels.normal(size=true_uv.shape)
     uv = np.where(seen[..., None], np.where(wrong[..., None], anywhere, uv), np.nan)
     columns = {
-        "true_u": _text(true_uv[..., 0], seen),
-        "true_v": _text(true_uv[..., 1], seen),
+        "true_u": _numbers_as_text(true_uv[..., 0], seen),
+        "true_v": _numbers_as_text(true_uv[..., 1], seen),
         "outlier": np.where(seen, np.where(wrong, "1", "0"), ""),
     }
     stated = np.where(seen & (noise_sd > 0), noise_sd, np.nan)[..., None].repeat(2, axis=2)
     cameras = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
-    known = _known(target, robot_noise, to_robot, cramer_rao_limit(rig, target.xyz, seen & ~wrong))
+    known = _known_positions(target, robot_noise, to_robot, cramer_rao_limit(rig, target.xyz, seen & ~wrong))
     return Dataset(
         f"{rig.name}-{target.name}",
         rig.length_unit,
@@ -116,7 +116,7 @@ def views(rig: Rig, target: Target) -> tuple[Floats, Bools]:
     pairs = [camera.pixel_from_world(target.xyz) for camera in rig.cameras]
     uv = np.stack([uv for uv, _ in pairs], axis=1)
     visible = np.stack(
-        [on & _faces(camera, target) for camera, (_, on) in zip(rig.cameras, pairs, strict=True)], axis=1
+        [on & _is_facing(camera, target) for camera, (_, on) in zip(rig.cameras, pairs, strict=True)], axis=1
     )
     return uv, visible if target.takes is None else visible & target.takes
 
@@ -150,7 +150,7 @@ def with_limit(rig: Rig, data: Dataset) -> Dataset:
     return replace(data, observations=observations, known=replace(known, extra=columns))
 
 
-def _faces(camera: SimulatedCamera, target: Target) -> Bools:
+def _is_facing(camera: SimulatedCamera, target: Target) -> Bools:
     if target.facing is None:
         return np.ones(len(target.xyz), dtype=np.bool_)
     to_camera = camera.camera_from_world.centre - target.xyz
@@ -158,7 +158,7 @@ def _faces(camera: SimulatedCamera, target: Target) -> Bools:
     return np.asarray(cos > GRAZING, dtype=np.bool_)
 
 
-def _known(target: Target, robot_noise: float, rng: np.random.Generator, limit: Floats) -> KnownPositions:
+def _known_positions(target: Target, robot_noise: float, rng: np.random.Generator, limit: Floats) -> KnownPositions:
     """Known positions and their stated uncertainty, with the truth as extra columns."""
     shots, shot_of_point = np.unique(target.shots, return_inverse=True)
     shift = robot_noise * rng.normal(size=(len(shots), 3))
@@ -170,10 +170,10 @@ def _truth_columns(xyz: Floats, limit: Floats) -> dict[str, Names]:
     off_diagonal = limit[:, [0, 0, 1], [1, 2, 2]]
     table = np.hstack([xyz, np.sqrt(np.diagonal(limit, axis1=1, axis2=2)), off_diagonal])
     everywhere = np.ones(len(table), dtype=np.bool_)
-    return {key: _text(table[:, i], everywhere) for i, key in enumerate(TRUTH_COLUMNS)}
+    return {key: _numbers_as_text(table[:, i], everywhere) for i, key in enumerate(TRUTH_COLUMNS)}
 
 
-def _text(numbers: Floats, where: Bools) -> Names:
+def _numbers_as_text(numbers: Floats, where: Bools) -> Names:
     """Numbers as text that reads back to the same bits; empty elsewhere."""
     flat = [repr(float(x)) if here else "" for x, here in zip(numbers.ravel(), where.ravel(), strict=True)]
     return np.array(flat, dtype=np.str_).reshape(numbers.shape)

@@ -110,7 +110,7 @@ class Studio:
         visible = visible.copy()
         for c in range(len(self.rig.cameras)):
             for s, shot in enumerate(self.shots):
-                cover = self._cover(c, s)
+                cover = self._place_cover(c, s)
                 if cover is not None:
                     rows = self.target.shots == shot
                     visible[rows, c] &= cover.distance(uv[rows, c]) > 0
@@ -119,7 +119,7 @@ class Studio:
 
     def picture(self, camera: int, shot: int) -> Grey:
         """The photograph of shot number `shot` by camera number `camera`."""
-        return self._exposed(self._composed(camera, shot), camera, np.random.default_rng([self.seed, 7, camera, shot]))
+        return self._expose(self._compose(camera, shot), camera, np.random.default_rng([self.seed, 7, camera, shot]))
 
     def showing(self, target: Target, *, seed: int) -> Studio:
         """The same cameras before another target; the costly part, their lines of sight and backgrounds, is shared."""
@@ -216,7 +216,7 @@ class Studio:
             columns.append(towards @ self._towards_cameras > 0.17 * np.linalg.norm(towards, axis=1))
         return np.stack(columns, axis=1)
 
-    def _cover(self, camera: int, shot: int) -> Cover | None:
+    def _place_cover(self, camera: int, shot: int) -> Cover | None:
         rng = np.random.default_rng([self.seed, 8, camera, shot])
         if rng.random() >= self.covered:
             return None
@@ -232,13 +232,13 @@ class Studio:
         middle = middle + rng.normal(scale=0.25 * size, size=2)
         return Cover(middle - along, middle + along, float(rng.uniform(0.1, 0.35)) * size)
 
-    def _composed(self, camera: int, shot: int) -> Grey:
+    def _compose(self, camera: int, shot: int) -> Grey:
         look, thing = self._looks[camera], self.thing(shot)
         picture = look.blurred.copy()
-        cover = self._cover(camera, shot)
-        box = self._box(camera, thing, cover)
+        cover = self._place_cover(camera, shot)
+        box = self._find_patch(camera, thing, cover)
         if box is None:
-            return _within(picture)
+            return _cut_padding(picture)
         top, bottom, left, right = box
         window = slice(top, bottom), slice(left, right)
         cv2 = opencv()
@@ -247,18 +247,18 @@ class Studio:
         directions = cv2.resize(look.directions[window], fine, interpolation=cv2.INTER_LINEAR)
         patch = thing.paint(Rays(look.camera.camera_from_world.centre, directions), ground)
         if cover is not None:
-            patch = _covered(patch, cover, (left, top))
+            patch = _paint_cover(patch, cover, (left, top))
         if self.optics.blur > 0:
             patch = cv2.GaussianBlur(patch, (0, 0), self.optics.blur * RAYS)
         small = cv2.resize(patch, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
         inner = slice(_MARGIN, -_MARGIN)  # what the blur took from beyond the patch's edge is not wanted
         picture[top + _MARGIN : bottom - _MARGIN, left + _MARGIN : right - _MARGIN] = small[inner, inner]
-        return _within(picture)
+        return _cut_padding(picture)
 
-    def _box(self, camera: int, thing: Thing, cover: Cover | None) -> tuple[int, int, int, int] | None:
+    def _find_patch(self, camera: int, thing: Thing, cover: Cover | None) -> tuple[int, int, int, int] | None:
         """The patch of the padded picture that shows the target: top, bottom, left, right."""
         view = self.rig.cameras[camera]
-        uv, _ = view.pixel_from_world(_densely(thing.reach()))
+        uv, _ = view.pixel_from_world(_densify(thing.reach()))
         if cover is not None:
             ends = np.stack([cover.start, cover.end])
             uv = np.concatenate([uv, ends - cover.width, ends + cover.width])
@@ -272,7 +272,7 @@ class Studio:
             return None
         return int(low[1]), int(high[1]), int(low[0]), int(high[0])
 
-    def _exposed(self, picture: Grey, camera: int, rng: np.random.Generator) -> Grey:
+    def _expose(self, picture: Grey, camera: int, rng: np.random.Generator) -> Grey:
         """Vignetting, noise (half of it from the light itself), and the steps of the sensor's numbers."""
         picture = picture * self._looks[camera].vignette
         noise = rng.standard_normal(picture.shape, dtype=np.float32)
@@ -371,7 +371,7 @@ def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
     return np.stack(planes, axis=2).astype(np.float32)
 
 
-def _covered(patch: Grey, cover: Cover, corner: tuple[int, int]) -> Grey:
+def _paint_cover(patch: Grey, cover: Cover, corner: tuple[int, int]) -> Grey:
     rows, columns = patch.shape
     u = (np.arange(columns) + 0.5) / RAYS - 0.5 + corner[0] - PAD
     v = (np.arange(rows) + 0.5) / RAYS - 0.5 + corner[1] - PAD
@@ -380,12 +380,12 @@ def _covered(patch: Grey, cover: Cover, corner: tuple[int, int]) -> Grey:
     return np.asarray(patch + part * (0.3 - patch), np.float32)
 
 
-def _densely(points: Floats) -> Floats:
+def _densify(points: Floats) -> Floats:
     """Points between all pairs of points too: the picture of a straight edge is not straight."""
     steps = np.linspace(0, 1, 5)[:, None, None, None]
     between = points[None, :, None] * steps + points[None, None, :] * (1 - steps)
     return np.asarray(between.reshape(-1, 3), dtype=np.float64)
 
 
-def _within(padded: Grey) -> Grey:
+def _cut_padding(padded: Grey) -> Grey:
     return padded[PAD:-PAD, PAD:-PAD]

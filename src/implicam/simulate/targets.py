@@ -86,7 +86,7 @@ def held_boards(
     names = [camera.name for camera in rig.cameras]
     positions, facing, takes = [], [], np.zeros((len(groups) * len(flat), len(names)), dtype=np.bool_)
     for g, group in enumerate(groups):
-        xyz, towards = _held(flat, [rig.cameras[names.index(name)] for name in group], rng)
+        xyz, towards = _hold_board(flat, [rig.cameras[names.index(name)] for name in group], rng)
         positions.append(xyz)
         facing.append(np.broadcast_to(towards, xyz.shape))
         takes[g * len(flat) : (g + 1) * len(flat), [names.index(name) for name in group]] = True
@@ -99,17 +99,17 @@ TRIES = 1500
 """Places and tilts that are tried for a board; of neighbours on a bar one in a hundred will do."""
 
 
-def _held(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> tuple[Floats, Floats]:
+def _hold_board(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Corners (k, 3) of a board that all the cameras see, and the side (3,) it shows."""
     middle = np.mean([camera.camera_from_world.centre for camera in cameras], axis=0)
     up = -cameras[0].camera_from_world.rotation[1]
-    for centre in _places(float(np.linalg.norm(np.ptp(flat, axis=0))), cameras, rng):
+    for centre in _propose_places(float(np.linalg.norm(np.ptp(flat, axis=0))), cameras, rng):
         turn = rng.normal(size=3) * [1.0, 1.0, 0.4]  # tilted more than turned in its own plane
         turn *= np.radians(rng.uniform(0, 50)) / np.linalg.norm(turn)
         # a board's x runs to the right and y down as seen from its front: its z looks away from the cameras
         frame = look_at(middle, centre, up).rotation.T @ rotation_from_vector(turn)
         xyz, towards = flat @ frame.T + centre, -frame[:, 2]
-        if all(_sees(each, xyz, towards) for each in cameras):
+        if all(_sees_all(each, xyz, towards) for each in cameras):
             return xyz, towards
     raise UsageError(
         f"no place was found where {', '.join(c.name for c in cameras)} see a whole board together.",
@@ -117,7 +117,7 @@ def _held(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random.Gener
     )
 
 
-def _places(diagonal: float, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> Floats:
+def _propose_places(diagonal: float, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> Floats:
     """(n, 3) places for a board's middle, of `TRIES` those that all cameras see."""
     chosen = rng.integers(len(cameras), size=TRIES)
     part, span = rng.uniform(0.05, 0.95, size=(TRIES, 2)), rng.uniform(0.25, 0.8, size=TRIES)
@@ -133,7 +133,7 @@ def _places(diagonal: float, cameras: Sequence[SimulatedCamera], rng: np.random.
     return np.asarray(places[seen], dtype=np.float64)
 
 
-def _sees(camera: SimulatedCamera, xyz: Floats, towards: Floats) -> bool:
+def _sees_all(camera: SimulatedCamera, xyz: Floats, towards: Floats) -> bool:
     to_camera = camera.camera_from_world.centre - xyz
     cos = to_camera @ towards / np.linalg.norm(to_camera, axis=1)
     return bool((cos > 0.3).all() and camera.pixel_from_world(xyz)[1].all())

@@ -40,18 +40,18 @@ class Window:
         Only the direction from the camera means something: along the normal the points stay where they are. NaN for
         points that are not behind the glass.
         """
-        depth, aside, radius, behind = self._parts(points)
-        slope = self._slope(depth, radius)
-        across = _ratio(slope, radius, 1 / self._reach(np.zeros_like(depth), depth))
+        depth, aside, radius, behind = self._split(points)
+        slope = self._slope_in_air(depth, radius)
+        across = _ratio_or_limit(slope, radius, 1 / self._reach_per_slope(np.zeros_like(depth), depth))
         return depth[:, None] * (self.normal + across[:, None] * aside), behind
 
     def jacobian(self, points: Floats) -> Floats:
         """(n, 3, 3) derivative of `apparent` with respect to the points; NaN for points not behind the glass."""
-        depth, aside, radius, _ = self._parts(points)
-        slope = self._slope(depth, radius)
-        growth = self._reach(slope, depth)
-        across = _ratio(slope, radius, 1 / self._reach(np.zeros_like(depth), depth))
-        outward = _ratio(aside, radius[:, None], 0.0)
+        depth, aside, radius, _ = self._split(points)
+        slope = self._slope_in_air(depth, radius)
+        growth = self._reach_per_slope(slope, depth)
+        across = _ratio_or_limit(slope, radius, 1 / self._reach_per_slope(np.zeros_like(depth), depth))
+        outward = _ratio_or_limit(aside, radius[:, None], 0.0)
         with_depth = -_tangent(slope, self.water) / growth  # d slope / d depth
         normal, n = self.normal, len(depth)
         along = np.broadcast_to(np.outer(normal, normal), (n, 3, 3))
@@ -60,7 +60,7 @@ class Window:
         bend = (depth * (1 / growth - across))[:, None, None] * outward[:, :, None] * outward[:, None, :]
         return np.asarray(along + sideways + by_depth + bend, dtype=np.float64)
 
-    def _parts(self, points: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
+    def _split(self, points: Floats) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
         """Depth along the normal (n,), the rest (n, 3) and its length (n,), and where a point is in the water."""
         depth = points @ self.normal
         behind = depth > self.distance + self.thickness
@@ -68,7 +68,7 @@ class Window:
         aside = points - depth[:, None] * self.normal
         return depth, aside, np.linalg.norm(aside, axis=1), behind
 
-    def _slope(self, depth: Floats, radius: Floats) -> Floats:
+    def _slope_in_air(self, depth: Floats, radius: Floats) -> Floats:
         """(n,) tangent of the ray's angle to the normal in air, so that it arrives `radius` beside the normal.
 
         How far a ray comes is concave in this tangent: from below, Newton's method never goes too far.
@@ -81,10 +81,10 @@ class Window:
                 + self.thickness * _tangent(slope, self.glass)
                 + water * _tangent(slope, self.water)
             )
-            slope = slope + (radius - comes) / self._reach(slope, depth)
+            slope = slope + (radius - comes) / self._reach_per_slope(slope, depth)
         return np.asarray(slope, dtype=np.float64)
 
-    def _reach(self, slope: Floats, depth: Floats) -> Floats:
+    def _reach_per_slope(self, slope: Floats, depth: Floats) -> Floats:
         """(n,) how much farther beside the normal a ray comes, per slope in air."""
         water = depth - self.distance - self.thickness
         bent = self.thickness * _tangent_slope(slope, self.glass) + water * _tangent_slope(slope, self.water)
@@ -100,7 +100,7 @@ def _tangent_slope(slope: Floats, index: float) -> Floats:
     return np.asarray(index**2 / (index**2 + (index**2 - 1) * slope**2) ** 1.5, dtype=np.float64)
 
 
-def _ratio(a: Floats, b: Floats, at_zero: Floats | float) -> Floats:
+def _ratio_or_limit(a: Floats, b: Floats, at_zero: Floats | float) -> Floats:
     """`a / b`, and its limit `at_zero` where b is zero: straight through the pane."""
     zero = b == 0
     return np.asarray(np.where(zero, at_zero, a / np.where(zero, 1.0, b)), dtype=np.float64)
