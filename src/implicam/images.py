@@ -177,10 +177,17 @@ def blank(picture: Grey) -> str:
 def find_pictures(folder: Path, pattern: str = PATTERN, cameras: Sequence[str] = ()) -> dict[str, dict[str, Path]]:
     """The files by camera and shot: {camera: {shot: path}}, both sorted as people count (2 before 10).
 
-    pattern: the path below `folder` with {camera} and {shot}, without the ending: "{camera}/{shot}" (a folder per
-    camera), "{shot}_{camera}", ... cameras: names to look for first, as in "cam_1_003" it is not clear where the camera
-    ends. Hidden files and folders are left out. UsageError for a pattern without both; ImageError where two files claim
-    one place.
+    Hidden files and folders are left out.
+
+    Args:
+        folder: where to look.
+        pattern: the path below `folder` with {camera} and {shot}, without the ending: "{camera}/{shot}" (a folder per
+            camera), "{shot}_{camera}", ...
+        cameras: names to look for first, as in "cam_1_003" it is not clear where the camera ends.
+
+    Raises:
+        UsageError: the pattern lacks {camera} or {shot}.
+        ImageError: there are no pictures, or two files claim one place.
     """
     expression = _compile_pattern(pattern, cameras)
     if not folder.is_dir():

@@ -147,7 +147,16 @@ def _principal_curvatures(answer: Grey, u: NDArray[np.intp], v: NDArray[np.intp]
 
 
 def measure_spots(picture: Grey, uv: Floats, sigma: float) -> Spots:
-    """Measure the bright spots of about the scale `sigma` near pixels uv (n, 2)."""
+    """Centroids of bright spots, with their uncertainties.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        uv: (n, 2) pixels near their middles.
+        sigma: their scale in pixels: the radius over the square root of two.
+
+    Returns:
+        n spots, NaN where there is none that can be measured.
+    """
     windows = [_Window.of(picture, float(u), float(v), sigma) for u, v in uv]
     good = [window for window in windows if window is not None]
     share = _estimate_shared_noise(good)

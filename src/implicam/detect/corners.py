@@ -74,10 +74,18 @@ class Corners:
 
 
 def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare: float = 1.0) -> Corners:
-    """Fit the corners near pixels uv (n, 2).
+    """Fit corners, each to the pixels in a window around it.
 
-    right, down: (n, 2) pixels from a corner to its neighbours, roughly. bare: how far from an edge, in squares, its
-    bright side is bare of print (1 on a checkerboard; on a ChArUco board markers begin earlier).
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        uv: (n, 2) pixels near the corners, within about a third of a square.
+        right: (n, 2) pixels from a corner to its neighbour along the rows, roughly.
+        down: (n, 2) the same along the columns.
+        bare: how far from an edge, in squares, its bright side is bare of print: 1 on a checkerboard; on a ChArUco
+            board markers begin earlier.
+
+    Returns:
+        n corners, NaN where none can be fitted.
     """
     uv, right, down = (np.asarray(x, dtype=np.float64) for x in (uv, right, down))
     out = Corners.unknown(len(uv))

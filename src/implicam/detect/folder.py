@@ -93,13 +93,23 @@ def detect_folder(
 ) -> DetectionRun:
     """Look for a target in all pictures of a dataset folder, and write its observations.csv.
 
-    pictures, pattern: where the pictures are, as `find_pictures` takes them, below `dataset`. Without dataset.toml one
-    is made, with lengths in `unit`. overlays: whether to draw pictures to check by eye. A run that was stopped goes on
-    where it was; `restart` forgets what it had found. correct: what is done to the observations before they are
-    written, instead of `detector.correct`.
+    A run that was stopped goes on where it was.
 
-    UsageError for options that do not go together, DatasetError for a damaged dataset.toml or points.csv, ImageError
-    where there are no pictures, or nothing was found in any of them.
+    Args:
+        dataset: the folder. Without dataset.toml one is made.
+        detector: what to look for.
+        unit: the length unit of a dataset.toml that is made.
+        pictures: the folder of the pictures, below `dataset`.
+        pattern: how their names tell camera and shot, as `find_pictures` takes it.
+        overlays: whether to draw pictures to check by eye.
+        restart: forget what an earlier run found.
+        correct: what is done to the observations before they are written, instead of `detector.correct`.
+        progress: told how far it is.
+
+    Raises:
+        UsageError: options do not go together.
+        DatasetError: dataset.toml or points.csv is damaged.
+        ImageError: there are no pictures, or nothing was found in any of them.
     """
     rig = _Rig.of(Path(dataset), unit, Path(dataset) / pictures, pattern)
     with one_thread_each():

@@ -123,9 +123,15 @@ class Places(NamedTuple):
 
 
 def grow(picture: Grey, seed: Floats, limit: int) -> Grid | None:
-    """The grid about corners found roughly, seed (rows, columns, 2), NaN for holes; None where it is no checkerboard.
+    """All of a checkerboard that can be seen, from a few of its corners.
 
-    limit: rows or columns beyond which it need not grow.
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        seed: (rows, columns, 2) pixels of corners found roughly, NaN for holes.
+        limit: rows or columns beyond which it need not grow.
+
+    Returns:
+        The grid, None where the seed is no part of a checkerboard.
     """
     grid = _grid_from_seed(picture, seed)
     return None if grid is None else _grow_from(picture, grid, limit)

@@ -27,11 +27,19 @@ MIN_POINTS = 10
 
 
 def centred(data: Dataset, radius: float, calibration: PredictsPixels | None = None) -> tuple[Dataset, list[str]]:
-    """The observations moved from the middle of each outline to the ball's middle; and what there is to say of it.
+    """The observations moved from the middle of each outline to the ball's middle.
 
-    radius: of the ball, in the dataset's unit. calibration: of the rig; without one, one is fitted to the known
-    positions of the dataset. The outline's own middle stays as the columns outline_u, outline_v. Data that cannot be
-    corrected come back as they are, with a note that says why.
+    Args:
+        data: observations of the middles of outlines.
+        radius: of the ball, in the dataset's unit.
+        calibration: of the rig; without one, one is fitted to the known positions of the dataset.
+
+    Returns:
+        The dataset, in which the outline's own middle stays as the columns outline_u, outline_v, and notes for the
+        person. Data that cannot be corrected come back as they are, with a note that says why.
+
+    Raises:
+        UsageError: the radius is not positive.
     """
     if not (np.isfinite(radius) and radius > 0):
         raise UsageError(f"a ball has no radius {radius:g}.", fix=f"give it in {data.length_unit}, for example 8")
@@ -70,7 +78,17 @@ def _fit_own(data: Dataset) -> PredictsPixels:
 
 
 def outline_shift(calibration: PredictsPixels, xyz: Floats, radius: float, cameras: tuple[str, ...]) -> Floats:
-    """(n, cameras, 2) by how much the middle of the outline of a ball at xyz (n, 3) is off its middle, pixels."""
+    """How far the middle of a ball's outline is from the picture of the ball's middle.
+
+    Args:
+        calibration: of the rig.
+        xyz: (n, 3) the ball's middle, in the world frame and the calibration's unit; NaN where it is not known.
+        radius: of the ball, in the same unit.
+        cameras: names.
+
+    Returns:
+        (n, cameras, 2) pixels; NaN where the camera is not calibrated, or the outline cannot be predicted.
+    """
     trained = calibration.trained.camera_names
     shift = np.full((len(xyz), len(cameras), 2), np.nan)
     there = np.isfinite(xyz).all(axis=1)

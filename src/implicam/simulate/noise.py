@@ -33,13 +33,25 @@ def simulate(
     visible: Bools | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> Dataset:
-    """The dataset that the rig records of a target; `seed` rules everything that the rig's own seed does not.
+    """The dataset that the rig records of a target.
 
-    robot_noise: sd per axis of the known positions, in the rig's unit; a shot is off as a whole, as a robot or a
-    slide is. missing: probability that a view is lost. outliers: probability that a view left is a wrong detection,
-    anywhere in the image. visible: (n, cameras) where a camera sees a point, where something else decides that. extra:
-    further entries of dataset.toml. The known positions carry the truth and the Cramer-Rao limit (`TRUTH_COLUMNS`), the
-    observations true_u, true_v and outlier, as extra columns.
+    Args:
+        rig: the cameras.
+        target: n points.
+        seed: rules everything that the rig's own seed does not.
+        robot_noise: sd per axis of the known positions, in the rig's unit; a shot is off as a whole, as a robot or a
+            slide is.
+        missing: probability that a view is lost.
+        outliers: probability that a view left is a wrong detection, anywhere in the image.
+        visible: (n, cameras) where a camera sees a point, where something else decides that.
+        extra: further entries of dataset.toml.
+
+    Returns:
+        The dataset. Its known positions carry the truth and the Cramer-Rao limit (`TRUTH_COLUMNS`), its observations
+        true_u, true_v and outlier, as extra columns.
+
+    Raises:
+        UsageError: an option is out of range.
     """
     _check_options(seed, robot_noise, missing, outliers)
     to_robot, to_missing, to_outliers, to_pixels = (np.random.default_rng([seed, i]) for i in range(4))
@@ -122,10 +134,18 @@ def views(rig: Rig, target: Target) -> tuple[Floats, Bools]:
 
 
 def cramer_rao_limit(rig: Rig, xyz: Floats, used: Bools, sd: Floats | None = None) -> Floats:
-    """(n, 3, 3) the covariance nobody can beat, with perfectly known cameras; NaN for fewer than two views.
+    """The smallest covariance that a position can have on average, with perfectly known cameras.
 
-    The inverse of the Fisher information: the sum of J^T J / sd^2 over the cameras used (n, cameras). sd: of the
-    pixels, (n, cameras, 2); that of each camera's noise where None.
+    It is the inverse of the Fisher information: the sum of J^T J / sd^2 over the cameras used.
+
+    Args:
+        rig: the cameras.
+        xyz: (n, 3) positions in the rig's world frame and unit.
+        used: (n, cameras) which views count.
+        sd: (n, cameras, 2) of the pixels; that of each camera's noise where None.
+
+    Returns:
+        (n, 3, 3) in the rig's unit squared; NaN for fewer than two views.
     """
     information = np.zeros((len(xyz), 3, 3))
     for c, camera in enumerate(rig.cameras):
