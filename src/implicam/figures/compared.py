@@ -10,7 +10,7 @@ import numpy as np
 from implicam.compare import RANDOM, mean_and_error, plane_of
 from implicam.dataset import Floats
 from implicam.errors import import_extra
-from implicam.figures.printed import PURPOSE, blank, plain_log, quiet, values
+from implicam.figures.printed import PURPOSE, blank, place_legend, plain_log, quiet, values
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, MARKS, ORANGE, PURPLE, SKY, VERMILLION
 
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, BLACK)
@@ -55,7 +55,7 @@ def _curves(rows: Sequence[Row], unit: str, over: str) -> Any:
                 axes.errorbar(known * shift, middle, yerr=_bars(middle, error), **_LOOK, lw=1.4, **look)
     _draw_limit(panels[0], rows)
     _finish_curves(panels, sorted({int(row["known"]) for row in rows}), unit)
-    _legend(figure, panels[0], f"mean ± standard error over the {over}")
+    place_legend(figure, panels[:1], f"mean ± standard error over the {over}")
     return figure
 
 
@@ -107,15 +107,6 @@ def _finish_curves(panels: Sequence[Any], known: Sequence[int], unit: str) -> No
     seconds.set_ylabel("seconds to fit")
 
 
-def _legend(figure: Any, axes: Any, title: str) -> None:
-    """Outside, below the panels: six methods hide nothing."""
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        figure.legend(
-            handles, labels, loc="outside lower center", ncols=min(len(labels), 4), frameon=False, title=title
-        )
-
-
 # what was left out
 
 
@@ -134,7 +125,7 @@ def _range_plot(rows: Sequence[Row], unit: str) -> Any:
         for axes, key in zip(panels, ("rmse", "ellipsoid_95"), strict=True):
             _draw_ranges(axes, mine, key, cells, step * (k - (len(kinds) - 1) / 2), look)
     _finish_ranges(panels, cells, unit)
-    _legend(figure, panels[0], "large: mean ± standard error; small: each split")
+    place_legend(figure, panels[:1], "large: mean ± standard error; small: each split")
     return figure
 
 

@@ -22,7 +22,7 @@ from implicam.figures.panels3d import (
     title_of,
     to_fit,
 )
-from implicam.figures.style import BLACK, BLUE, CLEAR, GREEN, GREY, ORANGE, SKY, WHITE, graph_objects, layout, plain
+from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, WHITE, figure_3d, plain, points_3d
 from implicam.formatting import number
 from implicam.templates import Markup, render
 
@@ -41,30 +41,28 @@ def panels_3d(panels: Iterable[Panel], *, scales: Scales | None = None, every: i
 
     One scene, since a browser gives a page some eight to sixteen of them and experiment 3 has twelve panels.
     """
-    go = graph_objects()
     chosen = list(panels)
     scales = scales or scales_of(chosen)
     found = [drawn(panel, every) for panel in chosen]
-    traces = [trace for i, panel in enumerate(chosen) for trace in _traces(go, panel, found[i], scales, i == 0)]
+    traces = [trace for i, panel in enumerate(chosen) for trace in _traces(panel, found[i], scales, i == 0)]
     titles = [plain(title_of(panel, d)) for panel, d in zip(chosen, found, strict=True)]
     corners = room([c for panel, d in zip(chosen, found, strict=True) for c in to_fit(panel, d, scales)])
-    return _figure(go, traces, corners, [_menu(titles)] if len(titles) > 1 else [])
+    return _figure(traces, corners, [_menu(titles)] if len(titles) > 1 else [])
 
 
 def aligned_3d(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2") -> Any:
     """A Plotly figure of explicit calibration's points before and after alignment; see `panels3d.aligned`."""
-    go = graph_objects()
     parts: list[tuple[Floats | None, str, str, str]] = [
         (true_xyz, "robot's positions", "cross", BLUE),
         (aligned_xyz, "explicit, aligned", "circle-open", GREEN),
         (camera_xyz, f"explicit, in the frame of {camera}", "diamond-open", ORANGE),
     ]
     traces = [
-        _points(go, np.asarray(xyz), plain(name), marker={"symbol": symbol, "size": 4, "color": colour})
+        _points(np.asarray(xyz), plain(name), marker={"symbol": symbol, "size": 4, "color": colour})
         for xyz, name, symbol, colour in parts
         if xyz is not None
     ]
-    return _figure(go, traces, room(xyz for xyz, *_ in parts if xyz is not None), [])
+    return _figure(traces, room(xyz for xyz, *_ in parts if xyz is not None), [])
 
 
 def html_page(figure: Any, *, title: str, caption: str = "") -> str:
@@ -91,27 +89,26 @@ def figure_json(figure: Any) -> Markup:
     return Markup(figure.to_json().replace("<", "\\u003c"))
 
 
-def _traces(go: Any, panel: Panel, found: Drawn, scales: Scales, visible: bool) -> list[Any]:
+def _traces(panel: Panel, found: Drawn, scales: Scales, visible: bool) -> list[Any]:
     """The _PER_PANEL traces of a panel."""
     lines = segments(found.xyz, found.true)
     known = known_of(panel)
     traces = [
-        _points(go, known, f"training points ({len(known)})", marker={"symbol": "cross", "size": 3, "color": SKY}),
-        _points(go, lines, "to the truth", mode="lines", line={"color": BLACK, "width": 2}),
-        _points(go, found.true, "truth", marker={"size": 2, "color": BLACK}),
-        _measured(go, found, scales),
+        _points(known, f"training points ({len(known)})", marker={"symbol": "cross", "size": 3, "color": SKY}),
+        _points(lines, "to the truth", mode="lines", line={"color": BLACK, "width": 2}),
+        _points(found.true, "truth", marker={"size": 2, "color": BLACK}),
+        _measured(found, scales),
     ]
     for trace in traces:
         trace.visible = visible
     return traces
 
 
-def _points(go: Any, xyz: Floats, name: str, **look: Any) -> Any:
-    x, y, z = xyz.T
-    return go.Scatter3d(x=x, y=y, z=z, name=name, hoverinfo="skip", **{"mode": "markers", **look})
+def _points(xyz: Floats, name: str, **look: Any) -> Any:
+    return points_3d(xyz, name, hoverinfo="skip", **look)
 
 
-def _measured(go: Any, found: Drawn, scales: Scales) -> Any:
+def _measured(found: Drawn, scales: Scales) -> Any:
     bar = {
         "title": {"text": "distance from<br>the truth (mm)", "side": "top"}, "thickness": 14, "len": 0.7,
         "outlinewidth": 0, "ticks": "outside", "x": 0.95,
@@ -122,8 +119,8 @@ def _measured(go: Any, found: Drawn, scales: Scales) -> Any:
         "line": {"width": 1, "color": BLACK}, "opacity": 1.0,
     }  # fmt: skip
     certain = "" if found.sd is None else ", larger: less certain"
-    trace = _points(go, found.xyz, f"measured ({len(found.xyz)}){certain}", marker=marker)
-    return trace.update(text=_hover(found), hoverinfo="text")
+    name = f"measured ({len(found.xyz)}){certain}"
+    return points_3d(found.xyz, name, marker=marker, text=_hover(found), hoverinfo="text")
 
 
 def _hover(found: Drawn) -> list[str]:
@@ -142,18 +139,8 @@ def _menu(titles: Sequence[str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _figure(go: Any, traces: list[Any], corners: Floats, menus: list[Any]) -> Any:
+def _figure(traces: list[Any], corners: Floats, menus: list[Any]) -> Any:
     """One scene with the same room for all panels, so that another panel does not change the view."""
-    sides = {
-        f"{name}axis": {
-            "title": {"text": f"{name} (mm)"}, "range": list(corners[:, i]), "gridcolor": GREY, "gridwidth": 0.5,
-            "zeroline": False, "showbackground": False,
-        }
-        for i, name in enumerate("xyz")
-    }  # fmt: skip
-    scene = {**sides, "aspectmode": "data", "camera": _VIEW}
-    figure = go.Figure(traces, layout(scene=scene, updatemenus=menus, uirevision="keep"))
-    figure.update_layout(margin={"l": 0, "r": 0, "t": 44, "b": 0})
-    return figure.update_layout(
-        legend={"x": 0, "y": 0, "yanchor": "bottom", "bgcolor": CLEAR, "itemsizing": "constant"}
-    )
+    ranges = {f"{name}axis": {"range": list(corners[:, i])} for i, name in enumerate("xyz")}
+    legend = {"x": 0, "y": 0, "yanchor": "bottom"}
+    return figure_3d(traces, "mm", _VIEW, scene=ranges, updatemenus=menus, legend=legend)

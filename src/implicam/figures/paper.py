@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.figures.printed import blank, looks, nothing_to_draw, plain_log, quiet, values
+from implicam.figures.printed import blank, looks, nothing_to_draw, place_legend, plain_log, quiet, values
 from implicam.figures.style import BLUE, GREEN, GREY, ORANGE, VERMILLION
 
 Row = Mapping[str, Any]
@@ -69,7 +69,7 @@ def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     _against_known(panels[-1:], _sizes(learners), total)
     for axes, name in zip(panels, sets, strict=False):
         _label_lines(axes, _where(explicit, set=name))
-    _legend(figure, panels, _RUNS, columns=3)
+    place_legend(figure, panels, _RUNS, columns=3)
     return figure
 
 
@@ -95,7 +95,7 @@ def sd_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     panels[0].set_ylabel("average stated standard deviation (mm)")
     _log_or_empty(panels)
     _against_known(panels, _sizes(table), total)
-    _legend(figure, panels, _RUNS)
+    place_legend(figure, panels, _RUNS)
     return figure
 
 
@@ -122,7 +122,7 @@ def sd_against_rmse(rows: Iterable[Row], *, floor: float | None = None) -> Any:
     if table:
         for axes in panels:
             _draw_honest(axes, floor)
-    _legend(figure, panels, "large: medians over runs with the same number of points; small: each run")
+    place_legend(figure, panels, "large: medians over runs with the same number of points; small: each run")
     return figure
 
 
@@ -146,7 +146,7 @@ def active_curves(rows: Iterable[Row]) -> Any:
         _log_or_empty(line)
     for axes in panels[-1]:
         axes.set_xlabel("points added")
-    _legend(figure, panels.ravel(), "a line for each start")
+    place_legend(figure, panels.ravel(), "a line for each start")
     return figure
 
 
@@ -282,7 +282,7 @@ def _draw_repeats(axes: Any, rows: Sequence[Row]) -> None:
             axes.plot([int(row["added"]) for row in mine], sd, **look, lw=0.9, label=label if i == 0 else None)
 
 
-# axes and legends
+# axes
 
 
 def _log_or_empty(panels: Iterable[Any], *, x: bool = False) -> None:
@@ -300,14 +300,3 @@ def _against_known(panels: Iterable[Any], sizes: Sequence[int], total: int | Non
     for axes in panels:
         axes.set_xticks(sizes, labels, size=8.5)
         axes.set_xlabel(f"training points, and their share of {total}" if total else "training points")
-
-
-def _legend(figure: Any, panels: Iterable[Any], title: str, columns: int = 4) -> None:
-    """One legend below all panels, each label once."""
-    found: dict[str, Any] = {}
-    for axes in panels:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
-    if found:
-        where = {"loc": "outside lower center", "ncols": min(len(found), columns), "frameon": False, "fontsize": 9}
-        figure.legend(list(found.values()), list(found), title=title, title_fontsize=9, handlelength=3.2, **where)

@@ -72,3 +72,14 @@ def values(rows: Iterable[Mapping[str, Any]], key: str) -> Floats:
 def nothing_to_draw(axes: Any) -> None:
     """Say in an empty panel that it is empty on purpose."""
     axes.text(0.5, 0.5, "no result", ha="center", va="center", color="0.4", transform=axes.transAxes)
+
+
+def place_legend(figure: Any, panels: Iterable[Any], title: str, columns: int = 4) -> None:
+    """One legend below all panels, each label once; outside, so that it hides nothing."""
+    found: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    if found:
+        where = {"loc": "outside lower center", "ncols": min(len(found), columns), "frameon": False, "fontsize": 9}
+        figure.legend(list(found.values()), list(found), title=title, title_fontsize=9, handlelength=3.2, **where)

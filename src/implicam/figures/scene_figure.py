@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from implicam.dataset import Floats, Names
-from implicam.figures.style import CLEAR, GREY, INK, SKY, VERMILLION, graph_objects, layout, plain
+from implicam.figures.style import GREY, INK, SKY, VERMILLION, figure_3d, plain, points_3d
 from implicam.formatting import number
 
 _FACTORS = (1, 10, 100, 1000, 10_000)
 # A line is seen from about a fiftieth of the scene; then neighbours do not yet tangle.
-_VISIBLE = 0.02
-_SMALLEST, _LARGEST = 5.0, 13.0
+_VISIBLE_SHARE = 0.02
+_SMALLEST_PX, _LARGEST_PX = 5.0, 13.0
+_VIEW = {"eye": {"x": 1.36, "y": 1.36, "z": 0.73}, "center": {"x": 0, "y": 0, "z": -0.16}}
 
 
 def scene(
@@ -37,37 +38,33 @@ def scene(
     draws a line from each measured point towards its truth, exaggerated by the factor on the buttons. known_xyz: (m, 3)
     the points the rig was calibrated from. cameras: name -> (3,) centre, hidden until clicked in the legend.
     """
-    go = graph_objects()
     i = np.isfinite(measured_xyz).all(axis=1)
     spread = np.linalg.norm(sd[i], axis=1)
     texts = _hover(np.asarray(names)[i], np.asarray(views)[i], sd[i], None if error is None else error[i], unit)
-    traces = [] if known_xyz is None else [_known(go, known_xyz)]
-    traces.append(_measured(go, measured_xyz[i], spread, None if error is None else error[i], texts, unit))
+    traces = [] if known_xyz is None else [_known(known_xyz)]
+    traces.append(_measured(measured_xyz[i], spread, None if error is None else error[i], texts, unit))
     lines, menus = [], []
     if true_xyz is not None and i.any():
         chosen = _factor(measured_xyz[i], true_xyz[i])
         factors = [factor for factor in _FACTORS if factor <= 10 * chosen]
-        lines = [_lines(go, measured_xyz[i], true_xyz[i], factor, factor == chosen) for factor in factors]
+        lines = [_lines(measured_xyz[i], true_xyz[i], factor, factor == chosen) for factor in factors]
         menus = [_buttons(len(traces), factors, chosen)]
     traces += lines
     if cameras:
-        traces.append(_cameras(go, cameras))
-    figure = go.Figure(traces, layout(scene=_room(unit), updatemenus=menus, uirevision="keep"))
-    figure.update_layout(margin={"l": 0, "r": 0, "t": 44, "b": 0})
-    return figure.update_layout(legend={"x": 0, "y": 1, "bgcolor": CLEAR, "itemsizing": "constant"})
+        traces.append(_cameras(cameras))
+    return figure_3d(traces, unit, _VIEW, updatemenus=menus, legend={"x": 0, "y": 1})
 
 
-def _known(go: Any, xyz: Floats) -> Any:
-    return go.Scatter3d(
-        **_coordinates(xyz),
-        mode="markers",
-        name=f"known points ({len(xyz)})",
+def _known(xyz: Floats) -> Any:
+    return points_3d(
+        xyz,
+        f"known points ({len(xyz)})",
         marker={"symbol": "cross", "size": 4, "color": SKY},
         hovertemplate="known point<br>(%{x:.4~g}, %{y:.4~g}, %{z:.4~g})<extra></extra>",
     )
 
 
-def _measured(go: Any, xyz: Floats, spread: Floats, error: Floats | None, texts: list[str], unit: str) -> Any:
+def _measured(xyz: Floats, spread: Floats, error: Floats | None, texts: list[str], unit: str) -> Any:
     value, what = (spread, "stated uncertainty") if error is None else (error, "error")
     # The top of the scale is a high quantile, so that one blunder does not paint all others alike.
     top = float(np.nanquantile(value, 0.98)) if np.isfinite(value).any() else 1.0
@@ -79,34 +76,28 @@ def _measured(go: Any, xyz: Floats, spread: Floats, error: Floats | None, texts:
         "size": _sizes(spread), "color": value, "colorscale": "Cividis", "cmin": 0.0, "cmax": top or 1.0,
         "colorbar": bar, "line": {"width": 0.5, "color": GREY}, "opacity": 1.0,
     }  # fmt: skip
-    return go.Scatter3d(
-        **_coordinates(xyz),
-        mode="markers",
-        name=f"measured points ({len(xyz)})",
-        marker=marker,
-        text=texts,
-        hovertemplate="%{text}<extra></extra>",
-    )
+    name = f"measured points ({len(xyz)})"
+    return points_3d(xyz, name, marker=marker, text=texts, hovertemplate="%{text}<extra></extra>")
 
 
-def _lines(go: Any, start: Floats, true: Floats, factor: int, visible: bool) -> Any:
+def _lines(start: Floats, true: Floats, factor: int, visible: bool) -> Any:
     path = np.full((len(start), 3, 3), np.nan)  # the third vertex stays NaN and breaks the line
     path[:, 0], path[:, 1] = start, start + factor * (true - start)
-    return go.Scatter3d(
-        **_coordinates(path.reshape(-1, 3)),
+    return points_3d(
+        path.reshape(-1, 3),
+        f"towards the truth, ×{factor}",
         mode="lines",
-        name=f"towards the truth, ×{factor}",
         line={"color": VERMILLION, "width": 2.5},
         hoverinfo="skip",
         visible=visible,
     )
 
 
-def _cameras(go: Any, cameras: Mapping[str, ArrayLike]) -> Any:
-    return go.Scatter3d(
-        **_coordinates(np.array([np.asarray(c, dtype=np.float64) for c in cameras.values()])),
+def _cameras(cameras: Mapping[str, ArrayLike]) -> Any:
+    return points_3d(
+        np.array([np.asarray(c, dtype=np.float64) for c in cameras.values()]),
+        "cameras (click to show)",
         mode="markers+text",
-        name="cameras (click to show)",
         visible="legendonly",  # they stand far off and would shrink everything else
         marker={"symbol": "diamond", "size": 6, "color": GREY},
         text=[plain(name) for name in cameras],
@@ -133,7 +124,7 @@ def _factor(start: Floats, true: Floats) -> int:
     """The smallest exaggeration at which the median line can be seen."""
     size = float(np.linalg.norm(np.ptp(start, axis=0)))
     typical = float(np.nanmedian(np.linalg.norm(true - start, axis=1), axis=0)) if np.isfinite(true).any() else 0.0
-    return next((f for f in _FACTORS if f * typical >= _VISIBLE * size), _FACTORS[-1] if typical else 1)
+    return next((f for f in _FACTORS if f * typical >= _VISIBLE_SHARE * size), _FACTORS[-1] if typical else 1)
 
 
 def _hover(names: Any, views: Any, sd: Floats, error: Floats | None, unit: str) -> list[str]:
@@ -154,21 +145,7 @@ def _views(count: int) -> str:
 def _sizes(spread: Floats) -> Floats:
     finite = spread[np.isfinite(spread)]
     if not len(finite) or np.ptp(finite) <= 1e-9 * finite.max():
-        return np.full(spread.shape, (_SMALLEST + _LARGEST) / 3)
+        return np.full(spread.shape, (_SMALLEST_PX + _LARGEST_PX) / 3)
     low, high = np.quantile(finite, [0.02, 0.98])
     share = np.clip((spread - low) / max(high - low, 1e-300), 0, 1)
-    return np.asarray(_SMALLEST + (_LARGEST - _SMALLEST) * np.nan_to_num(share), dtype=np.float64)
-
-
-def _room(unit: str) -> dict[str, Any]:
-    def side(name: str) -> dict[str, Any]:
-        title = {"text": plain(f"{name} ({unit})")}
-        return {"title": title, "gridcolor": GREY, "gridwidth": 0.5, "zeroline": False, "showbackground": False}
-
-    eye, centre = {"x": 1.36, "y": 1.36, "z": 0.73}, {"x": 0, "y": 0, "z": -0.16}
-    view = {"eye": eye, "center": centre}
-    return {"xaxis": side("x"), "yaxis": side("y"), "zaxis": side("z"), "aspectmode": "data", "camera": view}
-
-
-def _coordinates(xyz: Floats) -> dict[str, Floats]:
-    return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2]}
+    return np.asarray(_SMALLEST_PX + (_LARGEST_PX - _SMALLEST_PX) * np.nan_to_num(share), dtype=np.float64)

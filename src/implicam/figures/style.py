@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
+from implicam.dataset import Floats
 from implicam.errors import import_extra
 
 BLUE, SKY, GREEN, ORANGE, VERMILLION, PURPLE, BLACK = (
@@ -51,3 +53,32 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
     """A quiet axis."""
     lines = {"gridcolor": GRID, "linecolor": GREY, "zerolinecolor": GRID, "showline": True, "ticks": "outside"}
     return {"title": {"text": plain(title)}, "automargin": True, "tickcolor": GREY, **lines, **more}
+
+
+def points_3d(xyz: Floats, name: str, **look: Any) -> Any:
+    """A Plotly trace of points (n, 3) in a 3D scene; markers, unless `look` says otherwise."""
+    x, y, z = xyz.T
+    return graph_objects().Scatter3d(x=x, y=y, z=z, name=name, **{"mode": "markers", **look})
+
+
+def figure_3d(traces: list[Any], unit: str, camera: Mapping[str, Any], **more: Any) -> Any:
+    """A Plotly figure of one 3D scene with quiet axes.
+
+    Args:
+        traces: what it shows.
+        unit: of length, as the axes name it.
+        camera: from where the scene is seen, in Plotly's words.
+        more: of the layout; a `scene` in it is joined with ours.
+
+    Returns:
+        The figure. It has no margins but room for buttons at the top, and a legend without background.
+    """
+    scene: dict[str, Any] = {"aspectmode": "data", "camera": camera}
+    for name in "xyz":
+        title = {"text": plain(f"{name} ({unit})")}
+        scene[f"{name}axis"] = {
+            "title": title, "gridcolor": GREY, "gridwidth": 0.5, "zeroline": False, "showbackground": False,
+        }  # fmt: skip
+    figure = graph_objects().Figure(traces, layout(scene=scene, uirevision="keep"))
+    figure.update_layout(margin={"l": 0, "r": 0, "t": 44, "b": 0}, legend={"bgcolor": CLEAR, "itemsizing": "constant"})
+    return figure.update_layout(**more)
