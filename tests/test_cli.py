@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -78,12 +79,12 @@ HEAVY_EXAMPLES = ("demo", "compare", "report", "acquire", "paper")
 """Those that take 7 to 50 seconds of work each: with `make test-slow`."""
 
 
-def example(command: str, folder: Path) -> Ran:
-    """Run the example of a command, as installed, and look at what it leaves."""
+def example(command: str, folder: Path, run: Callable[[str, Path], Ran] = real) -> Ran:
+    """Run the example of a command, as installed unless told otherwise, and look at what it leaves."""
     before = {path.name for path in folder.iterdir()}
     name, *words = shlex.split(EXAMPLES[command])
     assert name == "implicam"
-    ran = real(shlex.join(words), folder)
+    ran = run(shlex.join(words), folder)
     assert ran.code == 0, ran.err
     assert ran.out.strip()
     assert "Warning" not in ran.err
@@ -94,13 +95,13 @@ def example(command: str, folder: Path) -> Ran:
     return ran
 
 
-def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path) -> None:
+def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path, cli: Cli) -> None:
     for module in ("plotly", "matplotlib"):
         pytest.importorskip(module)
-    real("simulate my-photos --images --cameras 2R --grid 3x2x2", tmp_path)
+    cli("simulate", "my-photos", "--images", "--cameras", "2R", "--grid", "3x2x2")
     for command in EXAMPLES:
-        if command not in HEAVY_EXAMPLES:
-            example(command, tmp_path)
+        if command not in HEAVY_EXAMPLES:  # in this process: to start one costs a second
+            example(command, tmp_path, lambda words, folder: cli(*shlex.split(words)))
     assert len(read_dataset(tmp_path / "my-rig")) == 157
     assert len(read_dataset(tmp_path / "my-rig.csv")) == 157
     assert len(read_measured(tmp_path / "measured.csv")) == 300

@@ -87,8 +87,10 @@ finally:
 '''
 
 
-def victims_folder(made: Path, folder: Path) -> Path:
-    """Everything the victims need, and in place of their output something old and good."""
+@pytest.fixture(scope="module")
+def template(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Everything the victims need, and in place of their output something old and good; to be copied."""
+    folder = tmp_path_factory.mktemp("victims") / "template"
     shutil.copytree(made, folder, ignore=shutil.ignore_patterns("photos"))
     rig = build_rig("bar6", seed=9, cameras="2R")
     old = simulate(rig, random_positions(rig, 25, np.random.default_rng(0)), seed=9)
@@ -139,14 +141,13 @@ def check_kill(folder: Path, victim: Victim, old: Any, new: Any, sources: dict[s
 
 @pytest.mark.parametrize("victim", VICTIMS, ids=str)
 def test_killed_before_any_of_its_changes_the_old_or_the_new_is_there(
-    victim: Victim, made: Path, tmp_path: Path
+    victim: Victim, template: Path, tmp_path: Path
 ) -> None:
     """One run; before each of its file operations (open, write to disk, rename, remove, ...) the folder is copied.
 
     A copy holds what a process killed at that instant leaves behind: what is on its way to a file is in neither.
     """
     pytest.importorskip(victim.needs)
-    template = victims_folder(made, tmp_path / "template")
     shutil.copytree(template, tmp_path / "run")
     told = subprocess.run(
         [sys.executable, "-c", KILLER, str(tmp_path / "run"), str(tmp_path), *shlex.split(victim.words)],
@@ -187,10 +188,9 @@ def killed_at(victim: Victim, folder: Path, delay: float) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", VICTIMS, ids=str)
-def test_killed_at_any_moment_the_old_or_the_new_is_there(victim: Victim, made: Path, tmp_path: Path) -> None:
+def test_killed_at_any_moment_the_old_or_the_new_is_there(victim: Victim, template: Path, tmp_path: Path) -> None:
     """Two dozen delays over the last part of a measured run, where the files are written."""
     pytest.importorskip(victim.needs)
-    template = victims_folder(made, tmp_path / "template")
     whole = tmp_path / "whole"
     shutil.copytree(template, whole)
     start = time.perf_counter()

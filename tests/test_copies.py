@@ -153,7 +153,7 @@ def test_marks_for_missing_views_are_none(mark: str, tmp_path: Path) -> None:
     (note,) = data.notes
     u = mark.split(",")[0]
     missing = int((~right.observations.seen).sum())
-    assert note.startswith(f"The pixel ({u}, {u}) is there {missing} times (cam1, ")
+    assert note.startswith(f"The pixel ({u}, {u}) occurs {missing} times (cam1, ")
     assert right.notes == ()
     assert data.select(np.arange(20)).notes == data.notes
 
@@ -172,7 +172,7 @@ def test_a_detector_that_always_finds_one_spot_is_said(tmp_path: Path) -> None:
     uv[::3, 1] = [317.25, 88.5]
     ic.write_dataset(with_pixels(data, uv), tmp_path / "d")
     found = ic.read_dataset(tmp_path / "d")
-    assert "(317.25, 88.5) is there 10 times (cam3)" in found.notes[0]
+    assert "(317.25, 88.5) occurs 10 times (cam3)" in found.notes[0]
     assert found.observations.seen[:, 1].sum() == 20
 
 

@@ -170,7 +170,7 @@ def test_marks_that_came_by_the_api_are_said() -> None:
     uv[::5, 0] = -1
     verdict = ic.judge(ic.ForwardGP().fit(with_pixels(data, uv)))
     assert verdict.word == DOUBTFUL
-    assert "The pixel (-1, -1) is there 5 times (cam1)" in verdict.reasons[0]
+    assert "The pixel (-1, -1) occurs 5 times (cam1)" in verdict.reasons[0]
     assert "taken for a pixel" in verdict.reasons[0]
 
 

@@ -4,7 +4,7 @@
     ├── DatasetError          a file or a value in a dataset is wrong
     ├── ImageError            a photograph cannot be read, or is not what the rig records
     ├── FitError              a calibration cannot be computed from these data
-    ├── CalibrationFileError  a .implicam file is damaged, hostile or too new
+    ├── CalibrationFileError  a .implicam file is damaged, unsafe or too new
     ├── NumericalError        a matrix that must be positive definite is not
     ├── MissingExtraError     an optional library is not installed
     ├── HardwareError         a camera, a trigger or a robot does not do what it was told
@@ -50,7 +50,7 @@ class FitError(ImplicamError):
 
 
 class CalibrationFileError(ImplicamError):
-    """A calibration file is damaged, hostile or from a newer version; nothing in it was run."""
+    """A calibration file is damaged, unsafe or from a newer version; nothing in it was run."""
 
 
 class NumericalError(ImplicamError):

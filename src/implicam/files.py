@@ -1,8 +1,8 @@
-"""Writing that a kill cannot halve, and reading that a hostile file cannot exploit.
+"""Write files whole or not at all; read zip and NumPy files that somebody may have tampered with.
 
-Every file is written beside its place and renamed into it, so that at any moment the old or the new file is
-there, whole. Zip and NumPy containers are read with their declared sizes checked *before* memory is spent, and
-never with pickle.
+Every file is written under a temporary name and then renamed, so that after a crash either the old or the new file is
+there, complete. The sizes that a zip or NumPy file declares are checked *before* memory is allocated; pickle is never
+used.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from implicam.errors import ImplicamError
 
 # A calibration or dataset is stored uncompressed by us, so a member is never larger than its file. Others may
 # deflate: text shrinks perhaps tenfold, while the bombs we refuse shrink a thousandfold. Bzip2 and LZMA may ask for
-# gigabytes before the first byte, and nobody writes NumPy files with them: they are refused.
-MAX_INFLATION = 100
-SMALL_BYTES = 1 << 24
+# gigabytes before the first byte, and NumPy files are not written with them: they are refused.
+MAX_INFLATION_RATIO = 100
+MIN_INFLATED_BYTES = 1 << 24
 
 _ZIP_ERRORS = (
     zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, KeyError, ValueError, OSError,
@@ -46,7 +46,7 @@ _NPY_HEADER = re.compile(
     r"\{\s*'descr':\s*'([<>|=]?[fiubU][0-9]{1,6})',\s*'fortran_order':\s*(True|False),"
     r"\s*'shape':\s*\(((?:[0-9]{1,15},\s*)*(?:[0-9]{1,15}\s*)?)\)\s*(?:,\s*)?\}\s*"
 )
-_MAX_NPY_HEADER = 10_000
+_MAX_NPY_HEADER_BYTES = 10_000
 
 
 @contextmanager
@@ -76,7 +76,7 @@ def must_be_no_folder(path: Path) -> None:
 
 @contextmanager
 def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """The same for a folder. An existing one is refused unless `overwrite`, and then swapped when all is ready.
+    """`replacing` for a folder. An existing one is refused unless `overwrite`, and is swapped when all is ready.
 
     Where the system cannot swap two folders in one step, a kill in the instant between two renames leaves the old
     folder beside its place; `left_behind` finds it, and nothing is lost.
@@ -215,7 +215,7 @@ def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 Refuse = Callable[[str], ImplicamError]
-"""Turns a reason into the error of the room that reads."""
+"""Turns a reason into the error that the reading module raises."""
 
 
 def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -> dict[str, bytes]:
@@ -235,7 +235,7 @@ def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -
 
 def inflated_bytes(size: int) -> int:
     """How much a zip of `size` bytes may honestly hold."""
-    return SMALL_BYTES + MAX_INFLATION * size
+    return MIN_INFLATED_BYTES + MAX_INFLATION_RATIO * size
 
 
 def _check_directory(entries: list[zipfile.ZipInfo], size: int, most: int, refuse: Refuse) -> None:
@@ -276,7 +276,7 @@ def _read_npy(name: str, content: bytes, refuse: Refuse) -> NDArray[Any]:
     if len(content) < start:
         raise refuse(f"array {name!r} is cut off")
     end = start + struct.unpack(width, content[8:start])[0]
-    header = content[start : min(end, start + _MAX_NPY_HEADER)].decode("latin-1")
+    header = content[start : min(end, start + _MAX_NPY_HEADER_BYTES)].decode("latin-1")
     match = _NPY_HEADER.fullmatch(header)
     if match is None:
         raise refuse(

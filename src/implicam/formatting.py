@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-SMALLEST_DECIMAL = 1e-8
+MIN_DECIMAL_VALUE = 1e-8
 """Smaller numbers would be nothing but zeros on a terminal."""
-MOST_DECIMALS = 9
+MAX_DECIMALS = 9
 
 
 def number(value: float | None, digits: int = 3, *, sign: bool = False, minus: str = "-") -> str:
@@ -39,9 +39,9 @@ def decimal_number(value: float, digits: int = 3) -> str:
     if value == 0:
         return "0"
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    if abs(value) < SMALLEST_DECIMAL:
+    if abs(value) < MIN_DECIMAL_VALUE:
         return f"{value:.{digits - 1}e}"
-    return f"{value:.{min(decimals, MOST_DECIMALS)}f}"
+    return f"{value:.{min(decimals, MAX_DECIMALS)}f}"
 
 
 def percent(share: float | None, decimals: int = 0, *, none: str = "–") -> str:

@@ -1,7 +1,7 @@
-"""Rows and cameras that are there more than once under other names, the same to the last bit: they are one.
+"""Find rows and cameras that occur more than once under different names, the same to the last bit.
 
-Files joined twice, a camera exported under two names. A copy carries no information, so it must not count as evidence:
-neither in a fit, which would believe a noise of nothing, nor in a held-out fold, whose points the fit would know.
+This happens when files are joined twice, or a camera is exported under two names. A copy carries no information, so it
+must not count as evidence: a fit would estimate a noise that is too small, and a held-out fold would hold known points.
 
 Points are copies where the known position is the same and so are all pixels, in two cameras or more. With whole-number
 pixels a point that was measured twice at rest may look like that: it is no news either. One camera alone proves
@@ -19,10 +19,10 @@ from implicam.dataset.model import Dataset, Floats, Observations, first_same
 
 Integers = NDArray[np.int64]
 
-FEWEST_VIEWS = 5
+MIN_COMMON_VIEWS = 5
 """Views that two cameras must have in common, with the same pixels and not all at one, to be one camera."""
 
-NAMED = 3
+MAX_COPIES_NAMED = 3
 """Copies that a note names one by one."""
 
 
@@ -54,9 +54,9 @@ def copies_of(data: Dataset) -> Copies:
     observations = data.observations
     views = observations.seen[:, own].sum(axis=1)
     point_of = first_same(np.concatenate([observations.uv[:, own].reshape(n, 2 * len(own)), data.known.xyz], axis=1))
-    proven = (views >= 2) & (point_of != np.arange(n))
-    believed = (views >= 1) if proven.any() else proven
-    return Copies(np.where(believed, point_of, np.arange(n)), camera_of)
+    certain = (views >= 2) & (point_of != np.arange(n))
+    copied = (views >= 1) if certain.any() else certain
+    return Copies(np.where(copied, point_of, np.arange(n)), camera_of)
 
 
 def _camera_of(observations: Observations) -> Integers:
@@ -72,15 +72,15 @@ def _camera_of(observations: Observations) -> Integers:
 
 
 def _same(a: Floats, b: Floats, both: NDArray[np.bool_]) -> bool:
-    if both.sum() < FEWEST_VIEWS or (a[both] != b[both]).any():
+    if both.sum() < MIN_COMMON_VIEWS or (a[both] != b[both]).any():
         return False
-    return len(np.unique(a[both], axis=0)) >= FEWEST_VIEWS - 2
+    return len(np.unique(a[both], axis=0)) >= MIN_COMMON_VIEWS - 2
 
 
 def without_copies(data: Dataset, *, cameras_too: bool = False) -> Dataset:
-    """Each point once, and each camera: the views of a copied camera are missing, or with `cameras_too` it is gone.
+    """The dataset with each point and camera once: a copied camera has no views, or with `cameras_too` is left out.
 
-    The dataset itself where nothing is a copy.
+    The same dataset where nothing is a copy.
     """
     copies = copies_of(data)
     if copies.points.any():
@@ -102,8 +102,8 @@ def copy_notes(data: Dataset) -> list[str]:
     notes += [f"{names[c]} is not used: {why_no_camera(data, int(c), copies)}." for c in np.flatnonzero(copies.cameras)]
     extra = np.flatnonzero(copies.points)
     if len(extra):
-        some = ", ".join(f"{data.points[i]} of {data.points[copies.point_of[i]]}" for i in extra[:NAMED])
-        more = f" and {len(extra) - NAMED} more" if len(extra) > NAMED else ""
+        some = ", ".join(f"{data.points[i]} of {data.points[copies.point_of[i]]}" for i in extra[:MAX_COPIES_NAMED])
+        more = f" and {len(extra) - MAX_COPIES_NAMED} more" if len(extra) > MAX_COPIES_NAMED else ""
         notes.append(
             f"{len(extra)} of {len(data)} known points are copies of others, the same pixels at the same position to "
             f"the last bit ({some}{more}): each is used once. Were files joined twice?"
