@@ -150,10 +150,10 @@ class Board(DetectorBase):
         ways = [find_numberings(grid, end, self.rows, self.columns) for grid, end in zip(grids, ends, strict=True)]
         fitting = [k for k in range(len(grids)) if ways[k]]
         if not fitting or (fitting[0] > 0 and len(ways[fitting[0]]) > 1):
-            return nothing(self._explain_misfit(grids[0], ends[0]), outlines=(_hull_of(grids[0]),))
+            return nothing(self._explain_misfit(grids[0], ends[0]), outlines=(hull_of(grids[0].uv[grids[0].occupied]),))
         first = fitting[0]
         grid, possible = grids[first], [self._name_corners(grids[first], way, view) for way in ways[first]]
-        outline = (_hull_of(grid),)
+        outline = (hull_of(grid.uv[grid.occupied]),)
         if len(possible) > 1:
             return nothing(
                 f"{grid.count} of the board's {self.rows * self.columns} corners are seen, and it is not certain "
@@ -169,9 +169,11 @@ class Board(DetectorBase):
                 return nothing(
                     f"two checkerboards are in view, of {grid.count} and {grids[k].count} corners, and either may be "
                     "the board. Take the other one away, or cover it.",
-                    outlines=(*outline, _hull_of(grids[k])),
+                    outlines=(*outline, hull_of(grids[k].uv[grids[k].occupied])),
                 )
-        return replace(possible[0], reason=self._explain_missing(len(possible[0])), outlines=outline)
+        return replace(
+            possible[0], reason=explain_missing(len(possible[0]), self.rows * self.columns), outlines=outline
+        )
 
     def _name_corners(self, grid: Grid, way: Numbering, view: View) -> Detected:
         """The corners under their names, in the order of their numbers."""
@@ -210,9 +212,10 @@ class Board(DetectorBase):
             f"{self.columns}. Give the size that the board has, or take this one out of the picture."
         )
 
-    def _explain_missing(self, found: int) -> str:
-        total = self.rows * self.columns
-        return "" if found == total else f"{total - found} of the board's {total} corners are hidden or not clear."
+
+def explain_missing(found: int, total: int) -> str:
+    """How many of a board's corners are missing; empty where none are."""
+    return "" if found == total else f"{total - found} of the board's {total} corners are hidden or not clear."
 
 
 def parse_board_size(text: str | None, described: Mapping[str, Any], example: str) -> tuple[int, int]:
@@ -286,7 +289,7 @@ def _share_corners(a: Grid, b: Grid) -> bool:
     return bool(apart.min() < 1.0)
 
 
-def _hull_of(grid: Grid) -> Floats:
-    """The grid's hull, closed, (k, 2) pixels."""
-    hull = opencv().convexHull(grid.uv[grid.occupied].astype(np.float32))[:, 0]
+def hull_of(uv: Floats) -> Floats:
+    """(k, 2) the hull of points (n, 2), closed, in pixels."""
+    hull = opencv().convexHull(uv.astype(np.float32))[:, 0]
     return np.asarray(np.vstack([hull, hull[:1]]), dtype=np.float64)

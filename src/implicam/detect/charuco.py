@@ -16,9 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
-from implicam.detect.board import MAX_SEARCH_PIXELS, corner_name, explain_unusable, parse_board_size
+from implicam.detect.board import (
+    MAX_SEARCH_PIXELS,
+    corner_name,
+    explain_missing,
+    explain_unusable,
+    hull_of,
+    parse_board_size,
+)
 from implicam.detect.corners import Corners, fit_corners
-from implicam.detect.grid import MAX_ASTRAY_SQUARES, Places, predict_places
+from implicam.detect.grid import MAX_ASTRAY_SQUARES, MAX_RESIDUAL_HEIGHTS, Places, predict_places
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import resize, to_original_pixels
 from implicam.errors import UsageError, did_you_mean
@@ -27,8 +34,6 @@ from implicam.registry import Option
 
 MIN_CORNERS = 6
 """Corners from which their neighbourhood can be checked."""
-
-MAX_RESIDUAL_HEIGHTS = 0.35
 
 MAX_MARKER_OFF_SQUARES = 0.3
 """Squares that a marker may be from where its neighbours put it; more than a fifth beyond, and it is another board."""
@@ -116,14 +121,12 @@ class Charuco(DetectorBase):
                 f"{len(seen.ids)} markers of the board were read, and {len(number)} corners between them are clear: "
                 "too few. Show more of the board, sharper or nearer."
             )
-        missing = self._total - len(number)
-        hull = opencv().convexHull(corners.uv[number].astype(np.float32))[:, 0].astype(np.float64)
         return Detected(
             tuple(corner_name(view.shot, int(j)) for j in number),
             corners.uv[number],
             corners.sd[number],
-            f"{missing} of the board's {self._total} corners are hidden or not clear." if missing else "",
-            (np.vstack([hull, hull[:1]]),),
+            explain_missing(len(number), self._total),
+            (hull_of(corners.uv[number]),),
         )
 
     @property
