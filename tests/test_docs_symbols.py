@@ -37,7 +37,8 @@ DOCUMENTS.remove(ROOT / "CHANGELOG.md")  # history
 CONSTANTS = "## Constants"
 """Head of the table in docs/method.md that the last test reads."""
 
-SUFFIXES = {"log", 
+SUFFIXES = {
+    "log",
     "avi", "cti", "csv", "db", "html", "implicam", "jpg", "json", "jsonl", "md", "npz", "parquet", "png", "tif", "toml",
     "txt", "yaml",
 }  # fmt: skip

@@ -219,9 +219,15 @@ Refuse = Callable[[str], ImplicamError]
 
 
 def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -> dict[str, bytes]:
-    """The members of a zip, after its directory has been checked; `refuse` makes the error.
+    """Read the members of a zip, after its directory has been checked.
 
-    most: how many bytes all members may have together; without it, what a zip of this size can honestly hold.
+    Args:
+        source: The zip, or where it is.
+        refuse: Makes the error from a reason.
+        most: How many bytes all members may have together; None for what a zip of this size can plausibly hold.
+
+    Returns:
+        Name of the member -> its content.
     """
     try:
         with zipfile.ZipFile(source if isinstance(source, Path) else io.BytesIO(source)) as archive:
@@ -234,7 +240,7 @@ def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -
 
 
 def inflated_bytes(size: int) -> int:
-    """How much a zip of `size` bytes may honestly hold."""
+    """How many bytes a zip of `size` bytes can plausibly hold."""
     return MIN_INFLATED_BYTES + MAX_INFLATION_RATIO * size
 
 

@@ -56,10 +56,17 @@ __all__ = [
 
 
 def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
-    """Read a dataset: a folder, a wide .csv, a .parquet or an .npz.
+    """Read a dataset from a folder, a wide .csv, a .parquet or an .npz.
 
-    `unit` names the length unit of a wide CSV that has no description beside it; where the data state another, that
-    is an error. Raises DatasetError, which names the file, the line, the value and the cure.
+    Args:
+        path: The folder or file.
+        unit: The length unit of a wide CSV without a description beside it; None to use the unit that the data state.
+
+    Returns:
+        The dataset, with marks for missing views read as missing.
+
+    Raises:
+        DatasetError: If something is wrong, or the data state another unit; names file, line, value and cure.
     """
     path = Path(path)
     try:
@@ -107,10 +114,17 @@ def write_dataset(
     also: Mapping[str, str] | None = None,
     fill: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write a dataset, whole or not at all; the ending chooses the form, none means a folder.
+    """Write a dataset completely or not at all.
 
-    An existing folder is refused unless `overwrite`; `also` adds text files to a folder, and `fill` writes whatever it
-    likes into it before it takes its place.
+    Args:
+        data: The dataset.
+        path: Where to; .csv, .parquet and .npz make a file, any other ending makes a folder.
+        overwrite: Whether an existing dataset folder may be replaced.
+        also: Text files to add to a folder: relative name -> text.
+        fill: Called with the temporary folder to write more into it, before it is renamed.
+
+    Raises:
+        DatasetError: If this form cannot hold the dataset, or the folder must not be replaced.
     """
     path = Path(path)
     suffix = path.suffix.lower()

@@ -83,9 +83,15 @@ class Camera:
 class Observations:
     """Which point was seen by which camera, at which pixel.
 
-    points: (n,) names, each once. uv: (n, cameras, 2) pixels, NaN where the camera did not see the point.
-    sd: standard uncertainty of each pixel coordinate, same shape, NaN where not stated or not seen.
-    extra: further columns of observations.csv as text, (n, cameras) each.
+    Attributes:
+        points: (n,) names, each once.
+        cameras: The cameras, in the order of the second axis.
+        uv: (n, cameras, 2) pixels, NaN where the camera did not see the point.
+        sd: (n, cameras, 2) standard uncertainties in pixels, NaN where not stated or not seen.
+        extra: Other columns of observations.csv as text, (n, cameras) each.
+
+    Raises:
+        DatasetError: If a name, a pixel or an uncertainty is not possible.
     """
 
     points: Names
@@ -147,8 +153,14 @@ class Observations:
 class KnownPositions:
     """Where the points were, and which shot each belongs to.
 
-    shots: (n,) names; the points of one exposure (a board) share one. xyz: (n, 3), world frame, the dataset's unit.
-    sd: standard uncertainties, (n, 3), NaN where not stated. extra: further columns of points.csv as text, (n,) each.
+    Attributes:
+        shots: (n,) names; the points of one exposure (a board) share one.
+        xyz: (n, 3) positions in the world frame, in the dataset's length unit.
+        sd: (n, 3) standard uncertainties in the same unit, NaN where not stated.
+        extra: Other columns of points.csv as text, (n,) each.
+
+    Raises:
+        DatasetError: If a name, a position or an uncertainty is not possible.
     """
 
     shots: Names
@@ -197,9 +209,15 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Observations, the known positions that go with them (None where they are to be measured), and the unit.
+    """Observations, the known positions of the same points, and the length unit.
 
-    notes: what reading it had to take for something else, such as marks for missing views; not written with it.
+    Attributes:
+        name: The dataset's name.
+        length_unit: The unit of all positions, for example "mm".
+        observations: Which camera saw which point at which pixel.
+        known: The positions, in the order of the observations; None where they are to be measured.
+        extra: Other entries of dataset.toml, as plain values.
+        notes: What was corrected in reading, such as marks for missing views; not written to files.
     """
 
     name: str
@@ -258,7 +276,7 @@ class Dataset:
     def places(self) -> NDArray[np.int64]:
         """(n,) the number of the first point at the same known position, to the last bit; its own where none is before.
 
-        A place that was measured again, or clicked again, is news of the pixel noise and none of the rig.
+        A place that was measured again tells something of the pixel noise, and nothing of the rig.
         """
         return np.arange(len(self)) if self.known is None else first_same(self.known.xyz)
 
@@ -311,7 +329,7 @@ class Dataset:
         return self.with_cameras([name for name in self.observations.camera_names if name not in names])
 
     def split(self, n: int, *, seed: int) -> tuple[Dataset, Dataset]:
-        """`n` points at random, and the rest."""
+        """Split into `n` points at random, and the rest; DatasetError where either would be empty."""
         if not 0 < n < len(self):
             raise DatasetError(
                 f"cannot split {len(self)} points into {n} and the rest.",
@@ -321,7 +339,7 @@ class Dataset:
         return self.select(np.sort(order[:n])), self.select(np.sort(order[n:]))
 
     def folds(self, k: int, *, seed: int) -> Iterator[tuple[str, Dataset, Dataset]]:
-        """`k` random folds: name, the others, the fold; each point is held out once, with all at the same position."""
+        """Yield `k` random folds: name, the other points, the fold; points at one position are in one fold."""
         places = len(np.unique(self.places))
         if not 2 <= k <= places:
             raise DatasetError(
@@ -376,7 +394,15 @@ def join(first: Dataset, second: Dataset) -> Dataset:
 
 
 def covariance_from_columns(sd: Floats, off_diagonal: Floats) -> Floats:
-    """(n, 3, 3) covariance from standard uncertainties (n, 3) and cov_xy, cov_xz, cov_yz (n, 3)."""
+    """Covariances from the columns of a table.
+
+    Args:
+        sd: (n, 3) standard uncertainties of x, y, z in the length unit.
+        off_diagonal: (n, 3) cov_xy, cov_xz, cov_yz in the length unit squared.
+
+    Returns:
+        (n, 3, 3) covariances, world frame.
+    """
     cov = np.zeros((len(sd), 3, 3))
     cov[:, [0, 1, 2], [0, 1, 2]] = sd**2
     cov[:, [0, 0, 1], [1, 2, 2]] = cov[:, [1, 2, 2], [0, 0, 1]] = off_diagonal

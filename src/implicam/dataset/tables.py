@@ -87,7 +87,10 @@ def read_columns(
 
 
 def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[list[str], Iterator[Row]]:
-    """The header, and the rows with their line numbers, read as they are asked for; blank lines are skipped."""
+    """Read the header of a CSV table, and its rows as they are asked for, with their line numbers.
+
+    Blank lines are skipped. `required` are the columns that must be there, and `example` says how a header looks.
+    """
     example = example or ",".join(required)
     require_file(path, f"put a comma-separated table with the columns {example} there")
     rows = _rows(path)
@@ -238,7 +241,18 @@ NO_VALUE_WORDS = ("", "-", "--", "n/a", "na", "#n/a", "none", "null", "missing")
 
 
 def number(text: str, place: str, column: str, *, cure_nan: str, missing: Sequence[str] = ()) -> float:
-    """A finite number, NaN for a text in `missing`, or an error that names the place, the value and the cure."""
+    """Read a finite number.
+
+    Args:
+        text: The cell.
+        place: File and line, for the error.
+        column: Its column, for the error.
+        cure_nan: What to do where the number is missing or not finite.
+        missing: Texts (small letters) that are read as NaN.
+
+    Raises:
+        DatasetError: If the text is no finite number; names the place, the value and the cure.
+    """
     text = text.strip()
     if text.lower() in missing:
         return math.nan
