@@ -44,7 +44,7 @@ TRUTH_COLUMNS = (
 )  # fmt: skip
 """Extra columns of points.csv that `implicam simulate` writes: where the point really was, and its Cramer-Rao limit."""
 
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 
 
 @dataclass(frozen=True)
@@ -299,13 +299,7 @@ class Dataset:
     @property
     def metres_per_unit(self) -> float:
         """How long one length unit is in metres."""
-        try:
-            return METRES[self.length_unit]
-        except KeyError:
-            raise DatasetError(
-                f"the length unit {self.length_unit!r} has no known size{did_you_mean(self.length_unit, METRES)}.",
-                fix=f"use one of {', '.join(METRES)}",
-            ) from None
+        return metres_per(self.length_unit)
 
     def select(self, index: ArrayLike) -> Dataset:
         """The dataset of some points: a boolean mask, or positions in the order wanted."""
@@ -391,6 +385,17 @@ def join(first: Dataset, second: Dataset) -> Dataset:
             _joined_columns(p.extra, q.extra, (len(first),), (len(second),)),
         )
     return replace(first, observations=observations, known=known)
+
+
+def metres_per(unit: str) -> float:
+    """How long a length unit is in metres; DatasetError for one that is not known."""
+    if unit not in METRES_PER_UNIT:
+        raise DatasetError(
+            f"the length unit is {unit!r}, which has no known size{did_you_mean(unit, METRES_PER_UNIT)}.",
+            why="lengths are wanted in another unit",
+            fix=f"use one of {', '.join(METRES_PER_UNIT)}",
+        )
+    return METRES_PER_UNIT[unit]
 
 
 def covariance_from_columns(sd: Floats, off_diagonal: Floats) -> Floats:

@@ -11,8 +11,8 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from implicam.dataset.model import METRES, Camera
-from implicam.errors import DatasetError, did_you_mean
+from implicam.dataset.model import Camera, metres_per
+from implicam.errors import DatasetError
 from implicam.geometry import Pose
 from implicam.lenses import Bools, BrownConrady, Floats, Lens
 
@@ -84,17 +84,6 @@ class Rig:
         moved = [Pose(pose.rotation, pose.translation * scale) for pose in poses]
         cameras = [replace(c, camera_from_world=pose) for c, pose in zip(self.cameras, moved, strict=True)]
         return replace(self, cameras=tuple(cameras), length_unit=unit)
-
-
-def metres_per(unit: str) -> float:
-    """How long a length unit is in metres."""
-    if unit not in METRES:
-        raise DatasetError(
-            f"the length unit of the rig is {unit!r}, which has no known size{did_you_mean(unit, METRES)}.",
-            why="the other format wants metres, or another unit was asked for",
-            fix=f"state the unit of the cameras: one of {', '.join(METRES)}",
-        )
-    return METRES[unit]
 
 
 def has_distortion(lens: Lens) -> bool:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from implicam.dataset.model import METRES
+from implicam.dataset.model import METRES_PER_UNIT
 from implicam.errors import HardwareError, UsageError, import_extra
 from implicam.hardware.protocol import Floats, RobotOptions, incomplete, point, wait_for
 from implicam.hardware.ur_worker import DECELERATION, Worker
@@ -85,12 +85,12 @@ class URRobot:
         sd: Sequence[float] | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
-        if unit not in METRES:
-            raise UsageError(f"there is no length unit {unit!r}.", fix=f"use {', '.join(METRES)}")
+        if unit not in METRES_PER_UNIT:
+            raise UsageError(f"there is no length unit {unit!r}.", fix=f"use {', '.join(METRES_PER_UNIT)}")
         if not 0 < speed <= FASTEST:
             raise UsageError(f"speed = {speed} m/s is out of range.", fix=f"0.1 is calm; {FASTEST} is the most")
         self.host, self.unit, self._speed = host, unit, speed
-        self._metres = METRES[unit]
+        self._metres = METRES_PER_UNIT[unit]
         self._low, self._high = _corners(box)
         self._tool = None if tool is None else point(np.asarray(tool, dtype=np.float64), "tool") * self._metres
         self._dry, self._confirm, self._say = dry_run, confirm, say

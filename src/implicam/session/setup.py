@@ -16,7 +16,7 @@ from implicam.active.acquisitions import DEFAULT
 from implicam.active.design_model import cannot_design, designs_experiments
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
-from implicam.dataset.model import METRES
+from implicam.dataset.model import METRES_PER_UNIT
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import (
@@ -81,10 +81,10 @@ class Setup:
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple((str(name), str(spec)) for name, spec in self.cameras))
         object.__setattr__(self, "tool", None if self.tool is None else tuple(map(float, self.tool)))
-        if self.unit not in METRES:
+        if self.unit not in METRES_PER_UNIT:
             raise UsageError(
-                f"there is no length unit {self.unit!r}{did_you_mean(self.unit, METRES)}.",
-                fix=f"use {', '.join(METRES)}",
+                f"there is no length unit {self.unit!r}{did_you_mean(self.unit, METRES_PER_UNIT)}.",
+                fix=f"use {', '.join(METRES_PER_UNIT)}",
             )
         method, _ = CALIBRATORS.find(self.method)
         if not designs_experiments(method.calibration):
@@ -225,7 +225,7 @@ def _simulated(setup: Setup) -> Hardware:
             f"the robot {setup.robot!r} does not move in front of simulated cameras.",
             fix="give cameras (--camera NAME=WHAT), or leave --robot out",
         )
-    speed = (setup.speed or SIMULATED_SPEED) / METRES[setup.unit]
+    speed = (setup.speed or SIMULATED_SPEED) / METRES_PER_UNIT[setup.unit]
     eyes, robot = simulated_rig(rig, seed=setup.seed, sd=setup.sd or 0.0, speed=speed)
     room = workspace_from(setup.workspace, None) if setup.workspace else Workspace.of_box(rig.volume)
     return list(eyes), robot, room
