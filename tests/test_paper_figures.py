@@ -454,15 +454,15 @@ def test_few_points_in_3d(n: int, tmp_path: Path) -> None:
 def test_aligned_shows_three_clouds(tmp_path: Path) -> None:
     true, moved, before = (np.random.default_rng(i).uniform(0, 100, (9, 3)) for i in range(3))
     moved[2] = np.nan
-    figure = panels3d.aligned(true, moved, before, camera="cam7")
+    figure = panels3d.draw_alignment(true, moved, before, camera="cam7")
     for line, xyz in zip(three_d(figure.axes[0]), (true, moved, before), strict=True):
         np.testing.assert_allclose(np.transpose(line.get_data_3d()), xyz)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts == ["robot's positions", "explicit, aligned", "explicit, in the frame of cam7"]
     assert len({line.get_marker() for line in three_d(figure.axes[0])}) == 3
     figure.savefig(tmp_path / "aligned.pdf")
-    assert len(three_d(panels3d.aligned(true, moved).axes[0])) == 2
-    shown = interactive3d.aligned_3d(true, moved, before).data
+    assert len(three_d(panels3d.draw_alignment(true, moved).axes[0])) == 2
+    shown = interactive3d.draw_alignment_3d(true, moved, before).data
     np.testing.assert_allclose(np.array([[t.x, t.y, t.z] for t in shown]), np.swapaxes([true, moved, before], 1, 2))
 
 

@@ -155,7 +155,7 @@ def test_verdict_in_words(factor: float, words: str):
 
 def test_without_truth_nothing_is_claimed():
     read = Reader(page(report_data(truth=False)))
-    assert "Nobody checked the error bars here." in read.text
+    assert "The error bars were not checked here." in read.text
     assert "503 points measured, with a typical stated uncertainty of" in read.text
     assert "honesty" not in read.ids
     assert "plot-scene" in read.ids

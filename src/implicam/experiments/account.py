@@ -14,7 +14,7 @@ from typing import Any
 from implicam.experiments import plan, published
 from implicam.experiments.evidence import FAILS, HOLDS
 from implicam.experiments.markdown import number, quartiles, span, spread, table
-from implicam.experiments.plan import EXPLICIT, GP, METHODS, PAPER, SHOWN, slug
+from implicam.experiments.plan import DRAWN_METHODS, EXPLICIT, GP, METHODS, PAPER, slug
 from implicam.experiments.source import BALL, BOARD_CHECK, BUDGETS, CHECK, RANDOM
 from implicam.formatting import percent
 from implicam.templates import render
@@ -68,7 +68,7 @@ def markdown(summary: Summary, *, figures: str = "figures") -> str:
         most_points=most_points,
         judged_at="random positions" if off_the_lattice else "the positions left out",
         table_place=published.load("board").place,
-        drawn_methods=[slug(method) for method in SHOWN],
+        drawn_methods=[slug(method) for method in DRAWN_METHODS],
         number=number,
         quartiles=quartiles,
         span=span,

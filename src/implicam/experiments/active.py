@@ -23,7 +23,7 @@ from implicam.experiments.source import BALL, CHECK, Source
 from implicam.experiments.stored import Values
 
 NAME = "active"
-CHECK_EVERY = 5
+POINTS_PER_CHECK = 5
 """Points added between two looks at the random positions, which cost more than those that are left."""
 
 
@@ -78,14 +78,14 @@ def grow(
         if new:
             fits = [fit for fit, _ in fit_each(calibrator_from_name(method), [data.select(mask) for mask in chosen])]
         for i, (repeat, mask) in enumerate(zip(repeats, chosen, strict=True)):
-            fit = _now(fits[i], data, mask, new)
+            fit = _update_fit(fits[i], data, mask, new)
             where = {"set": cameras, "method": method, "repeat": repeat, "added": added, "known": int(mask.sum())}
             if isinstance(fit, ImplicamError):
                 rows.append({**where, "failure": fit.what})
             elif fit is not None:
-                numbers, sds[i] = _of_the_rest(fit, data, mask)
+                numbers, sds[i] = _measure_rest(fit, data, mask)
                 off = {}
-                if check is not None and added % CHECK_EVERY == 0:
+                if check is not None and added % POINTS_PER_CHECK == 0:
                     off = errors(fit.measure(check.observations), check)
                 rows.append({**where, **numbers, **{f"check_{key}": value for key, value in off.items()}})
             if not isinstance(fits[i], ImplicamError):
@@ -93,7 +93,7 @@ def grow(
     return {"rows": rows}
 
 
-def _now(
+def _update_fit(
     fit: Calibration | ImplicamError, data: Dataset, mask: NDArray[np.bool_], new: bool
 ) -> Calibration | ImplicamError | None:
     """What is known with the points of the mask: a new fit; else one that took them in at once, or None."""
@@ -106,7 +106,7 @@ def _start(total: int, count: int, repeat: int) -> NDArray[np.int64]:
     return np.random.default_rng([repeat, 2]).permutation(total)[:count]
 
 
-def _of_the_rest(fit: Calibration, data: Dataset, mask: NDArray[np.bool_]) -> tuple[Values, Floats]:
+def _measure_rest(fit: Calibration, data: Dataset, mask: NDArray[np.bool_]) -> tuple[Values, Floats]:
     """The numbers of the positions that are left, and (n,) the standard deviation of each; what cannot be measured is
     least certain."""
     rest = data.select(~mask)

@@ -161,10 +161,10 @@ def errors(measured: Measurement, data: Dataset) -> Values:
 def example(source: Mapping[str, Any], cameras: str, method: str, known: int) -> Values:
     """One run to be drawn: positions and their stated standard deviations, in mm."""
     train, held_out = Source(**source).data(BALL, cameras).split(known, seed=0)
-    return drawn(calibrator_from_name(method).fit(train), train, held_out)
+    return measure_panel(calibrator_from_name(method).fit(train), train, held_out)
 
 
-def drawn(fit: Calibration, train: Dataset, held_out: Dataset) -> Values:
+def measure_panel(fit: Calibration, train: Dataset, held_out: Dataset) -> Values:
     """The arrays of a panel, in mm."""
     measured, scale = fit.measure(held_out.observations), millimetres(train)
     return {

@@ -17,7 +17,7 @@ from implicam.calibrators import calibrator_from_name
 from implicam.compare import Split, judge
 from implicam.dataset import Dataset
 from implicam.errors import DatasetError
-from implicam.experiments.ball import drawn, numbers
+from implicam.experiments.ball import measure_panel, numbers
 from implicam.experiments.cells import Cell
 from implicam.experiments.plan import METHODS, PAPER, Plan, slug
 from implicam.experiments.source import BOARD, BOARD_CHECK, Source, millimetres
@@ -71,7 +71,7 @@ def learn(source: Mapping[str, Any], cameras: str, boards: int, method: str) -> 
     taken = np.isin(data.shots, training(names, boards))
     train, held_out = data.select(taken), data.select(~taken)
     fit = calibrator_from_name(method).fit(train)
-    panel = drawn(fit, train, held_out)
+    panel = measure_panel(fit, train, held_out)
     where = {"set": cameras, "method": method, "boards": boards, "known": len(train), "trained": BOARD}
     scale = millimetres(train)
     trial = judge(method, Split(BOARD, train, held_out, 0), fit, 0.0)

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from implicam.experiments.evidence import Row, where
-from implicam.experiments.plan import FORWARD, GP, NETWORK, PAPER, SHOWN, slug
+from implicam.experiments.plan import DRAWN_METHODS, FORWARD, GP, NETWORK, PAPER, slug
 from implicam.experiments.source import BALL, BOARD, CHECK
-from implicam.figures.interactive3d import aligned_3d, html_page, panels_3d
-from implicam.figures.panels3d import BOARD_SCALES, EVERY, aligned, board_panels, clouds
+from implicam.figures.interactive3d import draw_alignment_3d, html_page, panels_3d
+from implicam.figures.panels3d import BOARD_SCALES, TEST_POINT_STEP, board_panels, clouds, draw_alignment
 from implicam.figures.paper import active_curves, rmse_curves, sd_against_rmse, sd_curves
 from implicam.files import replacing, write_text
 
-FLOOR = 10.0
+NOISE_FLOOR_MM = 10.0
 """sqrt(1e-4 m^2) in mm: GPyTorch's lower bound of the noise, where positions are in metres."""
-PAPERS_SCALES = (PAPER, NETWORK)
+METHODS_IN_PAPER_SCALES = (PAPER, NETWORK)
 """Methods whose boards are drawn in the paper's scales; in those the others are twelve times the same dot."""
 
 Values = Mapping[str, Mapping[str, Any]]
@@ -50,7 +50,7 @@ def _ball(rows: Sequence[Row], values: Values, folder: Path) -> Iterator[tuple[s
         return
     _save(sd_curves(lattice, total=_total(values)), folder / "ball-uncertainty")
     yield "ball-uncertainty", "Average stated standard deviation against training points (Figure 6)"
-    _save(sd_against_rmse(lattice, floor=FLOOR), folder / "noise-floor")
+    _save(sd_against_rmse(lattice, floor=NOISE_FLOOR_MM), folder / "noise-floor")
     yield "noise-floor", "Stated standard deviation against error: the paper's software cannot state less than 10 mm"
     yield from _in_3d(values, folder)
 
@@ -81,29 +81,29 @@ def _in_3d(values: Values, folder: Path) -> Iterator[tuple[str, str]]:
         cloud = values["ball/alignment"]
         parts = (cloud["true_xyz"], cloud["aligned_xyz"], cloud["camera_xyz"])
         caption = "The points of explicit calibration, before and after alignment to the robot's positions (Figure 4)"
-        _save(aligned(*parts, camera=str(cloud["camera"])), folder / "ball-alignment")
-        _save_page(aligned_3d(*parts, camera=str(cloud["camera"])), folder / "ball-alignment", caption)
+        _save(draw_alignment(*parts, camera=str(cloud["camera"])), folder / "ball-alignment")
+        _save_page(draw_alignment_3d(*parts, camera=str(cloud["camera"])), folder / "ball-alignment", caption)
         yield "ball-alignment", caption
 
 
 def _boards(rows: Sequence[Row], values: Values, folder: Path) -> Iterator[tuple[str, str]]:
-    for method in SHOWN:
+    for method in DRAWN_METHODS:
         panels = []
         for row in where(rows, method=method, judged=BOARD):
             found = values[f"board/{row['set']}/{row['boards']}/{slug(method)}"]
             panels.append({**found, "set": row["set"], "boards": row["boards"]})
         if panels:
             name = f"board-{slug(method)}"
-            scales = BOARD_SCALES if method in PAPERS_SCALES else None
+            scales = BOARD_SCALES if method in METHODS_IN_PAPER_SCALES else None
             _save(board_panels(panels, scales=scales), folder / name)
             in_scales = "the paper's scales (Figure 11)" if scales else "scales of its own"
             caption = f"The moving board, measured with {method}, in {in_scales}"
             titled = [{**panel, "title": f"{panel['set']}, {panel['boards']} boards"} for panel in panels]
-            _save_page(panels_3d(titled, scales=scales, every=EVERY), folder / name, caption)
+            _save_page(panels_3d(titled, scales=scales, every=TEST_POINT_STEP), folder / name, caption)
             yield name, caption
     shown = [row for row in where(rows, judged=BOARD) if row.get("mean_sd") is not None]
     if shown:
-        _save(sd_against_rmse(shown, floor=FLOOR), folder / "noise-floor-boards")
+        _save(sd_against_rmse(shown, floor=NOISE_FLOOR_MM), folder / "noise-floor-boards")
         yield "noise-floor-boards", "Stated standard deviation against error, with 2, 3, 5 and 9 boards to train on"
 
 

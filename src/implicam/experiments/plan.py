@@ -11,7 +11,7 @@ METHODS = (PAPER, GP, NETWORK, EXPLICIT, FORWARD)
 LEARNERS = (PAPER, GP, NETWORK, FORWARD)
 """Those that experiment 1 trains on positions; there, explicit learns from pictures of a board."""
 
-SHOWN = (PAPER, NETWORK, FORWARD)
+DRAWN_METHODS = (PAPER, NETWORK, FORWARD)
 """Whose boards are drawn."""
 
 

@@ -32,7 +32,14 @@ _CELLS: dict[str, Callable[[Source, Plan], list[Cell]]] = {
     active.NAME: active.cells,
     board.NAME: board.cells,
 }
-NEEDED = {"torch": "paper", "gpytorch": "paper", "joblib": "paper", "matplotlib": "report", "plotly": "report"}
+EXTRA_OF_LIBRARY = {
+    "torch": "paper",
+    "gpytorch": "paper",
+    "joblib": "paper",
+    "matplotlib": "report",
+    "plotly": "report",
+    "jinja2": "report",
+}
 """Library -> the extra that brings it."""
 
 
@@ -61,7 +68,7 @@ def reproduce(
     The account is of all experiments that have been computed whole, this time or before. DatasetError where the data
     have nothing for any; ImplicamError where every cell failed.
     """
-    for library, extra in NEEDED.items():
+    for library, extra in EXTRA_OF_LIBRARY.items():
         if find_spec(library) is None:  # said before the work, not after; importing them all takes seconds
             import_extra(library, extra, "the paper's experiments")
     start = time.perf_counter()

@@ -42,9 +42,9 @@ from implicam.simulate import (
 RIG = "bar6"
 BUDGETS = ((50, 10), (25, 6), (10, 4))
 """The paper's pictures of a checkerboard: of each camera, and of every pair of cameras."""
-STRAY = 2
+MAX_STRAY_SHOTS = 2
 """Pictures of a board that some cameras took together by chance: another one had its view hidden."""
-CHECKED = 300
+CHECK_POINTS = 300
 """Random positions to judge by."""
 BALL, RANDOM, CHECK, BOARDS, BOARD, BOARD_CHECK = "ball", "random", "check", "boards", "board", "board/check"
 PARTS = (BALL, RANDOM, CHECK, BOARDS, BOARD, BOARD_CHECK)
@@ -114,7 +114,7 @@ class Source:
         drawn, rows = np.random.default_rng([seed, each, pairs]), list[Rows]()
         for group, shots in _groups(self).items():
             wanted = each if len(group) == 1 else pairs
-            if not group <= set(self.sets[cameras]) or len(shots) <= STRAY:
+            if not group <= set(self.sets[cameras]) or len(shots) <= MAX_STRAY_SHOTS:
                 continue
             if len(shots) < wanted:
                 return None
@@ -179,8 +179,8 @@ def _simulated(seed: int, part: str) -> Dataset:
     if part == BOARDS:
         return simulate_boards(rig, each_and_every_pair(rig), seed=stream)
     if part == BOARD_CHECK:
-        return simulate(_within_boards(rig), random_positions(_within_boards(rig), CHECKED, rng), seed=stream)
-    count = CHECKED if part == CHECK else len(ball_grid(rig).xyz)
+        return simulate(_within_boards(rig), random_positions(_within_boards(rig), CHECK_POINTS, rng), seed=stream)
+    count = CHECK_POINTS if part == CHECK else len(ball_grid(rig).xyz)
     return simulate(rig, random_positions(rig, count, rng), seed=stream)
 
 

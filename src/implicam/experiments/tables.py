@@ -10,7 +10,7 @@ import numpy as np
 from implicam.dataset import Floats
 from implicam.experiments import published
 from implicam.experiments.evidence import Row, column, unpaired, where
-from implicam.experiments.findings.active import EARLY
+from implicam.experiments.findings.active import EARLY_POINTS
 from implicam.experiments.findings.board import nearest_and_farthest
 from implicam.experiments.plan import FORWARD, GP, METHODS
 from implicam.experiments.source import BALL, BOARD, CHECK, RANDOM
@@ -36,7 +36,7 @@ def active_table(rows: Sequence[Row]) -> Table:
     """A line for each set, method and stage (the start, 20 points added, the end): over the starts, lowest, median and
     highest, in mm."""
     table = []
-    steps = {0, EARLY, max((int(row["added"]) for row in rows), default=0)}
+    steps = {0, EARLY_POINTS, max((int(row["added"]) for row in rows), default=0)}
     for key, runs in _grouped(rows, ("set", "method", "added", "known")):
         good = where(runs)
         if key["added"] in steps and good:

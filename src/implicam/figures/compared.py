@@ -10,7 +10,7 @@ import numpy as np
 from implicam.compare import RANDOM, mean_and_error, plane_of
 from implicam.dataset import Floats
 from implicam.errors import import_extra
-from implicam.figures.printed import PURPOSE, blank, place_legend, plain_log, quiet, values
+from implicam.figures.printed import PURPOSE, new_figure, place_legend, plain_log, style_axes, values
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, MARKS, ORANGE, PURPLE, SKY, VERMILLION
 
 _COLOURS = (BLUE, VERMILLION, GREEN, ORANGE, PURPLE, SKY, BLACK)
@@ -41,7 +41,7 @@ def compare_figure(table: Iterable[Row], *, unit: str) -> Any:
 
 def _curves(rows: Sequence[Row], unit: str, over: str) -> Any:
     """Against the number of known points."""
-    figure = blank(11.0, 4.3)
+    figure = new_figure(11.0, 4.3)
     panels = figure.subplots(1, 3)
     methods = _names(rows)
     for k, method in enumerate(methods):
@@ -97,7 +97,7 @@ def _finish_curves(panels: Sequence[Any], known: Sequence[int], unit: str) -> No
         axes.set_xticks(known, [str(k) for k in known])
         axes.xaxis.set_minor_locator(ticker.NullLocator())
         axes.set_xlabel("known points")
-        quiet(axes)
+        style_axes(axes)
     plain_log(error.yaxis, name="y")
     error.set_ylabel(f"rms error ({unit})")
     inside.axhline(0.95, color=GREY, ls="--", lw=1.2)
@@ -116,7 +116,7 @@ def _range_plot(rows: Sequence[Row], unit: str) -> Any:
     cells = list(dict.fromkeys((_points(row), method) for method in methods for row in rows))
     cells = sorted(cells, key=lambda cell: (cell[0], methods.index(cell[1])))
     kinds = list(dict.fromkeys(str(row.get("split", RANDOM)) for row in rows))
-    figure = blank(11.0, 1.9 + (0.28 + 0.16 * len(kinds)) * len(cells))
+    figure = new_figure(11.0, 1.9 + (0.28 + 0.16 * len(kinds)) * len(cells))
     panels = figure.subplots(1, 2, sharey=True)
     step = 0.8 / len(kinds)
     for k, kind in enumerate(kinds):
@@ -164,7 +164,7 @@ def _finish_ranges(panels: Sequence[Any], cells: Sequence[tuple[int, str]], unit
     names = [f"{method}, {points} points" if several else method for points, method in cells]
     error, inside = panels
     for axes in panels:
-        quiet(axes)
+        style_axes(axes)
         axes.set_yticks(range(len(cells)), names)
         axes.grid(False, axis="y")
         for line in np.arange(0.5, len(cells) - 1):

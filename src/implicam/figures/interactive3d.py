@@ -10,17 +10,17 @@ import numpy as np
 from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.figures.panels3d import (
-    COLOURS,
-    Drawn,
+    COLOUR_MAP,
     Panel,
+    PanelPoints,
     Scales,
-    drawn,
+    bounding_box,
     known_of,
-    room,
+    line_segments,
+    points_in_view,
     scales_of,
-    segments,
+    select_points,
     title_of,
-    to_fit,
 )
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, WHITE, figure_3d, plain, points_3d
 from implicam.formatting import number
@@ -43,15 +43,19 @@ def panels_3d(panels: Iterable[Panel], *, scales: Scales | None = None, every: i
     """
     chosen = list(panels)
     scales = scales or scales_of(chosen)
-    found = [drawn(panel, every) for panel in chosen]
+    found = [select_points(panel, every) for panel in chosen]
     traces = [trace for i, panel in enumerate(chosen) for trace in _traces(panel, found[i], scales, i == 0)]
     titles = [plain(title_of(panel, d)) for panel, d in zip(chosen, found, strict=True)]
-    corners = room([c for panel, d in zip(chosen, found, strict=True) for c in to_fit(panel, d, scales)])
+    corners = bounding_box(
+        [c for panel, d in zip(chosen, found, strict=True) for c in points_in_view(panel, d, scales)]
+    )
     return _figure(traces, corners, [_menu(titles)] if len(titles) > 1 else [])
 
 
-def aligned_3d(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2") -> Any:
-    """A Plotly figure of explicit calibration's points before and after alignment; see `panels3d.aligned`."""
+def draw_alignment_3d(
+    true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2"
+) -> Any:
+    """A Plotly figure of explicit calibration's points before and after alignment; see `panels3d.draw_alignment`."""
     parts: list[tuple[Floats | None, str, str, str]] = [
         (true_xyz, "robot's positions", "cross", BLUE),
         (aligned_xyz, "explicit, aligned", "circle-open", GREEN),
@@ -62,7 +66,7 @@ def aligned_3d(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None 
         for xyz, name, symbol, colour in parts
         if xyz is not None
     ]
-    return _figure(traces, room(xyz for xyz, *_ in parts if xyz is not None), [])
+    return _figure(traces, bounding_box(xyz for xyz, *_ in parts if xyz is not None), [])
 
 
 def html_page(figure: Any, *, title: str, caption: str = "") -> str:
@@ -89,9 +93,9 @@ def figure_json(figure: Any) -> Markup:
     return Markup(figure.to_json().replace("<", "\\u003c"))
 
 
-def _traces(panel: Panel, found: Drawn, scales: Scales, visible: bool) -> list[Any]:
+def _traces(panel: Panel, found: PanelPoints, scales: Scales, visible: bool) -> list[Any]:
     """The _PER_PANEL traces of a panel."""
-    lines = segments(found.xyz, found.true)
+    lines = line_segments(found.xyz, found.true)
     known = known_of(panel)
     traces = [
         _points(known, f"training points ({len(known)})", marker={"symbol": "cross", "size": 3, "color": SKY}),
@@ -108,14 +112,14 @@ def _points(xyz: Floats, name: str, **look: Any) -> Any:
     return points_3d(xyz, name, hoverinfo="skip", **look)
 
 
-def _measured(found: Drawn, scales: Scales) -> Any:
+def _measured(found: PanelPoints, scales: Scales) -> Any:
     bar = {
         "title": {"text": "distance from<br>the truth (mm)", "side": "top"}, "thickness": 14, "len": 0.7,
         "outlinewidth": 0, "ticks": "outside", "x": 0.95,
     }  # fmt: skip
     marker = {
         "size": scales.diameters(found.sd, len(found.xyz)), "color": found.error, "cmin": 0.0,
-        "cmax": scales.error_top, "colorscale": COLOURS.capitalize(), "colorbar": bar,
+        "cmax": scales.error_top, "colorscale": COLOUR_MAP.capitalize(), "colorbar": bar,
         "line": {"width": 1, "color": BLACK}, "opacity": 1.0,
     }  # fmt: skip
     certain = "" if found.sd is None else ", larger: less certain"
@@ -123,7 +127,7 @@ def _measured(found: Drawn, scales: Scales) -> Any:
     return points_3d(found.xyz, name, marker=marker, text=_hover(found), hoverinfo="text")
 
 
-def _hover(found: Drawn) -> list[str]:
+def _hover(found: PanelPoints) -> list[str]:
     sd = np.full(len(found.error), np.nan) if found.sd is None else found.sd
     return [f"off by {number(e)} mm<br>stated sd {number(s)} mm" for e, s in zip(found.error, sd, strict=True)]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from implicam.dataset import Floats
-from implicam.figures.printed import blank, plain_log, quiet
+from implicam.figures.printed import new_figure, plain_log, style_axes
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
 
 _LOOKS: dict[str, dict[str, Any]] = {
@@ -37,7 +37,7 @@ class Panel:
 def learning(rows: Sequence[Sequence[Panel]]) -> Any:
     """A matplotlib Figure with rows of panels; bands and bars are one standard error of the mean."""
     columns = max(map(len, rows))
-    figure = blank(4.4 * columns, 3.7 * len(rows) + 0.7)
+    figure = new_figure(4.4 * columns, 3.7 * len(rows) + 0.7)
     grid = figure.subplots(len(rows), columns, squeeze=False)
     handles: dict[str, Any] = {}
     for across, panels in zip(grid, rows, strict=True):
@@ -53,7 +53,7 @@ def learning(rows: Sequence[Sequence[Panel]]) -> Any:
 
 def _draw(axes: Any, panel: Panel) -> dict[str, Any]:
     handles = {}
-    quiet(axes)
+    style_axes(axes)
     for name, (points, mean, error) in panel.rules.items():
         look = _LOOKS.get(name, {"color": GREY})
         every = max(1, len(points) // 8)

@@ -21,7 +21,7 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.errors import import_extra
-from implicam.figures.printed import PURPOSE, blank
+from implicam.figures.printed import PURPOSE, new_figure
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY
 from implicam.formatting import number
 
@@ -48,15 +48,15 @@ class Scales:
 
 BOARD_SCALES = Scales(error_top=100.0, sd=(10.0, 100.0))
 """The paper's scales for experiment 3."""
-EVERY = 10
+TEST_POINT_STEP = 10
 """The paper draws one test point in so many."""
 _PANEL_PX = 400
-COLOURS = "cividis_r"
+COLOUR_MAP = "cividis_r"
 """Light is right, dark is wrong: truths and lines, in black, stay visible on points that are nearly right."""
 
 
 @dataclass(frozen=True)
-class Drawn:
+class PanelPoints:
     """The points of a panel that were measured: k of n. error: (k,) distances from the truth (mm)."""
 
     true: Floats
@@ -66,19 +66,19 @@ class Drawn:
     missing: int
 
 
-def drawn(panel: Panel, every: int = 1) -> Drawn:
+def select_points(panel: Panel, every: int = 1) -> PanelPoints:
     """Every so many-th test point of a panel, without those that were not measured (their number is `missing`)."""
     true, xyz = (np.asarray(panel[key], dtype=np.float64).reshape(-1, 3) for key in ("true_xyz", "xyz"))
     sd = None if panel.get("sd") is None else np.asarray(panel["sd"], dtype=np.float64).ravel()[::every]
     measured = np.asarray(np.isfinite(xyz).all(axis=1))
     i, missing = measured[::every], int((~measured).sum())
     true, xyz = true[::every][i], xyz[::every][i]
-    return Drawn(true, xyz, np.linalg.norm(xyz - true, axis=1), None if sd is None else sd[i], missing)
+    return PanelPoints(true, xyz, np.linalg.norm(xyz - true, axis=1), None if sd is None else sd[i], missing)
 
 
 def scales_of(panels: Iterable[Panel]) -> Scales:
     """One scale for all panels: colour up to the 98th percentile of the errors, so that one blunder does not rule."""
-    found = [drawn(panel) for panel in panels]
+    found = [select_points(panel) for panel in panels]
     errors = np.concatenate([np.zeros(0), *(d.error for d in found)])
     sd = np.concatenate([np.zeros(0), *(d.sd[np.isfinite(d.sd)] for d in found if d.sd is not None)])
     low, high = np.quantile(sd, [0.02, 0.98]) if len(sd) else (0.0, 0.0)
@@ -86,13 +86,13 @@ def scales_of(panels: Iterable[Panel]) -> Scales:
     return Scales(top or 1.0, (float(low), float(high)), sizes=(9.0, 24.0))
 
 
-def title_of(panel: Panel, found: Drawn | None) -> str:
+def title_of(panel: Panel, found: PanelPoints | None) -> str:
     """The panel's title, and how many points are not shown because they were not measured."""
     left_out = f" ({found.missing} not measured)" if found and found.missing else ""
     return f"{panel.get('title', '')}{left_out}"
 
 
-def segments(start: Floats, end: Floats) -> Floats:
+def line_segments(start: Floats, end: Floats) -> Floats:
     """(3 n, 3) corners of n separate lines from start to end, with NaN after each."""
     return np.stack([start, end, np.full(start.shape, np.nan)], axis=1).reshape(-1, 3)
 
@@ -100,12 +100,12 @@ def segments(start: Floats, end: Floats) -> Floats:
 def clouds(panels: Iterable[Panel], *, scales: Scales | None = None) -> Any:
     """A matplotlib Figure of panels side by side, with one scale for all (the paper's Figure 7)."""
     chosen = list(panels)
-    figure = blank(1.4 + 4.1 * max(len(chosen), 1), 4.8)
+    figure = new_figure(1.4 + 4.1 * max(len(chosen), 1), 4.8)
     axes = figure.subplots(1, max(len(chosen), 1), squeeze=False, subplot_kw={"projection": _projection()})[0]
     return _fill(figure, axes, chosen, scales or scales_of(chosen), width=4.1, every=1)
 
 
-def board_panels(panels: Iterable[Panel], *, scales: Scales | None = BOARD_SCALES, every: int = EVERY) -> Any:
+def board_panels(panels: Iterable[Panel], *, scales: Scales | None = BOARD_SCALES, every: int = TEST_POINT_STEP) -> Any:
     """A matplotlib Figure: a row of panels for each set, a column for each number of boards (the paper's Figure 11).
 
     scales: the paper's, or None for those of the panels. Each panel has the keys `set` and `boards` besides; without a
@@ -114,19 +114,21 @@ def board_panels(panels: Iterable[Panel], *, scales: Scales | None = BOARD_SCALE
     cells = {(str(panel["set"]), int(panel["boards"])): panel for panel in panels}
     sets, boards = sorted({name for name, _ in cells}), sorted({count for _, count in cells})
     shape = (max(len(sets), 1), max(len(boards), 1))
-    figure = blank(1.2 + 2.6 * shape[1], 1.0 + 2.3 * shape[0])
+    figure = new_figure(1.2 + 2.6 * shape[1], 1.0 + 2.3 * shape[0])
     axes = figure.subplots(*shape, squeeze=False, subplot_kw={"projection": _projection()})
     chosen = [_with_title(cells.get((name, count), {}), name, count) for name in sets for count in boards]
     return _fill(figure, axes.ravel(), chosen, scales or scales_of(cells.values()), width=2.6, every=every)
 
 
-def aligned(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2") -> Any:
+def draw_alignment(
+    true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2"
+) -> Any:
     """A matplotlib Figure of explicit calibration's points before and after alignment (the paper's Figure 4).
 
     true_xyz: (n, 3) the robot's positions, crosses. aligned_xyz: (n, 3) explicit calibration's, moved onto them.
     camera_xyz: (n, 3) the same points in the frame of `camera`, before they were moved. All mm; NaN is not drawn.
     """
-    figure = blank(6.4, 5.2)
+    figure = new_figure(6.4, 5.2)
     axes = figure.add_subplot(projection=_projection())
     look: dict[str, Any] = {"ls": "", "mew": 0.8, "ms": 3.6}
     _plot(axes, true_xyz, **{**look, "ms": 7}, marker="+", color=BLUE, label="robot's positions")
@@ -135,7 +137,7 @@ def aligned(true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = N
         _plot(
             axes, camera_xyz, **look, marker="^", mfc="none", color=ORANGE, label=f"explicit, in the frame of {camera}"
         )
-    _walls(axes, room(xyz for xyz in (true_xyz, aligned_xyz, camera_xyz) if xyz is not None), size=8)
+    _style_axes(axes, bounding_box(xyz for xyz in (true_xyz, aligned_xyz, camera_xyz) if xyz is not None), size=8)
     figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     return figure
 
@@ -155,8 +157,10 @@ def _fill(
 ) -> Any:
     """Draw the panels, `width` inches wide each, then the scale of colours and that of sizes."""
     points_per_pixel = 72 * width / _PANEL_PX
-    found = [drawn(panel, every) if "xyz" in panel else None for panel in panels]
-    corners = room([c for panel, d in zip(panels, found, strict=True) if d for c in to_fit(panel, d, scales)])
+    found = [select_points(panel, every) if "xyz" in panel else None for panel in panels]
+    corners = bounding_box(
+        [c for panel, d in zip(panels, found, strict=True) if d for c in points_in_view(panel, d, scales)]
+    )
     shown = None
     for place, panel, points in zip(axes, panels, found, strict=False):
         place.set_title(title_of(panel, points), size=9, y=1.0)
@@ -165,7 +169,7 @@ def _fill(
             place.text2D(0.5, 0.5, "no result", ha="center", color="0.4", transform=place.transAxes)
         else:
             shown = _draw(place, known_of(panel), points, scales, points_per_pixel)
-            _walls(place, corners, size=6 if width < 3 else 8)
+            _style_axes(place, corners, size=6 if width < 3 else 8)
     if shown is not None:
         bar = figure.colorbar(shown, ax=list(axes), shrink=0.5, aspect=25, pad=0.02, extend="max")
         bar.set_label("distance from the truth (mm)")
@@ -180,12 +184,12 @@ def known_of(panel: Panel) -> Floats:
     return np.zeros((0, 3)) if known is None else np.asarray(known, dtype=np.float64).reshape(-1, 3)
 
 
-def to_fit(panel: Panel, found: Drawn, scales: Scales) -> list[Floats]:
+def points_in_view(panel: Panel, found: PanelPoints, scales: Scales) -> list[Floats]:
     """The points that the room must hold: all but those measured farther off than the colours reach."""
     return [known_of(panel), found.true, found.xyz[found.error <= scales.error_top]]
 
 
-def room(clouds: Iterable[Floats]) -> Floats:
+def bounding_box(clouds: Iterable[Floats]) -> Floats:
     """(2, 3) lowest and highest corner of a box around all points, with a margin; a unit box where there are none."""
     points = np.concatenate([np.zeros((0, 3)), *(np.asarray(c, dtype=np.float64).reshape(-1, 3) for c in clouds)])
     points = points[np.isfinite(points).all(axis=1)]
@@ -196,15 +200,15 @@ def room(clouds: Iterable[Floats]) -> Floats:
     return np.stack([low - margin, high + margin])
 
 
-def _draw(axes: Any, known: Floats, found: Drawn, scales: Scales, points_per_pixel: float) -> Any:
+def _draw(axes: Any, known: Floats, found: PanelPoints, scales: Scales, points_per_pixel: float) -> Any:
     axes.computed_zorder = False  # truths and lines above the circles, whatever their depth
     _plot(axes, known, ls="", marker="+", ms=9 * points_per_pixel, mew=0.5, color=SKY, zorder=1)
     diameter = points_per_pixel * scales.diameters(found.sd, len(found.xyz))
     shown = axes.scatter(
-        *found.xyz.T, s=diameter**2, c=found.error, cmap=COLOURS, vmin=0, vmax=scales.error_top,
+        *found.xyz.T, s=diameter**2, c=found.error, cmap=COLOUR_MAP, vmin=0, vmax=scales.error_top,
         linewidths=0.3, edgecolors=BLACK, depthshade=False, zorder=2,
     )  # fmt: skip
-    _plot(axes, segments(found.xyz, found.true), color=BLACK, lw=0.7, zorder=3)
+    _plot(axes, line_segments(found.xyz, found.true), color=BLACK, lw=0.7, zorder=3)
     _plot(axes, found.true, ls="", marker=".", ms=4.5 * points_per_pixel, mew=0, color=BLACK, zorder=4)
     return shown
 
@@ -213,7 +217,7 @@ def _plot(axes: Any, xyz: Floats, **look: Any) -> None:
     axes.plot(*np.asarray(xyz, dtype=np.float64).reshape(-1, 3).T, **look)
 
 
-def _walls(axes: Any, corners: Floats, *, size: float) -> None:
+def _style_axes(axes: Any, corners: Floats, *, size: float) -> None:
     """Equal lengths along all axes, pale walls, few ticks."""
     low, high = corners
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))

@@ -20,30 +20,30 @@ from typing import Any
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.figures.printed import blank, looks, nothing_to_draw, place_legend, plain_log, quiet, values
+from implicam.figures.printed import choose_looks, mark_empty, new_figure, place_legend, plain_log, style_axes, values
 from implicam.figures.style import BLUE, GREEN, GREY, ORANGE, VERMILLION
 
 Row = Mapping[str, Any]
 
 EXPLICIT = "explicit"
 # The paper's colours, from the palette; the dashes tell them apart in grey.
-_BUDGETS: dict[str, dict[str, Any]] = {
+_BUDGET_LOOKS: dict[str, dict[str, Any]] = {
     "50+10": {"color": GREEN, "ls": (0, (7, 2))},
     "25+6": {"color": ORANGE, "ls": (0, (4, 2, 1, 2))},
     "10+4": {"color": VERMILLION, "ls": (0, (1.5, 1.5))},
 }
-_SETS: tuple[dict[str, Any], ...] = (
+_SET_LOOKS: tuple[dict[str, Any], ...] = (
     {"color": BLUE, "marker": "o", "ls": "-"},
     {"color": VERMILLION, "marker": "s", "ls": "--"},
     {"color": GREEN, "marker": "^", "ls": "-."},
 )
-_WORDS = {
+_SET_TITLES = {
     "2R": "2R: two regular cameras",
     "2R2W": "2R2W: two regular, two wide-angle cameras",
     "2R4W": "2R4W: two regular, four wide-angle cameras",
 }
-_RUNS = "marker: median of the runs; thick bar: middle half; thin bar: all"
-_LABEL_GAP = 0.085  # of a panel's height, between labels beside it
+_RUNS_LEGEND = "marker: median of the runs; thick bar: middle half; thin bar: all"
+_LABEL_GAP_SHARE = 0.085  # of a panel's height, between labels beside it
 
 
 def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
@@ -57,19 +57,21 @@ def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     learners = [row for row in table if row["method"] != EXPLICIT]
     explicit = [row for row in table if row["method"] == EXPLICIT]
     sets = _words(table, "set")
-    figure = blank(7.5, 1.2 + 2.6 * max(len(sets), 1))
+    figure = new_figure(7.5, 1.2 + 2.6 * max(len(sets), 1))
     panels = figure.subplots(max(len(sets), 1), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for axes, name in zip(panels, sets or [""], strict=True):
-        _runs_of_methods(axes, _where(learners, set=name), "rmse", _sizes(learners), looks(_words(learners, "method")))
+        _runs_of_methods(
+            axes, _where(learners, set=name), "rmse", _sizes(learners), choose_looks(_words(learners, "method"))
+        )
         _explicit_lines(axes, _where(explicit, set=name))
-        axes.set_title(_WORDS.get(name, name), loc="left", size=10)
+        axes.set_title(_SET_TITLES.get(name, name), loc="left", size=10)
         axes.set_ylabel("rms error (mm)")
-        quiet(axes)
+        style_axes(axes)
     _log_or_empty(panels)
     _against_known(panels[-1:], _sizes(learners), total)
     for axes, name in zip(panels, sets, strict=False):
         _label_lines(axes, _where(explicit, set=name))
-    place_legend(figure, panels, _RUNS, columns=3)
+    place_legend(figure, panels, _RUNS_LEGEND, columns=3)
     return figure
 
 
@@ -80,10 +82,10 @@ def sd_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     which has no training points, is left out. total: as in rmse_curves.
     """
     table = [row for row in rows if row["method"] != EXPLICIT and len(values([row], "mean_sd"))]
-    methods = list(looks(_words(table, "method")))
-    figure = blank(1.2 + 3.7 * max(len(methods), 1), 4.0)
+    methods = list(choose_looks(_words(table, "method")))
+    figure = new_figure(1.2 + 3.7 * max(len(methods), 1), 4.0)
     panels = figure.subplots(1, max(len(methods), 1), sharey=True, squeeze=False)[0]
-    styles = {name: _SETS[i % len(_SETS)] for i, name in enumerate(_words(table, "set"))}
+    styles = {name: _SET_LOOKS[i % len(_SET_LOOKS)] for i, name in enumerate(_words(table, "set"))}
     for axes, method in zip(panels, methods or [""], strict=True):
         for i, (name, look) in enumerate(styles.items()):
             shift = _dodge(_sizes(table), i, len(styles))
@@ -91,11 +93,11 @@ def sd_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
                 axes, _where(table, method=method, set=name), "mean_sd", _sizes(table), shift, {**look, "label": name}
             )
         axes.set_title(method, loc="left", size=10)
-        quiet(axes)
+        style_axes(axes)
     panels[0].set_ylabel("average stated standard deviation (mm)")
     _log_or_empty(panels)
     _against_known(panels, _sizes(table), total)
-    place_legend(figure, panels, _RUNS)
+    place_legend(figure, panels, _RUNS_LEGEND)
     return figure
 
 
@@ -109,14 +111,14 @@ def sd_against_rmse(rows: Iterable[Row], *, floor: float | None = None) -> Any:
     """
     table = [row for row in rows if len(values([row], "rmse")) and len(values([row], "mean_sd"))]
     sets = _words(table, "set")
-    figure = blank(1.0 + 3.5 * max(len(sets), 1), 4.4)
+    figure = new_figure(1.0 + 3.5 * max(len(sets), 1), 4.4)
     panels = figure.subplots(1, max(len(sets), 1), sharex=True, sharey=True, squeeze=False)[0]
     for axes, name in zip(panels, sets or [""], strict=True):
-        for method, look in looks(_words(table, "method")).items():
+        for method, look in choose_looks(_words(table, "method")).items():
             _draw_pairs(axes, _where(table, set=name, method=method), {**look, "label": method})
-        axes.set_title(_WORDS.get(name, name).partition(":")[0], loc="left", size=10)
+        axes.set_title(_SET_TITLES.get(name, name).partition(":")[0], loc="left", size=10)
         axes.set_xlabel("rms error (mm)")
-        quiet(axes)
+        style_axes(axes)
     panels[0].set_ylabel("average stated standard deviation (mm)")
     _log_or_empty(panels, x=True)
     if table:
@@ -134,14 +136,14 @@ def active_curves(rows: Iterable[Row]) -> Any:
     column for each set, a thin line for each repeat.
     """
     table = list(rows)
-    methods, sets = list(looks(_words(table, "method"))) or [""], _words(table, "set") or [""]
-    figure = blank(1.0 + 3.4 * len(sets), 1.2 + 2.5 * len(methods))
+    methods, sets = list(choose_looks(_words(table, "method"))) or [""], _words(table, "set") or [""]
+    figure = new_figure(1.0 + 3.4 * len(sets), 1.2 + 2.5 * len(methods))
     panels = figure.subplots(len(methods), len(sets), sharex=True, sharey="row", squeeze=False)
     for line, method in zip(panels, methods, strict=True):
         for axes, name in zip(line, sets, strict=True):
             _draw_repeats(axes, _where(table, method=method, set=name))
             axes.set_title(f"{name}, {method}" if len(methods) > 1 else name, loc="left", size=10)
-            quiet(axes)
+            style_axes(axes)
         line[0].set_ylabel("standard deviation (mm)")
         _log_or_empty(line)
     for axes in panels[-1]:
@@ -202,15 +204,19 @@ def _quantiles(runs: Floats) -> Floats:
 def _explicit_lines(axes: Any, rows: Sequence[Row]) -> None:
     for budget, error in _medians_of_budgets(rows).items():
         axes.axhline(
-            error, lw=1.6, zorder=1.9, label=f"explicit, {_spaced(budget)} pictures", **_BUDGETS.get(budget, _UNKNOWN)
+            error,
+            lw=1.6,
+            zorder=1.9,
+            label=f"explicit, {_spaced(budget)} pictures",
+            **_BUDGET_LOOKS.get(budget, _OTHER_BUDGET_LOOK),
         )
 
 
-_UNKNOWN: dict[str, Any] = {"color": GREY, "ls": (0, (1, 3))}
+_OTHER_BUDGET_LOOK: dict[str, Any] = {"color": GREY, "ls": (0, (1, 3))}
 
 
 def _medians_of_budgets(rows: Sequence[Row]) -> dict[str, float]:
-    budgets = [*_BUDGETS, *sorted({str(row["budget"]) for row in rows} - set(_BUDGETS))]
+    budgets = [*_BUDGET_LOOKS, *sorted({str(row["budget"]) for row in rows} - set(_BUDGET_LOOKS))]
     found = {budget: values(_where(rows, budget=budget), "rmse") for budget in budgets}
     return {budget: float(np.median(errors)) for budget, errors in found.items() if len(errors)}
 
@@ -223,9 +229,9 @@ def _label_lines(axes: Any, rows: Sequence[Row]) -> None:
     """Name the explicit lines at the panel's right edge, kept apart where the lines nearly coincide."""
     medians = sorted(_medians_of_budgets(rows).items(), key=lambda item: item[1])
     low, high = np.log(axes.get_ylim())
-    places = _apart([(float(np.log(error)) - low) / (high - low) for _, error in medians], _LABEL_GAP)
+    places = _apart([(float(np.log(error)) - low) / (high - low) for _, error in medians], _LABEL_GAP_SHARE)
     for (budget, _), place in zip(medians, places, strict=True):
-        colour = _BUDGETS.get(budget, _UNKNOWN)["color"]
+        colour = _BUDGET_LOOKS.get(budget, _OTHER_BUDGET_LOOK)["color"]
         where = {"transform": axes.transAxes, "va": "center", "size": 8}
         axes.text(1.01, place, _spaced(budget), color=colour, weight="bold", **where)
 
@@ -288,7 +294,7 @@ def _draw_repeats(axes: Any, rows: Sequence[Row]) -> None:
 def _log_or_empty(panels: Iterable[Any], *, x: bool = False) -> None:
     for axes in panels:
         if not axes.lines:
-            nothing_to_draw(axes)
+            mark_empty(axes)
         plain_log(axes.yaxis, name="y")
         if x:
             plain_log(axes.xaxis, name="x")

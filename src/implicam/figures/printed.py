@@ -28,13 +28,13 @@ _OTHERS: tuple[dict[str, Any], ...] = (
 )
 
 
-def blank(width: float, height: float) -> Any:
+def new_figure(width: float, height: float) -> Any:
     """An empty matplotlib Figure of so many inches; nothing touches pyplot's global state."""
     module = import_extra("matplotlib.figure", "report", PURPOSE)
     return module.Figure(figsize=(width, height), layout="constrained")
 
 
-def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
+def choose_looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Colour, marker and dash of each method, the same in every figure for the methods we know; those come first."""
     names = set(methods)
     others = sorted(names - set(_LOOKS))
@@ -42,7 +42,7 @@ def looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
     return known | {name: _OTHERS[i % len(_OTHERS)] for i, name in enumerate(others)}
 
 
-def quiet(axes: Any) -> None:
+def style_axes(axes: Any) -> None:
     """A light grid behind the data, and no box around them."""
     axes.grid(True, color="0.9", lw=0.6)
     axes.set_axisbelow(True)
@@ -69,7 +69,7 @@ def values(rows: Iterable[Mapping[str, Any]], key: str) -> Floats:
     return np.array([value for value in found if np.isfinite(value)], dtype=np.float64)
 
 
-def nothing_to_draw(axes: Any) -> None:
+def mark_empty(axes: Any) -> None:
     """Say in an empty panel that it is empty on purpose."""
     axes.text(0.5, 0.5, "no result", ha="center", va="center", color="0.4", transform=axes.transAxes)
 

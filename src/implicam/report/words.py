@@ -54,7 +54,7 @@ def verdict(data: ReportData) -> tuple[str, str, str]:
     """Title, explanation and tone of what the error bars are worth."""
     if data.coverage is None:
         return (
-            "Nobody checked the error bars here.",
+            "The error bars were not checked here.",
             "The true positions are not known, so this page shows what the instrument states about itself, not "
             "whether that is so. Measure a few points whose positions you know, and evaluate.",
             "unknown",

@@ -20,9 +20,9 @@ from implicam.experiments.plan import GP, PAPER
 from implicam.simulate import CAMERA_SETS
 
 TESTS: dict[str, dict[str, Test]] = {"ball": ball.TESTS, "active": active.TESTS, "board": board.TESTS}
-TOGETHER = ("more_cameras_lower_sd", "more_cameras_lower_rmse")
+FINDINGS_ABOUT_SEVERAL_SETS = ("more_cameras_lower_sd", "more_cameras_lower_rmse")
 """Findings about several sets of cameras at once."""
-WITHOUT_GP = ("few_boards_hurt_explicit", "budget_matters_with_six_cameras")
+FINDINGS_WITHOUT_GP = ("few_boards_hurt_explicit", "budget_matters_with_six_cameras")
 """Findings that are about no Gaussian process."""
 
 
@@ -52,11 +52,11 @@ def verdicts(rows: Mapping[str, Rows]) -> list[Verdict]:
     for experiment, tests in TESTS.items():
         mine = list(rows.get(experiment, ()))
         for key, finding in published.load(experiment).findings.items() if mine else ():
-            for sets in _groups(finding.sets, mine, key in TOGETHER):
-                for method in ("",) if key in WITHOUT_GP else (PAPER, GP):
+            for sets in _groups(finding.sets, mine, key in FINDINGS_ABOUT_SEVERAL_SETS):
+                for method in ("",) if key in FINDINGS_WITHOUT_GP else (PAPER, GP):
                     cases = tests[key](mine, method, sets)
                     if any(np.isfinite(case.value) for case in cases):
-                        names, (verdict, number) = ", ".join(sets), _judged(cases)
+                        names, (verdict, number) = ", ".join(sets), _judge_cases(cases)
                         found.append(
                             Verdict(experiment, key, finding.statement, names, method, verdict, number, finding.remark)
                         )
@@ -65,14 +65,14 @@ def verdicts(rows: Mapping[str, Rows]) -> list[Verdict]:
 
 def _groups(sets: Sequence[str], rows: Rows, together: bool) -> list[tuple[str, ...]]:
     """The sets that a finding is judged for, one by one or together."""
-    there = list(dict.fromkeys(str(row["set"]) for row in rows))
-    asked = [name for name in sets if name in there] or ([] if set(there) & set(CAMERA_SETS) else there)
+    present = list(dict.fromkeys(str(row["set"]) for row in rows))
+    asked = [name for name in sets if name in present] or ([] if set(present) & set(CAMERA_SETS) else present)
     if together:
         return [tuple(asked)] if len(asked) > 1 else []
     return [(name,) for name in asked]
 
 
-def _judged(cases: Sequence[Case]) -> tuple[str, str]:
+def _judge_cases(cases: Sequence[Case]) -> tuple[str, str]:
     """The verdict, and the case that decides: of those with this verdict the one that is farthest from holding."""
     verdict = min((case.verdict for case in cases), key=(FAILS, OPEN, HOLDS).index)
     deciding = [case for case in cases if case.verdict == verdict]

@@ -9,9 +9,9 @@ import numpy as np
 from implicam.experiments.evidence import Case, Row, Rows, Test, column, share_of_drop, stages, where
 from implicam.formatting import percent
 
-EARLY, AROUND = 20, 10
+EARLY_POINTS, WINDOW_STEPS = 20, 10
 """Points added that are almost none of 100; steps that are looked at there and at the end."""
-CONVERGED = 0.1
+MAX_CONVERGED_RANGE = 0.1
 """The range of the starts, over the whole drop, that is one value."""
 
 
@@ -22,7 +22,7 @@ def _starts(rows: Rows, gp: str, cameras: str, added: int) -> dict[int, Row]:
 def _last_step(rows: Rows, gp: str, cameras: str) -> int:
     """How many points are added in all; 0 where these are too few to tell early from late."""
     last = max((int(row["added"]) for row in where(rows, method=gp, set=cameras)), default=0)
-    return last if last >= 2 * EARLY else 0
+    return last if last >= 2 * EARLY_POINTS else 0
 
 
 def _drops_fast(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
@@ -30,9 +30,11 @@ def _drops_fast(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     last = _last_step(rows, gp, sets[0])
     if not last:
         return []
-    parts = [_starts(rows, gp, sets[0], added) for added in (0, EARLY, last)]
+    parts = [_starts(rows, gp, sets[0], added) for added in (0, EARLY_POINTS, last)]
     return [
-        share_of_drop(*stages(parts, key), f"{what} sd: {{}} % of its drop by {EARLY} of {last} points (fast: half)")
+        share_of_drop(
+            *stages(parts, key), f"{what} sd: {{}} % of its drop by {EARLY_POINTS} of {last} points (fast: half)"
+        )
         for key, what in (("max_sd", "largest"), ("mean_sd", "mean"))
     ]
 
@@ -52,14 +54,14 @@ def _one_value(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     if drop <= 0:
         return []
     ranges = {added: float(np.ptp(sd)) / drop for added, sd in mean.items()}
-    early = float(np.median([ranges[added] for added in range(EARLY, EARLY + AROUND)]))
-    late = float(np.median([ranges[added] for added in range(last - AROUND + 1, last + 1)]))
+    early = float(np.median([ranges[added] for added in range(EARLY_POINTS, EARLY_POINTS + WINDOW_STEPS)]))
+    late = float(np.median([ranges[added] for added in range(last - WINDOW_STEPS + 1, last + 1)]))
     words = (
-        f"starts differ by {percent(ranges[0])} of the drop at first, {percent(early, 1)} after {EARLY} points, "
-        f"{percent(late, 1)} at the end (one value: {100 * CONVERGED:g} %)"
+        f"starts differ by {percent(ranges[0])} of the drop at first, {percent(early, 1)} after {EARLY_POINTS} points, "
+        f"{percent(late, 1)} at the end (one value: {100 * MAX_CONVERGED_RANGE:g} %)"
     )
     over = [1 / max(share, 1e-9) for share in (early, late)]
-    return [Case(value, value, value, words, 1 / CONVERGED) for value in over]
+    return [Case(value, value, value, words, 1 / MAX_CONVERGED_RANGE) for value in over]
 
 
 TESTS: dict[str, Test] = {"sd_drops_fast": _drops_fast, "any_start_converges": _one_value}

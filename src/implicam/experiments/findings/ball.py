@@ -15,11 +15,11 @@ from implicam.experiments.plan import EXPLICIT, NETWORK
 from implicam.experiments.source import BALL, BUDGETS
 from implicam.simulate import CAMERA_SETS
 
-PAIR = next(iter(CAMERA_SETS))
+CAMERA_PAIR = next(iter(CAMERA_SETS))
 """The set of two cameras."""
-MUCH, CLEARLY, ALIKE = 1.5, 1.1, 1.1
+MUCH_WORSE_RATIO, CLEAR_GAIN_RATIO, ALIKE_RATIO = 1.5, 1.1, 1.1
 """Factors that stand for the paper's words: much worse, a clear gain, at most so far apart."""
-TOO_FEW = 2.0
+TOO_FEW_RATIO = 2.0
 """Points are too few where twice as many of them more than halve the error."""
 
 
@@ -89,8 +89,8 @@ def _explicit_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
 
 def _few_boards_hurt(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     many, few = (_line(rows, sets[0], budget) for budget in (BUDGETS[0], BUDGETS[-1]))
-    words = f"10 + 4 pictures: {{}} times the error of 50 + 10 (much: {MUCH:g})"
-    return [_against(few, many, words, rows, sets[0], least=MUCH)]
+    words = f"10 + 4 pictures: {{}} times the error of 50 + 10 (much: {MUCH_WORSE_RATIO:g})"
+    return [_against(few, many, words, rows, sets[0], least=MUCH_WORSE_RATIO)]
 
 
 def _budget_matters(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
@@ -98,13 +98,13 @@ def _budget_matters(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     most, middle, least = BUDGETS
 
     def alike(a: tuple[int, int], b: tuple[int, int]) -> Case:
-        words = f"error of {a[0]} + {a[1]} over {b[0]} + {b[1]} pictures {{}} (alike: above {1 / ALIKE:.2f})"
-        return _against(lines[a], lines[b], words, rows, sets[0], least=1 / ALIKE)
+        words = f"error of {a[0]} + {a[1]} over {b[0]} + {b[1]} pictures {{}} (alike: above {1 / ALIKE_RATIO:.2f})"
+        return _against(lines[a], lines[b], words, rows, sets[0], least=1 / ALIKE_RATIO)
 
-    if sets[0] == PAIR:
+    if sets[0] == CAMERA_PAIR:
         return [alike(a, b) for a, b in permutations(BUDGETS, 2)]
-    words = f"error of 10 + 4 over 25 + 6 pictures {{}} (clear: {CLEARLY:g})"
-    return [_against(lines[least], lines[middle], words, rows, sets[0], least=CLEARLY), alike(most, middle)]
+    words = f"error of 10 + 4 over 25 + 6 pictures {{}} (clear: {CLEAR_GAIN_RATIO:g})"
+    return [_against(lines[least], lines[middle], words, rows, sets[0], least=CLEAR_GAIN_RATIO), alike(most, middle)]
 
 
 def _poor_explicit_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
@@ -144,8 +144,8 @@ def _too_few(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
         return []
     twice = min(sizes[1:], key=lambda known: abs(known - 2 * sizes[0]))
     few, more = (_lattice(rows, gp, sets[0], known) for known in (sizes[0], twice))
-    words = f"error with {sizes[0]} points {{}} times that with {twice} (too few: {TOO_FEW:g})"
-    return [ratio(*_paired(few, more, "rmse"), words, least=TOO_FEW)]
+    words = f"error with {sizes[0]} points {{}} times that with {twice} (too few: {TOO_FEW_RATIO:g})"
+    return [ratio(*_paired(few, more, "rmse"), words, least=TOO_FEW_RATIO)]
 
 
 def _most(rows: Rows, method: str, cameras: str) -> int:

@@ -12,7 +12,7 @@ from implicam.experiments.evidence import Case, Rows, Test, ratio, where
 from implicam.experiments.plan import NETWORK
 from implicam.experiments.source import BOARD
 
-PANELS = 5
+PANEL_BOARDS = 5
 """Boards of the panels in which the paper sees the uncertainty grow towards the cameras."""
 
 
@@ -84,7 +84,7 @@ def _nearer(key: str, what: str) -> Test:
         counts = _boards(rows, gp, sets[0])
         if not counts:
             return []
-        boards = PANELS if PANELS in counts else counts[-1]
+        boards = PANEL_BOARDS if PANEL_BOARDS in counts else counts[-1]
         found = _by_board(rows, gp, sets[0], boards, key)
         last = max(found) + 1  # the farthest board, which trains
         pairs = [(i, last - i) for i in found if i < last - i and last - i in found]
