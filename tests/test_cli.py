@@ -367,7 +367,7 @@ USAGE = {
     "calibrate RIG -o x.csv": "end it in .implicam: -o x.implicam",
     "compare RIG --train 17,x": "not a list of numbers",
     "compare RIG --train 500": "500 of 40 points leave none",
-    "compare RIG --methods inverse-gp:papre": "inverse-gp has no kernel 'papre'",
+    "compare RIG --methods inverse-gp:papre": "inverse-gp has no variant 'papre'",
     "compare RIG --methods forward-gp:nonee": "did you mean 'none'?",
     "compare RIG --methods forward-gp:paper": "forward-gp has no lens 'paper'",
     "compare RIG --methods mpl": "did you mean 'mlp'?",

@@ -95,7 +95,7 @@ def test_every_command_takes_it(cli: Cli, tmp_path: Path, request: pytest.Fixtur
     for to in ("opencv", "kalibr", "colmap", "aniposelib"):
         ran = cli(*f"export toy.implicam --to {to} -o {to}".split())
         assert ran.code == 1
-        assert f"has a equisolid lens, which {to} does not know" in " ".join(ran.err.split())
+        assert f"has a lens of the family equisolid, which {to} does not know" in " ".join(ran.err.split())
         assert not (tmp_path / to).exists()
     ran = cli(*["calibrate", "rig", "-o", "x.implicam", "--lens", "equisolit", "--method", "explicit"])
     assert "did you mean 'equisolid'" in ran.err

@@ -53,7 +53,7 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
     for camera in rig.cameras:
         if not (form.fits_lenses or isinstance(camera.lens, BrownConrady | KannalaBrandt)):
             raise DatasetError(
-                f"camera {camera.name!r} has a {camera.lens.family} lens, which {to} does not know.",
+                f"camera {camera.name!r} has a lens of the family {camera.lens.family}, which {to} does not know.",
                 why="it holds the two families of OpenCV, brown-conrady and kannala-brandt",
                 fix="calibrate with one of these, or export to dlt or pose2sim, which fit their own to it",
             )
