@@ -28,7 +28,7 @@ from scipy.linalg import lapack
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from implicam.calibrators.inverse_gp import EXTENT, Scaling
+from implicam.calibrators.inverse_gp import UNIFORM_EXTENT_SDS, Scaling
 from implicam.calibrators.paper_preset import LEARNING_RATE, exact_gp
 from implicam.files import write_text
 from implicam.gp import Fit, GaussianProcess, Kernel, maximise_each
@@ -45,7 +45,7 @@ def problem(n, d, seed):
 
 
 def ours(X, Y):
-    return maximise_each(X, Y, shortest=EXTENT)
+    return maximise_each(X, Y, shortest=UNIFORM_EXTENT_SDS)
 
 
 def with_gpytorch(X, Y):

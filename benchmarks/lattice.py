@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from implicam.calibrators import InverseGP
-from implicam.calibrators.inverse_gp import EXTENT
+from implicam.calibrators.inverse_gp import UNIFORM_EXTENT_SDS
 from implicam.evaluation import evaluate
 from implicam.simulate import ball_grid, build_rig, random_positions, simulate
 
-BOUNDS = (0.05, 2.0, 3.0, EXTENT, 5.0, 8.0)
+BOUNDS = (0.05, 2.0, 3.0, UNIFORM_EXTENT_SDS, 5.0, 8.0)
 
 
 def ratio(cameras, lattice, shortest, seed):

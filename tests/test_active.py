@@ -586,7 +586,7 @@ def test_a_grown_inverse_fit_is_never_less_probable(rig: Rig) -> None:
 
 def test_the_papers_experiment_is_one_configuration_of_the_loop() -> None:
     """The same points in the same order as experiments/active.py, which knows nothing of the loop."""
-    from implicam.experiments.active import _of_the_rest
+    from implicam.experiments.active import _measure_rest
 
     rig = build_rig("bar6", seed=0, cameras="2R")
     data = simulate(rig, ball_grid(rig, (4, 4, 4)), seed=0)
@@ -602,7 +602,7 @@ def test_the_papers_experiment_is_one_configuration_of_the_loop() -> None:
     )
     loop.run(RecordedOracle(data, set(data.points[mask].tolist())))
     for name in loop.data.points[13:]:  # type: ignore[union-attr]
-        _, sd = _of_the_rest(InverseGP(preset="plain").fit(data.select(mask)), data, mask)
+        _, sd = _measure_rest(InverseGP(preset="plain").fit(data.select(mask)), data, mask)
         sd[mask] = -np.inf
         # `mask` keeps the order of the data and the loop that of time: the fits differ in their last digits
         best = np.argsort(-sd)

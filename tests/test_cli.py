@@ -369,7 +369,7 @@ USAGE = {
     "compare RIG --train 500": "500 of 40 points leave none",
     "compare RIG --methods inverse-gp:papre": "inverse-gp has no variant 'papre'",
     "compare RIG --methods forward-gp:nonee": "did you mean 'none'?",
-    "compare RIG --methods forward-gp:paper": "forward-gp has no lens 'paper'",
+    "compare RIG --methods forward-gp:paper": "forward-gp has no variant 'paper'",
     "compare RIG --methods mpl": "did you mean 'mlp'?",
     "compare RIG -o figure.txt": "is no picture",
     "convert RIG RIG --overwrite": "would be replaced by itself",

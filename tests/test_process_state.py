@@ -17,7 +17,7 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from implicam import threads
-from implicam.experiments.workers import LocalProcesses, Task, attempt, attempts
+from implicam.experiments.workers import LocalProcesses, Task, attempt, compute_all
 from implicam.files import replacing, replacing_folder
 from implicam.images import opencv
 from implicam.simulate import Studio, build_rig, random_positions
@@ -90,7 +90,7 @@ def test_the_filter_of_warnings_goes_with_the_processes() -> None:
     speak = threading.Thread(target=warnings.warn, args=(said, UserWarning))  # an error in a thread fails the test
     speak.start()
     speak.join()
-    assert list(attempts(workers, [])) == []
+    assert list(compute_all(workers, [])) == []
     assert warnings.filters == before
     with pytest.raises(UserWarning, match="A worker stopped"):
         warnings.warn(said, UserWarning, stacklevel=1)
