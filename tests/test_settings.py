@@ -274,3 +274,19 @@ def test_a_file_whose_settings_make_no_sense_is_refused() -> None:
     for wrong in ({"max_rounds": -3}, {"max_rounds": [3]}, {"nothing": 3}):
         with pytest.raises(UsageError):
             ForwardGPCalibration.from_state(fitted().data, table | {"settings": wrong}, arrays)
+
+
+def test_info_shows_the_settings_that_were_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from implicam.cli import main
+
+    for settings, shown in ((ForwardGPSettings(), "113"), (ForwardGPSettings(max_squared_mahalanobis=30.0), "112")):
+        ForwardGP(settings=settings).fit(implicam.simulated("stereo", points=20, seed=1)).save(
+            tmp_path / "rig.implicam"
+        )
+        capsys.readouterr()
+        with pytest.raises(SystemExit):
+            main(["info", str(tmp_path / "rig.implicam")])
+        told = capsys.readouterr().out
+        assert f"the other {shown} settings are at their defaults" in told
+        assert ("max_squared_mahalanobis = 30.0" in told) == (shown == "112")
+        assert "noise_prior" not in told

@@ -360,12 +360,18 @@ def info_command(
     json: Json = False,
 ) -> None:
     """Show what a calibration file says about itself."""
-    load_calibration(calibration)  # a damaged file must not look healthy
+    loaded = load_calibration(calibration)  # a damaged file must not look healthy
     table = calibration_file.describe(calibration)
     if json:
         show.emit_json(table)
-    else:
-        show.line(toml_text(table).rstrip())
+        return
+    saved = table["options"].pop("settings", None)
+    show.line(toml_text(table).rstrip())
+    if saved is not None:
+        usual = type(loaded.calibrator)().settings.as_table()  # type: ignore[attr-defined]
+        changed = {name: value for name, value in saved.items() if value != usual[name]}
+        text = f"\n[options.settings]\n{toml_text(changed).rstrip()}\n" if changed else "\n"
+        show.line(f"{text}# the other {len(saved) - len(changed)} settings are at their defaults; --json shows all")
 
 
 def _version(shown: bool) -> None:
