@@ -79,7 +79,6 @@ def test_every_command_takes_it(cli: Cli, tmp_path: Path, request: pytest.Fixtur
     write_dataset(data(40, 1), tmp_path / "rig")
     write_dataset(data(20, 2), tmp_path / "new")
     for words in (
-        "calibrate rig -o toy.implicam --method explicit:equisolid",
         "calibrate rig -o toy.implicam --lens equisolid",
         "info toy.implicam",
         "measure toy.implicam new",
