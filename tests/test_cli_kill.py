@@ -191,11 +191,13 @@ def killed_at(victim: Victim, folder: Path, delay: float) -> bool:
 def test_killed_at_any_moment_the_old_or_the_new_is_there(victim: Victim, template: Path, tmp_path: Path) -> None:
     """Two dozen delays over the last part of a measured run, where the files are written."""
     pytest.importorskip(victim.needs)
-    whole = tmp_path / "whole"
-    shutil.copytree(template, whole)
-    start = time.perf_counter()
-    assert real(victim.words, whole).code == 0
-    seconds = time.perf_counter() - start
+    seconds = np.inf
+    for name in ("again", "whole"):  # the shorter of two: a machine that was busy just then measures too much
+        whole = tmp_path / name
+        shutil.copytree(template, whole)
+        start = time.perf_counter()
+        assert real(victim.words, whole).code == 0
+        seconds = min(seconds, time.perf_counter() - start)
     old, new = state(template, victim.target), state(whole, victim.target)
     sources = {name: state(template, name) for name in ("rig", "rig.implicam")}
     in_time = 0
