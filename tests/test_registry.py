@@ -34,6 +34,14 @@ def test_a_name_that_is_taken_or_cannot_be_written_is_refused(name):
         colours().register(name, 9)
 
 
+def test_a_part_of_another_package_that_cannot_be_imported_is_named_with_the_package(monkeypatch):
+    there = EntryPoints([EntryPoint("mauve", "no_such_package.colours:MAUVE", "implicam.colours")])
+    monkeypatch.setattr(registry, "entry_points", lambda **by: there.select(**by))
+    with pytest.raises(UsageError, match=r"the colour 'mauve' of the package no_such_package.colours") as error:
+        Registry("colour", {"red": 1}, "implicam.colours").find("mauve")
+    assert "ModuleNotFoundError" in error.value.why
+
+
 def test_another_package_adds_a_part_by_an_entry_point(monkeypatch):
     there = EntryPoints([EntryPoint("pi", "math:pi", "implicam.colours")])
     monkeypatch.setattr(registry, "entry_points", lambda **by: there.select(**by))

@@ -29,7 +29,7 @@ class Gantry:
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
         if not rest:
-            raise incomplete("robot", cls)
+            raise incomplete("robot", cls, rest)
         if options.box is None:
             raise UsageError("the gantry needs a box.", why="it could collide", fix="give --workspace")
         return cls(rest, *options.box)
@@ -78,7 +78,7 @@ class GantryCamera:
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool) -> FrameSource:
         if not rest.isdecimal():
-            raise incomplete("camera", cls)
+            raise incomplete("camera", cls, rest)
         return cls(name, int(rest))
 
     def __init__(self, name: str, number: int) -> None:

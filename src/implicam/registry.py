@@ -8,7 +8,7 @@ recipes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import NamedTuple, TypeVar
 
 from implicam.errors import UsageError, did_you_mean
@@ -71,8 +71,21 @@ class Registry(Mapping[str, Part]):
     def __getitem__(self, name: str) -> Part:
         if name not in self._parts:
             for entry in entry_points(group=self.group, name=name):
-                self._parts[name] = entry.load()
+                self._parts[name] = self._load(entry)
         return self._parts[name]
+
+    def _load(self, entry: EntryPoint) -> Part:
+        """A part of another package; UsageError, which names the package, where it cannot be imported."""
+        try:
+            part: Part = entry.load()
+        except Exception as error:
+            package = entry.dist.name if entry.dist is not None else entry.module
+            raise UsageError(
+                f"the {self.kind} {entry.name!r} of the package {package} cannot be imported.",
+                why=f"{type(error).__name__}: {error}",
+                fix=f"mend or update {package}, or take it out: pip uninstall {package}",
+            ) from error
+        return part
 
     def __contains__(self, name: object) -> bool:
         return name in self._parts or name in entry_points(group=self.group).names

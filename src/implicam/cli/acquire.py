@@ -229,7 +229,9 @@ def acquire_command(
     ] = None,
     method: Annotated[
         str | None,
-        typer.Option("--method", metavar="NAME", help="forward-gp (default), inverse-gp.", rich_help_panel=_PLAN),
+        typer.Option(
+            "--method", metavar="NAME", help="forward-gp (default), inverse-gp, explicit.", rich_help_panel=_PLAN
+        ),
     ] = None,
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, metavar="N", help="Rig and choices.", rich_help_panel=_PLAN)

@@ -365,11 +365,12 @@ def info_command(
     if json:
         show.emit_json(table)
         return
-    saved = table["options"].pop("settings", None)
+    settings: Any = getattr(getattr(loaded, "calibrator", None), "settings", None)
+    saved = None if settings is None else table["options"].pop("settings", None)
     show.line(toml_text(table).rstrip())
     if saved is not None:
-        usual = type(loaded.calibrator)().settings.as_table()  # type: ignore[attr-defined]
-        changed = {name: value for name, value in saved.items() if value != usual[name]}
+        usual = type(settings)().as_table()
+        changed = {name: value for name, value in saved.items() if value != usual.get(name)}
         text = f"\n[options.settings]\n{toml_text(changed).rstrip()}\n" if changed else "\n"
         show.line(f"{text}# the other {len(saved) - len(changed)} settings are at their defaults; --json shows all")
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from implicam.calibrators import CALIBRATORS, Calibrator, calibrator, method_for, options_of
+from implicam.calibrators import CALIBRATORS, Calibrator, calibrator, every_option, method_for, options_of
 from implicam.dataset import read_dataset
 from implicam.registry import Option
 
@@ -57,7 +57,8 @@ def _parameter(method: str, name: str) -> inspect.Parameter:
 
 def calibrator_from_options(method: str | None, seed: int, options: Mapping[str, Any]) -> Calibrator:
     """The calibrator that the options of a command line mean; those that were not given are None."""
-    read = {name: read_dataset(value) if isinstance(value, Path) else value for name, value in options.items()}
+    datasets = {name for name, by in every_option().items() if any(one.metadata["is_dataset"] for one in by.values())}
+    read = {name: read_dataset(value) if value and name in datasets else value for name, value in options.items()}
     return calibrator(method or method_for(**read), seed=seed, **read)
 
 

@@ -30,7 +30,7 @@ class CsvPlayer:
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
         """As of `RobotDriver`; it needs no option."""
         if not rest:
-            raise incomplete("robot", cls)
+            raise incomplete("robot", cls, rest)
         if options.sd is not None:
             raise UsageError("the table says how well its positions are known.", fix="give it columns sd_x, sd_y, sd_z")
         return cls(rest)

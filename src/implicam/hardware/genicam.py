@@ -39,7 +39,7 @@ class GenICamCamera:
         """As of `CameraDriver`."""
         serial, _, producer = rest.partition("@")
         if not serial or not producer:
-            raise incomplete("camera", cls)
+            raise incomplete("camera", cls, rest)
         return cls(name, serial, producer, triggered=triggered)
 
     def __init__(self, name: str, serial: str, producer: Path | str, *, triggered: bool = False) -> None:

@@ -21,7 +21,7 @@ class Person:
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
         """As of `RobotDriver`; options: ask, sd."""
         if rest or options.ask is None:
-            raise incomplete("robot", cls)
+            raise incomplete("robot", cls, rest)
         return cls(options.ask) if options.sd is None else cls(options.ask, options.sd)
 
     def __init__(self, ask: Callable[[Floats], None], sd: Sequence[float] = (np.nan, np.nan, np.nan)) -> None:

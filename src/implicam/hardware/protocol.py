@@ -204,9 +204,11 @@ class RobotDriver(Protocol):
         """
 
 
-def incomplete(what: str, driver: type[CameraDriver] | type[RobotDriver]) -> UsageError:
-    """The error of a spec that names a driver and lacks what must follow."""
-    return UsageError(f"that names no {what}.", why="something is missing after the colon", fix=f"write {driver.spec}")
+def incomplete(what: str, driver: type[CameraDriver] | type[RobotDriver], rest: str) -> UsageError:
+    """The error of a spec that names a driver and does not say what it needs; rest: what follows the colon."""
+    name = driver.spec.partition(":")[0]
+    spec = f"{name}:{rest}" if rest else name
+    return UsageError(f"{spec!r} names no {what}.", fix=f"write {driver.spec}")
 
 
 def point(xyz: Floats, what: str = "position") -> Floats:

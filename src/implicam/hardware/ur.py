@@ -61,7 +61,7 @@ class URRobot:
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
         """As of `RobotDriver`; options: all but ask. The box is required."""
         if not rest:
-            raise incomplete("robot", cls)
+            raise incomplete("robot", cls, rest)
         if options.box is None:
             raise UsageError(
                 f"ur:{rest} needs a box that it may move in.",

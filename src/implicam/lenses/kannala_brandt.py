@@ -115,8 +115,7 @@ class KannalaBrandt:
         """As of `Lens`; one of this family is itself."""
         if isinstance(lens, cls):
             return lens
-        k = PERSPECTIVE_K.tolist() if lens.pixel_from_camera_point(points)[1].all() else []
-        return fit_lens(cls(lens.fx, lens.fy, lens.cx, lens.cy, *k), points, lens.pixel_from_camera_point(points)[0])
+        return fit_lens(cls(lens.fx, lens.fy, lens.cx, lens.cy), points, lens.pixel_from_camera_point(points)[0])
 
     @property
     def _radial(self) -> tuple[float, ...]:
