@@ -70,7 +70,14 @@ ROBOTS: Registry[type[RobotDriver]] = Registry(
 
 
 def specs(drivers: Registry[Any]) -> str:
-    """What the specs of all drivers look like, for help and errors."""
+    """What the specs of all drivers look like, for help texts and errors.
+
+    Args:
+        drivers: `CAMERAS` or `ROBOTS`.
+
+    Returns:
+        The `spec` of each driver, with commas between them.
+    """
     return ", ".join(driver.spec for driver in drivers.values())
 
 
@@ -112,7 +119,14 @@ def robot_from(spec: str, **options: Any) -> Robot:
 
 
 def trigger_from(spec: str) -> Trigger:
-    """The trigger box at "udp://host:port" or "tcp://host:port"; UsageError for others. Opens nothing."""
+    """The trigger box at an address; it is not connected.
+
+    Args:
+        spec: "udp://host:port" or "tcp://host:port".
+
+    Raises:
+        UsageError: The address is of no such form.
+    """
     return NetworkTrigger(spec)
 
 

@@ -28,7 +28,15 @@ class CsvPlayer:
 
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
-        """As of `RobotDriver`; it needs no option."""
+        """A player of the file that a spec names; the file is not read yet.
+
+        Args:
+            rest: The path of the CSV file.
+            options: No option is needed.
+
+        Raises:
+            UsageError: There is no path, or `options.sd` is given: the table says how well its positions are known.
+        """
         if not rest:
             raise incomplete("robot", cls, rest)
         if options.sd is not None:
@@ -60,7 +68,7 @@ class CsvPlayer:
         self._is_open = True
 
     def position(self) -> Floats:
-        """The row that was gone to last."""
+        """(3,) the row that was gone to last; HardwareError before the first move."""
         if self._here is None:
             raise HardwareError(
                 f"{self.path.name} is at none of its rows yet.", why="no move was made", fix="move to a position first"
@@ -68,7 +76,17 @@ class CsvPlayer:
         return np.array(self._xyz[self._here])
 
     def move(self, xyz: Floats) -> Floats:
-        """Go to the nearest row that is left; ties go to the earlier one. HardwareError where none is left."""
+        """Go to the nearest row that is left; of two as near, to the earlier one.
+
+        Args:
+            xyz: (3,) the wish, in the dataset's unit and world frame.
+
+        Returns:
+            (3,) the position of that row.
+
+        Raises:
+            HardwareError: All rows have been used, the file cannot be read, or the wish is no position.
+        """
         wish = point(xyz)
         self.open()
         rows = np.flatnonzero(self._left)
@@ -97,7 +115,18 @@ class CsvPlayer:
 
 
 def read_positions(path: Path) -> Floats:
-    """(n, 6): x, y, z and their standard uncertainties, NaN where the file has none; HardwareError with the line."""
+    """Read a table of positions.
+
+    Args:
+        path: A CSV file with a head x, y, z and, where known, sd_x, sd_y, sd_z; other columns are ignored.
+
+    Returns:
+        (n, 6) x, y, z and their standard uncertainties in the file's unit, NaN where it has none.
+
+    Raises:
+        HardwareError: The file cannot be read, a column is missing, a cell is no number or an sd not above zero; the
+            error names the line.
+    """
     try:
         if path.stat().st_size > MAX_BYTES:
             raise HardwareError(f"{path} is larger than 200 MB.", fix="give a table of positions, one row a shot")

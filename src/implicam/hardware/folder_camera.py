@@ -32,12 +32,22 @@ class FolderCamera:
 
     @classmethod
     def takes(cls, spec: str) -> bool:
-        """A folder, or a name that ends like one."""
+        """Whether a spec without the driver's name is a folder, or ends like one.
+
+        Args:
+            spec: The words of the command line.
+        """
         return spec.endswith("/") or (bool(spec) and Path(spec).is_dir())
 
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
-        """As of `CameraDriver`; whether a trigger makes the pictures is the same here."""
+        """A camera that watches a folder, not opened yet.
+
+        Args:
+            name: The camera's name in the dataset.
+            rest: The folder.
+            triggered: Makes no difference: the pictures come from the folder either way.
+        """
         return cls(name, rest)
 
     def __init__(self, name: str, folder: Path | str, pattern: str = "*") -> None:
@@ -50,7 +60,17 @@ class FolderCamera:
         self._stamps()
 
     def frame(self, timeout: float = 5.0) -> Frame:
-        """The next picture that appears in the folder, once it is whole."""
+        """The next picture that appears in the folder, once it is whole.
+
+        Args:
+            timeout: Seconds to wait for it.
+
+        Returns:
+            The picture with the time at which its file was last written.
+
+        Raises:
+            HardwareError: None came in time, or the folder cannot be read.
+        """
         before = self._stamps()
         growing = {name for name, stamp in before.items() if self._growing(name, stamp)}
         partial: dict[str, ImageError] = {}

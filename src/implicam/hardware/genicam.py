@@ -31,12 +31,25 @@ class GenICamCamera:
 
     @classmethod
     def takes(cls, spec: str) -> bool:
-        """Only by its name."""
+        """Never: such a camera is only meant where the driver's name stands before the colon.
+
+        Args:
+            spec: The words of the command line.
+        """
         return False
 
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
-        """As of `CameraDriver`."""
+        """A camera by its serial number, not opened yet.
+
+        Args:
+            name: The camera's name in the dataset.
+            rest: "SERIAL@producer.cti", the serial number and the path of the GenTL producer.
+            triggered: The camera exposes only when a trigger fires.
+
+        Raises:
+            UsageError: The serial number or the producer is missing.
+        """
         serial, _, producer = rest.partition("@")
         if not serial or not producer:
             raise incomplete("camera", cls, rest)
@@ -72,7 +85,17 @@ class GenICamCamera:
             raise self._failed("cannot be opened", error) from error
 
     def frame(self, timeout: float = 5.0) -> Frame:
-        """The first picture that was exposed after the call."""
+        """The first picture that was exposed after the call.
+
+        Args:
+            timeout: Seconds to wait for it.
+
+        Returns:
+            The picture with the time at which it was received.
+
+        Raises:
+            HardwareError: None came in time, the camera is gone or cannot be opened, or its pixel format is not known.
+        """
         self.open()
         end = time.monotonic() + timeout
         try:
@@ -131,7 +154,20 @@ class GenICamCamera:
 
 
 def to_grey(data: NDArray[Any], width: int, height: int, pixel_format: str) -> Grey:
-    """The values of a buffer, as GenICam's pixel format names them, as grey from 0 to 1, a copy."""
+    """The values of a camera's buffer as a grey picture, a copy.
+
+    Args:
+        data: The buffer, height * width values, or three times as many where the format has three colours.
+        width: In pixels.
+        height: In pixels.
+        pixel_format: As GenICam names it, for example "Mono12" or "BayerRG8".
+
+    Returns:
+        (height, width) float32 from 0 to 1.
+
+    Raises:
+        HardwareError: The pixel format is not known.
+    """
     cv2 = opencv()
     if pixel_format in BITS:
         return _scaled(data.reshape(height, width), BITS[pixel_format])

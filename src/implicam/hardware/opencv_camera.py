@@ -41,12 +41,22 @@ class OpenCVCamera:
 
     @classmethod
     def takes(cls, spec: str) -> bool:
-        """The number or the file of a device, the address of a stream, a film."""
+        """Whether a spec without the driver's name is a device, the address of a stream, or a file.
+
+        Args:
+            spec: The words of the command line.
+        """
         return spec.isdecimal() or spec.startswith(("/dev/", *STREAMS)) or Path(spec).is_file()
 
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
-        """As of `CameraDriver`."""
+        """A camera of a device, stream or film, not opened yet.
+
+        Args:
+            name: The camera's name in the dataset.
+            rest: The number or file of a device, the address of a stream, or a film.
+            triggered: The camera exposes only when a trigger fires.
+        """
         return cls(name, rest, triggered=triggered)
 
     def __init__(self, name: str, source: int | str | Path, *, triggered: bool = False) -> None:
@@ -73,7 +83,17 @@ class OpenCVCamera:
             self._grabber = _Grabber(self._opened(), f"camera {self.name}")
 
     def frame(self, timeout: float = 5.0) -> Frame:
-        """The next picture of a film, or one that a live camera took after the call."""
+        """The next picture of a film, or one that a live camera took after the call.
+
+        Args:
+            timeout: Seconds that a live camera has; a film does not wait.
+
+        Returns:
+            The picture with the time at which it was read.
+
+        Raises:
+            HardwareError: None came in time, the camera is gone or cannot be opened, or the film is over.
+        """
         self.open()
         image, taken = self._next_of_film() if self._film else self._next_live(timeout)
         self._number += 1

@@ -19,7 +19,15 @@ class Person:
 
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
-        """As of `RobotDriver`; options: ask, sd."""
+        """A person as the robot.
+
+        Args:
+            rest: Must be empty.
+            options: `ask` is required, `sd` is used where it is given.
+
+        Raises:
+            UsageError: Something follows the name, or there is no `ask`.
+        """
         if rest or options.ask is None:
             raise incomplete("robot", cls, rest)
         return cls(options.ask) if options.sd is None else cls(options.ask, options.sd)
@@ -33,11 +41,18 @@ class Person:
         """Nothing to connect."""
 
     def set_position(self, xyz: Floats) -> None:
-        """The target is at xyz (3,): what was read from the ruler."""
+        """Say where the target is, as read from the ruler.
+
+        Args:
+            xyz: (3,) in the dataset's unit and world frame.
+
+        Raises:
+            HardwareError: These are not three finite numbers.
+        """
         self._position = point(xyz)
 
     def position(self) -> Floats:
-        """Where it was said to be last."""
+        """(3,) where the target was said to be last; HardwareError where nothing was said since the last move."""
         if self._position is None:
             raise HardwareError(
                 "it is not known yet where the target is.",
@@ -47,7 +62,17 @@ class Person:
         return self._position.copy()
 
     def move(self, xyz: Floats) -> Floats:
-        """Ask for xyz; returns the wish. Where the target ends up is what `set_position` is given afterwards."""
+        """Ask for the target to be put somewhere; where it ends up is what `set_position` is given afterwards.
+
+        Args:
+            xyz: (3,) the wish, in the dataset's unit and world frame.
+
+        Returns:
+            (3,) the wish.
+
+        Raises:
+            HardwareError: The wish is not three finite numbers.
+        """
         wish = point(xyz)
         self._position = None  # what was true before is not true while hands move the target
         self._ask(wish)

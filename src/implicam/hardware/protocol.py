@@ -65,9 +65,15 @@ class FrameSource(Protocol):
         """Ready the camera. Opening twice is harmless. HardwareError with the cure."""
 
     def frame(self, timeout: float = 5.0) -> Frame:
-        """A picture taken after the call (of a file: the next one), within `timeout` seconds.
+        """A picture taken after the call; of a film, the next one.
 
-        HardwareError where none comes in time or the camera is gone. The next call reopens the camera by itself.
+        After an error the next call reopens the camera by itself.
+
+        Args:
+            timeout: Seconds to wait for it.
+
+        Raises:
+            HardwareError: None came in time, or the camera is gone.
         """
 
     def close(self) -> None:
@@ -82,7 +88,11 @@ class CameraDriver(Protocol):
 
     @classmethod
     def takes(cls, spec: str) -> bool:
-        """Whether a spec without the driver's name, such as a number or a folder, is meant for it."""
+        """Whether a spec without the driver's name, such as a number or a folder, is meant for it.
+
+        Args:
+            spec: The words of the command line.
+        """
 
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool) -> FrameSource:
@@ -138,7 +148,17 @@ class Robot(Protocol):
         """(3,) where the target is now. HardwareError where that is not known."""
 
     def move(self, xyz: Floats) -> Floats:
-        """Go to xyz (3,), wait until there, return where it is. HardwareError: stopped, out of the box, refused."""
+        """Go somewhere, and wait until there.
+
+        Args:
+            xyz: (3,) in the dataset's unit and world frame.
+
+        Returns:
+            (3,) where the target is then.
+
+        Raises:
+            HardwareError: It was stopped, the place is out of its box, or it refuses.
+        """
 
     def stop(self) -> None:
         """Stop at once, from any thread. Harmless when it stands still."""
@@ -155,7 +175,11 @@ class MovedByHand(Protocol):
     """A `Robot` that is told where the target has been put, because it cannot know: a person with a ruler."""
 
     def set_position(self, xyz: Floats) -> None:
-        """The target is at xyz (3,)."""
+        """Say where the target is.
+
+        Args:
+            xyz: (3,) in the dataset's unit and world frame.
+        """
 
 
 @dataclass(frozen=True)
@@ -205,14 +229,34 @@ class RobotDriver(Protocol):
 
 
 def incomplete(what: str, driver: type[CameraDriver] | type[RobotDriver], rest: str) -> UsageError:
-    """The error of a spec that names a driver and does not say what it needs; rest: what follows the colon."""
+    """The error of a spec that names a driver and does not say what it needs.
+
+    Args:
+        what: "camera" or "robot".
+        driver: The driver's class; its `spec` says what to write.
+        rest: What follows the colon in the spec.
+
+    Returns:
+        The error, to be raised.
+    """
     name = driver.spec.partition(":")[0]
     spec = f"{name}:{rest}" if rest else name
     return UsageError(f"{spec!r} names no {what}.", fix=f"write {driver.spec}")
 
 
 def point(xyz: Floats, what: str = "position") -> Floats:
-    """The numbers as (3,) finite float64, a copy; HardwareError for anything else, before a robot hears of it."""
+    """Check a position before a robot hears of it.
+
+    Args:
+        xyz: Three numbers.
+        what: What to call them in the error.
+
+    Returns:
+        (3,) finite float64, a copy.
+
+    Raises:
+        HardwareError: These are not three finite numbers.
+    """
     out = np.array(xyz, dtype=np.float64)
     if out.shape != (3,) or not np.isfinite(out).all():
         raise HardwareError(
@@ -226,8 +270,21 @@ ARMED = 0.05
 
 
 def exposed(cameras: Sequence[FrameSource], trigger: Trigger | None, timeout: float, pool: Executor) -> list[Frame]:
-    """A new picture of each camera, all of one instant as far as they are triggered; each is asked in a thread of
-    `pool`. HardwareError once all have answered: a camera answers one thread at a time, not two."""
+    """Take a new picture with each camera, all at one instant as far as they are triggered.
+
+    Args:
+        cameras: Each is asked in a thread of `pool`.
+        trigger: Fired once all cameras wait; None where the cameras run freely.
+        timeout: Seconds for each picture.
+        pool: At least one thread for each camera, so that all of them wait when the trigger fires.
+
+    Returns:
+        A frame of each camera, in their order.
+
+    Raises:
+        HardwareError: The trigger or a camera failed; of a camera, once all have answered, because a camera answers one
+            thread at a time.
+    """
     waiting = [pool.submit(camera.frame, timeout) for camera in cameras]
     if trigger is not None:
         time.sleep(ARMED)
@@ -240,7 +297,16 @@ Value = TypeVar("Value")
 
 
 def wait_for(look: Callable[[], Value | None], timeout: float, pause: float = 0.01) -> Value | None:
-    """The first value that is not None within `timeout` seconds, looking every `pause`; None where none came."""
+    """Call a function again and again until it returns something.
+
+    Args:
+        look: Returns None as long as there is nothing.
+        timeout: Seconds after which to give up; it is called at least once.
+        pause: Seconds between two calls.
+
+    Returns:
+        The first value that is not None; None where there was none in time.
+    """
     end = time.monotonic() + timeout
     while True:
         value = look()

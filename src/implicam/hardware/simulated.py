@@ -52,7 +52,17 @@ class SimulatedRobot:
         return self._reported.copy()
 
     def move(self, xyz: Floats) -> Floats:
-        """Travel to xyz; HardwareError where it is stopped or told to fail: it stands somewhere on the way then."""
+        """Travel to a position at the robot's speed.
+
+        Args:
+            xyz: (3,) in the rig's unit and world frame.
+
+        Returns:
+            (3,) the position as reported.
+
+        Raises:
+            HardwareError: It was stopped, or told to fail, and stands somewhere on the way; or xyz is no position.
+        """
         target, start = point(xyz), self._reported
         self._stop.clear()
         seconds = float(np.linalg.norm(target - start)) / self._speed
@@ -99,18 +109,33 @@ class PhotographingCamera:
         self._fails = self._covers = self._number = 0
 
     def fail_for(self, n: int) -> None:
-        """The next n calls of `frame` raise HardwareError."""
+        """Let the next calls of `frame` raise HardwareError.
+
+        Args:
+            n: The number of calls.
+        """
         self._fails = n
 
     def cover(self, n: int = 1) -> None:
-        """Nobody sees the ball in the next n pictures."""
+        """Hide the ball in the next pictures.
+
+        Args:
+            n: The number of pictures.
+        """
         self._covers = n
 
     def open(self) -> None:
         """Nothing to connect."""
 
     def frame(self, timeout: float = 5.0) -> Frame:
-        """A photograph of where the ball is now."""
+        """A photograph of where the ball is now.
+
+        Args:
+            timeout: Not used: the picture is there at once.
+
+        Raises:
+            HardwareError: The camera was told to fail.
+        """
         if self._fails > 0:
             self._fails -= 1
             raise HardwareError(
@@ -140,10 +165,18 @@ def simulated_rig(
     optics: Optics | None = None,
     start: Floats | None = None,
 ) -> tuple[list[PhotographingCamera], SimulatedRobot]:
-    """Cameras and a robot that stand in for hardware, without any; `seed` rules their noise.
+    """Cameras and a robot that stand in for hardware.
 
-    sd: of the robot's positions along each axis, speed in units a second, both in the rig's unit; start: (3,) where the
-    ball is first, the middle of the volume where None.
+    Args:
+        rig: The simulated rig.
+        seed: Of the noise of pictures and positions.
+        sd: Standard deviation of the robot's positions along each axis, in the rig's unit.
+        speed: Of the robot, in units of the rig a second.
+        optics: How the cameras take pictures; None for the usual.
+        start: (3,) where the ball is first, in the rig's unit and world frame; None for the middle of the volume.
+
+    Returns:
+        One camera for each of the rig's, in their order, and the robot that holds the ball.
     """
     middle = rig.volume.world_from_box.translation if start is None else start
     robot = SimulatedRobot(middle, sd=sd, speed=speed, rng=np.random.default_rng([seed, 11]))

@@ -172,7 +172,14 @@ class TriggerSimulator:
         self._socket.close()
 
     def answer(self, question: str) -> str:
-        """What the box says to one line, and the pulse, if it is one."""
+        """Answer one line as the box does, and count the pulse where it asks for one.
+
+        Args:
+            question: The line, for example "TRIG 7".
+
+        Returns:
+            The answer, with its line end.
+        """
         word, _, number = question.strip().partition(" ")
         if word == "HELLO" and not number:
             return f"{VERSION}{self.lines}\n"

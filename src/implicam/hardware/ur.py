@@ -59,7 +59,15 @@ class URRobot:
 
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
-        """As of `RobotDriver`; options: all but ask. The box is required."""
+        """A robot by its address, not connected yet.
+
+        Args:
+            rest: The host's name or address.
+            options: All but `ask` are used; `box` is required.
+
+        Raises:
+            UsageError: The host or the box is missing, or an option is out of range.
+        """
         if not rest:
             raise incomplete("robot", cls, rest)
         if options.box is None:
@@ -126,7 +134,18 @@ class URRobot:
         return self._here()
 
     def move(self, xyz: Floats) -> Floats:
-        """In a straight line to xyz (3,), both ends inside the box; returns where it stands."""
+        """Move the TCP in a straight line; both ends must be inside the box.
+
+        Args:
+            xyz: (3,) in the robot's base frame, in `unit`.
+
+        Returns:
+            (3,) where it stands then; in a dry run it has not moved.
+
+        Raises:
+            HardwareError: An end is outside of the box, the move was not confirmed, the robot was stopped or refuses,
+                or the connection is lost.
+        """
         self._stop.clear()
         target, here = point(xyz), self.position()
         self._check_inside(target, "the target")

@@ -46,7 +46,21 @@ class Worker:
         self._reader.start()
 
     def call(self, thing: str, method: str, *args: object, timeout: float = 2.0) -> Any:
-        """What the method answers. RuntimeError for what it raises; TimeoutError where it does not come back."""
+        """Call a method of the library in the other process.
+
+        Args:
+            thing: "receive" or "control", see `LIBRARIES`.
+            method: The method's name; "connect" makes the thing itself.
+            args: Of the method; plain values that JSON can hold.
+            timeout: Seconds to wait for the answer.
+
+        Returns:
+            What the method returns.
+
+        Raises:
+            RuntimeError: The method raised an error; the message is the same.
+            TimeoutError: There was no answer in time, or the other process is gone.
+        """
         with self._lock:
             self._asked += 1
             try:
