@@ -151,7 +151,11 @@ class SessionController:
             self._shown(where)
 
     def arrived(self, xyz: Floats) -> None:
-        """A person says where the ball is (3,), measured with a ruler; then look."""
+        """Say where the ball is, as measured by a person, and take pictures of it.
+
+        Args:
+            xyz: (3,) in the session's length unit, world frame.
+        """
         with self._working("moving", "looking"):
             if isinstance(self.equipment.robot, MovedByHand):
                 self.equipment.robot.set_position(np.asarray(xyz, dtype=np.float64))
@@ -182,7 +186,14 @@ class SessionController:
             self._aim()
 
     def skip(self, reason: str = "skipped by hand") -> None:
-        """Leave this target out; it is not proposed again."""
+        """Leave this target out; it is not proposed again.
+
+        Args:
+            reason: Kept in the session.
+
+        Raises:
+            UsageError: There is no target now.
+        """
         target = self._target()
         with self._working("fitting", "choosing another target"):
             self.session.skip(target.xyz, reason)
@@ -220,8 +231,14 @@ class SessionController:
                 self.session.log("robot stopped by hand")
 
     def set_auto(self, auto: bool) -> None:
-        """Whether good points are accepted, and the next target is gone to, without being asked. UsageError where the
-        ball does not get there without a person's help."""
+        """Turn on or off that good points are accepted, and the next target is gone to, without being asked.
+
+        Args:
+            auto: Whether to go on by itself.
+
+        Raises:
+            UsageError: The ball does not get there without a person's help, or this is a dry run.
+        """
         if auto and (not self.equipment.robot.alone or self.equipment.dry_run):
             raise UsageError(
                 "this session cannot go on by itself.",
@@ -260,7 +277,17 @@ class SessionController:
         return path
 
     def run(self, progress: Progress = silent) -> Path | None:
-        """By itself until a rule says stop or something fails: the calibration's file, None after trouble."""
+        """Measure target after target until a rule says stop or something fails, then finish.
+
+        Args:
+            progress: Told after each target how many points there are.
+
+        Returns:
+            The path of the calibration's file; None where something failed, or there is no calibration.
+
+        Raises:
+            UsageError: The session cannot go on by itself, see `set_auto`.
+        """
         self.set_auto(True)
         if self.state.phase == "starting":
             self.start()
@@ -310,7 +337,15 @@ class SessionController:
             self._eyes.release()
 
     def wait(self, version: int, timeout: float) -> State:
-        """The state once it is newer than `version`, or after `timeout` seconds."""
+        """Wait until the state changes.
+
+        Args:
+            version: That of the state which the caller has.
+            timeout: Seconds to wait at most.
+
+        Returns:
+            The state now; it has another version unless the time is over.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self.state.version != version, timeout)
         return self.state

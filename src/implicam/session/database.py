@@ -66,7 +66,18 @@ class Database:
 
     @classmethod
     def create(cls, path: Path) -> Database:
-        """An empty one, locked, inside a transaction that `made` ends; UsageError where there is a session."""
+        """Create a database, locked, inside a transaction that `made` ends.
+
+        Args:
+            path: The file.
+
+        Returns:
+            The database, without tables yet.
+
+        Raises:
+            UsageError: There is a session already, or it is open elsewhere.
+            ImplicamError: The file cannot be written.
+        """
         database = cls._connect(path, "rwc")
         with database._closing_on_error():
             database.run("BEGIN EXCLUSIVE")
@@ -79,7 +90,17 @@ class Database:
         return database
 
     def made(self, name: str, length_unit: str, cameras: Sequence[Camera], settings: Mapping[str, str]) -> None:
-        """The tables and what a session begins with, all or nothing."""
+        """Write the tables and what a session begins with, all or nothing.
+
+        Args:
+            name: Of the session.
+            length_unit: That of its positions.
+            cameras: In their order.
+            settings: Key -> value as JSON text.
+
+        Raises:
+            ImplicamError: The file cannot be written; the database is closed then.
+        """
         with self._closing_on_error():
             for table in _TABLES:
                 self.run(table)
@@ -97,8 +118,16 @@ class Database:
 
     @classmethod
     def open(cls, path: Path) -> Database:
-        """What is there, checked and locked. UsageError where it is open elsewhere, DatasetError where it is damaged,
-        another program's or a newer version's; nothing in it was changed then."""
+        """Open a database, check it and lock it; where that fails, nothing in it was changed.
+
+        Args:
+            path: The file.
+
+        Raises:
+            UsageError: It is open elsewhere.
+            DatasetError: There is none, or it is damaged, another program's, or a newer version's.
+            ImplicamError: The file cannot be written.
+        """
         if not os.path.isfile(path):  # Path.is_file raises where the folder may not be looked into
             raise DatasetError(
                 f"{path.parent} is no session.",
@@ -161,11 +190,29 @@ class Database:
             raise damaged(self._path, "its end is cut off")
 
     def run(self, sql: str, *values: Any) -> None:
-        """Execute one statement."""
+        """Execute one statement.
+
+        Args:
+            sql: The statement, with a question mark for each value.
+            values: In their order.
+
+        Raises:
+            UsageError: The database is closed, or a value cannot be kept.
+            DatasetError: The database is damaged.
+            ImplicamError: The file cannot be written.
+        """
         self.rows(sql, *values)
 
     def rows(self, sql: str, *values: Any) -> list[tuple[Any, ...]]:
-        """What a query answers."""
+        """Execute one statement and fetch what it answers; it fails as `run` does.
+
+        Args:
+            sql: The statement, with a question mark for each value.
+            values: In their order.
+
+        Returns:
+            The rows.
+        """
         try:
             return self._connection.execute(sql, values).fetchall()
         except sqlite3.Error as error:
@@ -221,7 +268,15 @@ def _explained(path: Path, error: sqlite3.Error) -> ImplicamError:
 
 
 def damaged(path: Path, why: str) -> DatasetError:
-    """The error for a database that cannot be trusted."""
+    """The error for a database that cannot be trusted.
+
+    Args:
+        path: The database's file.
+        why: What is wrong with it.
+
+    Returns:
+        The error, to be raised.
+    """
     return DatasetError(
         f"{path} is damaged, or is no session; nothing in its folder was changed.",
         why=why,
@@ -236,7 +291,15 @@ def now() -> str:
 
 
 def json_text(value: Any, what: str) -> str:
-    """A value as JSON; UsageError for what has no form in it."""
+    """Write a value as JSON.
+
+    Args:
+        value: Text, numbers, booleans, None, lists and tables of these; NumPy's numbers and arrays as well.
+        what: What to call it in the error.
+
+    Raises:
+        UsageError: The value has no form in JSON.
+    """
     try:
         text = json.dumps(value, default=json_default, ensure_ascii=False)
         text.encode()
@@ -250,13 +313,23 @@ def json_text(value: Any, what: str) -> str:
 
 
 def read_cameras(database: Database) -> tuple[Camera, ...]:
-    """The cameras in their order."""
+    """Read the cameras, in their order.
+
+    Args:
+        database: An open one.
+    """
     rows = database.rows("SELECT name, width, height, more FROM cameras ORDER BY number")
     return tuple(Camera(name, width, height, tomllib.loads(more)) for name, width, height, more in rows)
 
 
 def insert_shot(database: Database, data: Dataset, notes: str) -> None:
-    """The rows of one accepted shot, to be run inside a transaction."""
+    """Insert the rows of one accepted shot, inside a transaction of the caller.
+
+    Args:
+        database: An open one.
+        data: The points of one shot, with known positions, in the session's unit and with its cameras.
+        notes: JSON text.
+    """
     shot = str(data.shots[0])
     database.run("DELETE FROM shots WHERE name = ? AND state = 'begun'", shot)
     database.run("INSERT INTO shots (name, state, time, notes) VALUES (?, 'accepted', ?, ?)", shot, now(), notes)
@@ -278,7 +351,19 @@ def _cells(*arrays: Floats) -> list[float | None]:
 
 
 def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
-    """All accepted points in their order, with the name, unit and cameras of `empty`; None where there is none."""
+    """Read all accepted points, in their order.
+
+    Args:
+        database: An open one.
+        empty: A dataset without points, for its name, unit and cameras.
+
+    Returns:
+        The dataset; None where no point was accepted.
+
+    Raises:
+        ValueError: An accepted shot has no points or no views: the database is damaged. Others, such as KeyError, come
+            from rows that do not fit together; `Session` takes all of them for damage.
+    """
     of_accepted = "JOIN shots ON shots.name = shot WHERE state = 'accepted' ORDER BY shots.number,"
     points = database.rows(
         f"SELECT shot, point, x, y, z, sd_x, sd_y, sd_z, more FROM points {of_accepted} points.number"

@@ -37,9 +37,16 @@ class Look:
 def reject_implausible(
     looks: tuple[Look, ...], where: Floats, where_sd: Floats, calibration: Calibration | None
 ) -> tuple[Look, ...]:
-    """The looks without detections far from where a ball at `where` (3,), known to where_sd, must be: another thing.
+    """Leave out what is too far from where the ball must be, because it is something else.
 
-    Of several things that might be the ball, the nearest to that place counts.
+    Args:
+        looks: One for each camera of the calibration, in its order.
+        where: (3,) where the ball is, in the calibration's world frame and unit.
+        where_sd: (3,) standard uncertainty of `where` along x, y, z.
+        calibration: Says where each camera must see the ball; where it predicts no pixels, all looks stay as they are.
+
+    Returns:
+        The looks; of several things that might be the ball the nearest, and where it is too far, nothing and a reason.
     """
     if not isinstance(calibration, PredictsPixels):
         return looks

@@ -25,30 +25,49 @@ _LONGEST = 200  # bytes of a name that becomes a file's; most disks take 255, an
 
 
 def is_session(folder: Path) -> bool:
-    """Whether a session was begun in the folder. The file is not opened: that could cost its lock (`Database`)."""
+    """Whether a session was begun in the folder. The file is not opened: that could cost its lock (`Database`).
+
+    Args:
+        folder: Any path; it need not exist.
+    """
     file = Path(folder) / DATABASE
     return file.is_file() and file.stat().st_size > 0
 
 
 def writing_into(folder: Path) -> AbstractContextManager[None]:
-    """What the system refuses, as an ImplicamError."""
+    """A context in which what the system refuses becomes an ImplicamError.
+
+    Args:
+        folder: Named in the error.
+    """
     return failing_to_write(f"into {folder}", "the permissions and the free space")
 
 
 def stale_tables(folder: Path, data: Dataset | None, empty: Dataset) -> dict[str, str]:
-    """The dataset's files that say something else than `data`, as they should be: name -> text.
+    """The dataset's files that say something else than the data, as they should be.
 
-    empty: the same dataset without points, for which there is dataset.toml only.
+    Args:
+        folder: Of the session.
+        data: The accepted points; None where there is none, and then only dataset.toml should be there.
+        empty: The same dataset without points.
+
+    Returns:
+        File name -> text.
     """
     files = folder_files(data) if data else {DESCRIPTION: description_text(empty)}
     return {name: text for name, text in files.items() if _content(folder / name) != text.encode()}
 
 
 def write_beside(beside: ExitStack, folder: Path, files: Mapping[str, str]) -> None:
-    """Files that `beside` renames when it closes, the last first.
+    """Write files under other names first; `beside` renames them when it closes, the last first.
 
     A new point so gets its position before its views, and an undone one loses them in the other order: who reads
     between the two finds a dataset at any time.
+
+    Args:
+        beside: An open stack of contexts; an error inside it leaves the old files.
+        folder: Of the session.
+        files: File name -> text.
     """
     for name, text in files.items():
         temporary = beside.enter_context(replacing(folder / name))
@@ -56,7 +75,13 @@ def write_beside(beside: ExitStack, folder: Path, files: Mapping[str, str]) -> N
 
 
 def rewrite_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
-    """Make the dataset's files say what `data` says, after points were taken away."""
+    """Make the dataset's files say what the data say, after points were taken away.
+
+    Args:
+        folder: Of the session.
+        data: The accepted points; None where there is none.
+        empty: The same dataset without points.
+    """
     with ExitStack() as beside:
         write_beside(beside, folder, dict(reversed(stale_tables(folder, data, empty).items())))
     if data is None:
@@ -65,7 +90,13 @@ def rewrite_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
 
 
 def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
-    """Copy a table that someone changed by hand to undone/ before it is written again."""
+    """Copy a table that someone changed by hand to undone/ before it is written again.
+
+    Args:
+        folder: Of the session.
+        data: The accepted points; None where there is none.
+        empty: The same dataset without points.
+    """
     right = stale_tables(folder, data, empty)
     if data is None:  # these two will be removed
         right |= {VIEWS: "", POINTS: ""}
@@ -76,14 +107,25 @@ def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> No
 
 
 def remove_partial(folder: Path, cameras: Sequence[Camera]) -> None:
-    """Delete half-written files, which nobody else can be writing."""
+    """Delete half-written files that a killed process left.
+
+    Args:
+        folder: Of the session, which must be locked: nobody else is writing then.
+        cameras: The folders of their pictures are cleaned as well.
+    """
     for place in [folder, *(folder / IMAGES / camera.name for camera in cameras)]:
         for partial in list(place.glob(_PARTIAL)):
             partial.unlink()
 
 
 def write_pictures(folder: Path, shot: str, pictures: Mapping[str, Grey]) -> None:
-    """images/<camera>/<shot>.png each, whole, and on the disk with its name."""
+    """Write images/<camera>/<shot>.png, whole, and flushed to the disk together with its name.
+
+    Args:
+        folder: Of the session.
+        shot: Its name.
+        pictures: Camera name -> grey (height, width), from 0 to 1, or uint8.
+    """
     for camera, picture in pictures.items():
         path = folder / IMAGES / camera / f"{shot}.png"
         write_picture(path, picture, bits=_bits(picture))
@@ -92,7 +134,13 @@ def write_pictures(folder: Path, shot: str, pictures: Mapping[str, Grey]) -> Non
 
 
 def set_pictures_aside(folder: Path, shots: Iterable[str], cameras: Sequence[Camera]) -> None:
-    """Move the pictures of some shots to undone/."""
+    """Move the pictures of some shots to undone/.
+
+    Args:
+        folder: Of the session.
+        shots: Their names.
+        cameras: All of the session.
+    """
     for shot in shots:
         for camera in cameras:
             picture = folder / IMAGES / camera.name / f"{shot}.png"
@@ -101,7 +149,15 @@ def set_pictures_aside(folder: Path, shots: Iterable[str], cameras: Sequence[Cam
 
 
 def make_folder(folder: Path) -> None:
-    """UsageError where the folder holds something; a session.db that no table was made in is what a kill left."""
+    """Make a folder for a new session; a session.db without tables, as a kill leaves it, counts as nothing.
+
+    Args:
+        folder: Its parents are made as well.
+
+    Raises:
+        UsageError: It holds a session or something else.
+        ImplicamError: It cannot be made or read.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         found = sorted({entry.name for entry in folder.iterdir()} - {DATABASE, f"{DATABASE}-journal"})
@@ -120,7 +176,15 @@ def make_folder(folder: Path) -> None:
 
 
 def check_file_name(name: str, what: str) -> None:
-    """DatasetError where no file or folder can have this name on every disk."""
+    """Refuse a name that cannot name a file or folder on every disk.
+
+    Args:
+        name: Of a camera or a shot.
+        what: "camera" or "shot", for the error.
+
+    Raises:
+        DatasetError: It has a slash or a backslash, begins with a dot, or is too long.
+    """
     if set("/\\") & set(name) or name.startswith(".") or len(name.encode()) > _LONGEST:
         raise DatasetError(
             f"the {what} name {name[:60]!r} cannot name a file.",
@@ -130,7 +194,16 @@ def check_file_name(name: str, what: str) -> None:
 
 
 def check_pictures(pictures: Mapping[str, Grey], cameras: Sequence[Camera]) -> None:
-    """DatasetError for an unknown camera, ImageError for what is no whole grey picture of it."""
+    """Refuse pictures that do not fit the session's cameras.
+
+    Args:
+        pictures: Camera name -> grey (height, width).
+        cameras: All of the session.
+
+    Raises:
+        DatasetError: There is no such camera.
+        ImageError: A picture is not grey and finite, or not as large as the camera's.
+    """
     known = {camera.name: camera for camera in cameras}
     for name, picture in pictures.items():
         if name not in known:
@@ -173,7 +246,11 @@ def _free(path: Path) -> Path:
 
 
 def flush_folder(folder: Path) -> None:
-    """Put the names in it on the disk, where system and disk flush folders; Windows and some shares do without."""
+    """Flush the file names in a folder to the disk, where the system can; Windows and some network shares cannot.
+
+    Args:
+        folder: Any; errors are ignored.
+    """
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

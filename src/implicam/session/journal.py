@@ -83,7 +83,20 @@ class Session:
     def create(
         cls, folder: Path, *, name: str, length_unit: str, cameras: Sequence[Camera], settings: Mapping[str, Any]
     ) -> Session:
-        """Begin a session in a new or empty folder; UsageError where something else is in it."""
+        """Begin a session in a new or empty folder.
+
+        Args:
+            folder: Made where it does not exist.
+            name: Of the session and its dataset.
+            length_unit: That of all positions.
+            cameras: In their order; the folders of their pictures are named after them.
+            settings: Plain values, kept as JSON.
+
+        Raises:
+            UsageError: Something else is in the folder, or a setting has no form in JSON.
+            DatasetError: A name, the unit or a camera cannot stand in a dataset.
+            ImplicamError: The folder cannot be written.
+        """
         folder = Path(folder).absolute()
         description_text(_without_points(name, length_unit, cameras))  # refuses what a dataset cannot hold
         for camera in cameras:
@@ -99,8 +112,13 @@ class Session:
     def open(cls, folder: Path) -> Session:
         """Continue a session with exactly the points that were accepted.
 
-        UsageError where it is open elsewhere; DatasetError where there is none, or where its database is damaged,
-        another program's, or a newer version's; ImplicamError where the folder cannot be written.
+        Args:
+            folder: Of the session.
+
+        Raises:
+            UsageError: It is open elsewhere.
+            DatasetError: There is none, or its database is damaged, another program's, or a newer version's.
+            ImplicamError: The folder cannot be written.
         """
         folder = Path(folder).absolute()
         return cls._ready(folder, Database.open(folder / DATABASE))
@@ -139,12 +157,19 @@ class Session:
             return dict(self._settings)
 
     def accept(self, point: Dataset, *, pictures: Mapping[str, Grey] = {}, notes: Mapping[str, Any] = {}) -> None:
-        """Add one shot, on disk when this returns; where it raises, nothing was added.
+        """Add one shot; it is on disk when this returns, and where it raises, nothing was added.
 
-        point: the known positions and the views of all cameras, one point of a ball or several of a board, of one
-        shot whose name is new. Its numbers are kept bit by bit, its columns too; its dataset name is not.
-        pictures: grey (height, width) from 0 to 1, by camera; written as 16 bits where 8 would lose something.
-        DatasetError, ImageError or UsageError for what does not fit the session; ImplicamError for a full disk.
+        Args:
+            point: The known positions and the views of all cameras, one point of a ball or several of a board, of one
+                shot whose name is new. Its numbers are kept bit by bit, its columns too; its dataset name is not.
+            pictures: Camera name -> grey (height, width) from 0 to 1; 16 bits are written where 8 would lose something.
+            notes: Plain values, kept as JSON beside the shot.
+
+        Raises:
+            DatasetError: The shot does not fit the session.
+            ImageError: A picture is not grey, or not as large as the camera's.
+            UsageError: A note has no form in JSON, or the session is closed.
+            ImplicamError: The disk is full or cannot be written.
         """
         with self._lock:
             shot = self._checked(point)
@@ -179,7 +204,15 @@ class Session:
             return last
 
     def skip(self, xyz: ArrayLike, reason: str) -> None:
-        """Keep that a target at xyz (3,) was not measured, and why."""
+        """Keep that a target was not measured, and why.
+
+        Args:
+            xyz: (3,) where it was to be, in the session's length unit, world frame.
+            reason: In words.
+
+        Raises:
+            UsageError: xyz is not three finite numbers.
+        """
         target = np.asarray(xyz, dtype=np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
             raise UsageError(f"a skipped target {str(target)[:80]} is no position.", fix="give x, y and z, finite")
@@ -188,14 +221,30 @@ class Session:
             self._database.run(sql, *target.tolist(), reason, now())
 
     def log(self, what: str, /, **more: Any) -> None:
-        """Keep an event with its time."""
+        """Keep an event with its time.
+
+        Args:
+            what: In a few words.
+            more: Plain values, kept as JSON.
+
+        Raises:
+            UsageError: A value has no form in JSON.
+        """
         text = json_text(more, f"the event {what!r}")
         _LOG.info("%s %s", what, text)
         with self._lock, self._database.transaction():
             self._database.run("INSERT INTO events (time, what, more) VALUES (?, ?, ?)", now(), what, text)
 
     def set(self, key: str, value: Any) -> None:
-        """Change a setting, on disk when this returns."""
+        """Change a setting; it is on disk when this returns.
+
+        Args:
+            key: Its name.
+            value: A plain value, kept as JSON.
+
+        Raises:
+            UsageError: The value has no form in JSON.
+        """
         text = json_text(value, f"the setting {key!r}")
         with self._lock:
             with self._database.transaction():
