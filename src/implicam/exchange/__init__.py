@@ -45,9 +45,20 @@ FORMATS = {
 
 
 def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
-    """Write the rig in a format of `FORMATS`, whole or not at all; the notes say what the format loses.
+    """Write the rig in another program's format, whole or not at all.
 
-    UsageError for a format that does not exist; DatasetError where it cannot hold the rig, with another that can.
+    Args:
+        rig: The cameras.
+        to: A name of `FORMATS`.
+        path: The file, of COLMAP the folder.
+
+    Returns:
+        Notes, each a sentence on what the format lost or cost; none where it holds everything.
+
+    Raises:
+        UsageError: There is no such format.
+        DatasetError: The format cannot hold the rig; the error names one that can.
+        ImplicamError: The file cannot be written.
     """
     form = _format(to)
     for camera in rig.cameras:
@@ -61,10 +72,19 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
 
 
 def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | None = None) -> Rig:
-    """Read cameras from a file or folder; its format is recognised by its content where `kind` does not name it.
+    """Read cameras from another program's file or folder.
 
-    unit: the length unit, for a file that does not say it; DatasetError where the file says another. The rig's notes
-    say what its reader should know.
+    Args:
+        path: The file or folder.
+        kind: A name of `FORMATS`; None to recognise the format by the content.
+        unit: The length unit, for a file that does not say it.
+
+    Returns:
+        The cameras; the rig's notes say what its reader should know.
+
+    Raises:
+        UsageError: There is no such format.
+        DatasetError: The file cannot be read, is not recognised, has a mistake, or states another unit.
     """
     path = Path(path)
     try:

@@ -42,7 +42,19 @@ NOT_CAMERAS = ("metadata", "capture_volume", "charuco", "checkerboard")
 
 
 def write_aniposelib(rig: Rig, path: Path) -> list[str]:
-    """Write in the rig's own unit; everything is kept."""
+    """Write the rig for aniposelib, in the rig's own unit.
+
+    Args:
+        rig: The cameras, all with image sizes.
+        path: The TOML file.
+
+    Returns:
+        No notes: everything is kept.
+
+    Raises:
+        DatasetError: An image size is not known.
+        ImplicamError: The file cannot be written.
+    """
     width = len(str(len(rig.cameras) - 1))  # aniposelib sorts the tables as text
     tables = {f"cam_{i:0{width}}": _table(camera, camera.lens) for i, camera in enumerate(rig.cameras)}
     metadata = {"adjusted": False, "error": 0.0, "length_unit": rig.length_unit}
@@ -51,7 +63,19 @@ def write_aniposelib(rig: Rig, path: Path) -> list[str]:
 
 
 def write_pose2sim(rig: Rig, path: Path) -> list[str]:
-    """Write in metres; a lens with more than k1, k2, p1, p2 is refitted, and the cost is in the notes."""
+    """Write the rig for Pose2Sim, in metres; a lens with more than k1, k2, p1, p2 is refitted.
+
+    Args:
+        rig: The cameras, all with image sizes, in a known unit.
+        path: The TOML file.
+
+    Returns:
+        Notes on the unit, and on what refitting a lens cost in pixels.
+
+    Raises:
+        DatasetError: A name, a lens, an image size or the unit does not fit the format.
+        ImplicamError: The file cannot be written.
+    """
     metres, notes, tables = rig.in_unit("m"), [], {}
     if rig.length_unit != "m":
         notes.append(f"Lengths are in metres; the rig's unit was {rig.length_unit}.")
@@ -81,19 +105,40 @@ def _table(camera: ExplicitCamera, lens: Lens) -> dict[str, Any]:
 
 
 def read_aniposelib(path: Path) -> Rig:
-    """Read a file of aniposelib or Anipose; its unit is known only where implicam wrote it."""
+    """Read a file of aniposelib or Anipose; its unit is known only where implicam wrote it.
+
+    Args:
+        path: The TOML file.
+
+    Raises:
+        DatasetError: The file has a mistake; the error names the key.
+    """
     table = read_toml(path)
     metadata = as_table(table.get("metadata", {}), f"{path}: metadata")
     return _rig(table, path, text_entry(metadata.get("length_unit", UNKNOWN), f"{path}: metadata.length_unit"))
 
 
 def read_pose2sim(path: Path) -> Rig:
-    """Read a Calib.toml of Pose2Sim: metres."""
+    """Read a Calib.toml of Pose2Sim, in metres.
+
+    Args:
+        path: The TOML file.
+
+    Raises:
+        DatasetError: The file has a mistake; the error names the key.
+    """
     return _rig(read_toml(path), path, "m")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file."""
+    """Read a TOML file as a dict.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: There is no such file, or it is no TOML.
+    """
     try:
         return parse_toml(read_text(path))
     except ValueError as error:
@@ -103,7 +148,14 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def camera_tables(table: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The tables that are cameras."""
+    """Those of the file's tables that are cameras.
+
+    Args:
+        table: The whole file, as `read_toml` gives it.
+
+    Returns:
+        Key -> table; what `NOT_CAMERAS` names is left out.
+    """
     return {key: value for key, value in table.items() if isinstance(value, dict) and key not in NOT_CAMERAS}
 
 

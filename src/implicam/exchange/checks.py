@@ -23,7 +23,16 @@ ROUNDED, WRONG = 1e-9, 1e-3
 
 
 def read_text(path: Path, most: int = MAX_BYTES) -> str:
-    """The text of a file of cameras."""
+    """Read the text of a file of cameras.
+
+    Args:
+        path: The file.
+        most: Bytes that it may have.
+
+    Raises:
+        DatasetError: There is no such file, it is too long, or it is no UTF-8 text.
+        OSError: The system refuses to read it; `import_cameras` turns this into a DatasetError.
+    """
     if not path.is_file():
         state = "is a folder, not a file" if path.is_dir() else "does not exist"
         raise DatasetError(f"{path} {state}.", fix="give the file that the other program wrote")
@@ -47,9 +56,16 @@ def read_text(path: Path, most: int = MAX_BYTES) -> str:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file as a dict, in which every value is text, a list or a dict; OpenCV's matrices are dicts.
+    """Read a YAML file as a dict, in which every value is text, a list or a dict; OpenCV's matrices are dicts.
 
     Tags, merges and types are not looked at: nothing in the file is run, and a few hundred bytes cannot unfold.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: There is no such file, or it is no YAML with a table at its top.
+        MissingExtraError: PyYAML is not installed.
     """
     text = read_text(path)
     yaml = import_extra("yaml", "exchange", "reading YAML")
@@ -70,14 +86,30 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def as_table(value: object, place: str) -> dict[str, Any]:
-    """A mapping with text keys."""
+    """Check that a value is a mapping with text keys.
+
+    Args:
+        value: From a file.
+        place: Where it stands, for the error.
+
+    Raises:
+        DatasetError: It is something else.
+    """
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
         raise DatasetError(f"{place}: {shown(value)} is no table of named values.", fix="export the file again")
     return value
 
 
 def as_list(value: object, place: str) -> list[Any]:
-    """A list that is not empty and not absurdly long."""
+    """Check that a value is a list of 1 to `MAX_CAMERAS` entries.
+
+    Args:
+        value: From a file.
+        place: Where it stands, for the error.
+
+    Raises:
+        DatasetError: It is something else.
+    """
     if not isinstance(value, list) or not 0 < len(value) <= MAX_CAMERAS:
         raise DatasetError(
             f"{place}: {shown(value)} is no list of cameras.", fix=f"give from 1 to {MAX_CAMERAS} cameras"
@@ -86,7 +118,16 @@ def as_list(value: object, place: str) -> list[Any]:
 
 
 def entry(table: Mapping[str, Any], key: str, place: str) -> Any:
-    """A value that must be there."""
+    """A value that must be in a table.
+
+    Args:
+        table: From a file.
+        key: Of the value.
+        place: Where the table stands, for the error.
+
+    Raises:
+        DatasetError: It is missing.
+    """
     if key not in table:
         raise DatasetError(
             f"{place}: {key!r} is missing{did_you_mean(key, table)}.",
@@ -96,14 +137,30 @@ def entry(table: Mapping[str, Any], key: str, place: str) -> Any:
 
 
 def text_entry(value: object, place: str) -> str:
-    """A text."""
+    """Check that a value is text.
+
+    Args:
+        value: From a file.
+        place: Where it stands, for the error.
+
+    Raises:
+        DatasetError: It is something else.
+    """
     if not isinstance(value, str):
         raise DatasetError(f"{place} = {shown(value)} must be text.", fix="write it in quotes")
     return value
 
 
 def whole(value: object, place: str) -> int:
-    """A whole number, which some programs write as 1280.0."""
+    """Read a whole number, which some programs write as 1280.0.
+
+    Args:
+        value: A number, or text.
+        place: Where it stands, for the error.
+
+    Raises:
+        DatasetError: It is no whole number, or is too large to be exact.
+    """
     number = _number(value, place)
     if not (number.is_integer() and abs(number) < MAX_WHOLE):
         raise DatasetError(f"{place} = {shown(value)} must be a whole number.", fix="correct the value")
@@ -111,16 +168,35 @@ def whole(value: object, place: str) -> int:
 
 
 def image_size(value: object, place: str) -> tuple[int, int]:
-    """Width and height from a pair."""
+    """Read width and height in pixels from a pair.
+
+    Args:
+        value: A list of two whole numbers.
+        place: Where it stands, for the error.
+
+    Raises:
+        DatasetError: It is something else.
+    """
     if not isinstance(value, list | tuple) or len(value) != 2:
         raise DatasetError(f"{place} = {shown(value)} must be [width, height] in pixels.", fix="correct the value")
     return whole(value[0], f"{place}[0]"), whole(value[1], f"{place}[1]")
 
 
 def numbers(value: object, shape: tuple[int, ...], place: str) -> Floats:
-    """Finite numbers as an array of this shape; of a vector, -1 is any length up to 14.
+    """Read finite numbers as an array.
 
     The lengths are checked on the way down, so that a file whose lists repeat each other cannot grow without end.
+
+    Args:
+        value: Lists in lists, of numbers or text.
+        shape: That of the array; of a vector, -1 is any length up to `MAX_COEFFICIENTS`.
+        place: Where it stands, for the error.
+
+    Returns:
+        float64 of this shape.
+
+    Raises:
+        DatasetError: The shape is another, or a number is none or not finite.
     """
     return np.array(_numbers(value, shape, place), dtype=np.float64)
 
@@ -151,7 +227,18 @@ def _number(value: object, place: str) -> float:
 
 
 def rotation_matrix(matrix: Floats, place: str) -> Floats:
-    """A rotation (3, 3) that may have been rounded to a few digits; DatasetError for what is none."""
+    """Check a rotation matrix, which may have been rounded to a few digits.
+
+    Args:
+        matrix: (3, 3).
+        place: Where it stands, for the error.
+
+    Returns:
+        (3, 3); orthogonal to rounding where it was off by `ROUNDED` or more.
+
+    Raises:
+        DatasetError: It is no rotation, or it mirrors.
+    """
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if not off < WRONG or np.linalg.det(matrix) < 0:
         mirror = off < WRONG
@@ -167,7 +254,15 @@ def rotation_matrix(matrix: Floats, place: str) -> Floats:
 
 
 def pose_from_matrix(value: object, place: str) -> Pose:
-    """A pose from a (4, 4) matrix."""
+    """Read a pose from a homogeneous matrix.
+
+    Args:
+        value: (4, 4), lists in lists.
+        place: Where it stands, for the error.
+
+    Raises:
+        DatasetError: It is no such matrix.
+    """
     matrix = numbers(value, (4, 4), place)
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise DatasetError(f"{place}: the last row must be 0, 0, 0, 1.", fix="correct the value")
@@ -175,7 +270,17 @@ def pose_from_matrix(value: object, place: str) -> Pose:
 
 
 def lens_from_matrix(matrix: Floats, coefficients: Sequence[float], *, fisheye: bool, place: str) -> Lens:
-    """A lens from OpenCV's camera matrix (3, 3) and distortion coefficients, in OpenCV's order."""
+    """Make a lens from OpenCV's camera matrix and distortion coefficients.
+
+    Args:
+        matrix: (3, 3), in pixels.
+        coefficients: In OpenCV's order, see `lens_from_numbers`.
+        fisheye: Whether they are those of cv2.fisheye.
+        place: Where they stand, for the error.
+
+    Raises:
+        DatasetError: The matrix has a skew, or there is no such lens here.
+    """
     skew = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1)
     if any(skew):
         raise DatasetError(
@@ -187,7 +292,17 @@ def lens_from_matrix(matrix: Floats, coefficients: Sequence[float], *, fisheye: 
 
 
 def lens_from_numbers(linear: Sequence[float], coefficients: Sequence[float], fisheye: bool, place: str) -> Lens:
-    """A lens from (fx, fy, cx, cy) and OpenCV's distortion coefficients: 4 for fisheye, else 0, 4, 5 or more."""
+    """Make a lens from focal lengths, principal point and OpenCV's distortion coefficients.
+
+    Args:
+        linear: fx, fy, cx, cy in pixels.
+        coefficients: k1, k2, p1, p2, k3 or a part of them; of a fisheye k1, k2, k3, k4. Any beyond k3 must be zero.
+        fisheye: Whether they are those of cv2.fisheye.
+        place: Where they stand, for the error.
+
+    Raises:
+        DatasetError: Their number is wrong, or the lens model has more terms than ours.
+    """
     given = [float(k) for k in coefficients]
     counts = (4,) if fisheye else (0, 4, 5, 8, 12, 14)
     if len(given) not in counts:
@@ -210,5 +325,9 @@ def lens_from_numbers(linear: Sequence[float], coefficients: Sequence[float], fi
 
 
 def shown(value: object) -> str:
-    """A value in an error message: short, whatever it is."""
+    """A value as an error message shows it, at most 80 characters.
+
+    Args:
+        value: Anything.
+    """
     return reprlib.repr(value)[:80]

@@ -60,7 +60,19 @@ FULL_OPENCV and OPENCV_FISHEYE."""
 
 
 def write(rig: Rig, path: Path) -> list[str]:
-    """Write the folder, in the rig's own unit; an earlier model in it is replaced, anything else is not touched."""
+    """Write the folder, in the rig's own unit; an earlier model in it is replaced, anything else is not touched.
+
+    Args:
+        rig: The cameras, all with image sizes.
+        path: The folder.
+
+    Returns:
+        Notes on names and units, which COLMAP does not have.
+
+    Raises:
+        DatasetError: The folder holds something else, two names become the same, or an image size is not known.
+        ImplicamError: The folder cannot be written.
+    """
     others = {entry.name for entry in path.iterdir()} - {CAMERAS, IMAGES, POINTS} if path.is_dir() else set()
     if others:
         raise DatasetError(
@@ -112,7 +124,14 @@ def _image_names(rig: Rig) -> tuple[list[str], list[str]]:
 
 
 def read(path: Path) -> Rig:
-    """Read a folder with cameras.txt and images.txt; each image becomes a camera, named after it."""
+    """Read a folder with cameras.txt and images.txt; each image becomes a camera, named after it.
+
+    Args:
+        path: The folder, or one of its files.
+
+    Raises:
+        DatasetError: It is no such folder, or a file has a mistake; the error names the line.
+    """
     if path.is_file() and path.name in (CAMERAS, IMAGES, POINTS):
         path = path.parent
     if not (path / CAMERAS).is_file() or not (path / IMAGES).is_file():

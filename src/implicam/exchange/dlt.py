@@ -32,10 +32,22 @@ COEFFICIENTS = 11
 
 
 def write(rig: Rig, path: Path, points: Floats | None = None) -> list[str]:
-    """Write coefficients and their description, in the rig's own unit; what a lens costs is in the notes.
+    """Write coefficients and their description, in the rig's own unit.
 
-    A pinhole is exact. A lens with distortion is replaced by the nearest transformation: over the whole image, or over
-    points (n, 3) of the world, for which the centre of projection may move too.
+    A pinhole is exact; a lens with distortion is replaced by the nearest transformation.
+
+    Args:
+        rig: The cameras, all with image sizes.
+        path: The CSV file; its description is written beside it, as NAME.csv.toml.
+        points: (n, 3) in the rig's world frame and unit, at which it is to be near, and for which the centre of
+            projection may move too; None for the whole image.
+
+    Returns:
+        Notes on what a lens cost in pixels.
+
+    Raises:
+        DatasetError: A camera has no such form, sees fewer than 12 of the points, or its image size is not known.
+        ImplicamError: The files cannot be written.
     """
     columns, notes = [], []
     for camera in rig.cameras:
@@ -52,7 +64,18 @@ def write(rig: Rig, path: Path, points: Floats | None = None) -> list[str]:
 
 
 def coefficients(camera: ExplicitCamera, points: Floats | None = None) -> tuple[Floats, Cost | None]:
-    """L1 ... L11 for pixels from the upper left, and what the format costs; None where nothing (a pinhole)."""
+    """The coefficients of one camera, for pixels from the upper left, and what the format costs.
+
+    Args:
+        camera: With its image size.
+        points: (n, 3) at which it is to be near, see `write`; None for the whole image.
+
+    Returns:
+        (11,) L1 ... L11; and the cost, None where there is none (a pinhole).
+
+    Raises:
+        DatasetError: The camera has no such form, or sees fewer than 12 of the points.
+    """
     p, cost = nearest_matrix(camera, points)
     p = np.linalg.inv(_ours_from_dlt("upper-left", camera.size[1])) @ p
     if abs(p[2, 3]) < 1e-9 * np.abs(p[2]).max():
@@ -65,7 +88,17 @@ def coefficients(camera: ExplicitCamera, points: Floats | None = None) -> tuple[
 
 
 def read(path: Path) -> Rig:
-    """Read coefficients and the description beside them; a skew, which no camera has, is left out and noted."""
+    """Read coefficients and the description beside them; a skew, which no camera has, is left out and noted.
+
+    Args:
+        path: The CSV file.
+
+    Returns:
+        Cameras without distortion; the rig's notes say what leaving out a skew cost.
+
+    Raises:
+        DatasetError: There is no description, or one of the files has a mistake.
+    """
     columns = _columns(path)
     unit, origin, tables = _described(path, len(columns))
     cameras, notes = [], []

@@ -39,7 +39,12 @@ class Cost:
 
     @classmethod
     def between(cls, a: Floats, b: Floats) -> Cost:
-        """Of pixels (n, 2) and (n, 2)."""
+        """The distance between two sets of pixels.
+
+        Args:
+            a: (n, 2).
+            b: (n, 2).
+        """
         distance = np.hypot(*(a - b).T)
         return cls(float(np.sqrt(np.mean(distance**2))), float(distance.max()))
 
@@ -48,15 +53,33 @@ class Cost:
 
 
 def pixel_lattice(camera: ExplicitCamera) -> Floats:
-    """Pixels (n, 2) that cover the image from edge to edge."""
+    """Pixels that cover the image from edge to edge.
+
+    Args:
+        camera: With its image size.
+
+    Returns:
+        (n, 2).
+
+    Raises:
+        DatasetError: The image size is not known.
+    """
     u, v = (np.linspace(-0.5, size - 0.5, LATTICE) for size in camera.size)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 def image_rays(camera: ExplicitCamera, form: str) -> tuple[Floats, Floats]:
-    """Rays (n, 3) in the camera frame with z = 1, and their pixels (n, 2), over the image.
+    """The rays of pixels that cover the image; pixels without a ray are left out.
 
-    DatasetError where the camera looks sideways or backwards: `form`, what is wanted of it, holds a plane only.
+    Args:
+        camera: With its image size.
+        form: What is wanted of it, for the error.
+
+    Returns:
+        Rays (n, 3) in the camera frame with z = 1; and their pixels (n, 2).
+
+    Raises:
+        DatasetError: The camera looks sideways or backwards somewhere, and `form` holds a plane only.
     """
     uv = pixel_lattice(camera)
     rays, valid = camera.lens.ray_from_pixel(uv)
@@ -73,9 +96,16 @@ def image_rays(camera: ExplicitCamera, form: str) -> tuple[Floats, Floats]:
 
 
 def four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None]:
-    """The lens with k1, k2, p1, p2 alone that is nearest over the image, and the cost; None where it is the same lens.
+    """The lens with k1, k2, p1, p2 alone that is nearest over the image, by Gauss-Newton on all eight parameters.
 
-    Gauss-Newton on all eight parameters. DatasetError where it is off by more than `TOLERABLE` pixels somewhere.
+    Args:
+        camera: With its image size.
+
+    Returns:
+        The lens; and the cost, None where it is the same lens.
+
+    Raises:
+        DatasetError: It is off by more than `TOLERABLE` pixels somewhere.
     """
     lens = camera.lens
     if isinstance(lens, BrownConrady) and lens.k3 == 0:
@@ -103,17 +133,32 @@ def four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None
 
 
 def camera_matrix(camera: ExplicitCamera) -> Floats:
-    """P (3, 4), `pixel_from_world`, of the camera without its distortion."""
+    """The projection matrix of the camera without its distortion.
+
+    Args:
+        camera: Any.
+
+    Returns:
+        (3, 4) homogeneous `pixel_from_world`.
+    """
     lens, pose = camera.lens, camera.camera_from_world
     k = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
     return np.asarray(k @ np.column_stack([pose.rotation, pose.translation]), dtype=np.float64)
 
 
 def nearest_matrix(camera: ExplicitCamera, points: Floats | None = None) -> tuple[Floats, Cost | None]:
-    """P (3, 4), the direct linear transformation that comes nearest to the camera, and the cost; None for a pinhole.
+    """The direct linear transformation that comes nearest to the camera, by least squares in pixels.
 
-    Least squares in pixels. Without points: over the whole image, with the camera's centre kept, so that it holds at
-    every distance. With points (n, 3) in the world: over those in view, and the centre may move to suit them.
+    Args:
+        camera: With its image size.
+        points: (n, 3) in the world: it is fitted to those in view, and the centre may move to suit them. None: it is
+            fitted over the whole image with the camera's centre kept, so that it holds at every distance.
+
+    Returns:
+        P (3, 4), homogeneous `pixel_from_world`; and the cost, None for a pinhole.
+
+    Raises:
+        DatasetError: The camera looks sideways somewhere, or sees fewer than 12 of the points.
     """
     if not has_distortion(camera.lens):
         return camera_matrix(camera), None
@@ -164,10 +209,22 @@ def _spread(uv: Floats) -> Floats:
 
 
 def pinhole_from_matrix(name: str, size: tuple[int, int], p: Floats, place: str) -> tuple[ExplicitCamera, Cost | None]:
-    """A camera without distortion from P (3, 4), and what its skew costs; None where it has none.
+    """A camera without distortion from a projection matrix.
 
-    P is split by the RQ decomposition (Hartley & Zisserman, 6.2.4). Eleven numbers hold a skew, which no camera has:
-    the nearest camera without is taken, over the whole image.
+    The matrix is split by the RQ decomposition (Hartley & Zisserman, 6.2.4). Eleven numbers hold a skew, which no
+    camera has: the nearest camera without is taken, over the whole image.
+
+    Args:
+        name: Of the camera.
+        size: Width and height in pixels.
+        p: (3, 4) homogeneous `pixel_from_world`, of any scale and sign.
+        place: Where it stands, for the error.
+
+    Returns:
+        The camera; and what leaving out the skew costs, None where there is none.
+
+    Raises:
+        DatasetError: It is no camera.
     """
     upper, rotation = rq(p[:, :3])
     signs = np.sign(np.diag(upper))

@@ -47,7 +47,19 @@ DISTORTIONS = {"radtan": 4, "equidistant": 4, "none": 0}
 
 
 def write(rig: Rig, path: Path) -> list[str]:
-    """Write the chain in metres. A lens with k3 is refitted without, and the cost is in the notes."""
+    """Write the chain, in metres; a lens with k3 is refitted without.
+
+    Args:
+        rig: The cameras, all with image sizes, in a known unit.
+        path: The YAML file.
+
+    Returns:
+        Notes on what Kalibr does not have, and on what refitting a lens cost in pixels.
+
+    Raises:
+        DatasetError: A lens, an image size or the unit does not fit the format.
+        ImplicamError: The file cannot be written.
+    """
     rig = rig.in_unit("m")
     notes = [
         "Kalibr has no world frame: its frame is the first camera's. The keys T_cam_world and camera_name keep the "
@@ -106,7 +118,17 @@ def _number(x: float) -> str:
 
 
 def read(path: Path) -> Rig:
-    """Read a chain; the world is that of T_cam_world where every camera has it, else the first camera's frame."""
+    """Read a chain; the world is that of T_cam_world where every camera has it, else the first camera's frame.
+
+    Args:
+        path: The YAML file.
+
+    Returns:
+        The cameras, in metres.
+
+    Raises:
+        DatasetError: The file has a mistake; the error names the key.
+    """
     table = read_yaml(path)
     names = [f"cam{i}" for i in range(len(table))]
     if not names or set(names) != set(table):

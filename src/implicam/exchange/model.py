@@ -53,7 +53,14 @@ class ExplicitCamera:
         return self.width, self.height
 
     def pixel_from_world(self, xyz: Floats) -> tuple[Floats, Bools]:
-        """Pixels (n, 2) of points (n, 3) in the rig's unit; and (n,) where they exist, else NaN."""
+        """Project points into the camera.
+
+        Args:
+            xyz: (n, 3) in the rig's world frame and unit.
+
+        Returns:
+            Pixels (n, 2), NaN where there is none; and (n,) where there is one.
+        """
         return self.lens.pixel_from_camera_point(self.camera_from_world.apply(xyz))
 
 
@@ -76,7 +83,14 @@ class Rig:
                 raise DatasetError(f"camera {name!r} is there {times} times.", fix="give each a name of its own")
 
     def in_unit(self, unit: str) -> Rig:
-        """The same rig with lengths in another unit; DatasetError where one of the two is not known."""
+        """The same rig with lengths in another unit.
+
+        Args:
+            unit: For example "m".
+
+        Raises:
+            DatasetError: One of the two units is not known.
+        """
         if unit == self.length_unit:
             return self
         scale = metres_per(self.length_unit) / metres_per(unit)
@@ -87,5 +101,9 @@ class Rig:
 
 
 def has_distortion(lens: Lens) -> bool:
-    """Whether a lens is anything but a pinhole."""
+    """Whether a lens is anything but a pinhole.
+
+    Args:
+        lens: Of any family.
+    """
     return not isinstance(lens, BrownConrady) or any(astuple(lens)[4:])

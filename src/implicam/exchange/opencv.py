@@ -44,7 +44,19 @@ from implicam.lenses import Floats, KannalaBrandt
 
 
 def write(rig: Rig, path: Path) -> list[str]:
-    """Write the rig in metres; nothing is lost but the unit."""
+    """Write the rig in metres; nothing is lost but the unit.
+
+    Args:
+        rig: The cameras, all with image sizes, in a known unit.
+        path: The YAML file.
+
+    Returns:
+        A note where the unit was another.
+
+    Raises:
+        DatasetError: An image size or the unit is not known.
+        ImplicamError: The file cannot be written.
+    """
     cameras = "".join(_camera_text(camera) for camera in rig.in_unit("m").cameras)
     write_text(path, f'%YAML:1.0\n---\nlength_unit: "m"\ncameras:\n{cameras}')
     return [] if rig.length_unit == "m" else [f"Lengths are in metres; the rig's unit was {rig.length_unit}."]
@@ -73,7 +85,14 @@ def _matrix(name: str, values: Floats) -> list[str]:
 
 
 def read(path: Path) -> Rig:
-    """Read a rig; see the head of this file. DatasetError names file, key and cure."""
+    """Read a rig; the head of this file says which files.
+
+    Args:
+        path: The YAML file.
+
+    Raises:
+        DatasetError: The file has a mistake; the error names the key and the cure.
+    """
     table = read_yaml(path)
     place = str(path)
     unit = text_entry(table.get("length_unit", UNKNOWN), f"{place}: length_unit")
