@@ -91,7 +91,12 @@ class ReportData:
 
 
 def report_of(evaluation: Evaluation, title: str) -> ReportData:
-    """The report of an evaluation."""
+    """What a report says of an evaluation.
+
+    Args:
+        evaluation: As `evaluate` or `cross_validate` gives it.
+        title: Of the page.
+    """
     data = evaluation.data
     facts = (
         ("Dataset", data.name),

@@ -22,14 +22,26 @@ def write_report(path: str | Path, data: ReportData) -> None:
 
     The same data give the same bytes, as long as the versions are the same.
 
+    Args:
+        path: The file; one that is there is replaced.
+        data: What the report is about.
+
     Raises:
-        MissingExtraError: without Plotly or Jinja2.
+        MissingExtraError: Plotly or Jinja2 is not installed.
+        ImplicamError: The file cannot be written.
     """
     write_text(Path(path), page(data))
 
 
 def page(data: ReportData) -> str:
-    """The report as HTML text."""
+    """The report as HTML text.
+
+    Args:
+        data: What the report is about.
+
+    Raises:
+        MissingExtraError: Plotly or Jinja2 is not installed.
+    """
     return render(
         __package__,
         "page.html",

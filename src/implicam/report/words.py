@@ -21,21 +21,33 @@ VERDICTS = {
 
 
 def per_cent(share: Estimate) -> str:
-    """`94.1 % (91.2–96.3)`, the interval in brackets."""
+    """A share with its interval in brackets: `94.1 % (91.2–96.3)`.
+
+    Args:
+        share: From 0 to 1, with its interval; a dash where it is not finite.
+    """
     if not math.isfinite(share.value):
         return "–"
     return f"{percent(share.value, 1)} ({100 * share.low:.1f}–{100 * share.high:.1f})"
 
 
 def interval(value: Estimate) -> str:
-    """`2.94 (2.71–3.19)`, without brackets where there is no interval."""
+    """A value with its interval: `2.94 (2.71–3.19)`, without brackets where there is none.
+
+    Args:
+        value: In any unit.
+    """
     if not math.isfinite(value.low):
         return number(value.value)
     return f"{number(value.value)} ({number(value.low)}–{number(value.high)})"
 
 
 def headline(data: ReportData) -> str:
-    """The result in one sentence."""
+    """The result in one sentence.
+
+    Args:
+        data: What the report is about.
+    """
     unit, n = data.unit, int(data.measurement.measured.sum())
     if n == 0:
         return "No point could be measured."
@@ -51,7 +63,14 @@ def headline(data: ReportData) -> str:
 
 
 def verdict(data: ReportData) -> tuple[str, str, str]:
-    """Title, explanation and tone of what the error bars are worth."""
+    """What the error bars are worth.
+
+    Args:
+        data: What the report is about.
+
+    Returns:
+        Title, explanation, and tone: "good", "bad", "careful" or "unknown".
+    """
     if data.coverage is None:
         return (
             "The error bars were not checked here.",
@@ -65,7 +84,14 @@ def verdict(data: ReportData) -> tuple[str, str, str]:
 
 
 def tiles(data: ReportData) -> list[tuple[str, str, str]]:
-    """Label, value and explanation of the key numbers."""
+    """The key numbers.
+
+    Args:
+        data: What the report is about.
+
+    Returns:
+        Label, value and explanation of each.
+    """
     unit, m = data.unit, data.measurement
     measured = int(m.measured.sum())
     count = ("points measured", f"{measured:,} of {len(m):,}", "the others are listed below, with the reason")
