@@ -45,7 +45,11 @@ class Copies:
 
 
 def copies_of(data: Dataset) -> Copies:
-    """Which points and cameras are copies; points only where their positions are known."""
+    """Which points and cameras are copies of others; points only where their positions are known.
+
+    Args:
+        data: n points, C cameras.
+    """
     n, cameras = len(data), len(data.cameras)
     camera_of = _camera_of(data.observations)
     if data.known is None:
@@ -78,9 +82,11 @@ def _same(a: Floats, b: Floats, both: NDArray[np.bool_]) -> bool:
 
 
 def without_copies(data: Dataset, *, cameras_too: bool = False) -> Dataset:
-    """The dataset with each point and camera once: a copied camera has no views, or with `cameras_too` is left out.
+    """The dataset with each point and camera once; the same dataset where nothing is a copy.
 
-    The same dataset where nothing is a copy.
+    Args:
+        data: The dataset.
+        cameras_too: Whether a copied camera is left out; else it stays, without views.
     """
     copies = copies_of(data)
     if copies.points.any():
@@ -96,7 +102,14 @@ def without_copies(data: Dataset, *, cameras_too: bool = False) -> Dataset:
 
 
 def copy_notes(data: Dataset) -> list[str]:
-    """What is there more than once, in words; empty where nothing is."""
+    """What occurs more than once, in sentences for the user.
+
+    Args:
+        data: The dataset.
+
+    Returns:
+        One note for each copied camera, then one for all copied points; none where nothing is a copy.
+    """
     copies, notes = copies_of(data), list[str]()
     names = data.observations.camera_names
     notes += [f"{names[c]} is not used: {why_no_camera(data, int(c), copies)}." for c in np.flatnonzero(copies.cameras)]
@@ -112,6 +125,12 @@ def copy_notes(data: Dataset) -> list[str]:
 
 
 def why_no_camera(data: Dataset, c: int, copies: Copies) -> str:
-    """Of a copied camera, what it is."""
+    """Why a copied camera is not used, in words.
+
+    Args:
+        data: The dataset.
+        c: Number of the camera.
+        copies: Of the same dataset.
+    """
     original = data.observations.camera_names[copies.camera_of[c]]
     return f"its pixels are those of {original} to the last bit, so the two are one camera"

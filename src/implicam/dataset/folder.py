@@ -51,7 +51,14 @@ _VIEW_NUMBERS = {**dict.fromkeys("uv", _PIXEL_NUMBER), **dict.fromkeys(SD_VIEW, 
 
 
 def read_folder(path: Path) -> Dataset:
-    """Read a dataset folder; every mistake is a DatasetError naming file, line, value and cure."""
+    """Read a dataset folder, without looking for marks of missing views.
+
+    Args:
+        path: The folder.
+
+    Raises:
+        DatasetError: For the first mistake; names file, line, value and cure.
+    """
     name, unit, cameras, extra = read_description(path)
     table = read_known(path)
     observations, missing = _read_observations(path, cameras, table and table[0])
@@ -61,18 +68,48 @@ def read_folder(path: Path) -> Dataset:
 
 
 def read_description(path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
-    """What dataset.toml in the folder says: name, length unit, cameras, and its further entries."""
+    """Read what dataset.toml says.
+
+    Args:
+        path: The folder.
+
+    Returns:
+        Name, length unit, cameras, and the further entries as plain values.
+
+    Raises:
+        DatasetError: The file is missing or has a mistake.
+    """
     toml = path / DESCRIPTION
     return description_from_toml(read_toml(toml), toml)
 
 
 def read_known(path: Path) -> tuple[list[str], KnownPositions] | None:
-    """The names and positions in the folder's points.csv, in its order; None where there is none."""
+    """Read the folder's points.csv.
+
+    Args:
+        path: The folder.
+
+    Returns:
+        Names and positions in the order of the file; None where there is no such file.
+
+    Raises:
+        DatasetError: The file has a mistake; names the line.
+    """
     return read_points(path / POINTS) if (path / POINTS).exists() else None
 
 
 def read_points(path: Path) -> tuple[list[str], KnownPositions]:
-    """The names and positions in a table with the columns of points.csv, in its order."""
+    """Read a table with the columns of points.csv.
+
+    Args:
+        path: The file.
+
+    Returns:
+        n names, and n positions in the same order.
+
+    Raises:
+        DatasetError: The file is missing, has no rows or a mistake; names the line.
+    """
     header, rows = read_table(path, POINT_COLUMNS)
     table = read_columns(path, header, rows, ("point", "shot"), _POINT_NUMBERS)
     if not table.n:
@@ -151,8 +188,19 @@ def write_folder(
     also: Mapping[str, str] | None = None,
     fill: Callable[[Path], None] | None = None,
 ) -> None:
-    """Write a dataset folder, whole or not at all; `also` maps further relative file names to their text, and `fill`
-    writes the rest into the folder."""
+    """Write a dataset folder, whole or not at all.
+
+    Args:
+        data: The dataset.
+        path: The folder.
+        overwrite: Whether an existing dataset folder may be replaced; never one with photographs.
+        also: Text files to add: relative name -> text.
+        fill: Called with the temporary folder to write more into it, before it is renamed.
+
+    Raises:
+        DatasetError: A folder cannot hold the dataset, or must not be replaced.
+        ImplicamError: The folder exists, or cannot be written.
+    """
     files = {**folder_files(data), **(also or {})}
     if overwrite:
         _refuse_to_destroy(path)
@@ -184,7 +232,18 @@ def _refuse_to_destroy(path: Path) -> None:
 
 
 def folder_files(data: Dataset) -> dict[str, str]:
-    """The files of a dataset folder: name -> text. DatasetError for what this form cannot hold."""
+    """The files of a dataset folder as texts.
+
+    Args:
+        data: The dataset.
+
+    Returns:
+        File name -> text.
+
+    Raises:
+        DatasetError: A folder cannot hold the dataset: a row of observations.csv is a view, so what belongs to no view
+            would be lost.
+    """
     _refuse_to_lose(data)
     files = {DESCRIPTION: description_text(data), VIEWS: _observations_text(data.observations)}
     if data.known is not None:
@@ -216,7 +275,14 @@ def _refuse_to_lose(data: Dataset) -> None:
 
 
 def description_text(data: Dataset) -> str:
-    """dataset.toml as text."""
+    """The text of dataset.toml.
+
+    Args:
+        data: The dataset.
+
+    Raises:
+        DatasetError: An extra entry cannot be written so that it can be read again.
+    """
     cameras = [{**camera.as_table(), **camera.extra} for camera in data.cameras]
     table = {"name": data.name, "length_unit": data.length_unit, **data.extra}
     try:
@@ -257,7 +323,11 @@ def _observations_text(observations: Observations) -> str:
 
 
 def cells(values: Floats) -> list[str]:
-    """Numbers as the shortest texts that read back to the same bits; nothing for NaN."""
+    """Numbers as the shortest texts that read back to the same bits; an empty text for NaN.
+
+    Args:
+        values: (n,).
+    """
     return ["" if value != value else repr(value) for value in values.tolist()]
 
 
@@ -271,7 +341,12 @@ class _Lines(list[str]):
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A comma-separated table."""
+    """The text of a comma-separated table.
+
+    Args:
+        header: The names of the columns.
+        rows: The cells of each row.
+    """
     lines = _Lines()
     writer = csv.writer(lines, lineterminator=_Lines.ENDING)
     writer.writerow(header)

@@ -25,7 +25,14 @@ MIN_REPEATED_SHARE = 0.02
 
 
 def without_marks(data: Dataset) -> Dataset:
-    """The dataset with its marks read as missing views, and a note on them; the same dataset where there are none."""
+    """Read marks, such as (-1, -1), as missing views.
+
+    Args:
+        data: The dataset as the file has it.
+
+    Returns:
+        The dataset with a note on each mark; the same dataset where there are none.
+    """
     observations = data.observations
     places = None if data.known is None else data.known.xyz
     found = {pixel: _at(observations.uv, pixel) for pixel in (*MISSING_VIEW_PIXELS, *_repeated(observations, places))}

@@ -129,13 +129,24 @@ class Observations:
         return tuple(camera.name for camera in self.cameras)
 
     def select(self, index: ArrayLike) -> Observations:
-        """The observations of some points: a boolean mask, or positions in the order wanted."""
+        """The observations of some points.
+
+        Args:
+            index: (n,) a boolean mask; or numbers of points, in the order wanted.
+        """
         i = _index(index)
         extra = {key: value[i] for key, value in self.extra.items()}
         return Observations(self.points[i], self.cameras, self.uv[i], self.sd[i], extra)
 
     def with_cameras(self, names: Sequence[str]) -> Observations:
-        """The observations of some cameras, in the order wanted; every point stays, seen or not."""
+        """The observations of some cameras; every point stays, seen or not.
+
+        Args:
+            names: In the order wanted.
+
+        Raises:
+            DatasetError: There is no such camera.
+        """
         known = self.camera_names
         for name in names:
             if name not in known:
@@ -182,19 +193,34 @@ class KnownPositions:
         _freeze(self, shots=shots, xyz=xyz, sd=sd, extra=extra)
 
     def select(self, index: ArrayLike) -> KnownPositions:
-        """The positions of some points."""
+        """The positions of some points.
+
+        Args:
+            index: (n,) a boolean mask; or numbers of points, in the order wanted.
+        """
         i = _index(index)
         extra = {key: value[i] for key, value in self.extra.items()}
         return KnownPositions(self.shots[i], self.xyz[i], self.sd[i], extra)
 
 
 def fingerprints(values: Floats) -> list[bytes]:
-    """Per row (n, k) its numbers as bytes, with one NaN and one zero."""
+    """The numbers of each row as bytes, with one NaN and one zero, so that equal rows have equal bytes.
+
+    Args:
+        values: (n, k).
+    """
     return [row.tobytes() for row in np.where(np.isnan(values), np.nan, values + 0.0)]
 
 
 def first_same(values: Floats) -> NDArray[np.int64]:
-    """(n,) of rows (n, k): the number of the first that is the same to the last bit; its own where none is before."""
+    """The first row that is the same to the last bit.
+
+    Args:
+        values: (n, k).
+
+    Returns:
+        (n,) number of the first row that is the same; its own where none is before.
+    """
     first: dict[bytes, int] = {}
     return np.array([first.setdefault(mark, i) for i, mark in enumerate(fingerprints(values))], dtype=np.int64)
 
@@ -302,7 +328,11 @@ class Dataset:
         return metres_per(self.length_unit)
 
     def select(self, index: ArrayLike) -> Dataset:
-        """The dataset of some points: a boolean mask, or positions in the order wanted."""
+        """The dataset of some points.
+
+        Args:
+            index: (n,) a boolean mask; or numbers of points, in the order wanted.
+        """
         known = self.known.select(index) if self.known else None
         return replace(self, observations=self.observations.select(index), known=known)
 
@@ -310,6 +340,12 @@ class Dataset:
         """The dataset of some cameras; every point stays, seen or not.
 
         The Cramer-Rao limit of a simulated dataset holds for all its cameras: with fewer it becomes unknown.
+
+        Args:
+            names: In the order wanted.
+
+        Raises:
+            DatasetError: There is no such camera.
         """
         known = self.known
         if known and set(names) != set(self.observations.camera_names):
@@ -318,12 +354,30 @@ class Dataset:
         return replace(self, observations=self.observations.with_cameras(names), known=known)
 
     def without(self, names: Sequence[str]) -> Dataset:
-        """The dataset without some cameras."""
+        """The dataset without some cameras; every point stays, seen or not.
+
+        Args:
+            names: Of the cameras to leave out.
+
+        Raises:
+            DatasetError: There is no such camera, or none is left.
+        """
         self.observations.with_cameras(names)  # says which name is unknown
         return self.with_cameras([name for name in self.observations.camera_names if name not in names])
 
     def split(self, n: int, *, seed: int) -> tuple[Dataset, Dataset]:
-        """Split into `n` points at random, and the rest; DatasetError where either would be empty."""
+        """Split the points at random into two datasets.
+
+        Args:
+            n: Points of the first.
+            seed: The same seed gives the same split.
+
+        Returns:
+            The first, with n points, and the rest; the points of each in the order that they had.
+
+        Raises:
+            DatasetError: One of the two would be empty.
+        """
         if not 0 < n < len(self):
             raise DatasetError(
                 f"cannot split {len(self)} points into {n} and the rest.",
@@ -333,7 +387,18 @@ class Dataset:
         return self.select(np.sort(order[:n])), self.select(np.sort(order[n:]))
 
     def folds(self, k: int, *, seed: int) -> Iterator[tuple[str, Dataset, Dataset]]:
-        """Yield `k` random folds: name, the other points, the fold; points at one position are in one fold."""
+        """Random folds for cross-validation; points at one position are in one fold.
+
+        Args:
+            k: Number of folds, at least two.
+            seed: The same seed gives the same folds.
+
+        Yields:
+            Name of the fold, the dataset of the other points, the dataset of the fold.
+
+        Raises:
+            DatasetError: There are fewer positions than folds; raised when the first fold is asked for.
+        """
         places = len(np.unique(self.places))
         if not 2 <= k <= places:
             raise DatasetError(
@@ -358,7 +423,15 @@ class Dataset:
 
 
 def join(first: Dataset, second: Dataset) -> Dataset:
-    """One dataset of the points of both, named and described as the first; they must share cameras, unit and kind."""
+    """One dataset of the points of two, named and described as the first.
+
+    Args:
+        first: Its points come first.
+        second: With the same cameras and length unit, and with known positions if the first has them.
+
+    Raises:
+        DatasetError: The two do not belong together, or a point has the same name in both.
+    """
     if first.cameras != second.cameras or first.length_unit != second.length_unit:
         raise DatasetError(
             f"datasets {first.name!r} and {second.name!r} do not belong to one rig.",
@@ -388,7 +461,14 @@ def join(first: Dataset, second: Dataset) -> Dataset:
 
 
 def metres_per(unit: str) -> float:
-    """How long a length unit is in metres; DatasetError for one that is not known."""
+    """The length of a unit in metres.
+
+    Args:
+        unit: For example "mm", see `METRES_PER_UNIT`.
+
+    Raises:
+        DatasetError: The unit has no known length.
+    """
     if unit not in METRES_PER_UNIT:
         raise DatasetError(
             f"the length unit is {unit!r}, which has no known size{did_you_mean(unit, METRES_PER_UNIT)}.",
@@ -442,7 +522,16 @@ def _index(index: ArrayLike) -> NDArray[Any]:
 
 
 def check_name(name: object, what: str, place: str = "") -> None:
-    """Refuse what could not stand in every form of a dataset; `place` says where it stands."""
+    """Refuse a name that could not stand in every form of a dataset.
+
+    Args:
+        name: Anything.
+        what: What it names, for the error.
+        place: Where it stands, for the error; empty where it comes from no file.
+
+    Raises:
+        DatasetError: It is no printable text, is too long, or has spaces at an end.
+    """
     if not (
         isinstance(name, str) and name.isprintable() and name == name.strip() and 0 < len(name) <= MAX_NAME_CHARACTERS
     ):
@@ -454,7 +543,16 @@ def check_name(name: object, what: str, place: str = "") -> None:
 
 
 def check_unique(names: Iterable[str], what: str, place: Callable[[int], str] | None = None) -> None:
-    """Refuse names that are not usable or not unique; `place(i)` says where the i-th stands."""
+    """Refuse names that are not usable or not unique.
+
+    Args:
+        names: The names.
+        what: What they name, for the error.
+        place: Says where the i-th stands, for the error; None where they come from no file.
+
+    Raises:
+        DatasetError: For the first such name.
+    """
     first: dict[str, int] = {}
     for i, name in enumerate(names):
         check_name(name, what, place(i) if place else "")
@@ -518,7 +616,15 @@ def check_views(uv: Floats, sd: Floats, cameras: Sequence[Camera], place: Callab
 
 
 def check_position_sd(sd: Floats, place: Callable[[int], str]) -> None:
-    """Refuse standard uncertainties (n, 3) of positions below zero or infinite; `place(i)` says where a row stands."""
+    """Refuse standard uncertainties of positions that are below zero or infinite.
+
+    Args:
+        sd: (n, 3) in the dataset's unit, NaN where not stated.
+        place: Says where row i stands, for the error.
+
+    Raises:
+        DatasetError: For the first such row.
+    """
     for i, k in np.argwhere((sd < 0) | np.isinf(sd))[:1]:
         raise DatasetError(
             f"{place(i)}: {SD_POINT[k]} = {sd[i, k]:g}.",
@@ -576,7 +682,15 @@ def _described(extra: Mapping[str, Any], taken: Sequence[str], whose: str) -> di
 
 
 def plain(value: Any, depth: int = 0) -> Any:
-    """A copy made of what TOML knows; ValueError for anything else."""
+    """A copy made of the types that TOML knows.
+
+    Args:
+        value: Text, numbers, booleans, dates, lists and mappings of these; NumPy's numbers and arrays as well.
+        depth: How deeply the value is nested already.
+
+    Raises:
+        ValueError: It has no form in TOML.
+    """
     if depth > MAX_TOML_DEPTH:
         raise ValueError("it is nested too deeply")
     if isinstance(value, np.generic | np.ndarray):

@@ -13,7 +13,15 @@ MAX_RELATIVE_THICKNESS = 1e-3
 
 
 def same_cameras(trained: Observations, observations: Observations) -> Observations:
-    """The observations with the calibration's cameras in its order; an error where one of them is missing."""
+    """The observations with the cameras of a calibration, in its order.
+
+    Args:
+        trained: The observations that the calibration was made from.
+        observations: Those to be measured; other cameras are left out.
+
+    Raises:
+        DatasetError: A camera of the calibration is missing, or has images of another size.
+    """
     wanted, given = trained.camera_names, observations.camera_names
     missing = [name for name in wanted if name not in given]
     if missing:
@@ -37,7 +45,17 @@ def same_cameras(trained: Observations, observations: Observations) -> Observati
 
 
 def require_points(n: int, least: int, method: str, why: str = "") -> None:
-    """FitError for fewer usable points than a method needs; `why` others cannot be used, where there are others."""
+    """Refuse too few known points.
+
+    Args:
+        n: Usable known points.
+        least: How many the method needs.
+        method: Its name.
+        why: Why others cannot be used, where there are others.
+
+    Raises:
+        FitError: n is less than `least`.
+    """
     if n < least:
         raise FitError(
             f"{n} usable known point{'s' * (n != 1)}; {method} needs at least {least}.",
@@ -48,7 +66,15 @@ def require_points(n: int, least: int, method: str, why: str = "") -> None:
 
 
 def require_volume(xyz: NDArray[np.float64], method: str) -> None:
-    """FitError for points (n, 3) on one plane or line."""
+    """Refuse known points on one plane or line.
+
+    Args:
+        xyz: (n, 3) in any unit.
+        method: The method's name.
+
+    Raises:
+        FitError: They are as thin as `MAX_RELATIVE_THICKNESS`, or all have the same x, y or z.
+    """
     require_two_values(xyz, method)
     extents = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
     if extents[2] > MAX_RELATIVE_THICKNESS * extents[0]:
@@ -62,7 +88,15 @@ def require_volume(xyz: NDArray[np.float64], method: str) -> None:
 
 
 def require_two_values(xyz: NDArray[np.float64], method: str) -> None:
-    """FitError where all points (n, 3) have the same x, y or z."""
+    """Refuse known points that all have the same x, y or z.
+
+    Args:
+        xyz: (n, 3) in any unit.
+        method: The method's name.
+
+    Raises:
+        FitError: A coordinate has one value only.
+    """
     same = [axis for axis, values in zip("xyz", xyz.T, strict=True) if np.ptp(values) == 0]
     if same:
         axes = " and ".join(same)

@@ -53,11 +53,26 @@ class Columns:
     place: Callable[[int], str]
 
     def stack(self, columns: Sequence[str]) -> Floats:
-        """(n, columns) numbers, NaN in a column that is not there."""
+        """Columns of numbers side by side.
+
+        Args:
+            columns: Their names.
+
+        Returns:
+            (n, columns), NaN in a column that is not there.
+        """
         return np.stack([self.numbers.get(column, np.full(self.n, np.nan)) for column in columns], axis=1)
 
     def known_positions(self, points: Sequence[str], extra: Iterable[str]) -> KnownPositions:
-        """Positions, uncertainties and extra columns of the points, each a shot of its own where there is no column."""
+        """The positions, uncertainties and extra columns of the points.
+
+        Args:
+            points: n names; each point is a shot of its own where the table has no column `shot`.
+            extra: Names of columns with text.
+
+        Raises:
+            DatasetError: A shot's name or an uncertainty is not possible; names the line.
+        """
         shots = self.texts.get("shot", points)
         for i, shot in enumerate(shots):
             check_name(shot, "shot", self.place(i))
@@ -70,7 +85,18 @@ class Columns:
 def read_columns(
     path: Path, header: Sequence[str], rows: Iterable[Row], names: Sequence[str], numbers: Mapping[str, NumberColumn]
 ) -> Columns:
-    """The rows of a table by columns: names lose the spaces around them, all other text stays as it is."""
+    """Read the rows of a table into columns.
+
+    Args:
+        path: The file, for errors.
+        header: The names of all columns.
+        rows: Line number and cells of each row, as `read_table` gives them.
+        names: Columns whose texts lose the spaces around them; all other text stays as it is.
+        numbers: Columns of numbers, and what may be missing in them.
+
+    Raises:
+        DatasetError: A cell is no number; names the line.
+    """
     columns: dict[str, list[Any]] = {column: [] for column in header}
     lines, in_file = list[int](), f"{path}, line "  # formatted once: a table may have a million rows
     for line, row in rows:
@@ -87,9 +113,18 @@ def read_columns(
 
 
 def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[list[str], Iterator[Row]]:
-    """Read the header of a CSV table, and its rows as they are asked for, with their line numbers.
+    """Read the header of a CSV table, and its rows as they are asked for; blank lines are skipped.
 
-    Blank lines are skipped. `required` are the columns that must be there, and `example` says how a header looks.
+    Args:
+        path: The file.
+        required: Columns that must be there.
+        example: How a header looks, for the error; empty for `required`.
+
+    Returns:
+        The names of the columns; and an iterator of line number and cells of each row.
+
+    Raises:
+        DatasetError: There is no such file, or its header has a mistake. The iterator raises it for a row.
     """
     example = example or ",".join(required)
     require_file(path, f"put a comma-separated table with the columns {example} there")
@@ -103,7 +138,15 @@ def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[
 
 
 def require_file(path: Path, fix: str) -> None:
-    """DatasetError where there is no such file."""
+    """Refuse a path at which there is no file.
+
+    Args:
+        path: The file.
+        fix: The cure that the error states.
+
+    Raises:
+        DatasetError: There is none, or it is a folder.
+    """
     if path.is_dir():
         raise DatasetError(f"{path} is a folder, not a file.", fix=fix)
     if not path.is_file():
@@ -112,7 +155,14 @@ def require_file(path: Path, fix: str) -> None:
 
 @contextmanager
 def naming(place: Path | str) -> Iterator[None]:
-    """Put the file's name before an error of the values themselves."""
+    """A context that puts the file's name before an error of the values themselves.
+
+    Args:
+        place: The file, or where in it.
+
+    Raises:
+        DatasetError: That of the values, with the place before it.
+    """
     try:
         yield
     except DatasetError as error:
@@ -230,7 +280,16 @@ def _checked_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]
 
 
 def name_in(text: str, what: str, place: str) -> str:
-    """A name without the spaces around it, or an error that names the place."""
+    """Read a name, without the spaces around it.
+
+    Args:
+        text: The cell.
+        what: What it names, for the error.
+        place: File and line, for the error.
+
+    Raises:
+        DatasetError: The name is not usable.
+    """
     name = text.strip()
     check_name(name, what, place)
     return name
@@ -277,7 +336,14 @@ def number(text: str, place: str, column: str, *, cure_nan: str, missing: Sequen
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as a dict."""
+    """Read a TOML file as a dict of plain values.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: There is no such file, it is too long, or it is no TOML.
+    """
     require_file(
         path,
         "a dataset is a folder with dataset.toml, observations.csv and (unless it is to be measured) points.csv; "
@@ -304,7 +370,14 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """TOML text as a dict; ValueError for whatever is wrong with it."""
+    """Read TOML text as a dict of plain values.
+
+    Args:
+        text: Its content.
+
+    Raises:
+        ValueError: It is no TOML, is too long or too deeply nested.
+    """
     if len(text) > MAX_TOML_BYTES:
         raise ValueError(f"it is {len(text):,} characters long")
     for line, content in enumerate(text.split("\n"), 1):
@@ -318,7 +391,18 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def description_from_toml(table: dict[str, Any], path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
-    """Name, length unit, cameras and whatever else dataset.toml says."""
+    """Read name, length unit, cameras and the further entries of a description.
+
+    Args:
+        table: The content of dataset.toml, as `read_toml` gives it.
+        path: The file, for errors.
+
+    Returns:
+        Name, length unit, cameras, and the further entries.
+
+    Raises:
+        DatasetError: One of them is missing or has a mistake.
+    """
     extra = dict(table)
     extra.pop(WIDE_TABLE, None)
     name = _text_entry(extra, "name", path, example="my-rig")

@@ -28,7 +28,11 @@ class Rejected:
 
 
 def copied_points(data: Dataset) -> tuple[Unused, ...]:
-    """The known points that are copies of others: each is used once."""
+    """The known points that are copies of others: each is used once.
+
+    Args:
+        data: The dataset that is fitted.
+    """
     copies = copies_of(data)
     return tuple(
         Unused(str(data.points[i]), "a copy of another: the same pixels at the same position to the last bit")
@@ -37,11 +41,23 @@ def copied_points(data: Dataset) -> tuple[Unused, ...]:
 
 
 def uncalibrated_with_copies(data: Dataset, uncalibrated: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
-    """Why cameras (their number, the reason) are not calibrated, of those that are copies what they are."""
+    """Say of uncalibrated cameras that are copies whose copies they are.
+
+    Args:
+        data: The dataset that was fitted.
+        uncalibrated: Number of each camera that is not calibrated, and the reason.
+
+    Returns:
+        The same cameras; of copies the reason is that they are copies.
+    """
     copies = copies_of(data)
     return tuple((c, why_no_camera(data, c, copies) if copies.cameras[c] else why) for c, why in uncalibrated)
 
 
 def point_copy_notes(data: Dataset) -> list[str]:
-    """What is there more than once among points; a method that names its uncalibrated cameras names copied ones too."""
+    """What occurs more than once among points; a method that names its uncalibrated cameras names copied ones too.
+
+    Args:
+        data: The dataset that is fitted.
+    """
     return copy_notes(data)[int(copies_of(data).cameras.sum()) :]

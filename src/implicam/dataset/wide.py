@@ -178,7 +178,15 @@ def _assemble(table: Columns, layout: _Layout) -> Dataset:
 
 
 def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
-    """Read `x,y,z,u_cam1,v_cam1,...`, with or without point, shot, sd_x, sd_u_cam1 and further columns."""
+    """Read `x,y,z,u_cam1,v_cam1,...`, with or without point, shot, sd_x, sd_u_cam1 and further columns.
+
+    Args:
+        path: The file; its description is read from `<name>.csv.toml` beside it, where that is there.
+        unit: The length unit where there is no description; else it is not used.
+
+    Raises:
+        DatasetError: The unit is not stated, or there is a mistake; names file, line, value and cure.
+    """
     header, rows = read_table(path, (), _EXAMPLE)
     sidecar = _sidecar(path)
     layout = _layout(header, read_toml(sidecar) if sidecar.exists() else None, path, unit)
@@ -237,6 +245,14 @@ def write_wide_csv(data: Dataset, path: Path) -> None:
 
     Two files cannot change at one instant. Where the description changes, the old one goes first: a kill in between
     leaves a table without a description, which reading reports, never a table with the description of another.
+
+    Args:
+        data: The dataset.
+        path: The file; one that is there is replaced.
+
+    Raises:
+        DatasetError: A table cannot hold the dataset: it has no points, or a column that could be mistaken for another.
+        ImplicamError: The files cannot be written.
     """
     columns, description = _columns(data)
     text = [v.tolist() if v.dtype.kind == "U" else cells(v) for v in columns.values()]
@@ -250,7 +266,15 @@ def write_wide_csv(data: Dataset, path: Path) -> None:
 
 
 def read_parquet(path: Path) -> Dataset:
-    """Read a wide table from Parquet."""
+    """Read a wide table from Parquet.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: It is no readable Parquet file of implicam, or has a mistake.
+        MissingExtraError: pyarrow is not installed.
+    """
     parquet = import_extra("pyarrow.parquet", "parquet", "reading Parquet")
     arrow = import_extra("pyarrow", "parquet", "reading Parquet")
     require_file(path, "check the name")
@@ -303,7 +327,17 @@ def _check_types(values: list[Any], wanted: type | tuple[type, ...], what: str, 
 
 
 def write_parquet(data: Dataset, path: Path) -> None:
-    """Write a wide table as Parquet; NaN is written as NaN."""
+    """Write a wide table as Parquet; NaN is written as NaN.
+
+    Args:
+        data: The dataset.
+        path: The file; one that is there is replaced.
+
+    Raises:
+        DatasetError: A table cannot hold the dataset: it has no points, or a column that could be mistaken for another.
+        MissingExtraError: pyarrow is not installed.
+        ImplicamError: The file cannot be written.
+    """
     pyarrow = import_extra("pyarrow", "parquet", "writing Parquet")
     parquet = import_extra("pyarrow.parquet", "parquet", "writing Parquet")
     columns, description = _columns(data)
@@ -313,7 +347,17 @@ def write_parquet(data: Dataset, path: Path) -> None:
 
 
 def arrays_from_dataset(data: Dataset) -> dict[str, NDArray[Any]]:
-    """The dataset as named arrays without objects; what an NPZ and a calibration file carry."""
+    """The dataset as named arrays without objects; what an NPZ and a calibration file carry.
+
+    Args:
+        data: The dataset.
+
+    Returns:
+        Name -> array; those of positions only where they are known.
+
+    Raises:
+        DatasetError: The description cannot be written so that it can be read again.
+    """
     o, k = data.observations, data.known
     arrays: dict[str, NDArray[Any]] = {
         "dataset": np.array(description_text(data)),
@@ -335,7 +379,15 @@ def arrays_from_dataset(data: Dataset) -> dict[str, NDArray[Any]]:
 
 
 def dataset_from_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> Dataset:
-    """The inverse; whatever does not fit together is a DatasetError."""
+    """The dataset of named arrays, the inverse of `arrays_from_dataset`.
+
+    Args:
+        arrays: Name -> array.
+        path: The file that they come from, for errors.
+
+    Raises:
+        DatasetError: One is missing, or they do not fit together.
+    """
     try:
         with naming(path):
             description = parse_toml(str(arrays["dataset"][()]))
@@ -354,7 +406,14 @@ def dataset_from_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> Datas
 
 
 def read_npz_dataset(path: Path) -> Dataset:
-    """Read a dataset from NPZ, never with pickle."""
+    """Read a dataset from NPZ, never with pickle.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: It is no NPZ file, is damaged, or its arrays do not fit together.
+    """
     require_file(path, "check the name")
     with path.open("rb") as file:
         if file.read(2) != b"PK":
@@ -368,6 +427,15 @@ def _refused(path: Path, reason: str) -> ImplicamError:
 
 
 def write_npz_dataset(data: Dataset, path: Path) -> None:
-    """Write a dataset as NPZ."""
+    """Write a dataset as NPZ.
+
+    Args:
+        data: The dataset.
+        path: The file; one that is there is replaced.
+
+    Raises:
+        DatasetError: The description cannot be written so that it can be read again.
+        ImplicamError: The file cannot be written.
+    """
     with replacing(path) as temporary:
         temporary.write_bytes(npz_bytes(arrays_from_dataset(data)))
