@@ -82,7 +82,16 @@ class Template:
 
     @classmethod
     def from_click(cls, path: Path, u: float, v: float) -> Template:
-        """Learn it from one click on the ball at pixel (u, v) of a picture."""
+        """Learn the template from one click on the ball.
+
+        Args:
+            path: A picture.
+            u: Column of the click, in pixels.
+            v: Row of the click, in pixels.
+
+        Raises:
+            ImageError: There is no ball, or the picture cannot be read.
+        """
         picture = read_picture(path)
         rough = [find_rough_edge(picture, np.array([u, v]), radius) for radius in (5, 8, 12, 18, 27, 40, 60)]
         edges = [edge for one in rough if one and (edge := _fit_ball(picture, one))]
@@ -98,7 +107,15 @@ class Template:
 
     @classmethod
     def from_words(cls, text: str) -> Template:
-        """From one click as the command line has it, `images/cam1/001.png:613,402`."""
+        """Learn the template from one click as the command line has it.
+
+        Args:
+            text: The picture's path, a colon, u and v in pixels: "images/cam1/001.png:613,402".
+
+        Raises:
+            UsageError: The text is of no such form.
+            ImageError: There is no ball, or the picture cannot be read.
+        """
         try:
             name, _, place = text.rpartition(":")
             u, v = (float(part) for part in place.split(","))
@@ -110,7 +127,14 @@ class Template:
 
     @classmethod
     def from_file(cls, path: Path) -> Template:
-        """A picture of the ball before its plate, cropped so that the ball is in the middle."""
+        """Learn the template from a cropped picture.
+
+        Args:
+            path: A picture of the ball before its plate, with the ball in the middle.
+
+        Raises:
+            ImageError: There is no ball, or the picture cannot be read.
+        """
         picture = read_picture(path)
         return cls.from_click(path, (picture.shape[1] - 1) / 2, (picture.shape[0] - 1) / 2)
 
@@ -159,7 +183,21 @@ class Ball(DetectorBase):
             Path | None, Option("correct its outline's middle with this calibration", "FILE")
         ] = None,
     ) -> Ball:
-        """As the command line says it."""
+        """Make the detector from the options of the command line.
+
+        Args:
+            dataset: The dataset's folder.
+            described: The table [target] of dataset.toml.
+            radius: Of the ball, in the dataset's unit; None or 0 for no correction.
+            bright: Whether the ball is lighter than what is behind it.
+            template: A cropped picture of the ball before its plate.
+            click: "FILE:U,V", see `Template.from_words`.
+            calibration: The file of a calibration that predicts pixels.
+
+        Raises:
+            UsageError: Options exclude each other, or the calibration's method predicts no pixels.
+            ImageError: There is no ball in the template's picture.
+        """
         if template and click:
             raise UsageError("--template and --click exclude each other.", fix="give one of them")
         learned = Template.from_words(click) if click else Template.from_file(template) if template else None
@@ -180,7 +218,15 @@ class Ball(DetectorBase):
         }  # fmt: skip
 
     def detect(self, picture: Grey, view: View) -> Detected:
-        """The likeliest ball, with its edge; others that it might be stay beside it."""
+        """Find the likeliest ball in a picture; others that it might be are kept as `Detected.others`.
+
+        Args:
+            picture: (height, width) grey from 0 to 1.
+            view: Which picture it is; the ball gets the name of the shot.
+
+        Returns:
+            One point or none, with the ball's edge as an outline.
+        """
         looked = 1 - picture if self.bright else picture
         found = self._find_balls(looked)
         if not found:
@@ -189,7 +235,11 @@ class Ball(DetectorBase):
         return _choose(made)
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
-        """Drop what is at the same place in shot after shot of a camera, and choose again."""
+        """Drop what is at the same place in shot after shot of a camera, or far fainter than usual, and choose again.
+
+        Args:
+            found: What `detect` gave of each picture.
+        """
         cameras = dict.fromkeys(view.camera for view in found)
         views = {camera: [view for view in found if view.camera == camera] for camera in cameras}
         moving: dict[View, Detected] = {}
@@ -206,7 +256,14 @@ class Ball(DetectorBase):
         return {view: _drop_if_faint(moving[view], usual.get(view.camera, 0.0)) for view in found}
 
     def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
-        """The ball's middle for that of its outline."""
+        """Move the pixels from the middle of the ball's outline to the ball's middle, where the radius is known.
+
+        Args:
+            data: Observations of the middles of outlines.
+
+        Returns:
+            The dataset, and notes for the user.
+        """
         if self.radius is not None:
             return centred(data, self.radius, self.calibration)
         return data, [

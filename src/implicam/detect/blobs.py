@@ -77,17 +77,33 @@ class Spots:
 
 
 def laplacian(picture: Grey, sigma: float) -> Grey:
-    """The scale-normalised Laplacian of Gaussian, positive on bright spots."""
+    """The scale-normalised Laplacian of Gaussian, positive on bright spots.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        sigma: The scale in pixels.
+
+    Returns:
+        (height, width).
+    """
     cv2 = opencv()
     smooth = cv2.GaussianBlur(picture, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(-(sigma**2) * cv2.Laplacian(smooth, cv2.CV_32F, borderType=cv2.BORDER_REPLICATE))
 
 
 def find_scale(picture: Grey, uv: Floats, largest: float) -> tuple[float, Floats]:
-    """The scale in pixels, at most `largest`, of the spots that pixels uv (n, 2) show, and their answers (n,) to it.
+    """Find the one scale of the spots that some pixels show.
 
-    An answer is negative where the spot is dark, NaN outside the picture. It is one scale for all: specks of noise and
-    glints, which are small, are at odds with each other.
+    It is one scale for all: specks of noise and glints, which are small, are at odds with each other.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        uv: (n, 2) pixels, each within `MAX_CLICK_PX` of a spot.
+        largest: The largest scale to be tried, in pixels.
+
+    Returns:
+        The scale in pixels; and the answers (n,) of the spots to it, negative where a spot is dark, NaN outside the
+        picture.
     """
     sigmas = MIN_SCALE_PX * SCALE_FACTOR ** np.arange(
         0, 1 + np.log(max(largest / MIN_SCALE_PX, 1.0)) / np.log(SCALE_FACTOR)
@@ -122,7 +138,15 @@ def _answer_noise(picture: Grey, sigma: Floats) -> Floats:
 
 
 def find_spots(picture: Grey, sigma: float) -> tuple[Floats, Floats]:
-    """Pixels (n, 2), to about half a pixel, and answers (n,) of all bright spots of about the scale `sigma`."""
+    """Find all bright spots of about one scale.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        sigma: The scale in pixels.
+
+    Returns:
+        Pixels (n, 2), to about half a pixel; and answers (n,) of the Laplacian.
+    """
     cv2 = opencv()
     answer = laplacian(picture, sigma)
     around = cv2.dilate(answer, np.ones((3, 3), np.uint8))
@@ -152,7 +176,7 @@ def measure_spots(picture: Grey, uv: Floats, sigma: float) -> Spots:
     Args:
         picture: (height, width) grey from 0 to 1.
         uv: (n, 2) pixels near their middles.
-        sigma: their scale in pixels: the radius over the square root of two.
+        sigma: Their scale in pixels: the radius over the square root of two.
 
     Returns:
         n spots, NaN where there is none that can be measured.

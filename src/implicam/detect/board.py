@@ -77,7 +77,17 @@ class Board(DetectorBase):
         board: Annotated[str | None, Option("inner corners, 8x11", "RxC")] = None,
         square: Annotated[float | None, Option("edge of a square", "MM", 0)] = None,
     ) -> Board:
-        """As the command line says it."""
+        """Make the detector from the options of the command line.
+
+        Args:
+            dataset: The dataset's folder.
+            described: The table [target] of dataset.toml, whose rows and columns stand in for `board`.
+            board: Inner corners, rows x columns: "8x11".
+            square: Edge of a square in millimetres.
+
+        Raises:
+            UsageError: The size is not known, or there can be no such board.
+        """
         rows, columns = parse_board_size(board, described, "--board 8x11 (inner corners, rows x columns)")
         return cls(rows, columns, float(square or 1.0))
 
@@ -86,7 +96,15 @@ class Board(DetectorBase):
         return {"target": "board", **asdict(self)}
 
     def detect(self, picture: Grey, view: View) -> Detected:
-        """The corners of the board in one picture, or why they cannot be given."""
+        """Find the corners of the board in one picture.
+
+        Args:
+            picture: (height, width) grey from 0 to 1.
+            view: Which picture it is; corners are named after the shot.
+
+        Returns:
+            The corners in the order of their numbers, or the reason why they cannot be given.
+        """
         unfit = explain_unusable(picture)
         if unfit:
             return nothing(unfit)
@@ -214,12 +232,26 @@ class Board(DetectorBase):
 
 
 def explain_missing(found: int, total: int) -> str:
-    """How many of a board's corners are missing; empty where none are."""
+    """How many of a board's corners are missing, in words; empty where none are.
+
+    Args:
+        found: Corners found.
+        total: Corners of the board.
+    """
     return "" if found == total else f"{total - found} of the board's {total} corners are hidden or not clear."
 
 
 def parse_board_size(text: str | None, described: Mapping[str, Any], example: str) -> tuple[int, int]:
-    """Rows and columns from "8x11", or, where that is None, from what dataset.toml says; `example` is the cure."""
+    """The rows and columns of a board.
+
+    Args:
+        text: "8x11" from the command line; None to take them from `described`.
+        described: The table [target] of dataset.toml.
+        example: The cure that the error states.
+
+    Raises:
+        UsageError: There are no two whole numbers.
+    """
     rows, columns = described.get("rows"), described.get("columns")
     if text is not None:
         rows, _, columns = text.lower().partition("x")
@@ -232,12 +264,21 @@ def parse_board_size(text: str | None, described: Mapping[str, Any], example: st
 
 
 def corner_name(shot: str, number: int) -> str:
-    """The name of a corner, number counted from 0: that of points.csv."""
+    """The name that a corner has in points.csv.
+
+    Args:
+        shot: The name of the shot.
+        number: Of the corner, from 0; names count from 1.
+    """
     return f"{shot}-c{number + 1:03d}"
 
 
 def explain_unusable(picture: Grey) -> str:
-    """Why a picture cannot show anything; empty where it can."""
+    """Why a picture cannot show anything, in words; empty where it can.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+    """
     if picture.ndim != 2 or min(picture.shape, default=0) < 16:
         return f"the picture is too small: {' x '.join(map(str, picture.shape[::-1]))} pixels."
     if not np.isfinite(picture).all():
@@ -290,6 +331,13 @@ def _share_corners(a: Grid, b: Grid) -> bool:
 
 
 def hull_of(uv: Floats) -> Floats:
-    """(k, 2) the hull of points (n, 2), closed, in pixels."""
+    """The convex hull of points as a closed curve.
+
+    Args:
+        uv: (n, 2) pixels.
+
+    Returns:
+        (k, 2) pixels, the last the same as the first.
+    """
     hull = opencv().convexHull(uv.astype(np.float32))[:, 0]
     return np.asarray(np.vstack([hull, hull[:1]]), dtype=np.float64)

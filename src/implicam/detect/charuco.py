@@ -91,7 +91,19 @@ class Charuco(DetectorBase):
         marker: Annotated[float | None, Option("edge of a marker", "MM", 0)] = None,
         dictionary: Annotated[str | None, Option("OpenCV's name, such as DICT_5X5_100")] = None,
     ) -> Charuco:
-        """As the command line says it."""
+        """Make the detector from the options of the command line.
+
+        Args:
+            dataset: The dataset's folder.
+            described: The table [target] of dataset.toml, whose rows and columns stand in for `board`.
+            board: Squares, rows x columns: "9x12".
+            square: Edge of a square in millimetres.
+            marker: Edge of a marker in millimetres.
+            dictionary: OpenCV's name of the markers' dictionary; None for the default of the class.
+
+        Raises:
+            UsageError: Something is missing, or there can be no such board.
+        """
         rows, columns = parse_board_size(board, described, "--board 9x12 (squares, rows x columns)")
         if not square or not marker:
             raise UsageError(
@@ -104,7 +116,15 @@ class Charuco(DetectorBase):
         return {"target": "charuco", **asdict(self)}
 
     def detect(self, picture: Grey, view: View) -> Detected:
-        """The corners of the board in one picture, or why they cannot be given."""
+        """Find the corners of the board in one picture.
+
+        Args:
+            picture: (height, width) grey from 0 to 1.
+            view: Which picture it is; corners are named after the shot.
+
+        Returns:
+            The corners in the order of their numbers, or the reason why they cannot be given.
+        """
         unfit = explain_unusable(picture)
         if unfit:
             return nothing(unfit)

@@ -62,7 +62,11 @@ class Corners:
 
     @classmethod
     def unknown(cls, n: int) -> Corners:
-        """No corner, n times."""
+        """Corners that are all NaN.
+
+        Args:
+            n: How many.
+        """
         return cls(*(np.full((n, *more), np.nan) for more in ((2,), (2,), (), (), (), (), ())))
 
     def __getitem__(self, rows: Bools | NDArray[np.intp]) -> Corners:
@@ -81,7 +85,7 @@ def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare:
         uv: (n, 2) pixels near the corners, within about a third of a square.
         right: (n, 2) pixels from a corner to its neighbour along the rows, roughly.
         down: (n, 2) the same along the columns.
-        bare: how far from an edge, in squares, its bright side is bare of print: 1 on a checkerboard; on a ChArUco
+        bare: How far from an edge, in squares, its bright side is bare of print: 1 on a checkerboard; on a ChArUco
             board markers begin earlier.
 
     Returns:

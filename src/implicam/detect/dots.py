@@ -97,9 +97,16 @@ class Dots(DetectorBase):
 
     @classmethod
     def from_files(cls, layout: str | Path, labels: str | Path, *, polarity: str = "auto") -> Self:
-        """From a layout with the columns of points.csv, and labels with the columns point,camera,u,v and perhaps shot.
+        """Make the detector from a layout and labels.
 
-        DatasetError names file, line and cure.
+        Args:
+            layout: A table with the columns of points.csv.
+            labels: A table with the columns point, camera, u, v in pixels, and perhaps shot.
+            polarity: "bright", "dark" or "auto".
+
+        Raises:
+            DatasetError: A file has a mistake; names file, line and cure.
+            UsageError: There is no such polarity.
         """
         points, known = read_points(Path(layout))
         return cls(tuple(points), known, _read_labels(Path(labels), points), polarity)
@@ -113,7 +120,18 @@ class Dots(DetectorBase):
         layout: Annotated[Path | None, Option("where they are (default DATASET/points.csv)", "FILE")] = None,
         labels: Annotated[Path | None, Option("six or more named (default DATASET/labels.csv)", "FILE")] = None,
     ) -> Dots:
-        """As the command line says it."""
+        """Make the detector from the options of the command line.
+
+        Args:
+            dataset: The dataset's folder.
+            described: The table [target] of dataset.toml; nothing of it is used here.
+            layout: A table with the columns of points.csv; None for the dataset's own.
+            labels: A table of labelled dots; None for labels.csv of the dataset.
+
+        Raises:
+            UsageError: There are no labels.
+            DatasetError: A file has a mistake; names file, line and cure.
+        """
         labels = labels or dataset / LABELS
         if not labels.exists():
             raise UsageError(
@@ -130,7 +148,16 @@ class Dots(DetectorBase):
         return {"target": "dots", "layout": layout, "labels": marks, "polarity": self.polarity}
 
     def detect(self, picture: Grey, view: View) -> Detected:
-        """The dots found; notes: "labelled", "missing" (where those not found are predicted), "scale" in pixels."""
+        """Find the dots in one picture.
+
+        Args:
+            picture: (height, width) grey from 0 to 1.
+            view: Which picture it is; its camera has labels, and where the layout has several shots, it is one of them.
+
+        Returns:
+            The dots found, or the reason why there are none. Notes: "labelled", "missing" (where those not found are
+            predicted), "scale" in pixels.
+        """
         rows = self._rows(view)
         if not len(rows):
             shots = sorted(set(self.known.shots.tolist()))

@@ -66,14 +66,26 @@ class Ellipse(NamedTuple):
         return float(1 / np.sqrt(abs(np.linalg.det(self.shape))))
 
     def points(self, n: int = 64) -> Floats:
-        """(n, 2) points on it."""
+        """Points on the ellipse; the last is the first again.
+
+        Args:
+            n: How many.
+
+        Returns:
+            (n, 2) pixels.
+        """
         angle = np.linspace(0, 2 * np.pi, n)
         circle = np.column_stack([np.cos(angle), np.sin(angle)])
         return np.asarray(self.centre + circle @ np.linalg.inv(self.shape).T, dtype=np.float64)
 
 
 def fit_ellipse(points: Floats, start: Ellipse) -> Ellipse:
-    """The ellipse nearest to points (n, 2), by least squares of the distances."""
+    """The ellipse nearest to points, by least squares of the distances.
+
+    Args:
+        points: (n, 2) pixels.
+        start: An ellipse near them.
+    """
     ellipse = start
     for _ in range(20):
         distance, slope = _signed_distance(points, ellipse)
@@ -111,9 +123,16 @@ class Rough(NamedTuple):
 
 
 def find_rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.0) -> Rough | None:
-    """The edge of a disc, darker than what is around it, near `centre` (2,) with about this radius, to a pixel or so.
+    """Find the edge of a disc that is darker than what is around it, to a pixel or so.
 
-    None where there is none on most sides, or where it is darker by less than `step` grey values.
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        centre: (2,) a pixel near the disc's middle.
+        radius: The disc's radius in pixels, roughly.
+        step: Least difference of grey between the disc and what is around it.
+
+    Returns:
+        The edge; None where there is none on most sides.
     """
     for _ in range(3):
         points, rise = _find_steepest_rise(picture, centre, radius)
@@ -196,7 +215,16 @@ class _Fit(NamedTuple):
 
 
 def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
-    """The edge that fits the pixels best, from a start within a pixel or so; None where there is none."""
+    """Fit the edge of a disc to the pixels along it.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        start: An ellipse within a pixel or so of the edge.
+        blur: Of the edge, in pixels, roughly.
+
+    Returns:
+        The edge; None where there is none, or it is not wholly in the picture.
+    """
     ellipse, kept = start, np.ones(SECTORS, dtype=np.bool_)
     band = fit = None
     for _ in range(3):

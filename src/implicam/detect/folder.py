@@ -96,20 +96,20 @@ def detect_folder(
     A run that was stopped goes on where it was.
 
     Args:
-        dataset: the folder. Without dataset.toml one is made.
-        detector: what to look for.
-        unit: the length unit of a dataset.toml that is made.
-        pictures: the folder of the pictures, below `dataset`.
-        pattern: how their names tell camera and shot, as `find_pictures` takes it.
-        overlays: whether to draw pictures to check by eye.
-        restart: forget what an earlier run found.
-        correct: what is done to the observations before they are written, instead of `detector.correct`.
-        progress: told how far it is.
+        dataset: The folder. Without dataset.toml one is made.
+        detector: What to look for.
+        unit: The length unit of a dataset.toml that is made.
+        pictures: The folder of the pictures, below `dataset`.
+        pattern: How their names tell camera and shot, as `find_pictures` takes it.
+        overlays: Whether to draw pictures to check by eye.
+        restart: Forget what an earlier run found.
+        correct: What is done to the observations before they are written, instead of `detector.correct`.
+        progress: Told how far it is.
 
     Raises:
-        UsageError: options do not go together.
-        DatasetError: dataset.toml or points.csv is damaged.
-        ImageError: there are no pictures, or nothing was found in any of them.
+        UsageError: Options do not go together.
+        DatasetError: Dataset.toml or points.csv is damaged.
+        ImageError: There are no pictures, or nothing was found in any of them.
     """
     rig = _Rig.of(Path(dataset), unit, Path(dataset) / pictures, pattern)
     with one_thread_each():

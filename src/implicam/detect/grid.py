@@ -82,18 +82,30 @@ class Grid:
         return np.asarray(self.corners.height.reshape(i.shape) * (1 - 2 * ((i + j) % 2)), dtype=np.float64)
 
     def keep_only(self, keep: Bools) -> Grid:
-        """The same grid with the corners where `keep` (rows, columns) is false taken out."""
+        """The same grid without some of its corners.
+
+        Args:
+            keep: (rows, columns) where corners stay.
+        """
         return replace(self, corners=_merge_corners(Corners.unknown(keep.size), self.corners, keep.ravel()))
 
     def turn(self, turns: int) -> Grid:
-        """The same corners, counted from another end: turned by quarter turns."""
+        """The same corners, counted from another end.
+
+        Args:
+            turns: Quarter turns.
+        """
         index = np.rot90(np.arange(self.rows * self.columns).reshape(self.rows, self.columns), turns)
         corners = self.corners[index.ravel()]
         rows, columns = (self.rows, self.columns) if turns % 2 == 0 else (self.columns, self.rows)
         return Grid(rows, columns, replace(corners, height=corners.height * (-1) ** turns))
 
     def pad(self, by: int) -> Grid:
-        """With empty rows and columns all round."""
+        """The grid with empty rows and columns all round.
+
+        Args:
+            by: How many on each side.
+        """
         inner = np.zeros((self.rows + 2 * by, self.columns + 2 * by), dtype=np.bool_)
         inner[by : by + self.rows, by : by + self.columns] = True
         return Grid(inner.shape[0], inner.shape[1], _scatter_corners(self.corners, inner.ravel()))
@@ -109,7 +121,11 @@ class Grid:
         return Grid(int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1, self.corners[index.ravel()])
 
     def places(self, nodes: Floats) -> Places:
-        """Where the nodes (n, 2), (i, j), whole numbers or not, must be, from their nearest known neighbours."""
+        """Predict where nodes must be from their nearest known neighbours.
+
+        Args:
+            nodes: (n, 2) row and column, whole numbers or not.
+        """
         known = np.argwhere(self.occupied).astype(np.float64)
         return predict_places(known, self.uv[self.occupied], nodes)
 
@@ -128,7 +144,7 @@ def grow(picture: Grey, seed: Floats, limit: int) -> Grid | None:
     Args:
         picture: (height, width) grey from 0 to 1.
         seed: (rows, columns, 2) pixels of corners found roughly, NaN for holes.
-        limit: rows or columns beyond which it need not grow.
+        limit: Rows or columns beyond which it need not grow.
 
     Returns:
         The grid, None where the seed is no part of a checkerboard.
@@ -138,10 +154,19 @@ def grow(picture: Grey, seed: Floats, limit: int) -> Grid | None:
 
 
 def join(picture: Grey, a: Grid, b: Grid, size: tuple[int, int], limit: int) -> Grid | None:
-    """One grid of two that are parts of one board, behind something that hides what is between; None if they are not.
+    """Join two grids that are parts of one board, behind something that hides what is between.
 
-    The plane of each must put the corners of the other on whole numbers of squares, the colours must agree, and
-    together they must not be larger than a board of `size` (rows, columns), upright or lying.
+    The plane of each must put the corners of the other on whole numbers of squares, and the colours must agree.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        a: The one; its numbering stays.
+        b: The other.
+        size: Rows and columns of the board's corners, upright or lying; together they must not be larger.
+        limit: Rows or columns beyond which the whole need not grow.
+
+    Returns:
+        The whole; None if they are not parts of one board.
     """
     for turns in range(4):
         turned = b.turn(turns)
@@ -301,7 +326,15 @@ def _sample_quadrants(picture: Grey, places: Places) -> Floats:
 
 
 def sample_bilinear(picture: Grey, uv: Floats) -> Floats:
-    """Grey at pixels (n, 2), bilinear; NaN outside the picture."""
+    """The grey values at pixels, bilinear.
+
+    Args:
+        picture: (height, width).
+        uv: (n, 2) pixels.
+
+    Returns:
+        (n,), NaN outside the picture.
+    """
     at = np.where(np.isfinite(uv), uv, -1)[:, ::-1].T
     grey = ndimage.map_coordinates(picture, at, output=np.float64, order=1, cval=np.nan)
     return np.asarray(grey, dtype=np.float64)
@@ -348,10 +381,15 @@ def _drop_thin_rims(there: Bools) -> Bools:
 
 
 def predict_places(known: Floats, uv: Floats, nodes: Floats) -> Places:
-    """The homography through the nearest `NEIGHBOURS` known nodes, without the node itself, one for each node.
+    """Predict where nodes are, each by the homography through its nearest known nodes, without the node itself.
 
     Linear, with its denominator 1 at the node; a little of the plane's perspective is taken away (a ridge) where the
     neighbours do not fix it, so that three or four of them give an affine map.
+
+    Args:
+        known: (k, 2) row and column of the nodes that are known; the nearest `NEIGHBOURS` are used.
+        uv: (k, 2) their pixels.
+        nodes: (n, 2) row and column, whole numbers or not.
     """
     nodes, pixels = nodes.astype(np.float64), uv
     distance = np.linalg.norm(nodes[:, None] - known[None], axis=2)

@@ -43,7 +43,16 @@ class Key(NamedTuple):
 
     @classmethod
     def of(cls, view: View, path: Path, options: str) -> Key:
-        """The key of a picture as its file is now."""
+        """The key of a picture as its file is now.
+
+        Args:
+            view: Which picture it is.
+            path: Its file.
+            options: The detector's `digest`.
+
+        Raises:
+            OSError: The file is not there.
+        """
         state = path.stat()
         return cls(view.camera, view.shot, path.name, state.st_size, state.st_mtime_ns, options)
 
@@ -62,12 +71,23 @@ class Entry:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Entry:
-        """The inverse of `as_dict`."""
+        """The inverse of `as_dict`.
+
+        Args:
+            table: Plain values, as `as_dict` gives them.
+
+        Raises:
+            ValueError: They are not such values; or KeyError or TypeError.
+        """
         return cls(int(table["width"]), int(table["height"]), Detected.from_dict(table["found"]))
 
 
 def digest(detector: Detector) -> str:
-    """One short text for a detector, all its options, and the version of implicam, which may find something else."""
+    """A short text for a detector, all its options, and the version of implicam, which may find something else.
+
+    Args:
+        detector: Any.
+    """
     text = json.dumps(
         [package_version(), type(detector).__name__, detector.options()], sort_keys=True, default=json_default
     )
@@ -98,7 +118,19 @@ class Journal:
         self._file.close()
 
     def add(self, key: Key, entry: Entry) -> Entry:
-        """Write a line; the entry as it will be read again. TypeError or ValueError for what JSON cannot hold."""
+        """Write a line.
+
+        Args:
+            key: What the result depends on.
+            entry: The result.
+
+        Returns:
+            The entry as it will be read again.
+
+        Raises:
+            TypeError: JSON cannot hold the entry; or ValueError.
+            ImplicamError: The file cannot be written.
+        """
         content = json.dumps({**key._asdict(), **entry.as_dict()}, default=json_default).encode()
         line = content[:-1] + _CHECK + str(zlib.crc32(content)).encode() + b"}\n"
         read = _parse_line(line)
@@ -171,9 +203,19 @@ class Looked:
 def detect_all(
     pictures: Mapping[View, Path], detector: Detector, path: Path, *, restart: bool, progress: Progress
 ) -> Looked:
-    """Detect in each picture that the journal at `path` does not know yet, on all cores.
+    """Detect in each picture that the journal does not know yet, on all cores.
 
     A picture that cannot be used, and a detector that fails on one, are problems, and looked at again the next time.
+
+    Args:
+        pictures: View -> file.
+        detector: Used in several threads at a time.
+        path: The journal's file.
+        restart: Whether to forget what the journal has.
+        progress: Told how many pictures are done.
+
+    Raises:
+        ImplicamError: The journal cannot be written.
     """
     options = digest(detector)
     entries: dict[View, Entry] = {}
@@ -262,6 +304,10 @@ def _find_fault(entry: Entry) -> str:
 
 
 def sentence(error: ImplicamError) -> str:
-    """An error's three lines in one."""
+    """An error's three lines in one sentence.
+
+    Args:
+        error: Any of ours.
+    """
     what = error.what.rstrip(".")
     return what + (f" ({error.why.rstrip('.')})" if error.why else "") + (f"; {error.fix}" if error.fix else "")

@@ -57,7 +57,11 @@ class Detected:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Detected:
-        """The inverse of `as_dict`."""
+        """The inverse of `as_dict`.
+
+        Args:
+            table: Plain values, as `as_dict` gives them.
+        """
         return cls(
             tuple(table["points"]),
             np.array(table["uv"], dtype=np.float64).reshape(-1, 2),
@@ -70,7 +74,12 @@ class Detected:
 
 
 def nothing(reason: str, **more: Any) -> Detected:
-    """Nothing found, and why."""
+    """Nothing found, and why.
+
+    Args:
+        reason: In a sentence for the user: what to do about it.
+        more: Other fields of `Detected`, such as outlines.
+    """
     return Detected(reason=reason, **more)
 
 
@@ -87,22 +96,49 @@ class Detector(Protocol):
         """All that its results depend on, as plain values: other options, other results."""
 
     def detect(self, picture: Grey, view: View) -> Detected:
-        """Look at one picture. Never raises for what is in the picture: nothing found is a reason."""
+        """Look at one picture. Never raises for what is in the picture: nothing found is a reason.
+
+        Args:
+            picture: (height, width) float32 grey from 0 to 1.
+            view: Which picture it is.
+        """
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
-        """A second look when all pictures are known: what recurs in every shot is no target, and so on."""
+        """A second look when all pictures are known: what recurs in every shot is no target, and so on.
+
+        Args:
+            found: What `detect` gave of each picture.
+
+        Returns:
+            What is to be kept of each, with the same keys.
+        """
 
     def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
-        """What it found as observations, made better, and notes: the middle of a ball for that of its outline, say."""
+        """Make observations better: the middle of a ball for that of its outline, say.
+
+        Args:
+            data: All that was found.
+
+        Returns:
+            The dataset, and notes for the user.
+        """
 
 
 class DetectorBase:
     """What most detectors say of themselves: each picture speaks for itself, and nothing is to be corrected."""
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
-        """Nothing to add."""
+        """Change nothing: each picture speaks for itself.
+
+        Args:
+            found: What `detect` gave of each picture.
+        """
         return dict(found)
 
     def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
-        """The same."""
+        """Change nothing, and note nothing.
+
+        Args:
+            data: All that was found.
+        """
         return data, []

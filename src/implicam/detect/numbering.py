@@ -37,21 +37,46 @@ class Numbering(NamedTuple):
     column: int
 
     def of(self, shape: tuple[int, int]) -> tuple[Ints, Ints]:
-        """Row and column on the board, both of the grid's shape."""
+        """The row and column on the board of each node of a grid.
+
+        Args:
+            shape: Rows and columns of the grid.
+
+        Returns:
+            Rows and columns on the board, both of that shape.
+        """
         i, j = np.indices(shape)
         r, c = _turn(i, j, shape, self.turns)
         return (r + self.row).astype(np.intp), (c + self.column).astype(np.intp)
 
 
 def find_sides(picture: Grey, grid: Grid) -> tuple[str, str, str, str]:
-    """What follows the grid's outermost squares at the top, right, bottom, left: `END` (white), `MORE` squares, or
-    `UNKNOWN`: covered, outside of the picture, or neither."""
+    """What follows the grid's outermost squares.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        grid: Found in it.
+
+    Returns:
+        For top, right, bottom, left: `END` (white), `MORE` squares, or `UNKNOWN`: covered, outside of the picture, or
+        neither.
+    """
     top, right, bottom, left = (_judge_side(picture, grid, side) for side in range(4))
     return top, right, bottom, left
 
 
 def find_numberings(grid: Grid, ends: tuple[str, str, str, str], rows: int, columns: int) -> list[Numbering]:
-    """All the ways to read a grid as part of a board with so many inner corners; none where it cannot be one."""
+    """All the ways to read a grid as part of a board.
+
+    Args:
+        grid: The corners found.
+        ends: What `find_sides` says of it.
+        rows: Rows of the board's inner corners.
+        columns: Columns of the board's inner corners.
+
+    Returns:
+        The ways; an empty list where it cannot be part of such a board.
+    """
     found = []
     for turns in range(4):
         height, width = (grid.rows, grid.columns) if turns % 2 == 0 else (grid.columns, grid.rows)

@@ -59,9 +59,14 @@ class Result:
 
 
 def overlay(grey: Pixels | None, result: Result) -> Pixels:
-    """The whole picture with what was found, and a caption: (height, width, 3), red, green, blue.
+    """Draw the whole picture with what was found, and a caption.
 
-    grey: the picture as `eight_bit` gives it, None where it cannot be read.
+    Args:
+        grey: (height, width) as `eight_bit` gives it; None where the picture cannot be read.
+        result: What came of the picture.
+
+    Returns:
+        (rows, columns, 3) red, green, blue, from 0 to 255.
     """
     if grey is None:
         return _add_caption(_draw_unreadable(640, 400), result).pixels
@@ -77,7 +82,15 @@ def overlay(grey: Pixels | None, result: Result) -> Pixels:
 
 
 def thumbnail(grey: Pixels | None, result: Result) -> Pixels:
-    """A tile of a sheet: the neighbourhood of what was found, the whole picture small, and a caption below."""
+    """Draw a tile of a sheet: the neighbourhood of what was found, the whole picture small, and a caption below.
+
+    Args:
+        grey: (height, width) as `eight_bit` gives it; None where the picture cannot be read.
+        result: What came of the picture.
+
+    Returns:
+        (rows, columns, 3) red, green, blue, from 0 to 255; all tiles have the same size.
+    """
     width, height = TILE_PX
     if grey is None:
         inner = _draw_unreadable(width, height)

@@ -25,7 +25,17 @@ TARGETS: Registry[type[Any]] = Registry(
 
 
 def options_of(target: str) -> dict[str, inspect.Parameter]:
-    """The options that a target has on the command line: the keyword arguments of its detector's `from_options`."""
+    """The options that a target has on the command line: the keyword arguments of its detector's `from_options`.
+
+    Args:
+        target: A name in `TARGETS`.
+
+    Returns:
+        Name -> parameter, with its annotation and default.
+
+    Raises:
+        KeyError: There is no such target.
+    """
     parameters = inspect.signature(TARGETS[target].from_options, eval_str=True).parameters
     return {name: one for name, one in parameters.items() if one.kind is one.KEYWORD_ONLY}
 
@@ -34,12 +44,12 @@ def detector_from_options(target: str | None, dataset: Path, **options: Any) -> 
     """The detector that finds a target in the pictures of a dataset folder.
 
     Args:
-        target: a name in `TARGETS`; where it is None, the `kind` of the table `[target]` of dataset.toml.
-        dataset: the folder; what dataset.toml says of the target fills the options that are not given.
-        **options: those of `options_of(target)`; None and False stand for "not given".
+        target: A name in `TARGETS`; where it is None, the `kind` of the table `[target]` of dataset.toml.
+        dataset: The folder; what dataset.toml says of the target fills the options that are not given.
+        **options: Those of `options_of(target)`; None and False stand for "not given".
 
     Raises:
-        UsageError: the target or an option is not known, or an option is missing or wrong.
+        UsageError: The target or an option is not known, or an option is missing or wrong.
     """
     described = _described_target(dataset)
     name = target or str(described.get("kind", ""))

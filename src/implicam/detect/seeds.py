@@ -42,7 +42,15 @@ PATIENCE_SECONDS = 60.0
 
 
 def from_opencv(picture: Grey, scale: float) -> list[Floats]:
-    """The board that `cv2.findChessboardCornersSB` sees in the picture shrunk or enlarged by `scale`."""
+    """The board that `cv2.findChessboardCornersSB` sees in the picture.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        scale: Factor by which the picture is shrunk or enlarged before.
+
+    Returns:
+        One seed (rows, columns, 2) in pixels of the picture; none where it sees no board.
+    """
     cv2 = opencv()
     image = resize(eight_bit(picture), scale)
     if min(image.shape) < 16:
@@ -57,7 +65,12 @@ def from_opencv(picture: Grey, scale: float) -> list[Floats]:
 
 
 def resize(picture: NDArray[Any], scale: float) -> NDArray[Any]:
-    """The picture shrunk or enlarged."""
+    """Shrink or enlarge a picture.
+
+    Args:
+        picture: (height, width).
+        scale: The factor; 1 gives the picture itself.
+    """
     cv2 = opencv()
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     out: NDArray[Any] = picture if scale == 1 else cv2.resize(picture, None, fx=scale, fy=scale, interpolation=way)
@@ -65,16 +78,33 @@ def resize(picture: NDArray[Any], scale: float) -> NDArray[Any]:
 
 
 def to_original_pixels(uv: Floats, small: NDArray[Any], picture: NDArray[Any]) -> Floats:
-    """Pixels (..., 2) of a picture that was resized, as pixels of the original."""
+    """Convert pixels of a picture that was resized to pixels of the original.
+
+    Args:
+        uv: (..., 2) pixels of the resized picture.
+        small: The resized picture, for its size.
+        picture: The original, for its size.
+
+    Returns:
+        (..., 2) pixels of the original.
+    """
     factor = np.array(picture.shape[::-1]) / np.array(small.shape[::-1])
     return np.asarray((uv + 0.5) * factor - 0.5, dtype=np.float64)
 
 
 def from_libcbdetect(picture: Grey, scale: float) -> list[Floats]:
-    """The board that libCBDetect sees; none where it is not installed, or fails.
+    """The board that libCBDetect sees in the picture.
 
     It runs in a process of its own: version 1.0.5 divides by zero where it finds no corner at all, in a black picture
     for one, which takes the process down.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        scale: Factor by which the picture is shrunk or enlarged before.
+
+    Returns:
+        One seed (rows, columns, 2) in pixels of the picture, NaN for holes; none where the library is not installed, or
+        fails.
     """
     if importlib.util.find_spec("libCBDetect") is None:
         return []
@@ -119,7 +149,15 @@ class Saddles(NamedTuple):
 
 
 def find_saddles(picture: Grey, blur: float = 1.5) -> Saddles:
-    """The saddle points of the picture blurred a little, where its Hessian has a determinant much below zero."""
+    """Find the saddle points of the picture blurred a little, where its Hessian has a determinant much below zero.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        blur: Sigma of the Gaussian in pixels.
+
+    Returns:
+        At most `MAX_SADDLES`, the strongest first.
+    """
     cv2 = opencv()
     smooth = cv2.GaussianBlur(picture, (0, 0), blur)
     uu, vv, uv = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
@@ -143,8 +181,15 @@ def find_saddles(picture: Grey, blur: float = 1.5) -> Saddles:
 
 
 def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[Floats]:
-    """Three by three saddle points (3, 3, 2) that lie as corners of a board do, the strongest first; each point is
-    the middle of one at most, and none is where `taken` says that a pixel (2,) belongs to a board already."""
+    """Three by three saddle points that lie as corners of a board do; each is the middle of one seed at most.
+
+    Args:
+        points: Saddle points.
+        taken: Whether a pixel (2,) belongs to a board already; no seed is made there.
+
+    Yields:
+        Seeds (3, 3, 2) in pixels, the strongest first, at most `MAX_SEEDS`.
+    """
     if len(points.uv) < 9:
         return
     given = 0

@@ -31,7 +31,15 @@ DRAWN = "drawn.json"
 
 
 def sheet(title: str, tiles: Sequence[Pixels]) -> Pixels:
-    """Thumbnails side by side under a title and the meaning of the colours."""
+    """Put thumbnails side by side under a title and the meaning of the colours.
+
+    Args:
+        title: Cut where it is too long.
+        tiles: One or more, (rows, columns, 3) red, green, blue from 0 to 255, all of one size.
+
+    Returns:
+        The page, (rows, columns, 3).
+    """
     gap, head = 12, 56
     height, width = tiles[0].shape[:2]
     columns = min(COLUMNS, len(tiles))
@@ -52,9 +60,21 @@ def sheet(title: str, tiles: Sequence[Pixels]) -> Pixels:
 def draw(
     folder: Path, results: Sequence[Result], progress: Progress, *, redraw: bool = False
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Write folder/overlays/<camera>/<shot>.jpg and folder/<camera>.jpg, -2.jpg, ...; the sheets, and notes of failure.
+    """Draw overlays and sheets: folder/overlays/<camera>/<shot>.jpg and folder/<camera>.jpg, -2.jpg, ...
 
-    What is there and shows the same is left alone, unless `redraw`. What shows pictures that are gone is removed.
+    What is there and shows the same is left alone. What shows pictures that are gone is removed.
+
+    Args:
+        folder: Where to.
+        results: What came of each picture.
+        progress: Told how many pictures are drawn.
+        redraw: Whether to draw all again.
+
+    Returns:
+        The files of the sheets, and notes on what could not be drawn.
+
+    Raises:
+        ImplicamError: The record of what is drawn cannot be written.
     """
     before = {} if redraw else _read_drawn(folder / DRAWN)
     now: dict[str, str] = {}

@@ -30,16 +30,16 @@ def centred(data: Dataset, radius: float, calibration: PredictsPixels | None = N
     """The observations moved from the middle of each outline to the ball's middle.
 
     Args:
-        data: observations of the middles of outlines.
-        radius: of the ball, in the dataset's unit.
-        calibration: of the rig; without one, one is fitted to the known positions of the dataset.
+        data: Observations of the middles of outlines.
+        radius: Of the ball, in the dataset's unit.
+        calibration: Of the rig; without one, one is fitted to the known positions of the dataset.
 
     Returns:
         The dataset, in which the outline's own middle stays as the columns outline_u, outline_v, and notes for the
         person. Data that cannot be corrected come back as they are, with a note that says why.
 
     Raises:
-        UsageError: the radius is not positive.
+        UsageError: The radius is not positive.
     """
     if not (np.isfinite(radius) and radius > 0):
         raise UsageError(f"a ball has no radius {radius:g}.", fix=f"give it in {data.length_unit}, for example 8")
@@ -81,10 +81,10 @@ def outline_shift(calibration: PredictsPixels, xyz: Floats, radius: float, camer
     """How far the middle of a ball's outline is from the picture of the ball's middle.
 
     Args:
-        calibration: of the rig.
+        calibration: Of the rig.
         xyz: (n, 3) the ball's middle, in the world frame and the calibration's unit; NaN where it is not known.
-        radius: of the ball, in the same unit.
-        cameras: names.
+        radius: Of the ball, in the same unit.
+        cameras: Names.
 
     Returns:
         (n, cameras, 2) pixels; NaN where the camera is not calibrated, or the outline cannot be predicted.

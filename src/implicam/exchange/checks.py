@@ -295,7 +295,7 @@ def lens_from_numbers(linear: Sequence[float], coefficients: Sequence[float], fi
     """Make a lens from focal lengths, principal point and OpenCV's distortion coefficients.
 
     Args:
-        linear: fx, fy, cx, cy in pixels.
+        linear: Fx, fy, cx, cy in pixels.
         coefficients: k1, k2, p1, p2, k3 or a part of them; of a fisheye k1, k2, k3, k4. Any beyond k3 must be zero.
         fisheye: Whether they are those of cv2.fisheye.
         place: Where they stand, for the error.

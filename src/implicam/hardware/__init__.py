@@ -85,12 +85,12 @@ def camera_from(name: str, spec: str, *, triggered: bool = False) -> FrameSource
     """The camera that the words of a command line name; it is not opened.
 
     Args:
-        name: the camera's name in the dataset.
-        spec: a driver's name, a colon, and what it asks for; or what one of the drivers takes as it is.
-        triggered: the camera exposes only when a trigger fires.
+        name: The camera's name in the dataset.
+        spec: A driver's name, a colon, and what it asks for; or what one of the drivers takes as it is.
+        triggered: The camera exposes only when a trigger fires.
 
     Raises:
-        UsageError: no driver takes it; the error says what the specs look like.
+        UsageError: No driver takes it; the error says what the specs look like.
     """
     driver, colon, rest = spec.partition(":")
     if colon and driver in CAMERAS:
@@ -106,11 +106,11 @@ def robot_from(spec: str, **options: Any) -> Robot:
     """The robot that the words of a command line name; it is not connected.
 
     Args:
-        spec: a driver's name; for most a colon, and what it asks for: "ur:192.168.0.10".
-        options: the fields of `RobotOptions`.
+        spec: A driver's name; for most a colon, and what it asks for: "ur:192.168.0.10".
+        options: The fields of `RobotOptions`.
 
     Raises:
-        UsageError: there is no such driver, or something that it needs is missing.
+        UsageError: There is no such driver, or something that it needs is missing.
     """
     name, _, rest = spec.partition(":")
     if name not in ROBOTS:

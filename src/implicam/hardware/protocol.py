@@ -99,12 +99,12 @@ class CameraDriver(Protocol):
         """A camera of this driver, not yet opened.
 
         Args:
-            name: the camera's name in the dataset.
-            rest: the spec, or what follows the driver's name and a colon.
-            triggered: the camera exposes only when a trigger fires.
+            name: The camera's name in the dataset.
+            rest: The spec, or what follows the driver's name and a colon.
+            triggered: The camera exposes only when a trigger fires.
 
         Raises:
-            UsageError: the spec is not complete.
+            UsageError: The spec is not complete.
         """
 
 
@@ -187,15 +187,15 @@ class RobotOptions:
     """What a session knows when it makes a robot; a driver takes what it needs.
 
     Attributes:
-        ask: shows a person where the target is to go, a position (3,).
-        unit: the length unit of the dataset; box, sd and tool are in it.
-        box: two opposite corners (3,) of the space that a robot may move in, in its base frame.
+        ask: Shows a person where the target is to go, a position (3,).
+        unit: The length unit of the dataset; box, sd and tool are in it.
+        box: Two opposite corners (3,) of the space that a robot may move in, in its base frame.
         speed: m/s; None for the driver's own.
-        sd: standard uncertainty of positions along x, y, z; None for the driver's own.
+        sd: Standard uncertainty of positions along x, y, z; None for the driver's own.
         tool: (3,) the target's centre in the frame of the robot's flange; None where the robot knows it.
-        dry_run: say where it would go; move nothing.
-        confirm: asked before each move with here and there, each (3,); only True lets it move.
-        say: shows a line of text to the user.
+        dry_run: Say where it would go; move nothing.
+        confirm: Asked before each move with here and there, each (3,); only True lets it move.
+        say: Shows a line of text to the user.
     """
 
     ask: Callable[[Floats], None] | None = None
@@ -220,11 +220,11 @@ class RobotDriver(Protocol):
         """A robot of this driver, not yet connected.
 
         Args:
-            rest: what follows the driver's name and a colon; empty where the name stands alone.
-            options: what the session knows.
+            rest: What follows the driver's name and a colon; empty where the name stands alone.
+            options: What the session knows.
 
         Raises:
-            UsageError: the spec, or an option that this driver needs, is missing or wrong.
+            UsageError: The spec, or an option that this driver needs, is missing or wrong.
         """
 
 

@@ -211,7 +211,7 @@ class Session:
             reason: In words.
 
         Raises:
-            UsageError: xyz is not three finite numbers.
+            UsageError: Xyz is not three finite numbers.
         """
         target = np.asarray(xyz, dtype=np.float64)
         if target.shape != (3,) or not np.isfinite(target).all():
