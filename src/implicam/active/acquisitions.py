@@ -15,29 +15,37 @@ from implicam.registry import Registry
 
 
 class Acquisition(Protocol):
-    """A rule, without any state: the same design and random numbers give the same scores.
+    """A rule that scores candidates; it has no state: the same design and random numbers give the same scores.
 
     Attributes:
-        name: on the command line and in files.
-        same_candidates: whether the loop offers it the same candidates in the same order each time, without as many
-            as there are known points, and not new ones.
+        name: Its name on the command line and in files.
+        same_candidates: Whether the loop offers it the same candidates in the same order each time, without as many as
+            there are known points, instead of new ones.
     """
 
     name: ClassVar[str]
     same_candidates: ClassVar[bool] = False
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """(m,) how much is to be expected of a known point at each candidate, never negative; NaN for nothing."""
+        """How much a known point at each candidate is expected to help.
+
+        Args:
+            design: What is known now and what one more point would change, with m candidates.
+            rng: Random numbers, for rules that need some.
+
+        Returns:
+            (m,) scores, never negative; NaN where a point is of no use.
+        """
 
 
 @dataclass(frozen=True)
 class Random(Acquisition):
-    """Anywhere, all candidates alike."""
+    """All candidates alike."""
 
     name: ClassVar[str] = "random"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """Random numbers."""
+        """As of `Acquisition`: random numbers from 0 to 1."""
         return rng.random(len(design.candidates))
 
 
@@ -49,7 +57,7 @@ class Sobol(Acquisition):
     same_candidates: ClassVar[bool] = True
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """The first one first."""
+        """As of `Acquisition`: the first candidate has the largest score."""
         return np.arange(len(design.candidates), 0, -1, dtype=np.float64)
 
 
@@ -60,7 +68,7 @@ class MaximumVariance(Acquisition):
     name: ClassVar[str] = "variance"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """In the length unit."""
+        """As of `Acquisition`: the mean standard deviation of x, y and z, in the length unit."""
         total = design.there.total
         return np.asarray(np.sqrt(np.diagonal(total, axis1=1, axis2=2)).mean(axis=1), dtype=np.float64)
 
@@ -72,7 +80,7 @@ class RelativeExcess(Acquisition):
     name: ClassVar[str] = "excess"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """The ratio, minus one."""
+        """As of `Acquisition`: the ratio of the variances, minus one."""
         return np.asarray(np.maximum(design.there.excess**2 - 1, 0), dtype=np.float64)
 
 
@@ -80,9 +88,11 @@ class RelativeExcess(Acquisition):
 class IntegratedVariance(Acquisition):
     """By how much a point would reduce the variance of the whole workspace (Cohn, Ghahramani & Jordan 1996).
 
-    relative: in units of what pixel noise alone would leave, or else in length units, where the far end, with its large
-    noise, counts most. power: of the excess that a place already has; the larger, the more the worst places count: it
-    is the slope of the mean of `excess^(2 power)`.
+    Attributes:
+        relative: Whether variances are divided by what pixel noise alone would leave; if not, they are in the squared
+            length unit, and the far end, with its large noise, counts most.
+        power: Of the excess that a place has now; the larger, the more the worst places count. The score is the slope
+            of the mean of `excess^(2 power)`.
     """
 
     relative: bool = True
@@ -91,7 +101,7 @@ class IntegratedVariance(Acquisition):
     name: ClassVar[str] = "integrated"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """The reduction of the weighted mean over the judged places."""
+        """As of `Acquisition`: the reduction of the weighted mean over the judged places."""
         now = design.now
         floor = np.trace(now.floor, axis1=1, axis2=2) if self.relative else 1.0
         excess = np.trace(now.total, axis1=1, axis2=2) / floor
@@ -102,12 +112,12 @@ class IntegratedVariance(Acquisition):
 
 @dataclass(frozen=True)
 class DOptimal(Acquisition):
-    """The view that tells most of the unknowns, wherever it matters: the largest information, in nats."""
+    """The view that tells most about the unknowns, wherever in the workspace that helps: information, in nats."""
 
     name: ClassVar[str] = "d-optimal"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """Half the log of the determinant's ratio."""
+        """As of `Acquisition`: half the log of the ratio of the determinants."""
         return design.information()
 
 
@@ -125,7 +135,14 @@ DEFAULT = IntegratedVariance.name
 
 
 def acquisition(name: str) -> Acquisition:
-    """The rule with this name; UsageError for another."""
+    """The rule with this name.
+
+    Args:
+        name: A key of `ACQUISITIONS`.
+
+    Raises:
+        UsageError: There is no such rule, or a variant is asked for; acquisitions have none.
+    """
     rule, variant = ACQUISITIONS.find(name)
     if variant:
         raise UsageError(f"the acquisition {rule.name} has no variants.", fix=f"write {rule.name}")
@@ -134,7 +151,12 @@ def acquisition(name: str) -> Acquisition:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Candidates chosen, in the order in which to go there, and the score of each when it was chosen."""
+    """Candidates that were chosen, in the order in which to visit them.
+
+    Attributes:
+        index: Their numbers among the candidates.
+        scores: The score of each when it was chosen.
+    """
 
     index: list[int]
     scores: list[float]
@@ -156,11 +178,22 @@ def choose(
     here: Floats | None = None,
     reach: float = np.inf,
 ) -> Choice:
-    """The `count` best candidates, each as if those before it were known already.
+    """Choose the best candidates, each as if those before it were known already.
 
-    reach: the distance that costs as much time as one measurement; a score counts per time, so that a robot `here`
-    (3,) does not cross the volume for little. Several are then ordered to a short path. UsageError where no candidate
-    is of any use.
+    Args:
+        design: What is known now, with m candidates.
+        rule: What scores the candidates.
+        rng: Random numbers for the rule.
+        count: How many to choose; fewer come back where no more are of any use.
+        here: (3,) where the target is now, in the world; with it, the chosen ones are ordered to a short path.
+        reach: The distance that costs as much time as one measurement. A score then counts per time, so that a robot
+            does not cross the volume for little.
+
+    Returns:
+        The candidates chosen, in the order in which to visit them.
+
+    Raises:
+        UsageError: No candidate is of any use.
     """
     chosen: list[int] = []
     scores: list[float] = []
@@ -211,5 +244,13 @@ def _path(xyz: Floats, here: Floats | None) -> list[int]:
 
 
 def path_length(xyz: Floats | Sequence[Floats], here: Floats) -> float:
-    """The length of the way from `here` through places (k, 3)."""
+    """The length of the path from `here` through places, in their order.
+
+    Args:
+        xyz: (k, 3) places.
+        here: (3,) where the path begins.
+
+    Returns:
+        The length, in the unit of the places.
+    """
     return float(np.linalg.norm(np.diff(np.concatenate([here[None], np.asarray(xyz)]), axis=0), axis=1).sum())

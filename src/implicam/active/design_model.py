@@ -33,8 +33,13 @@ K95 = float(np.sqrt(chi2.ppf(0.95, 3)))
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Positions xyz (n, 3), the pixels (n, cameras, 2) at which all cameras of the dataset see them or would, and
-    seen (n, cameras) where they do: in the picture, and not behind the lens."""
+    """Positions, and where the cameras see them.
+
+    Attributes:
+        xyz: (n, 3) positions in the world.
+        uv: (n, cameras, 2) the pixels at which all cameras of the dataset see them, or would.
+        seen: (n, cameras) where they do: in the picture, and not behind the lens.
+    """
 
     xyz: Floats
     uv: Floats
@@ -44,18 +49,31 @@ class Places:
         return len(self.xyz)
 
     def select(self, index: NDArray[np.int64] | Bools) -> Places:
-        """Some of them."""
+        """Some of the places.
+
+        Args:
+            index: (k,) numbers, or (n,) which to keep.
+        """
         return Places(self.xyz[index], self.uv[index], self.seen[index])
 
     @classmethod
     def predicted(cls, rig: PredictsPixels, xyz: Floats) -> Places:
-        """Where a calibration says that the cameras would see positions (n, 3)."""
+        """Where a calibration says that the cameras would see positions.
+
+        Args:
+            rig: A calibration that predicts pixels.
+            xyz: (n, 3) positions in the world.
+        """
         uv = rig.predict(xyz)
         return cls(xyz, uv, on_image(rig.trained, uv))
 
     @classmethod
     def recorded(cls, data: Dataset) -> Places:
-        """Known points that were recorded already: a pool to choose from."""
+        """Known points that were recorded already, to choose from.
+
+        Args:
+            data: A dataset with known positions.
+        """
         return cls(data.xyz, data.observations.uv, data.observations.seen)
 
 
@@ -64,7 +82,15 @@ UNTOLD_IMAGE_MARGIN = 0.25
 
 
 def on_image(observations: Observations, uv: Floats) -> Bools:
-    """(n, cameras) which pixels (n, cameras, 2) are in the picture; where its size is not told, near those seen."""
+    """Which pixels are in the picture; where its size is not known, which are near those that were seen.
+
+    Args:
+        observations: The cameras, with their image sizes where known, and what they saw.
+        uv: (n, cameras, 2) pixels.
+
+    Returns:
+        (n, cameras), false for NaN and for a camera of unknown size that saw nothing.
+    """
     seen = np.zeros(uv.shape[:2], dtype=np.bool_)
     for c, camera in enumerate(observations.cameras):
         if camera.width is not None and camera.height is not None:
@@ -81,16 +107,19 @@ def on_image(observations: Observations, uv: Floats) -> Bools:
 
 @dataclass(frozen=True, eq=False)
 class PredictedCovariance:
-    """What measuring at n places would be worth: total (n, 3, 3) the covariance of a position measured there; floor
-    (n, 3, 3) what pixel noise alone would leave, however well the cameras are known. NaN where nothing is measured.
-    make_floor: called when somebody asks for it, for it can cost as much as all the rest."""
+    """The covariance that a position measured at each of n places would have.
+
+    Attributes:
+        total: (n, 3, 3) covariance in the squared length unit; NaN where nothing can be measured.
+        make_floor: Computes `floor` when it is first asked for, because it can cost as much as all the rest.
+    """
 
     total: Floats
     make_floor: Callable[[], Floats]
 
     @cached_property
     def floor(self) -> Floats:
-        """(n, 3, 3) what pixel noise alone would leave."""
+        """(n, 3, 3) the covariance that pixel noise alone would leave, however well the cameras are known."""
         return self.make_floor()
 
     @property
@@ -100,17 +129,17 @@ class PredictedCovariance:
 
     @property
     def sd(self) -> Floats:
-        """(n,) standard deviation of a position, of all three axes together."""
+        """(n,) standard deviation of a position, of all three axes together, in the length unit."""
         return np.asarray(np.sqrt(np.trace(self.total, axis1=1, axis2=2)), dtype=np.float64)
 
     @property
     def excess(self) -> Floats:
-        """(n,) how many times as large it is as pixel noise alone would leave."""
+        """(n,) the standard deviation over that which pixel noise alone would leave."""
         return np.asarray(self.sd / np.sqrt(np.trace(self.floor, axis1=1, axis2=2)), dtype=np.float64)
 
     @property
     def u95(self) -> Floats:
-        """(n,) 95 % uncertainty: the longest semi-axis of the ellipsoid that holds the position with 95 %."""
+        """(n,) 95 % uncertainty in the length unit: the longest semi-axis of the 95 % ellipsoid of the position."""
         largest = np.full(len(self.total), np.nan)
         i = self.measured
         largest[i] = K95 * np.sqrt(np.linalg.eigvalsh(self.total[i])[:, -1])
@@ -130,31 +159,48 @@ class DesignModel(Protocol):
 
     @property
     def now(self) -> PredictedCovariance:
-        """What measuring at the judged places is worth."""
+        """The covariance of measuring at the judged places."""
 
     @property
     def there(self) -> PredictedCovariance:
-        """What measuring at the candidates is worth."""
+        """The covariance of measuring at the candidates."""
 
     @property
     def useful(self) -> Bools:
         """(m,) at which candidates a known point could be used."""
 
     def gain(self, weights: Floats) -> Floats:
-        """(m,) by how much a known point at each candidate would reduce `sum weights * total variance` of the judged
-        places (m judged,), to first order."""
+        """How much a known point at each candidate would reduce the variance at the judged places, to first order.
+
+        Args:
+            weights: (g,) of the judged places, NaN for those that do not count.
+
+        Returns:
+            (m,) by how much `sum weights * trace of the covariance` would fall; zero where a point is of no use.
+        """
 
     def information(self) -> Floats:
-        """(m,) what a known point at each candidate would tell of the unknowns, in nats."""
+        """(m,) what a known point at each candidate would tell about the unknowns, in nats."""
 
     def after(self, i: int) -> Self:
-        """The design when candidate number i is a known point too."""
+        """The design when one candidate is a known point too.
+
+        Args:
+            i: The number of the candidate.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardDesignModel:
-    """Of a method that predicts pixels. parts: the sensitivities at candidates and judged places, in this order; what
-    is not seen is zero, with unit noise. place: (3, 3) covariance of a known position."""
+    """The design model of a method that predicts pixels.
+
+    Attributes:
+        candidates: Where the next known point may be, m places.
+        judged: Where the calibration has to be good, g places.
+        parts: The sensitivities at candidates and judged places, in this order; zero, with unit noise, where a camera
+            does not see a place.
+        place: (3, 3) covariance of a known position.
+    """
 
     candidates: Places
     judged: Places
@@ -163,7 +209,13 @@ class ForwardDesignModel:
 
     @classmethod
     def of(cls, rig: PredictsPixels, candidates: Places, judged: Places) -> ForwardDesignModel:
-        """What the rig's cameras would see."""
+        """The design model of a rig whose known positions are exact.
+
+        Args:
+            rig: A calibration that predicts pixels.
+            candidates: Where the next known point may be.
+            judged: Where the calibration has to be good.
+        """
         xyz = np.concatenate([candidates.xyz, judged.xyz])
         seen = np.concatenate([candidates.seen, judged.seen])
         parts = tuple(_masked(part, seen[:, part.cameras]) for part in rig.sensitivities(xyz))
@@ -171,7 +223,7 @@ class ForwardDesignModel:
 
     @property
     def useful(self) -> Bools:
-        """Seen by any camera: its position is known."""
+        """(m,) which candidates any camera sees; their position is known, so one view is enough."""
         return np.asarray(self.candidates.seen.any(axis=1))
 
     @cached_property
@@ -194,19 +246,22 @@ class ForwardDesignModel:
 
     @property
     def now(self) -> PredictedCovariance:
-        """At the judged places."""
+        """The covariance of measuring at the judged places."""
         m = len(self.candidates)
         return PredictedCovariance(self._predicted.total[m:], lambda: self._predicted.floor[m:])
 
     @property
     def there(self) -> PredictedCovariance:
-        """At the candidates."""
+        """The covariance of measuring at the candidates."""
         m = len(self.candidates)
         return PredictedCovariance(self._predicted.total[:m], lambda: self._predicted.floor[:m])
 
     def gain(self, weights: Floats) -> Floats:
-        """(m,) the expected reduction: a position is off by `A (error of the pixels)`, A = T D^T S^-1, and one more
-        point takes `K (S + place)^-1 K^T` off their covariance (Cohn's criterion, for a Gaussian linear model)."""
+        """As of `DesignModel`: Cohn's criterion for a linear model with normal errors.
+
+        A position is off by `A (error of the pixels)`, A = T D^T S^-1, and one more point reduces their covariance by
+        `K (S + place)^-1 K^T`.
+        """
         m = len(self.candidates)
         total = self._predicted.total[m:]
         good = np.isfinite(total[:, 0, 0]) & np.isfinite(weights)
@@ -222,7 +277,7 @@ class ForwardDesignModel:
         return np.where(self.useful, found, 0.0)
 
     def information(self) -> Floats:
-        """(m,) half the log determinant of the predicted views' covariance over that of their noise."""
+        """As of `DesignModel`: half the log determinant of the predicted views' covariance over that of their noise."""
         m = len(self.candidates)
         found = np.zeros(m)
         for part, S in zip(self.parts, self._covariances, strict=True):
@@ -236,7 +291,10 @@ class ForwardDesignModel:
         return np.asarray(D @ self.place @ D.swapaxes(1, 2), dtype=np.float64)
 
     def after(self, i: int) -> ForwardDesignModel:
-        """Candidate i known too: `half <- half (I - V diag(1 - 1/sqrt(1 + s^2)) V^T)`, s and V of its whitened half."""
+        """As of `DesignModel`: `half <- half (I - V diag(1 - 1/sqrt(1 + s^2)) V^T)`.
+
+        s and V are the singular values and vectors of the candidate's whitened half.
+        """
         parts = []
         for part in self.parts:
             noise = self._of_place(part)[i] + np.diag(part.noise[i] + part.rest[i])
@@ -247,7 +305,15 @@ class ForwardDesignModel:
 
 
 def floor_of(rig: PredictsPixels, places: Places) -> Floats:
-    """(n, 3, 3) the covariance that pixel noise alone would leave at each place; NaN with fewer than two views."""
+    """The covariance of a position that pixel noise alone would leave.
+
+    Args:
+        rig: A calibration that predicts pixels.
+        places: n places, with the cameras that see each.
+
+    Returns:
+        (n, 3, 3), NaN with fewer than two views.
+    """
     information = np.zeros((len(places), 3, 3))
     views = np.zeros(len(places))
     for part in rig.sensitivities(places.xyz):
@@ -286,13 +352,14 @@ def _diagonal(variances: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class InverseDesignModel:
-    """Of Gaussian processes from pixels to positions.
+    """The design model of Gaussian processes from pixels to positions.
 
     Attributes:
-        candidates, judged: places; only those that every camera sees count.
-        at: the processes at candidates and judged places, in this order.
-        pilot: knows what pixel noise leaves at each place. Without it that is what the processes take for noise, and
-            with few points they take nearly everything for noise.
+        candidates: Where the next known point may be, m places; only those that every camera sees count.
+        judged: Where the calibration has to be good, g places; only those that every camera sees count.
+        at: The processes at candidates and judged places, in this order.
+        pilot: A calibration that says what pixel noise leaves at each place. Without it the noise of the processes is
+            taken, and with few points that is nearly everything.
     """
 
     candidates: Places
@@ -302,7 +369,7 @@ class InverseDesignModel:
 
     @property
     def useful(self) -> Bools:
-        """Seen by every camera."""
+        """(m,) which candidates every camera sees."""
         return np.asarray(self.candidates.seen.all(axis=1))
 
     def _predicted(self, part: slice, places: Places) -> PredictedCovariance:
@@ -318,16 +385,16 @@ class InverseDesignModel:
 
     @property
     def now(self) -> PredictedCovariance:
-        """At the judged places."""
+        """The covariance of measuring at the judged places."""
         return self._predicted(slice(len(self.candidates), None), self.judged)
 
     @property
     def there(self) -> PredictedCovariance:
-        """At the candidates."""
+        """The covariance of measuring at the candidates."""
         return self._predicted(slice(len(self.candidates)), self.candidates)
 
     def gain(self, weights: Floats) -> Floats:
-        """(m,) the expected reduction, in closed form: covariance squared over the variance of a new output."""
+        """As of `DesignModel`, in closed form: covariance squared over the variance of a new output."""
         m = len(self.candidates)
         weights = weights * self.at.widened[m:]
         good = np.isfinite(weights) & self.judged.seen.all(axis=1)
@@ -339,23 +406,31 @@ class InverseDesignModel:
         return np.where(self.useful, found, 0.0)
 
     def information(self) -> Floats:
-        """(m,) half the log of the variance of a new output over that of its noise, all three axes."""
+        """As of `DesignModel`: half the log of the variance of a new output over that of its noise, all three axes."""
         m = len(self.candidates)
         ratios = [one.outputs * np.log1p(one.variances[:m] / one.noise_variance) for one in self.at.processes]
         return np.where(self.useful, 0.5 * np.sum(ratios, axis=0), 0.0)
 
     def after(self, i: int) -> InverseDesignModel:
-        """Candidate i known too."""
+        """As of `DesignModel`."""
         return replace(self, at=self.at.with_known(i))
 
 
 def designs_experiments(calibration: Calibration | type) -> bool:
-    """Whether a calibration, or a class of them, says what one more known point would add."""
+    """Whether a calibration says what one more known point would add.
+
+    Args:
+        calibration: A calibration, or a class of them.
+    """
     return any(hasattr(calibration, name) for name in ("sensitivities", "position_processes"))
 
 
 def cannot_design(method: str) -> UsageError:
-    """The error for a method that does not say it."""
+    """The error for a method that does not say what one more known point would add.
+
+    Args:
+        method: Its name.
+    """
     able = [name for name, (_, calibration) in CALIBRATORS.items() if designs_experiments(calibration)]
     return UsageError(
         f"{method} cannot say where to measure next.",
@@ -370,13 +445,16 @@ def design_model_of(
     """The design model of a calibration.
 
     Args:
-        calibration: that of the rig.
+        calibration: That of the rig.
         candidates: (m, 3) in the world, or places whose pixels are known.
         judged: (g, 3) in the world, or places whose pixels are known.
-        pilot: another calibration of the same rig, which predicts pixels; needed for a method that does not.
+        pilot: Another calibration of the same rig, which predicts pixels; needed for a method that does not.
+
+    Returns:
+        The design model, with the covariance of a known position that the data state.
 
     Raises:
-        UsageError: the method cannot say what one more known point would add, or nothing predicts pixels.
+        UsageError: The method cannot say what one more known point would add, or nothing predicts pixels.
     """
     if not designs_experiments(calibration):
         raise cannot_design(calibration.method)

@@ -49,8 +49,15 @@ MAX_SKIPPED = 20
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Where to put the next known point: xyz (3,) in the world; uv (cameras, 2) where each camera is going to see it,
-    NaN where it does not or where nothing is known yet; score: of the acquisition, NaN for a point to begin with."""
+    """Where to put the next known point.
+
+    Attributes:
+        name: The name of the point.
+        xyz: (3,) in the world.
+        uv: (cameras, 2) the pixel at which each camera will see it; NaN where it will not, or where no calibration is
+            there yet.
+        score: Of the acquisition; NaN for a point to begin with.
+    """
 
     name: str
     xyz: Floats
@@ -59,7 +66,13 @@ class Target:
 
 
 def targets_of(places: Places, chosen: Choice, data: Dataset) -> list[Target]:
-    """The candidates chosen, with names that no point of the data has."""
+    """The chosen candidates as targets, with names that no point of the data has.
+
+    Args:
+        places: The candidates.
+        chosen: Which of them, in the order in which to visit them.
+        data: What is known already.
+    """
     uv = np.where(places.seen[..., None], places.uv, np.nan)
     return [
         Target(name, places.xyz[i], uv[i], score)
@@ -68,14 +81,23 @@ def targets_of(places: Places, chosen: Choice, data: Dataset) -> list[Target]:
 
 
 def free_names(data: Dataset | None) -> Iterator[str]:
-    """p<number>, from the number of points on; none that a point has already."""
+    """Names for new points, without end: p and a number, from the number of points on.
+
+    Args:
+        data: Known points, whose names are left out; None for none.
+    """
     used = set() if data is None else set(data.points.tolist())
     names = (f"p{number:03d}" for number in count(len(used) + 1))
     return (name for name in names if name not in used)
 
 
 class Answer(NamedTuple):
-    """What came of a target: one shot of known points, or why there is none."""
+    """What came of a target.
+
+    Attributes:
+        data: One shot of known points; None where nothing was measured.
+        reason: Why nothing was measured, in words.
+    """
 
     data: Dataset | None
     reason: str = ""
@@ -85,18 +107,39 @@ class Oracle(Protocol):
     """Answers what the cameras see when the target is there."""
 
     def observe(self, target: Target) -> Answer:
-        """The known point that was measured there, or nearby; a target that cannot be measured is no error."""
+        """Measure a known point at a target, or near it; a target that cannot be measured is no error.
+
+        Args:
+            target: Where.
+
+        Returns:
+            What the cameras saw, or the reason why nothing was measured.
+        """
 
 
 @dataclass(eq=False)
 class Loop:
-    """Active learning of a calibration; changes as points are told.
+    """Active learning of a calibration; it changes with each point that it is told.
 
-    calibrator: the method; workspace: where targets can be and where the calibration has to be good. start: so many
-    points before the first fit, evenly spread. candidates, judged: numbers of places. reach: the distance that costs
-    as much as one measurement. growth: a fit begins from no guess when the points have grown by this factor, from the
-    last result between; 1 for always from no guess, as the paper does. pool: a recorded dataset that the targets are
-    chosen from, its own pixels known. data: what is known already.
+    Attributes:
+        calibrator: The method.
+        workspace: Where targets can be, and where the calibration has to be good.
+        acquisition: What scores the candidates.
+        rule: When to stop.
+        start: The number of evenly spread points before the first fit.
+        candidates: How many places are scored for the next target.
+        judged: How many places the calibration is judged at.
+        reach: The distance that costs as much time as one measurement.
+        seed: Of the candidates, the judged places and random rules.
+        growth: A fit begins from no guess when the number of points has grown by this factor, and from the last result
+            otherwise; 1 for always from no guess, as the paper does.
+        pool: A recorded dataset from which the targets are chosen, with its own pixels.
+        data: What is known already.
+        history: One step for each change of the data: the uncertainty over the workspace.
+        calibration: The last fit; None before there is one.
+        problem: Why the last fit failed; None where it did not.
+        predicted: The covariance at the judged places; None before there is a calibration.
+        judged_at: (g, 3) the judged places in the world.
     """
 
     calibrator: Calibrator
@@ -137,13 +180,18 @@ class Loop:
 
     @property
     def skipped(self) -> list[tuple[Floats, str]]:
-        """Where targets could not be measured, and why."""
+        """Where targets could not be measured, (3,) in the world, and why."""
         return self._refused
 
     def ask(self, number: int = 1, here: Floats | None = None) -> list[Target]:
-        """The next targets, in the order in which to go there from `here` (3,).
+        """The next targets, in the order in which to visit them.
 
-        UsageError where there is no place left that any camera would see.
+        Args:
+            number: How many.
+            here: (3,) where the target is now, in the world; None where that does not matter.
+
+        Raises:
+            UsageError: No place is left that any camera would see.
         """
         self._asked += 1
         if self.calibration is None:
@@ -163,7 +211,16 @@ class Loop:
         return [replace(target, name=self._name(target.xyz, k)) for k, target in enumerate(targets)]
 
     def tell(self, answer: Answer | Dataset, target: Target | None = None, progress: Progress = silent) -> None:
-        """Add what was measured and fit again; what could not be measured is remembered, and not asked for again."""
+        """Add what was measured and fit again.
+
+        Args:
+            answer: What was measured, or the reason why nothing was.
+            target: The target that was asked for; where nothing was measured, it is not asked for again.
+            progress: Called as the fit goes on.
+
+        Raises:
+            DatasetError: The new points do not go with those that are there: other cameras, another unit, a name twice.
+        """
         data, reason = (answer, "") if isinstance(answer, Dataset) else answer
         if data is None:
             if target is not None:
@@ -172,11 +229,21 @@ class Loop:
         self.reset(data if self.data is None else join(self.data, data), progress)
 
     def refuse(self, xyz: Floats, reason: str) -> None:
-        """A place (3,) where no target could be measured: neither it nor what is near it is asked for again."""
+        """Remember a place where no target could be measured; neither it nor what is near it is asked for again.
+
+        Args:
+            xyz: (3,) the place in the world.
+            reason: Why, in words.
+        """
         self._refused.append((xyz, reason))
 
     def reset(self, data: Dataset | None, progress: Progress = silent) -> None:
-        """Go on from other known points: some that were there already, or fewer because one was taken back."""
+        """Go on with other known points: some that were there already, or fewer because one was withdrawn.
+
+        Args:
+            data: All known points from now on; None for none. With fewer points than before, the history is cut.
+            progress: Called as the fit goes on.
+        """
         if data is None or self.data is None or len(data) <= len(self.data):
             self._pilot = None
             self.history = [step for step in self.history if data is not None and step.points < len(data)]
@@ -192,7 +259,15 @@ class Loop:
             self.history.append(self._step())
 
     def run(self, oracle: Oracle, progress: Progress = silent) -> Loop:
-        """Ask and tell until a rule says stop, or no place is left; the loop itself."""
+        """Ask and tell until the rule says stop, no place is left, or `MAX_SKIPPED` targets in a row were not measured.
+
+        Args:
+            oracle: What measures at a target.
+            progress: Called after each target.
+
+        Returns:
+            The loop itself.
+        """
         in_vain = 0
         while not self.stop and in_vain < MAX_SKIPPED:
             try:
@@ -314,7 +389,16 @@ class Loop:
 
 
 def step_of(predicted: PredictedCovariance, points: int, seconds: float = 0.0) -> Step:
-    """The numbers of a predicted over the places where it is measured."""
+    """The uncertainty over the places where something can be measured.
+
+    Args:
+        predicted: The covariance at the judged places.
+        points: How many known points there are.
+        seconds: Since the beginning.
+
+    Returns:
+        The step; its lengths are NaN where nothing can be measured.
+    """
     u95, excess = predicted.u95[predicted.measured], predicted.excess[predicted.measured]
     share = float(predicted.measured.mean()) if len(predicted.measured) else 0.0
     if not len(u95):

@@ -14,10 +14,15 @@ from implicam.simulate import Target as Shown
 
 @dataclass(eq=False)
 class SimulatedOracle:
-    """A simulated rig that looks at a ball where the target is; `seed` rules the noise.
+    """A simulated rig that looks at a ball where the target is.
 
-    robot_noise: sd per axis of the known position. missing: probability that a view is lost. fails: that nothing is
-    measured at all.
+    Attributes:
+        rig: The rig.
+        seed: Of the noise.
+        robot_noise: Standard deviation of the known position per axis, in the length unit.
+        missing: Probability that a view is lost.
+        fails: Probability that nothing is measured at all.
+        asked: How many targets it was asked for.
     """
 
     rig: Rig
@@ -28,7 +33,7 @@ class SimulatedOracle:
     asked: int = field(default=0, init=False)
 
     def observe(self, target: Target) -> Answer:
-        """One known point with the views of the cameras that see it."""
+        """As of `Oracle`: one known point with the views of the cameras that see it."""
         self.asked += 1
         if np.random.default_rng([self.seed, self.asked, 7]).random() < self.fails:
             return Answer(None, "the ball was not found")
@@ -42,14 +47,21 @@ class SimulatedOracle:
 
 @dataclass(frozen=True, eq=False)
 class RecordedOracle:
-    """A dataset that was recorded before; a target is answered by the point nearest to it that was not used yet, of
-    several at one place by the one with its name."""
+    """A dataset that was recorded before.
+
+    A target is answered by the point nearest to it that was not used yet; of several at one place, by the one with the
+    target's name.
+
+    Attributes:
+        data: The recorded points.
+        used: The names of those that were used.
+    """
 
     data: Dataset
     used: set[str] = field(default_factory=set)
 
     def observe(self, target: Target) -> Answer:
-        """The nearest point that is left."""
+        """As of `Oracle`: the nearest point that is left."""
         names = self.data.points.tolist()
         left = [i for i, name in enumerate(names) if name not in self.used]
         if not left:

@@ -15,12 +15,16 @@ from implicam.formatting import percent
 
 @dataclass(frozen=True)
 class Step:
-    """What is known after so many known points, over the workspace.
+    """The uncertainty over the workspace with a number of known points; NaN before there is a calibration.
 
-    worst, mean, usual: 95 % uncertainty of a position in the length unit, at the worst place, on average, and not
-    exceeded in 95 % of the workspace; excess: the same 95th percentile of the standard deviation over what pixel noise
-    alone would leave; measured: part of the workspace that can be measured. seconds: since the beginning. NaN before
-    there is a calibration.
+    Attributes:
+        points: How many known points.
+        worst: 95 % uncertainty of a position at the worst place, in the length unit.
+        mean: The same, on average.
+        usual: The same, not exceeded in 95 % of the workspace.
+        excess: 95th percentile of the standard deviation over that which pixel noise alone would leave.
+        measured: The part of the workspace in which a position can be measured, from 0 to 1.
+        seconds: Since the beginning.
     """
 
     points: int
@@ -36,7 +40,15 @@ class Rule:
     """A stopping rule: `met(history)` is why to stop, empty for not yet."""
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """Why to stop now, in words; empty where not yet. unit: of lengths, for the words."""
+        """Why to stop now.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The reason in words; empty where it is not time to stop.
+        """
         raise NotImplementedError
 
     def __and__(self, other: Rule) -> Rule:
@@ -54,7 +66,7 @@ class Both(Rule):
     second: Rule
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """Both reasons."""
+        """As of `Rule`: both reasons."""
         one, two = self.first.met(history, unit), self.second.met(history, unit)
         return f"{one}, and {two}" if one and two else ""
 
@@ -67,7 +79,7 @@ class Either(Rule):
     second: Rule
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """The first reason there is."""
+        """As of `Rule`: the first reason there is."""
         return self.first.met(history, unit) or self.second.met(history, unit)
 
 
@@ -81,8 +93,15 @@ OF = {"worst": "everywhere", "usual": "in 95 % of the workspace", "mean": "on av
 
 @dataclass(frozen=True)
 class Below(Rule):
-    """When the 95 % uncertainty, in the length unit, is at most `value`: everywhere ("worst"), in 95 % of the workspace
-    ("usual"), or on average ("mean")."""
+    """When the 95 % uncertainty is small enough.
+
+    Attributes:
+        value: The largest uncertainty at which to stop, in the length unit.
+        of: "worst", everywhere; "usual", in 95 % of the workspace; "mean", on average.
+
+    Raises:
+        UsageError: The value is not a positive number, or `of` is another word.
+    """
 
     value: float
     of: str = "worst"
@@ -96,15 +115,23 @@ class Below(Rule):
             raise UsageError(f"a stop below {self.value} is never reached.", fix="give a length greater than zero")
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """The uncertainty now."""
+        """As of `Rule`: the uncertainty now."""
         now = getattr(history[-1], self.of) if history else math.nan
         return f"{now:.2g} {unit}".strip() + f" {OF[self.of]}{_where(history[-1])}" if now <= self.value else ""
 
 
 @dataclass(frozen=True)
 class Within(Rule):
-    """When, in 95 % of the workspace, a position is at most `times` as uncertain as pixel noise alone would leave it:
-    then more points hardly help, and better pictures would."""
+    """When, in 95 % of the workspace, a position is hardly more uncertain than pixel noise alone would leave it.
+
+    Then more points hardly help, and better pictures would.
+
+    Attributes:
+        times: The largest ratio of the standard deviations at which to stop.
+
+    Raises:
+        UsageError: The ratio is not a number above 1.
+    """
 
     times: float = 1.2
 
@@ -115,21 +142,27 @@ class Within(Rule):
             )
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """How near it is."""
+        """As of `Rule`: the ratio now."""
         now = history[-1].excess if history else math.nan
         return f"{now:.2f} times what pixel noise alone leaves{_where(history[-1])}" if now <= self.times else ""
 
 
 @dataclass(frozen=True)
 class Converged(Rule):
-    """When the last `over` points together changed the 95 % uncertainty by less than the part `change` of it."""
+    """When the last points together hardly changed the 95 % uncertainty.
+
+    Attributes:
+        change: The part of the uncertainty by which it may still have changed.
+        over: The number of points.
+        of: "worst", "usual" or "mean", as of `Below`.
+    """
 
     change: float = 0.05
     over: int = 5
     of: str = "usual"
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """By how much it still changes."""
+        """As of `Rule`: by how much it still changes."""
         values = [getattr(step, self.of) for step in history]
         if len(values) <= self.over or not all(math.isfinite(v) for v in values[-self.over - 1 :]):
             return ""
@@ -145,7 +178,7 @@ class AtLeast(Rule):
     points: int
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """How many there are."""
+        """As of `Rule`: how many there are."""
         return f"{history[-1].points} points" if history and history[-1].points >= self.points else ""
 
 
@@ -154,7 +187,7 @@ class Budget(AtLeast):
     """When the budget of known points is spent."""
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """How many there were."""
+        """As of `Rule`: how many there were."""
         return f"all {self.points} points of the budget are measured" if super().met(history, unit) else ""
 
 
@@ -165,15 +198,15 @@ class Time(Rule):
     seconds: float
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """How many have."""
+        """As of `Rule`: how many have passed."""
         over = history and history[-1].seconds >= self.seconds
         return f"{history[-1].seconds:.0f} s have passed" if over else ""
 
 
 @dataclass(frozen=True)
 class Never(Rule):
-    """Until a person says so."""
+    """Until a person stops it."""
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """Nothing."""
+        """As of `Rule`: always empty."""
         return ""

@@ -18,8 +18,13 @@ from implicam.errors import UsageError
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """The next targets in the order in which to go there; what is known of the workspace now, and what is to be
-    expected when all of them are known points."""
+    """The next targets of a calibration.
+
+    Attributes:
+        targets: In the order in which to visit them.
+        now: The uncertainty over the workspace now.
+        then: The uncertainty to be expected when all targets are known points.
+    """
 
     targets: list[Target]
     now: Step
@@ -38,8 +43,22 @@ def suggest(
     judged: int = 400,
     seed: int = 0,
 ) -> Suggestion:
-    """The `count` best next targets for a calibration. rule: the default acquisition where None. here, reach: as for
-    `choose`. UsageError for a method that cannot say, and for a workspace that the cameras do not see."""
+    """The best next targets for a calibration.
+
+    Args:
+        calibration: That of the rig.
+        workspace: Where targets can be, and where the calibration has to be good.
+        count: How many targets.
+        rule: What scores the candidates; None for the default acquisition.
+        here: (3,) where the target is now, in the world; with it, the targets are ordered to a short path.
+        reach: The distance that costs as much time as one measurement.
+        candidates: How many places are scored.
+        judged: How many places the calibration is judged at.
+        seed: Of the places and of random rules.
+
+    Raises:
+        UsageError: The method cannot say what one more point would add, or the cameras do not see the workspace.
+    """
     if not designs_experiments(calibration):
         raise cannot_design(calibration.method)
     pilot = None if isinstance(calibration, PredictsPixels) else ForwardGP().fit(calibration.data)

@@ -31,8 +31,15 @@ RELATIVE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """A convex region: `normals (k, 3) @ xyz <= offsets (k,)`; vertices (v, 3) its corners; places (n, 3) the only
-    ones where a target can be, None for anywhere inside. name: in words."""
+    """A convex region of the world: `normals @ xyz <= offsets`.
+
+    Attributes:
+        normals: (k, 3) unit vectors out of its faces.
+        offsets: (k,) of the faces, in the length unit.
+        vertices: (v, 3) its corners.
+        places: (n, 3) the only places where a target can be; None for anywhere inside.
+        name: What it is, in words.
+    """
 
     normals: Floats
     offsets: Floats
@@ -42,7 +49,15 @@ class Workspace:
 
     @classmethod
     def box(cls, low: ArrayLike, high: ArrayLike) -> Workspace:
-        """From `low` (3,) to `high` (3,), along the axes of the world; UsageError for an empty one."""
+        """A box along the axes of the world.
+
+        Args:
+            low: (3,) its lower end of x, y and z.
+            high: (3,) its upper end.
+
+        Raises:
+            UsageError: The box is empty, or an end is not finite.
+        """
         a, b = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         if a.shape != (3,) or b.shape != (3,) or not np.isfinite([a, b]).all() or not (a < b).all():
             raise UsageError(
@@ -54,20 +69,38 @@ class Workspace:
 
     @classmethod
     def of_box(cls, box: Box) -> Workspace:
-        """The working volume of a simulated rig, whichever way it lies."""
+        """The working volume of a simulated rig, in any orientation.
+
+        Args:
+            box: The working volume.
+        """
         corners = np.array(list(product((-0.5, 0.5), repeat=3))) * box.size
         size = " x ".join(f"{n:.4g}" for n in box.size)
         return cls._of(box.world_from_box.apply(corners), None, f"a box of {size}")
 
     @classmethod
     def hull(cls, xyz: ArrayLike) -> Workspace:
-        """The convex hull of points (n, 3); UsageError where they do not fill a volume."""
+        """The convex hull of points.
+
+        Args:
+            xyz: (n, 3) points in the world.
+
+        Raises:
+            UsageError: They do not fill a volume, or one is not finite.
+        """
         points = np.asarray(xyz, dtype=np.float64)
         return cls._of(points, None, f"the hull of {len(points)} points")
 
     @classmethod
     def only(cls, xyz: ArrayLike) -> Workspace:
-        """Some reachable places (n, 3), and no others; what lies between them is judged too."""
+        """Some reachable places and no others; the calibration is judged between them too.
+
+        Args:
+            xyz: (n, 3) places in the world.
+
+        Raises:
+            UsageError: They do not fill a volume, or one is not finite.
+        """
         points = np.asarray(xyz, dtype=np.float64)
         return cls._of(points, points, f"{len(points)} places")
 
@@ -88,7 +121,7 @@ class Workspace:
 
     @property
     def size(self) -> float:
-        """The diagonal of the box around it."""
+        """The diagonal of the box around it, along the axes of the world."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
     @property
@@ -97,14 +130,31 @@ class Workspace:
         return np.asarray(self.vertices.mean(axis=0), dtype=np.float64)
 
     def inside(self, xyz: Floats) -> NDArray[np.bool_]:
-        """(n,) which of points (n, 3) are in it."""
+        """Which points are inside.
+
+        Args:
+            xyz: (n, 3) points in the world.
+
+        Returns:
+            (n,), true within rounding of the surface.
+        """
         return np.asarray(
             (xyz @ self.normals.T <= self.offsets + RELATIVE_TOLERANCE * self.size).all(axis=1), dtype=np.bool_
         )
 
     def candidates(self, n: int, seed: int) -> Floats:
-        """(n, 3) where the next target may be: evenly spread, some of them on the surface, and the corners, where a
-        calibration knows least. Of a list of places at most so many, in random order."""
+        """Where the next target may be.
+
+        They are evenly spread, some of them on the surface and in the corners, where a calibration knows least. Of a
+        list of places at most n come, in random order.
+
+        Args:
+            n: How many.
+            seed: Of the Sobol sequence, or of the order.
+
+        Returns:
+            (n, 3) places in the world.
+        """
         if self.places is not None:
             return self.places[np.random.default_rng(seed).permutation(len(self.places))[:n]]
         corners = self._corners(n)
@@ -113,12 +163,31 @@ class Workspace:
         return self._pull_in(np.concatenate([found, corners]), 1 - RELATIVE_TOLERANCE)
 
     def judged(self, n: int, seed: int = 0) -> Floats:
-        """(about n, 3) places at which a calibration is judged: evenly spread, and the corners."""
+        """Places at which a calibration is judged: evenly spread, and the corners.
+
+        Args:
+            n: How many.
+            seed: Of the Sobol sequence.
+
+        Returns:
+            (n, 3) places in the world.
+        """
         corners = self._corners(n)
         return np.concatenate([corners, self._spread(n - len(corners), [seed, 1])])
 
     def design(self, n: int, seed: int) -> Floats:
-        """(n, 3) places to begin with while nothing is known of the cameras: each as far from the others as can be."""
+        """Places to begin with, while nothing is known of the cameras: each as far from the others as can be.
+
+        Args:
+            n: How many.
+            seed: Of the candidates that they are chosen from.
+
+        Returns:
+            (n, 3) places in the world.
+
+        Raises:
+            UsageError: The workspace is a list of fewer places.
+        """
         pool = self.candidates(64 * n, seed)
         if self.places is None:
             pool = self._pull_in(pool, START_DISTANCE_RATIO)
@@ -165,8 +234,15 @@ class Workspace:
 
 
 def workspace_from(text: str, xyz: Floats | None) -> Workspace:
-    """The workspace that a word of the command line means: `x0:x1,y0:y1,z0:z1`, a CSV file of places (x,y,z), or `box`
-    or `hull`, those of the known points xyz (n, 3)."""
+    """The workspace that an argument of the command line stands for.
+
+    Args:
+        text: `x0:x1,y0:y1,z0:z1`, a CSV file of places (x,y,z), or `box` or `hull` of the known points.
+        xyz: (n, 3) the known points; None where there are none.
+
+    Raises:
+        UsageError: The text or the file cannot be read, or there are too few known points.
+    """
     if text in ("box", "hull"):
         if xyz is None or len(xyz) < 4:
             raise UsageError(
@@ -188,7 +264,17 @@ def workspace_from(text: str, xyz: Floats | None) -> Workspace:
 
 
 def read_places(path: Path) -> Floats:
-    """(n, 3) the positions in a CSV file with columns x, y and z; UsageError with the line of what cannot be read."""
+    """The positions in a CSV file with columns x, y and z.
+
+    Args:
+        path: The file.
+
+    Returns:
+        (n, 3) positions.
+
+    Raises:
+        UsageError: The file cannot be read; names the line.
+    """
     try:
         return read_positions(path)[:, :3]
     except HardwareError as error:
