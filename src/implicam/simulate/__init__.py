@@ -57,7 +57,20 @@ __all__ = [
 
 
 def simulated(rig: str = "bar6", *, points: int | None = None, seed: int = 0, cameras: str | None = None) -> Dataset:
-    """A simulated dataset in one call: the ball on the paper's grid, or at `points` random positions."""
+    """A simulated dataset in one call: a ball on the paper's grid, or at random positions.
+
+    Args:
+        rig: The name of a rig, as of `build_rig`.
+        points: How many random positions; None for the grid.
+        seed: Of the rig, the positions and the noise.
+        cameras: Names joined by commas, or a set of the paper; None for all.
+
+    Returns:
+        The dataset, with the truth in extra columns.
+
+    Raises:
+        UsageError: There is no such rig or camera, or a number is out of range.
+    """
     built = build_rig(rig, seed=seed, cameras=cameras)
     rng = np.random.default_rng([seed, 17])
     target = ball_grid(built) if points is None else random_positions(built, points, rng)

@@ -30,8 +30,13 @@ class SmoothError:
     A sum of random Fourier features (Rahimi & Recht 2007) is nearly a sample of a Gaussian process with a
     squared-exponential kernel, and has an exact derivative. Its affine part is taken away because a focal length, a
     principal point or a rotation would absorb it.
-    frequencies: (waves, 2) radians per pixel; phases: (waves,) radians; amplitudes: (waves, 2) pixels in u and v;
-    affine: (3, 2) pixels, to be subtracted for (1, u, v). rms: over the image, pixels per coordinate.
+
+    Attributes:
+        frequencies: (waves, 2) radians per pixel.
+        phases: (waves,) radians.
+        amplitudes: (waves, 2) pixels in u and v.
+        affine: (3, 2) pixels, to be subtracted for (1, u, v).
+        rms: Root mean square over the image, pixels per coordinate.
     """
 
     frequencies: Floats
@@ -41,19 +46,40 @@ class SmoothError:
     rms: float
 
     def at(self, uv: Floats) -> Floats:
-        """(n, 2) shift at pixels (n, 2)."""
+        """The shift at pixels.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            (n, 2) pixels.
+        """
         waves: Floats = np.cos(uv @ self.frequencies.T + self.phases) @ self.amplitudes
         return waves - _affine_basis(uv) @ self.affine
 
     def jacobian(self, uv: Floats) -> Floats:
-        """(n, 2, 2) derivative of the shift with respect to the pixel."""
+        """The derivative of the shift with respect to the pixel.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            (n, 2, 2).
+        """
         slope = -np.sin(uv @ self.frequencies.T + self.phases)
         waves: Floats = np.einsum("nw,wi,wj->nij", slope, self.amplitudes, self.frequencies, optimize=True)
         return waves - self.affine[1:].T
 
 
 def random_error(rng: np.random.Generator, width: int, height: int, rms: float) -> SmoothError:
-    """A smooth error whose root mean square over the image is `rms` pixels in u and in v."""
+    """A random smooth error of a given size.
+
+    Args:
+        rng: Random numbers.
+        width: Of the image, pixels.
+        height: Of the image, pixels.
+        rms: Its root mean square over the image, in pixels, in u and in v.
+    """
     frequencies = rng.normal(size=(WAVES, 2)) / (RANGE * 0.5 * np.hypot(width, height))
     phases = rng.uniform(0, 2 * np.pi, WAVES)
     amplitudes = rng.normal(size=(WAVES, 2))
@@ -66,12 +92,20 @@ def random_error(rng: np.random.Generator, width: int, height: int, rms: float) 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCamera:
-    """A camera that knows itself perfectly: image size in pixels, lens, pose, smooth error, noise in pixels.
+    """A camera whose model is known exactly.
 
-    tilt: rotation vector in radians about the image's u and v axes by which the sensor is turned away from square to
-    the lens's axis, about the point where that axis meets it (Scheimpflug). mirrored: it looks into a plane mirror, and
-    camera_from_world is where it seems to stand behind it; v counted from below and a left-handed world are the same.
-    window: a flat pane before it, with water behind.
+    Attributes:
+        name: Its name.
+        width: Of the image, pixels.
+        height: Of the image, pixels.
+        lens: The lens.
+        camera_from_world: The pose; of a mirrored camera, where it seems to stand behind the mirror.
+        error: The smooth error that no lens model contains.
+        noise_sd: Standard deviation of a view per coordinate, pixels.
+        tilt: Rotation vector in radians about the image's u and v axes by which the sensor is turned away from square
+            to the lens's axis, about the point where that axis meets it (Scheimpflug).
+        mirrored: Whether it looks into a plane mirror; v counted from below and a left-handed world are the same.
+        window: A flat pane in front of it, with water behind; None for none.
     """
 
     name: str
@@ -86,9 +120,14 @@ class SimulatedCamera:
     window: Window | None = None
 
     def pixel_from_world(self, xyz: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Pixels (n, 2) of world points (n, 3), without noise, and (n,) where they fall on the image.
+        """The pixels of world points, without noise.
 
-        NaN where the lens gives no pixel at all; a pixel outside the image keeps its numbers.
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            (n, 2) pixels, NaN where the lens gives none; and (n,) whether they fall on the image. A pixel outside the
+            image keeps its numbers.
         """
         uv, valid = self.lens.pixel_from_camera_point(self._before_lens(xyz))
         if self._tilting is not None:
@@ -101,7 +140,14 @@ class SimulatedCamera:
         return uv, valid & on_image
 
     def jacobian(self, xyz: Floats) -> Floats:
-        """(n, 2, 3) derivative of the pixels with respect to the world points, the smooth error included."""
+        """The derivative of the pixels with respect to the world points, the smooth error included.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            (n, 2, 3) pixels per length unit; NaN where there is no pixel.
+        """
         points = self._before_lens(xyz)
         uv, _ = self.lens.pixel_from_camera_point(points)
         along = self.lens.jacobian(points)
@@ -117,9 +163,15 @@ class SimulatedCamera:
         return jacobian
 
     def ray_from_pixel(self, uv: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Unit rays (n, 3) in the camera frame of pixels (n, 2), before any window; and (n,) where they exist.
+        """The rays that pixels look along, in front of any window.
 
-        The smooth error is left out: take it off the pixels before, where it matters.
+        The smooth error is left out: subtract it from the pixels first where it matters.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            (n, 3) unit vectors in the camera frame, NaN where there is none; and (n,) whether there is one.
         """
         if self._tilting is not None:
             uv, _ = _projected(np.asarray(np.linalg.inv(self._tilting), dtype=np.float64), uv)

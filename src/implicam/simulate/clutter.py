@@ -1,4 +1,4 @@
-"""What is behind the target: a laboratory's wall, things on it, and blobs that look like the target but are not."""
+"""What is behind the target: a laboratory's wall, things on it, and blobs that look like the target but are not it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,17 @@ THINGS, LOOK_ALIKES = 24, 14
 
 
 def background(width: int, height: int, rng: np.random.Generator, *, clutter: bool = True) -> Grey:
-    """A grey picture from 0 to 1 without noise; plain with a slow gradient where `clutter` is not wanted."""
+    """The picture of what is behind the target, without noise.
+
+    Args:
+        width: Of the picture, pixels.
+        height: Of the picture, pixels.
+        rng: Random numbers.
+        clutter: Whether there are things on the wall; without them it is plain, with a slow gradient.
+
+    Returns:
+        (height, width) brightness from 0 to 1.
+    """
     v, u = np.mgrid[-0.5 : 0.5 : height * 1j, -0.5 : 0.5 : width * 1j].astype(np.float32)
     tilt = rng.normal(scale=0.08, size=2)
     wall = np.asarray(rng.uniform(0.2, 0.35) + tilt[0] * u + tilt[1] * v, np.float32)

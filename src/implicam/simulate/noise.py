@@ -36,22 +36,22 @@ def simulate(
     """The dataset that the rig records of a target.
 
     Args:
-        rig: the cameras.
+        rig: The cameras.
         target: n points.
-        seed: rules everything that the rig's own seed does not.
-        robot_noise: sd per axis of the known positions, in the rig's unit; a shot is off as a whole, as a robot or a
-            slide is.
-        missing: probability that a view is lost.
-        outliers: probability that a view left is a wrong detection, anywhere in the image.
-        visible: (n, cameras) where a camera sees a point, where something else decides that.
-        extra: further entries of dataset.toml.
+        seed: Of everything that is random here; the rig has a seed of its own.
+        robot_noise: Standard deviation of the known positions per axis, in the rig's unit; all points of a shot have
+            the same error, because a robot or a slide does.
+        missing: Probability that a view is lost.
+        outliers: Probability that a view left is a wrong detection, anywhere in the image.
+        visible: (n, cameras) where a camera sees a point; None to compute it from the rig and the target.
+        extra: Further entries of dataset.toml.
 
     Returns:
         The dataset. Its known positions carry the truth and the Cramer-Rao limit (`TRUTH_COLUMNS`), its observations
         true_u, true_v and outlier, as extra columns.
 
     Raises:
-        UsageError: an option is out of range.
+        UsageError: An option is out of range.
     """
     _check_options(seed, robot_noise, missing, outliers)
     to_robot, to_missing, to_outliers, to_pixels = (np.random.default_rng([seed, i]) for i in range(4))
@@ -91,9 +91,22 @@ def simulate_boards(
     corners: tuple[int, int] = (8, 11),
     square: float = 13.29,
 ) -> Dataset:
-    """Corners of a board held by hand, once for each group of cameras (`held_boards`), at positions nobody knows.
+    """The corners of a board held by hand, once for each group of cameras (`held_boards`), at unknown positions.
 
-    square: in mm. missing, outliers: as for `simulate`.
+    Args:
+        rig: The cameras.
+        groups: For each board, the names of the cameras that take a picture of it.
+        seed: Of the boards' poses and the noise.
+        missing: Probability that a view is lost.
+        outliers: Probability that a view left is a wrong detection.
+        corners: Rows and columns of the board's inner corners.
+        square: The edge of a square, mm.
+
+    Returns:
+        A dataset without known positions; its description says how the corners lie on the board.
+
+    Raises:
+        UsageError: An option is out of range, or no pose is found that a group sees together.
     """
     rng = np.random.default_rng([seed, 9])
     target = held_boards(rig, groups, rng, corners=corners, square=square)
@@ -101,7 +114,12 @@ def simulate_boards(
 
 
 def as_boards(data: Dataset, target: Target) -> Dataset:
-    """A recording of boards without their positions: what is known is how the corners lie on the board."""
+    """A recording of boards without their positions, but with how the corners lie on the board.
+
+    Args:
+        data: The recording.
+        target: The board that was recorded, with its true positions.
+    """
     assert target.board is not None
     rows, columns = target.board
     square = float(np.linalg.norm(target.xyz[1] - target.xyz[0]))
@@ -110,7 +128,16 @@ def as_boards(data: Dataset, target: Target) -> Dataset:
 
 
 def each_and_pairs(rig: Rig, each: int, pairs: int) -> list[tuple[str, ...]]:
-    """The paper's budget: `each` pictures by every camera alone, and `pairs` by every two neighbours."""
+    """The paper's budget of board pictures: some by every camera alone, and some by every two neighbours.
+
+    Args:
+        rig: The cameras.
+        each: Pictures by each camera alone.
+        pairs: Pictures by each pair of neighbours.
+
+    Returns:
+        For each picture, the names of the cameras that take it.
+    """
     along = rig.volume.world_from_box.rotation[:, 0]
     left = sorted(rig.cameras, key=lambda camera: float(camera.camera_from_world.centre @ along))
     order = [left.pop(0)]
@@ -124,7 +151,15 @@ def each_and_pairs(rig: Rig, each: int, pairs: int) -> list[tuple[str, ...]]:
 
 
 def views(rig: Rig, target: Target) -> tuple[Floats, Bools]:
-    """The true pixels (n, cameras, 2), and (n, cameras) where the camera sees the point."""
+    """The true pixels of a target.
+
+    Args:
+        rig: The cameras.
+        target: n points.
+
+    Returns:
+        (n, cameras, 2) pixels, and (n, cameras) where a camera sees the point and takes a picture.
+    """
     pairs = [camera.pixel_from_world(target.xyz) for camera in rig.cameras]
     uv = np.stack([uv for uv, _ in pairs], axis=1)
     visible = np.stack(
@@ -139,7 +174,7 @@ def cramer_rao_limit(rig: Rig, xyz: Floats, used: Bools, sd: Floats | None = Non
     It is the inverse of the Fisher information: the sum of J^T J / sd^2 over the cameras used.
 
     Args:
-        rig: the cameras.
+        rig: The cameras.
         xyz: (n, 3) positions in the rig's world frame and unit.
         used: (n, cameras) which views count.
         sd: (n, cameras, 2) of the pixels; that of each camera's noise where None.
@@ -159,7 +194,15 @@ def cramer_rao_limit(rig: Rig, xyz: Floats, used: Bools, sd: Floats | None = Non
 
 
 def with_limit(rig: Rig, data: Dataset) -> Dataset:
-    """A dataset of the rig's cameras with the Cramer-Rao limit that follows from the sd its own views state."""
+    """A dataset with the Cramer-Rao limit that follows from the standard uncertainties of its own views.
+
+    Args:
+        rig: The cameras.
+        data: Simulated with them.
+
+    Raises:
+        UsageError: The dataset has no simulated truth.
+    """
     truth = data.truth
     if truth is None:
         raise UsageError(f"dataset {data.name!r} has no simulated truth, so its limit is not known.")

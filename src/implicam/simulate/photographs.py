@@ -35,10 +35,18 @@ BALL_RADIUS_MM = 8.0
 
 @dataclass(frozen=True)
 class Optics:
-    """How the cameras see: standard deviations of noise (of full scale, at white) and blur (pixels).
+    """How the cameras see.
 
-    vignetting: how much darker the corners are. uneven: how much the light changes across the volume. clutter: whether
-    there is anything behind the target, look-alikes among it. bits: of the sensor, 8 or 16.
+    Attributes:
+        noise: Standard deviation, as a part of full scale, at white.
+        blur: Standard deviation, pixels.
+        vignetting: How much darker the corners are, from 0 to 1.
+        uneven: How much the light changes across the volume, from 0 to 1.
+        clutter: Whether there is anything behind the target, look-alikes among it.
+        bits: Of the sensor, 8 or 16.
+
+    Raises:
+        UsageError: A number is out of range.
     """
 
     noise: float = 0.01
@@ -56,14 +64,27 @@ class Optics:
 
 
 class Cover(NamedTuple):
-    """A bar before the target, in pixels: round ends at `start` and `end` (2,), `width` to either side."""
+    """A bar in front of the target, with round ends.
+
+    Attributes:
+        start: (2,) one end of its middle line, pixels.
+        end: (2,) the other end.
+        width: To either side of the middle line, pixels.
+    """
 
     start: Floats
     end: Floats
     width: float
 
     def distance(self, uv: Floats) -> Floats:
-        """(...,) how far pixels (..., 2) are outside of it; negative inside."""
+        """How far pixels are outside of it.
+
+        Args:
+            uv: (..., 2) pixels.
+
+        Returns:
+            (...,) pixels; negative inside.
+        """
         along = self.end - self.start
         part = np.clip((uv - self.start) @ along / (along @ along), 0, 1)
         return np.asarray(np.linalg.norm(uv - self.start - part[..., None] * along, axis=-1) - self.width, np.float64)
@@ -71,10 +92,20 @@ class Cover(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Studio:
-    """A rig with a target before it, ready to take pictures; `seed` rules noise and what is covered.
+    """A rig with a target in front of it, ready to take pictures.
 
-    Light and background are the rig's own, the same whatever the seed. covered: share of the pictures in which
-    something stands before the target.
+    Light and background are the rig's own and do not depend on the seed.
+
+    Attributes:
+        rig: The cameras; without a window.
+        target: What they look at.
+        optics: How they see.
+        seed: Of the noise and of what is covered.
+        covered: The share of the pictures in which something stands in front of the target.
+        ball_radius_mm: Of the ball, where the target is one.
+
+    Raises:
+        UsageError: The rig has a window, or the target is a board and a camera is mirrored.
     """
 
     rig: Rig
@@ -118,18 +149,31 @@ class Studio:
         return uv, visible
 
     def picture(self, camera: int, shot: int) -> Grey:
-        """The photograph of shot number `shot` by camera number `camera`."""
+        """One photograph.
+
+        Args:
+            camera: The number of the camera.
+            shot: The number of the shot.
+
+        Returns:
+            (height, width) brightness from 0 to 1, in the steps of the sensor.
+        """
         return self._expose(self._compose(camera, shot), camera, np.random.default_rng([self.seed, 7, camera, shot]))
 
     def showing(self, target: Target, *, seed: int) -> Studio:
-        """The same cameras before another target; the costly part, their lines of sight and backgrounds, is shared."""
+        """The same cameras with another target; their lines of sight and backgrounds, the costly part, are shared.
+
+        Args:
+            target: What they look at.
+            seed: Of the noise and of what is covered.
+        """
         other = replace(self, target=target, seed=seed)
         other.__dict__["_looks"] = self._looks  # where the cached property keeps it
         return other
 
     @cached_property
     def jobs(self) -> list[tuple[int, int]]:
-        """The pictures that are taken: numbers of camera and shot."""
+        """The pictures that are taken: the numbers of camera and shot of each."""
         takes = np.ones((len(self.target.shots), len(self.rig.cameras)), dtype=np.bool_)
         if self.target.takes is not None:
             takes = self.target.takes
@@ -141,7 +185,16 @@ class Studio:
         ]
 
     def write(self, folder: Path, progress: Progress = silent, *, ending: str = ".png") -> int:
-        """Write all pictures to folder/<camera>/<shot>.png; how many."""
+        """Write all pictures to folder/<camera>/<shot>.png.
+
+        Args:
+            folder: Where to; it is made where it is missing.
+            progress: Called after each picture.
+            ending: Of the file names.
+
+        Returns:
+            How many pictures.
+        """
         jobs = self.jobs
         done = 0
         for camera in self.rig.cameras:
@@ -162,7 +215,7 @@ class Studio:
         return len(jobs)
 
     def description(self) -> dict[str, Any]:
-        """What dataset.toml says of the target; lengths in the rig's unit."""
+        """The target as dataset.toml describes it; lengths in the rig's unit."""
         if self.target.board is None:
             return {"kind": "ball", "radius": self.ball_radius_mm * self.rig.units_per_mm}
         rows, columns = self.target.board
@@ -171,7 +224,11 @@ class Studio:
         return {"kind": "board", "rows": rows, "columns": columns, "square": float(np.linalg.norm(thing.right))}
 
     def thing(self, shot: int) -> Thing:
-        """What stands there in a shot."""
+        """The object that the cameras see in a shot.
+
+        Args:
+            shot: The number of the shot.
+        """
         xyz = self.target.xyz[self.target.shots == self.shots[shot]]
         if self.target.board is None:
             return Ball(xyz[0], self._towards_cameras, self.ball_radius_mm * self.rig.units_per_mm, self._light)
@@ -284,18 +341,28 @@ class Studio:
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What a rig records of a target: the dataset, and the studio that takes its photographs, None for none."""
+    """What a rig records of a target.
+
+    Attributes:
+        data: The dataset.
+        studio: What takes its photographs; None for none.
+    """
 
     data: Dataset
     studio: Studio | None = None
 
     @property
     def photographs(self) -> int:
-        """How many."""
+        """How many photographs there are."""
         return len(self.studio.jobs) if self.studio else 0
 
     def write_photographs(self, folder: Path, progress: Progress = silent) -> None:
-        """Into folder/images/<camera>/<shot>.png, if there are to be any."""
+        """Write the photographs, if there are any, to folder/images/<camera>/<shot>.png.
+
+        Args:
+            folder: The folder of the dataset.
+            progress: Called after each picture.
+        """
         if self.studio is not None:
             self.studio.write(folder / "images", progress)
 
@@ -310,10 +377,24 @@ def record(
     outliers: float = 0.0,
     optics: Optics | None = None,
 ) -> Recorded:
-    """As `simulate`, and with `optics` photographs too: then what is missing is covered by something in the picture.
+    """As `simulate`, with photographs too where `optics` are given.
 
-    dataset.toml then says what the target is. UsageError for outliers with photographs: wrong detections come from
-    the detector.
+    With photographs, a view is missing where something covers the target in the picture, and dataset.toml says what the
+    target is.
+
+    Args:
+        rig: The cameras.
+        target: n points.
+        seed: Of the noise and of what is missing.
+        robot_noise: Standard deviation of the known positions per axis, in the rig's unit.
+        missing: Probability that a view is lost; with photographs, the share of the pictures in which something covers
+            the target.
+        outliers: Probability that a view left is a wrong detection.
+        optics: How the cameras see; None for no photographs.
+
+    Raises:
+        UsageError: An option is out of range, or outliers are asked for with photographs: there, wrong detections come
+            from the detector.
     """
     if optics is None:
         return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, missing=missing, outliers=outliers))
@@ -349,10 +430,16 @@ class _Look:
 
 
 def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
-    """(height + 2 PAD, width + 2 PAD, 3) the unit vector in the world that each pixel looks along.
+    """The directions that the pixels of a camera look along.
 
-    Found every eighth pixel and interpolated by a bicubic spline, exact to much less than a thousandth of a pixel.
-    Pixels beyond the image circle of the lens look where its rim looks; nothing that the lens sees falls there.
+    Computed at every eighth pixel and interpolated by a bicubic spline, exact to much less than a thousandth of a
+    pixel. Pixels beyond the image circle of the lens look where its rim looks; nothing that the lens sees falls there.
+
+    Args:
+        camera: The camera; without a window.
+
+    Returns:
+        (height + 2 PAD, width + 2 PAD, 3) unit vectors in the world.
     """
     size = np.array([camera.width, camera.height])
     us, vs = (np.linspace(-PAD, n - 1 + PAD, (n + 2 * PAD) // 8 + 2) for n in size)

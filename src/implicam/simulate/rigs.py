@@ -1,7 +1,7 @@
 """Simulated rigs: the paper's six cameras on a bar, a stereo pair, a dome.
 
-A rig is built on a bench, in millimetres: the working volume's centre is the origin, x runs along the bar to the
-right, y down, z away from the cameras. Then it is moved into a world frame nobody chose for our convenience.
+A rig is designed on a bench, in millimetres: the working volume's centre is the origin, x runs along the bar to the
+right, y down, z away from the cameras. Then it is moved into a world frame with another origin and orientation.
 """
 
 from __future__ import annotations
@@ -50,7 +50,12 @@ _ROBOT_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A box with its centre at the origin of its own frame and edges `size` (3,) along its axes; z is depth."""
+    """A box with its centre at the origin of its own frame.
+
+    Attributes:
+        world_from_box: Its pose.
+        size: (3,) its edges along its axes, in the length unit; z is depth.
+    """
 
     world_from_box: Pose
     size: Floats
@@ -60,11 +65,17 @@ class Box:
 class Unusual:
     """What is unusual about all cameras of a rig, or some of them.
 
-    tilt: degrees by which each sensor is turned away from square to the lens's axis, each about a line of its own.
-    mirror: names of the cameras that look into a mirror, or see v counted from below, joined by commas; "all" for a
-    left-handed world. aspect: fy / fx, the pictures resized in height. window: thickness in mm of a flat pane of
-    acrylic glass with water behind it; 0 for none. Of a bar or a stereo pair it is one pane across the bench, of a dome
-    one before each camera, square to the line from there to the middle.
+    Attributes:
+        tilt: Degrees by which each sensor is turned away from square to the lens's axis, each about a line of its own.
+        mirror: Names of the cameras that look into a mirror, or see v counted from below, joined by commas; "all" for a
+            left-handed world.
+        aspect: fy / fx, the pictures resized in height.
+        window: Thickness in mm of a flat pane of acrylic glass with water behind it; 0 for none. Of a bar or a stereo
+            pair it is one pane across the bench, of a dome one in front of each camera, square to the line from there
+            to the middle.
+
+    Raises:
+        UsageError: A number is out of range.
     """
 
     tilt: float = 0.0
@@ -87,7 +98,17 @@ class Unusual:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras and the volume they watch, in a world frame with `length_unit`; built with `frame` and `seed`."""
+    """Cameras and the volume they watch, in a world frame.
+
+    Attributes:
+        name: As given to `build_rig`.
+        cameras: The cameras.
+        volume: The working volume.
+        length_unit: Of the world.
+        frame: "robot" or "random", as given to `build_rig`.
+        seed: As given to `build_rig`.
+        unusual: What is unusual about the cameras.
+    """
 
     name: str
     cameras: tuple[SimulatedCamera, ...]
@@ -124,12 +145,22 @@ def build_rig(
     cameras: str | None = None,
     unusual: Unusual = Unusual(),
 ) -> Rig:
-    """A rig like `spec`: "bar6", "stereo", "dome8", or any "bar<N>" or "dome<N>"; every seed differs a little.
+    """A simulated rig; each seed gives slightly different cameras.
 
-    lens_error: rms in pixels of the smooth error no lens model contains. noise: sd in pixels of a view. frame: a
-    world like a robot's base (z up, axes parallel to the bench, origin elsewhere) or any rotation and offset.
-    unit: of the world. cameras: names joined by commas, or a set of the paper ("2R", "2R2W", "2R4W"); the
-    rig itself stays the same. unusual: tilted sensors, mirrors, pixels that are not square, a window.
+    Args:
+        spec: "bar6", "stereo", "dome8", or any "bar<N>" or "dome<N>".
+        seed: Of everything that differs from the design.
+        lens_error: Root mean square in pixels of the smooth error that no lens model contains.
+        noise: Standard deviation in pixels of a view.
+        frame: "robot" for a world like a robot's base (z up, axes parallel to the bench, origin elsewhere), "random"
+            for any rotation and offset.
+        unit: Length unit of the world.
+        cameras: Names joined by commas, or a set of the paper ("2R", "2R2W", "2R4W"); None for all. The rig itself
+            stays the same.
+        unusual: Tilted sensors, mirrors, pixels that are not square, a window.
+
+    Raises:
+        UsageError: There is no such rig or camera, or an option is out of range.
     """
     _check_options(seed=seed, lens_error=lens_error, noise=noise, frame=frame, unit=unit)
     mounts, size = _design(spec)
@@ -155,7 +186,11 @@ def build_rig(
 def write_rig(rig: Rig) -> dict[str, Any]:
     """The truth about a rig as plain tables, for `truth.toml`: lenses, poses, noise, seed.
 
-    Of the smooth error only its size: `build_rig` makes the same one again from name, seed, frame and the numbers here.
+    Of the smooth error only its size is written: `build_rig` makes the same one again from name, seed, frame and the
+    numbers here.
+
+    Args:
+        rig: The rig.
     """
     volume = rig.volume
     return {

@@ -20,7 +20,12 @@ Patch = NDArray[np.float32]
 
 
 class Rays(NamedTuple):
-    """Lines of sight: from `centre` (3,) along unit `directions` (rows, columns, 3), in the world frame."""
+    """Lines of sight.
+
+    Attributes:
+        centre: (3,) where they begin, in the world.
+        directions: (rows, columns, 3) unit vectors in the world.
+    """
 
     centre: Floats
     directions: Patch
@@ -28,20 +33,40 @@ class Rays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A lamp in the direction `towards` (3,); the light grows along `slope` (3,), per length, from `middle` (3,)."""
+    """A lamp, with a brightness that changes across the volume.
+
+    Attributes:
+        towards: (3,) unit vector towards the lamp, in the world.
+        slope: (3,) by how much the brightness grows per length unit.
+        middle: (3,) where the brightness is 1, in the world.
+    """
 
     towards: Floats
     slope: Floats
     middle: Floats
 
     def at(self, points: Patch) -> Patch:
-        """How bright it is at points (..., 3); 1 in the middle of the volume."""
+        """How bright it is at points.
+
+        Args:
+            points: (..., 3) in the world.
+
+        Returns:
+            (...,) brightness; 1 in the middle of the volume.
+        """
         return np.asarray(1 + (points - self.middle.astype(np.float32)) @ self.slope.astype(np.float32), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Ball:
-    """A dark ball on a stem before a white plate that faces `facing` (3,), a unit vector; the tool is behind it."""
+    """A dark ball on a stem in front of a white plate, with the tool behind the plate.
+
+    Attributes:
+        centre: (3,) of the ball, in the world.
+        facing: (3,) unit vector that the front of the plate faces.
+        radius: Of the ball, in the length unit.
+        light: The lamp.
+    """
 
     centre: Floats
     facing: Floats
@@ -52,7 +77,15 @@ class Ball:
     """In radii: ball to plate, half the plate's edge, its rounding, the radii of stem and tool, the tool's length."""
 
     def paint(self, rays: Rays, ground: Patch) -> Patch:
-        """The picture of it over what is behind."""
+        """Paint it over what is behind it.
+
+        Args:
+            rays: One for each sample.
+            ground: (rows, columns) brightness of what is behind it.
+
+        Returns:
+            (rows, columns) brightness.
+        """
         plate_at = self.centre - self.GAP * self.radius * self.facing
         back = plate_at - self.TOOL_LENGTH * self.radius * self.facing
         layers: list[tuple[Patch, Any]] = [
@@ -68,7 +101,7 @@ class Ball:
         return ground
 
     def reach(self) -> Floats:
-        """(n, 3) points that the picture of it lies between."""
+        """(n, 3) points in the world whose pixels enclose its picture."""
         a, b = _across(self.facing)
         half = self.PLATE * self.radius
         plate = self.centre - self.GAP * self.radius * self.facing
@@ -121,9 +154,15 @@ class Ball:
 
 @dataclass(frozen=True, eq=False)
 class Checkerboard:
-    """A printed board: `corner` (3,) its inner corner 1, steps `right` and `down` (3,) from corner to corner.
+    """A printed board. The outermost square at corner 1 is black; a white margin of one square follows.
 
-    rows, columns: of inner corners. The outermost square at corner 1 is black; a white margin of one square follows.
+    Attributes:
+        corner: (3,) its inner corner 1, in the world.
+        right: (3,) the step from a corner to the next in its row.
+        down: (3,) the step to the next row.
+        rows: Of inner corners.
+        columns: Of inner corners.
+        light: The lamp.
     """
 
     corner: Floats
@@ -134,7 +173,7 @@ class Checkerboard:
     light: Light
 
     def paint(self, rays: Rays, ground: Patch) -> Patch:
-        """The picture of it over what is behind."""
+        """As `Ball.paint`."""
         facing = np.cross(self.down, self.right)
         hit = _on_plane(rays, self.corner, facing / np.linalg.norm(facing))
         offset = hit - self.corner.astype(np.float32)
@@ -150,7 +189,7 @@ class Checkerboard:
         return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
 
     def reach(self) -> Floats:
-        """(4, 3) the corners of the sheet."""
+        """(4, 3) the corners of the sheet, in the world."""
         ends = [(i, j) for i in (-2, self.columns + 1) for j in (-2, self.rows + 1)]
         return np.array([self.corner + i * self.right + j * self.down for i, j in ends])
 

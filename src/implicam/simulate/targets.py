@@ -17,11 +17,16 @@ from implicam.simulate.rigs import Rig
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Points with their true positions (n, 3), in the rig's world frame and unit, and the shot each belongs to.
+    """Points with their true positions in the rig's world frame and unit.
 
-    facing: (3,) or (n, 3) the side a board shows, a unit vector in the world; None for a ball, which has none. board:
-    rows and columns of its inner corners, None for a ball. takes: (n, cameras) which cameras take a picture, None
-    for all of them.
+    Attributes:
+        name: What it is, for the name of the dataset.
+        points: (n,) names.
+        shots: (n,) the shot each point belongs to.
+        xyz: (n, 3) positions.
+        facing: (3,) or (n, 3) the side that a board shows, a unit vector in the world; None for a ball, which has none.
+        board: Rows and columns of its inner corners; None for a ball.
+        takes: (n, cameras) which cameras take a picture; None for all of them.
     """
 
     name: str
@@ -34,7 +39,15 @@ class Target:
 
 
 def ball_grid(rig: Rig, shape: tuple[int, int, int] = (5, 5, 7)) -> Target:
-    """A regular lattice that fills the working volume: along the bar, down, away; the paper's 175 positions."""
+    """A ball on a regular lattice that fills the working volume: along the bar, down, away.
+
+    Args:
+        rig: The rig.
+        shape: Positions along, down and away; by default the paper's 175.
+
+    Raises:
+        UsageError: A number is below 1.
+    """
     _check_counts(shape=shape)
     steps = [np.linspace(-0.5, 0.5, n) if n > 1 else np.zeros(1) for n in shape]
     depth, down, along = np.meshgrid(*steps[::-1], indexing="ij")
@@ -42,7 +55,16 @@ def ball_grid(rig: Rig, shape: tuple[int, int, int] = (5, 5, 7)) -> Target:
 
 
 def random_positions(rig: Rig, n: int, rng: np.random.Generator) -> Target:
-    """`n` positions uniform in the working volume."""
+    """A ball at positions uniform in the working volume.
+
+    Args:
+        rig: The rig.
+        n: How many.
+        rng: Random numbers.
+
+    Raises:
+        UsageError: The number is below 1.
+    """
     _check_counts(n=(n,))
     return _balls(rig, "random", rng.uniform(-0.5, 0.5, size=(n, 3)))
 
@@ -55,7 +77,18 @@ def moving_board(
     positions: int = 20,
     step: float = 10.0,
 ) -> Target:
-    """A board's corners (rows, columns) at `positions` along its normal, nearest first; all in mm, as in the paper."""
+    """The corners of a board on a slide along its normal, nearest position first, as in the paper.
+
+    Args:
+        rig: The rig.
+        corners: Rows and columns of inner corners.
+        square: The edge of a square, mm.
+        positions: How many.
+        step: From one position to the next, mm.
+
+    Raises:
+        UsageError: A number is below 1.
+    """
     _check_counts(corners=corners, positions=(positions,))
     rows, columns = corners
     z, y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in (positions, rows, columns)), indexing="ij")
@@ -77,8 +110,17 @@ def held_boards(
 ) -> Target:
     """A board held by hand, once for each group of cameras, which all see all of it; only they take a picture.
 
-    Tilted up to 50 degrees, as far away as lets its diagonal span 0.25 to 0.8 of the image's width. UsageError where no
-    pose is found that a group sees together.
+    It is tilted up to 50 degrees, and as far away as lets its diagonal span 0.25 to 0.8 of the image's width.
+
+    Args:
+        rig: The rig.
+        groups: For each board, the names of the cameras.
+        rng: Random numbers.
+        corners: Rows and columns of inner corners.
+        square: The edge of a square, mm.
+
+    Raises:
+        UsageError: No pose is found that a group sees together.
     """
     _check_counts(corners=corners, pictures=(len(groups),))
     y, x = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in corners), indexing="ij")

@@ -18,10 +18,14 @@ NEWTON_STEPS = 40
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A pane in the camera frame: `normal` (3,), a unit vector away from the camera, its air side at `distance`.
+    """A pane in the camera frame, with air in front and water behind.
 
-    distance from the camera's centre along the normal, and thickness of the glass, in the unit of the world; water
-    fills all that is behind. glass, water: refractive indices.
+    Attributes:
+        normal: (3,) unit vector away from the camera.
+        distance: From the camera's centre to its air side along the normal, in the unit of the world.
+        thickness: Of the glass, in the unit of the world.
+        glass: Refractive index.
+        water: Refractive index.
     """
 
     normal: Floats
@@ -31,14 +35,24 @@ class Window:
     water: float = WATER
 
     def scaled(self, scale: float) -> Window:
-        """The same window in another unit of length."""
+        """The same window in another unit of length.
+
+        Args:
+            scale: How many of the other unit one of this unit is.
+        """
         return replace(self, distance=self.distance * scale, thickness=self.thickness * scale)
 
     def apparent(self, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """(n, 3) points where those of the water (n, 3) seem to be, all of it in air, and (n,) where they are in it.
+        """Where points in the water seem to be, if all were air.
 
-        Only the direction from the camera means something: along the normal the points stay where they are. NaN for
-        points that are not behind the glass.
+        Only the direction from the camera means something: along the normal the points stay where they are.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 3) points in the camera frame, NaN for those that are not behind the glass; and (n,) which are behind
+            it.
         """
         depth, aside, radius, behind = self._split(points)
         slope = self._slope_in_air(depth, radius)
@@ -46,7 +60,14 @@ class Window:
         return depth[:, None] * (self.normal + across[:, None] * aside), behind
 
     def jacobian(self, points: Floats) -> Floats:
-        """(n, 3, 3) derivative of `apparent` with respect to the points; NaN for points not behind the glass."""
+        """The derivative of `apparent` with respect to the points.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 3, 3); NaN for points not behind the glass.
+        """
         depth, aside, radius, _ = self._split(points)
         slope = self._slope_in_air(depth, radius)
         growth = self._reach_per_slope(slope, depth)
