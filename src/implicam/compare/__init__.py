@@ -25,11 +25,26 @@ def compare(
     check: Dataset | None = None,
     progress: Progress = silent,
 ) -> list[Trial]:
-    """Fit each method to `n` random known points, for each n of `sizes` and each seed, and evaluate.
+    """Fit each method to random known points, for each number of points and each seed, and evaluate.
 
-    Held out are the points not drawn, or those of `check`, another dataset of the same rig: give it where the known
-    points stand on a lattice, because on a lattice the held-out points lie on planes that were also trained on. Without
-    such a dataset, `compare_on(plane_splits(data, sizes), methods)` holds whole planes out.
+    Held out are the points that were not drawn, or those of `check`. Give `check` where the known points stand on a
+    lattice, because there the held-out points lie on planes that were also trained on. Without such a dataset,
+    `compare_on(plane_splits(data, sizes), methods)` holds whole planes out.
+
+    Args:
+        data: Known points to train on.
+        methods: Name -> method.
+        sizes: Numbers of points to train on.
+        seeds: How many draws of each number.
+        check: Another dataset of the same rig to judge by; None for the points that were not drawn.
+        progress: Called before each fit.
+
+    Returns:
+        The trials, in the order of the splits (sizes, then seeds), then of the methods.
+
+    Raises:
+        UsageError: There is nothing to compare, or a number of points leaves none to evaluate on.
+        DatasetError: Known positions are missing, or the two datasets have different length units.
     """
     return compare_on(random_splits(data, sizes, seeds=seeds, check=check), methods, progress)
 

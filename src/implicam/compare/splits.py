@@ -28,11 +28,15 @@ MIN_CROSSING_SHARE = 1 / 8
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Known points to train on, and known points to judge by; nobody trains on those.
+    """Known points to train on, and known points to judge by; no fit uses the latter.
 
-    kind: RANDOM, SHOT or `plane x`, `plane y`, `plane z`. left_out: the shot, or the plane as `z = 3`; empty where
-    points were held out at random. seed: of the draw, and the number of the shot or plane. all_others: nothing was
-    drawn, everything else trains.
+    Attributes:
+        kind: `RANDOM`, `SHOT`, or "plane x", "plane y", "plane z".
+        train: The points to train on.
+        held_out: The points to judge by.
+        seed: Of the draw, or the number of the shot or plane.
+        left_out: The shot, or the plane as "z = 3"; empty where points were held out at random.
+        all_others: Whether nothing was drawn: everything else trains.
     """
 
     kind: str
@@ -44,19 +48,35 @@ class Split:
 
     @property
     def cell(self) -> tuple[str, int]:
-        """Equal for the splits that one mean is taken over: the same kind, the same number of points drawn."""
+        """Equal for the splits that are averaged together: the same kind, the same number of points drawn."""
         return self.kind, 0 if self.all_others else len(self.train)
 
 
 def plane_of(kind: str) -> str:
-    """The coordinate that the held-out points of this kind of split share, or ""."""
+    """The coordinate that the held-out points of a kind of split share.
+
+    Args:
+        kind: As of `Split`.
+
+    Returns:
+        "x", "y" or "z"; empty for other kinds.
+    """
     return _PLANES.get(kind, "")
 
 
 def random_splits(data: Dataset, sizes: Sequence[int], *, seeds: int, check: Dataset | None = None) -> list[Split]:
-    """`seeds` draws of each number of points; the rest is held out, or all of `check`.
+    """Random draws of known points; the rest is held out, or all of `check`.
 
-    No split is drawn twice: neither for the same size again, nor where all points are taken.
+    No split comes twice: neither for a size that is given twice, nor where all points are taken.
+
+    Args:
+        data: Known points to draw from.
+        sizes: Numbers of points to draw.
+        seeds: How many draws of each number.
+        check: Another dataset to judge by; None for the points that were not drawn.
+
+    Raises:
+        UsageError: There is no size or no seed, or a number of points leaves none to judge by.
     """
     if seeds < 1 or not sizes:
         raise _nothing_to_compare()
@@ -74,10 +94,17 @@ def random_splits(data: Dataset, sizes: Sequence[int], *, seeds: int, check: Dat
 
 
 def shot_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int | None = None) -> list[Split]:
-    """Each shot (a board, a plate) held out in turn; all others train, or so many points drawn from them.
+    """Each shot (a board, a plate) held out in turn; the others train.
 
-    most: hold out no more shots than this, drawn at random. A UsageError where a shot is a single point: leaving it
-    out is a random split, only slower.
+    Args:
+        data: Known points.
+        sizes: Numbers of points to draw from the others; None for all of them.
+        most: How many shots to hold out at most, drawn at random; None for all.
+
+    Raises:
+        DatasetError: There is only one shot.
+        UsageError: Each shot is a single point, so that this would be a random split; or the others are fewer than a
+            size.
     """
     names = [str(name) for name in np.unique(data.shots)]
     if len(names) < 2:
@@ -98,10 +125,18 @@ def shot_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int 
 
 
 def plane_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int | None = None) -> list[Split]:
-    """Each inner plane of a lattice of known positions held out in turn, along x, y and z of the world.
+    """Each inner plane of a lattice of known positions held out in turn, across x, y and z; the others train.
 
-    The others train, or so many points drawn from them. The outer planes stay: to measure them is to extrapolate.
-    most: hold out no more planes along an axis than this, drawn at random. UsageError where there is no lattice.
+    The outer planes are never held out, because measuring them is to extrapolate.
+
+    Args:
+        data: Known points.
+        sizes: Numbers of points to draw from the others; None for all of them.
+        most: How many planes to hold out along an axis at most, drawn at random; None for all.
+
+    Raises:
+        DatasetError: The points stand on no lattice with an inner plane.
+        UsageError: The others are fewer than a size.
     """
     splits = []
     for kind, axis in _PLANES.items():
@@ -114,12 +149,19 @@ def plane_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int
 
 
 def lattice_planes(xyz: Floats, axis: int) -> list[tuple[float, NDArray[np.bool_]]] | None:
-    """The planes of a lattice across one axis, by rising coordinate: its value, and (n,) which points lie on it.
+    """The planes of a lattice across one axis of the world.
 
-    None where the coordinates (n, 3) do not gather at few values: a plane is thinner than MAX_PLANE_THICKNESS and has
-    MIN_POINTS_PER_PLANE points on average; and where they do, but meet those of another axis at few of their crossings
-    only (MIN_CROSSING_SHARE): these are the rows of a lattice that is turned about the third axis. Planes are looked
-    for across the axes of the world.
+    There are none where the coordinates are spread over many values: a plane is thinner than `MAX_PLANE_THICKNESS` and
+    has `MIN_POINTS_PER_PLANE` points on average. There are none either where they meet those of another axis at few of
+    their crossings only (`MIN_CROSSING_SHARE`): these are the rows of a lattice that is turned about the third axis.
+
+    Args:
+        xyz: (n, 3) positions in the world.
+        axis: 0, 1 or 2.
+
+    Returns:
+        For each plane, by rising coordinate: the coordinate, and (n,) which points lie on it. None where there are
+            none.
     """
     gathered = [_plane_numbers(xyz, k) for k in range(3)]
     mine = gathered[axis]

@@ -17,9 +17,18 @@ from implicam.dataset import Floats
 class Row:
     """The trials of one method with one number of known points: means, and standard errors over the splits.
 
-    The keys are NUMBERS; `measured` is the share of the held-out points that could be measured. A number is averaged
-    over the splits that have it: a fit may succeed and measure nothing. known: points trained on, their mean where all
-    others trained. seeds: splits in which the fit succeeded, of `tried`. split, all_others: as in Trial.
+    A number is averaged over the splits that have it: a fit may succeed and measure nothing.
+
+    Attributes:
+        method: Its name.
+        known: Points trained on; their mean where all others trained.
+        seeds: Splits in which the fit succeeded.
+        mean: Name in `NUMBERS` -> mean; "measured" is the share of the held-out points that could be measured.
+        standard_error: Name in `NUMBERS` -> standard error of the mean; NaN with fewer than two splits.
+        failures: Why fits failed, each reason once.
+        tried: How many splits there are.
+        split: As of `Trial`.
+        all_others: As of `Trial`.
     """
 
     method: str
@@ -40,7 +49,11 @@ NUMBERS = (
 
 
 def summarise(trials: Sequence[Trial]) -> list[Row]:
-    """One row per kind of split, number of points and method, in the order of the trials."""
+    """One row per kind of split, number of points and method, in the order of the trials.
+
+    Args:
+        trials: As of `compare_on`.
+    """
     groups: dict[tuple[str, int, str], list[Trial]] = {}
     for trial in trials:
         known = 0 if trial.all_others else trial.known
@@ -67,7 +80,14 @@ def _row(trials: list[Trial]) -> Row:
 
 
 def mean_and_error(values: Floats) -> tuple[float, float]:
-    """Mean of (n,) values and its standard error; without those that are NaN, NaN where there are too few."""
+    """The mean of values and its standard error; NaN values are left out.
+
+    Args:
+        values: (n,).
+
+    Returns:
+        Mean and standard error; NaN where there are too few values.
+    """
     found = values[~np.isnan(values)]
     n = len(found)
     mean = float(found.mean()) if n else float("nan")
@@ -84,5 +104,9 @@ def _number(trial: Trial, key: str) -> float:
 
 
 def as_json(trials: Sequence[Trial]) -> dict[str, Any]:
-    """Trials and rows as plain values."""
+    """Trials and rows as plain values.
+
+    Args:
+        trials: As of `compare_on`.
+    """
     return {"trials": [asdict(t) for t in trials], "rows": [asdict(row) for row in summarise(trials)]}

@@ -24,14 +24,29 @@ _WHAT = "comparing"
 
 @dataclass(frozen=True)
 class Trial:
-    """One method on one split. Lengths in the dataset's unit.
+    """One method on one split. Lengths are in the dataset's unit; NaN where a number is not known.
 
-    known: points trained on. seed, split, left_out, all_others: those of the `Split`.
-    limit: rms of the Cramer-Rao limit at the same points, NaN where unknown. coverage_95: per axis, pooled;
-    ellipsoid_95: of the 3D ellipsoid. held_out points were to be measured, and unmeasured of them could not be.
-    rmse_common: over the `common` held-out points that every method measured (`compare_on` says which methods count).
-    mean_sd: stated standard deviation, mean over x, y, z and the points, as the paper averages it.
-    fit_seconds: of this fit; where a method fits all splits at once, its share. failure: why there are no numbers.
+    Attributes:
+        method: Its name.
+        known: Points trained on.
+        seed: That of the `Split`.
+        rmse: Root mean square error in 3D.
+        median: Median error in 3D.
+        limit: Root mean square of the Cramer-Rao limit at the same points.
+        coverage_95: Coverage of the 95 % interval per axis, all axes together.
+        ellipsoid_95: Coverage of the 95 % ellipsoid.
+        nees: Mean of e' C^-1 e; 3 is right.
+        held_out: Points to be measured.
+        unmeasured: How many of them could not be measured.
+        fit_seconds: Of this fit; where a method fits all splits at once, its share.
+        failure: Why there are no numbers; empty where there are.
+        split: The kind of the `Split`.
+        left_out: That of the `Split`.
+        all_others: That of the `Split`.
+        rmse_common: Root mean square error over the points that every method measured (`compare_on` says which methods
+            count).
+        common: How many points these are.
+        mean_sd: Stated standard deviation, mean over x, y, z and the points, as the paper averages it.
     """
 
     method: str
@@ -60,7 +75,15 @@ class FitsMany(Protocol):
     """A method that fits many datasets in less time together than one by one."""
 
     def fit_many(self, datasets: Sequence[Dataset], progress: Progress = silent) -> Sequence[Calibration | FitError]:
-        """A calibration of each dataset, in order, or why it cannot be had."""
+        """Fit to each of several datasets.
+
+        Args:
+            datasets: What to fit to.
+            progress: Called as the fits go on.
+
+        Returns:
+            For each dataset, in order, a calibration, or why there is none.
+        """
 
 
 @dataclass(frozen=True)
@@ -72,12 +95,24 @@ class _Judged:
 
 
 def compare_on(splits: Sequence[Split], methods: Mapping[str, Calibrator], progress: Progress = silent) -> list[Trial]:
-    """Fit and judge every method on every split; trials in the order of the splits, then of the methods.
+    """Fit and judge every method on every split.
 
     A fit that fails is a trial with a reason. Where methods measure different points, their errors are those of easy
     and of hard points, so each trial also has the error at the points that all of them measured. A method that measured
-    nothing in a cell (all splits of one kind and number of points) has no say in that cell; one that measured
-    something has a say in every split of it, so that the means over the splits are of the same points, too.
+    nothing in a cell (all splits of one kind and number of points) does not count in that cell; one that measured
+    something counts in every split of it, so that the means over the splits are of the same points, too.
+
+    Args:
+        splits: Which points train and which judge.
+        methods: Name -> method.
+        progress: Called before each fit.
+
+    Returns:
+        The trials, in the order of the splits, then of the methods.
+
+    Raises:
+        UsageError: There is no method or no split.
+        DatasetError: Known positions are missing, or the parts of a split have different length units.
     """
     if not methods or not splits:
         raise UsageError("comparing needs at least one method, one number of points and one seed.")
@@ -132,9 +167,16 @@ def fit_each(
     starting: Callable[[int], None] = lambda i: None,
     progress: Progress = silent,
 ) -> Iterator[tuple[Calibration | ImplicamError, float]]:
-    """Fit to each dataset: the calibration or why there is none, and the seconds it took; many at once where it can.
+    """Fit a method to each of several datasets, many at once where the method can.
 
-    starting: called with the number of a dataset before the work on it. progress: of a fit of many at once.
+    Args:
+        method: The method.
+        datasets: What to fit to.
+        starting: Called with the number of a dataset before the work on it.
+        progress: Called as a fit of many at once goes on.
+
+    Yields:
+        For each dataset, the calibration or why there is none, and the seconds that it took.
     """
     if isinstance(method, FitsMany):
         starting(0)
@@ -173,7 +215,14 @@ def _fit_many(
 
 
 def judge(name: str, split: Split, fit: Calibration | ImplicamError, seconds: float) -> Trial:
-    """The trial of a fit, or of why there is none, at the held-out points of a split."""
+    """The trial of a fit at the held-out points of a split.
+
+    Args:
+        name: Of the method.
+        split: The split.
+        fit: The calibration, or why there is none.
+        seconds: That the fit took.
+    """
     return _judge(name, split, fit, seconds).trial
 
 
@@ -191,7 +240,15 @@ def _judge(name: str, split: Split, fit: Calibration | ImplicamError, seconds: f
 
 
 def trial_of(evaluation: Evaluation, name: str, known: int, seed: int, seconds: float) -> Trial:
-    """The numbers of an evaluation that a comparison shows."""
+    """The numbers of an evaluation that a comparison shows.
+
+    Args:
+        evaluation: The evaluation.
+        name: Of the method.
+        known: Points trained on.
+        seed: Of the split.
+        seconds: That the fit took.
+    """
     overall = evaluation.coverage.overall
     level = overall.level(0.95)
     return Trial(
@@ -212,7 +269,11 @@ def trial_of(evaluation: Evaluation, name: str, known: int, seed: int, seconds: 
 
 
 def mean_sd(measurement: Measurement) -> float:
-    """Stated standard deviation, mean over x, y, z and the points that were measured; NaN where none was."""
+    """Stated standard deviation, mean over x, y, z and the points that were measured; NaN where none was.
+
+    Args:
+        measurement: The measured points.
+    """
     sd = measurement.sd[measurement.measured]
     return float(sd.mean()) if len(sd) else NAN
 
