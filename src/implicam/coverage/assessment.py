@@ -37,13 +37,23 @@ def assess(
     regions: Mapping[str, ArrayLike] | None = None,
     limit: ArrayLike | None = None,
 ) -> Coverage:
-    """Judge the covariances `cov` (n, 3, 3) by the errors, measured - true (n, 3), in one length unit.
+    """Judge covariances by the errors of the positions that they belong to.
 
-    A row of NaN in `errors` is a point that was not measured. clusters: (n,) labels, one per shot; without
-    them, and in a row whose points all come from one shot, every point counts as independent
-    (`Summary.cluster_kind` says which). regions: name -> (n,) labels; each label becomes a row, "" none.
-    limit: (n, 3, 3) Cramer-Rao covariances, NaN where unknown.
-    One bad covariance is a reason in the result; only arrays of the wrong shape raise UsageError.
+    One bad covariance is a reason in the result, not an exception.
+
+    Args:
+        errors: (n, 3) measured minus true position; a row of NaN is a point that was not measured.
+        cov: (n, 3, 3) stated covariances, in the squared unit of the errors.
+        clusters: (n,) labels, one per shot. Without them, and in a row whose points all come from one shot, every point
+            counts as independent (`Summary.cluster_kind` says which).
+        regions: Name -> (n,) labels; each label becomes a row, "" none.
+        limit: (n, 3, 3) Cramer-Rao covariances, NaN where unknown.
+
+    Returns:
+        A row over all points, then one per region.
+
+    Raises:
+        UsageError: An array has the wrong shape.
     """
     e = np.asarray(errors, dtype=np.float64)
     if e.ndim != 2 or e.shape[1] != 3:
@@ -64,7 +74,15 @@ def assess(
 
 
 def tercile_labels(values: ArrayLike, names: tuple[str, str, str] = ("near", "middle", "far")) -> Names:
-    """(n,) labels of the lowest, middle and highest third of the values; "" where the value is not finite."""
+    """Labels of the lowest, middle and highest third of values.
+
+    Args:
+        values: (n,).
+        names: Of the three thirds.
+
+    Returns:
+        (n,) labels; "" where the value is not finite.
+    """
     x = np.asarray(values, dtype=np.float64)
     finite = np.isfinite(x)
     labels = np.full(x.shape, "", dtype=f"<U{max(map(len, names))}")

@@ -24,7 +24,13 @@ from implicam.dataset import Floats
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its 95 % interval; NaN where it cannot be estimated."""
+    """A number with its 95 % interval; NaN where it cannot be estimated.
+
+    Attributes:
+        value: The number.
+        low: The lower end of the interval.
+        high: The upper end.
+    """
 
     value: float
     low: float
@@ -33,7 +39,11 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Which of n points belong together: labels (n,), equal within a cluster."""
+    """Which of n points belong together.
+
+    Attributes:
+        labels: (n,), equal within a cluster.
+    """
 
     labels: NDArray[Any]
 
@@ -44,12 +54,12 @@ class Clusters:
 
     @cached_property
     def sizes(self) -> Floats:
-        """Points per cluster."""
+        """(clusters,) points per cluster."""
         return self.sums(np.ones(len(self.labels)))
 
     @property
     def effective(self) -> float:
-        """Kish's number: that of equal clusters whose total varies as much."""
+        """Kish's effective number: that of equal clusters whose total varies as much."""
         return float(self.sizes.sum() ** 2 / (self.sizes**2).sum())
 
     @property
@@ -58,22 +68,40 @@ class Clusters:
         return float(stdtrit(max(self.effective - 1, 1), 0.975))
 
     def sums(self, values: NDArray[Any]) -> Floats:
-        """Sum of (n,) values per cluster."""
+        """The sum of values per cluster.
+
+        Args:
+            values: (n,).
+
+        Returns:
+            (clusters,).
+        """
         return np.asarray(np.bincount(self.index, weights=values), dtype=np.float64)
 
     def variance_of_mean(self, values: NDArray[Any]) -> float:
-        """Cluster-robust variance of the mean of (n,) values; needs two clusters."""
+        """Cluster-robust variance of the mean of values.
+
+        Args:
+            values: (n,), in at least two clusters.
+        """
         groups = len(self.sizes)
         residual = self.sums(values) - values.mean() * self.sizes
         return groups / (groups - 1) * float((residual**2).sum()) / len(values) ** 2
 
 
 def shares(values: Floats, bounds: ArrayLike, clusters: Clusters) -> list[Estimate]:
-    """Share of the values (n, k) within each bound.
+    """The share of values within each bound.
 
     Misses are rare at 0.99, and a few hardly show how strongly a cluster agrees. So the design effect is at least that
     of the indicator "below the median", which has the most data; agreement in the tails is weaker, if anything.
-    With a single cluster the interval is all of 0 to 1.
+
+    Args:
+        values: (n, k), k of each point.
+        bounds: (b,) or one number; a value on a bound is within it.
+        clusters: Of the n points.
+
+    Returns:
+        One estimate per bound. With a single cluster its interval is all of 0 to 1; without values it is NaN.
     """
     limits = np.atleast_1d(np.asarray(bounds, dtype=np.float64))
     if not len(values):
@@ -85,7 +113,15 @@ def shares(values: Floats, bounds: ArrayLike, clusters: Clusters) -> list[Estima
 
 
 def mean_interval(values: Floats, clusters: Clusters) -> Estimate:
-    """Mean of (n,) positive values."""
+    """The mean of positive values, with an interval on a log scale.
+
+    Args:
+        values: (n,) positive.
+        clusters: Of the n points.
+
+    Returns:
+        The mean; its interval is NaN with fewer than two clusters.
+    """
     mean = float(values.mean()) if len(values) else float("nan")
     if len(values) == 0 or len(clusters.sizes) < 2 or mean <= 0:
         return Estimate(mean, np.nan, np.nan)

@@ -35,7 +35,14 @@ VAGUE_NEES_RATIO = 4.0
 
 @dataclass(frozen=True)
 class Level:
-    """Observed coverage at one nominal probability: all axes together, x, y and z alone, and the 3D ellipsoid."""
+    """Observed coverage at one nominal probability.
+
+    Attributes:
+        nominal: The nominal probability.
+        pooled: Of the intervals of x, y and z, all together.
+        axes: Of the intervals of x, y and z alone.
+        ellipsoid: Of the 3D ellipsoids.
+    """
 
     nominal: float
     pooled: Estimate
@@ -45,16 +52,29 @@ class Level:
 
 @dataclass(frozen=True)
 class Summary:
-    """One region. Lengths in the unit of the errors.
+    """The errors and covariances of one region. Lengths are in the unit of the errors.
 
-    n: points measured, the base of rmse, median and p95. unmeasured: points without a position, counted only.
-    unusable: measured points whose covariance could not be judged (`Coverage.reasons`); they count in n only.
-    rmse: sqrt(mean |e|²); stated_rms: what the covariance says it should be, sqrt(mean trace C). mean_sd: per axis.
-    nees: mean e' C⁻¹ e, right at 3. nll: mean negative log density of the 3D Gaussian in nats (depends on the unit).
-    crps: mean over points and axes. sd_factor: times this, the 95 % ellipsoid would have held 95 %.
-    rmse_over_limit: rms error over the Cramer-Rao limit, 1 is perfect, NaN without limits.
-    clusters: how many things the intervals took as independent, and `cluster_kind` what: "shots"; "points" where
-    there are no shots; "points of one shot" where one shot is all there is, so that the intervals may be too narrow.
+    Attributes:
+        group: "all", or the name of the regions.
+        region: The label.
+        n: Points measured, which rmse, median and p95 are of.
+        unmeasured: Points without a position, counted only.
+        unusable: Measured points whose covariance could not be judged (`Coverage.reasons`); they count in n only.
+        clusters: How many things the intervals took as independent.
+        cluster_kind: What these are: "shots"; "points" where there are no shots; "points of one shot" where one shot is
+            all there is, so that the intervals may be too narrow.
+        rmse_axes: Root mean square error of x, y and z.
+        rmse: Root mean square error in 3D, sqrt(mean |e|²).
+        median_error: Median of |e|.
+        p95_error: 95th percentile of |e|.
+        mean_sd: Mean stated standard deviation of x, y and z.
+        stated_rms: What the covariances say the rmse should be, sqrt(mean trace C).
+        levels: Coverage at each of `LEVELS`.
+        nees: Mean e' C⁻¹ e; 3 is right.
+        nll: Mean negative log density of the 3D Gaussian in nats; it depends on the unit.
+        crps: Continuous ranked probability score, mean over points and axes.
+        sd_factor: Times this, the 95 % ellipsoid would have held 95 %.
+        rmse_over_limit: Rms error over the Cramer-Rao limit; 1 is perfect, NaN without limits.
     """
 
     group: str
@@ -78,7 +98,14 @@ class Summary:
     rmse_over_limit: float
 
     def level(self, nominal: float) -> Level:
-        """The coverage at one of LEVELS."""
+        """The coverage at one nominal probability.
+
+        Args:
+            nominal: One of `LEVELS`.
+
+        Raises:
+            ValueError: It is none of them.
+        """
         return self.levels[LEVELS.index(nominal)]
 
     @property
@@ -102,7 +129,12 @@ class Summary:
 
 @dataclass(frozen=True)
 class Coverage:
-    """One row per region, the first over all points; reasons: (point's index, why its covariance was not judged)."""
+    """How well covariances agree with errors.
+
+    Attributes:
+        rows: One per region, the first over all points.
+        reasons: The number of a point, and why its covariance was not judged.
+    """
 
     rows: tuple[Summary, ...]
     reasons: tuple[tuple[int, str], ...] = ()
@@ -113,7 +145,7 @@ class Coverage:
         return self.rows[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """Ready for JSON: plain numbers, lists and text; None where there is no number."""
+        """Plain numbers, lists and text, ready for JSON; None where there is no number."""
         plain: dict[str, Any] = json_safe(asdict(self))
         for row, summary in zip(plain["rows"], self.rows, strict=True):
             row["verdict"] = summary.verdict
