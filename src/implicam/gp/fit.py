@@ -37,7 +37,15 @@ _FAILED = 1e12
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Hyperparameters at the optimum, in the units of the data, and how it was reached."""
+    """Hyperparameters at the optimum, in the units of the data, and how it was reached.
+
+    Attributes:
+        kernel: The kernel, with its signal variance and lengthscales.
+        noise_variance: Of an output.
+        log_marginal_likelihood: At the optimum, in nats.
+        evaluations: Number of points -> how often the likelihood was evaluated on so many.
+        converged: Whether the search ended by itself.
+    """
 
     kernel: Kernel
     noise_variance: float
@@ -48,7 +56,11 @@ class Fit:
 
 
 class ProfiledLikelihood:
-    """Negative log marginal likelihood of standardised data, and its gradient, over [log lengthscales, log rho]."""
+    """Negative log marginal likelihood of standardised data, and its gradient.
+
+    Its argument is theta (d + 1,): the log lengthscales and log rho. It is made from X (n, d), y (n,) and the name of a
+    kernel shape.
+    """
 
     def __init__(self, X: Floats, y: Floats, shape: str) -> None:
         self.X, self.y, self.shape = X, y, SHAPES[shape]
@@ -61,7 +73,14 @@ class ProfiledLikelihood:
         self._left, self._right = np.ones((n, d + 2)), np.ones((n, d + 2))
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
-        """The value and its gradient (d + 1,)."""
+        """The value and its gradient.
+
+        Args:
+            theta: (d + 1,) log lengthscales and log rho.
+
+        Returns:
+            The value, and (d + 1,); a very large value with a zero gradient where the matrix is not positive definite.
+        """
         self.evaluations += 1
         n, d = self.X.shape
         rho = float(np.exp(theta[d]))
@@ -98,7 +117,14 @@ class ProfiledLikelihood:
         return self._d2
 
     def signal_variance(self, theta: Floats) -> float:
-        """The profiled signal variance at theta."""
+        """The profiled signal variance.
+
+        Args:
+            theta: (d + 1,) log lengthscales and log rho.
+
+        Raises:
+            NumericalError: The matrix is not positive definite.
+        """
         d = self.X.shape[1]
         scaled = self.X * np.exp(-theta[:d])
         A = self.shape(squared_distances(scaled, scaled))[0]
@@ -106,7 +132,14 @@ class ProfiledLikelihood:
         return float(self.y @ solve(cholesky(A.T), self.y)) / len(A)
 
     def fisher_information(self, theta: Floats) -> Floats:
-        """(d + 1, d + 1) expected second derivatives, ½ tr(A^-1 dA A^-1 dA') less what the profiled signal absorbs."""
+        """Expected second derivatives: ½ tr(A^-1 dA A^-1 dA') less what the profiled signal variance absorbs.
+
+        Args:
+            theta: (d + 1,) log lengthscales and log rho.
+
+        Returns:
+            (d + 1, d + 1).
+        """
         n, d = self.X.shape
         scaled = self.X * np.exp(-theta[:d])
         correlation, slope = self.shape(squared_distances(scaled, scaled))
@@ -127,11 +160,19 @@ def maximise(
     start: Fit | None = None,
     seed: int = 0,
 ) -> Fit:
-    """Hyperparameters of a zero-mean GP that maximise the marginal likelihood of y (n,) at X (n, d).
+    """Hyperparameters of a zero-mean GP that maximise the marginal likelihood.
 
-    `shortest` bounds every lengthscale from below, in standard deviations of its input: prior knowledge of how smooth
-    the function is. `start` continues from an earlier fit (a point was added), which is cheaper than a search from
-    nothing. `seed` draws the subset. Raises NumericalError where there is nothing to learn from.
+    Args:
+        X: (n, d) inputs.
+        y: (n,) outputs.
+        shape: A key of `SHAPES`.
+        shortest: The least lengthscale, in standard deviations of its input: prior knowledge of how smooth the function
+            is.
+        start: An earlier fit to go on from (a point was added), which is cheaper than a search from no guess.
+        seed: Of the subset that a search begins on.
+
+    Raises:
+        NumericalError: The arrays do not fit together, hold NaN, or the outputs are all zero.
     """
     if start is not None:
         return _search(X, y, shape, "continued", shortest, start, seed)
@@ -149,10 +190,23 @@ def maximise_each(
     starts: Sequence[Fit] = (),
     anew: bool = True,
 ) -> list[Fit]:
-    """The same for every column of Y (n, m), all searches side by side; `done(k, of)` is told when one has ended.
+    """As `maximise`, for each of several outputs, all searches side by side.
 
-    starts: earlier fits, one a column, that searches go on from, too; without `anew` only from them. Of several
-    searches the most probable result is taken.
+    Args:
+        X: (n, d) inputs.
+        Y: (n, m) outputs.
+        shape: A key of `SHAPES`.
+        shortest: The least lengthscale, in standard deviations of its input.
+        seed: Of the subset that a search begins on.
+        done: Called with the numbers of finished and of all searches.
+        starts: Earlier fits, one for each output, to go on from.
+        anew: Whether to search from no guess as well; without `starts` that is always done.
+
+    Returns:
+        For each output the most probable result.
+
+    Raises:
+        NumericalError: As `maximise`.
     """
     ended: list[int] = []
     columns = np.asarray(Y).T

@@ -40,9 +40,16 @@ SHAPES: dict[str, Callable[[Floats], tuple[Floats, Floats]]] = {
 
 
 def squared_distances(A: Floats, B: Floats) -> Floats:
-    """(n, m) squared Euclidean distances, by one matrix product.
+    """Squared Euclidean distances, by one matrix product.
 
-    Rounding leaves errors of about 1e-16 |a|², so inputs should be centred; negative zeros are clipped.
+    Rounding leaves errors of about 1e-16 |a|², so inputs should be centred; negative results are set to zero.
+
+    Args:
+        A: (n, d).
+        B: (m, d).
+
+    Returns:
+        (n, m).
     """
     d2 = A @ B.T
     d2 *= -2.0
@@ -55,7 +62,16 @@ def squared_distances(A: Floats, B: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """`signal_variance * correlation(r²)`; lengthscale: (d,), in units of the inputs."""
+    """The covariance function `signal_variance * correlation(r²)`.
+
+    Attributes:
+        shape: A key of `SHAPES`.
+        signal_variance: In squared units of the output.
+        lengthscale: (d,), in units of the inputs.
+
+    Raises:
+        UsageError: There is no such shape, or a number is not positive and finite.
+    """
 
     shape: str
     signal_variance: float
@@ -75,7 +91,15 @@ class Kernel:
         object.__setattr__(self, "lengthscale", lengthscale)
 
     def __call__(self, A: Floats, B: Floats) -> Floats:
-        """(n, m) covariance of the function values at A (n, d) and B (m, d)."""
+        """The covariance of the function values at two sets of inputs.
+
+        Args:
+            A: (n, d).
+            B: (m, d).
+
+        Returns:
+            (n, m).
+        """
         scaled = A / self.lengthscale
         d2 = squared_distances(scaled, scaled if A is B else B / self.lengthscale)
         return self.signal_variance * SHAPES[self.shape](d2)[0]

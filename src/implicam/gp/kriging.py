@@ -38,7 +38,13 @@ _FAILED = 1e12
 
 @dataclass(frozen=True, eq=False)
 class LengthscalePrior:
-    """Log-normal: median (d,), and the covariance (d, d) of the logs; no lengthscale is below `shortest`."""
+    """The log-normal prior of the lengthscales.
+
+    Attributes:
+        median: (d,).
+        covariance: (d, d) of the logs.
+        shortest: No lengthscale is shorter.
+    """
 
     median: Floats
     covariance: Floats
@@ -46,21 +52,39 @@ class LengthscalePrior:
 
     @property
     def root(self) -> Floats:
-        """(d, d) lower triangular."""
+        """(d, d) lower Cholesky factor of the covariance."""
         return np.asarray(np.linalg.cholesky(self.covariance))
 
     def log_lengthscale(self, t: Floats) -> tuple[Floats, Floats]:
-        """(d,) from whitened t (d,), and its slope (d, d), which is zero where the bound holds."""
+        """The log lengthscales of whitened coordinates.
+
+        Args:
+            t: (d,) standard normal under the prior.
+
+        Returns:
+            (d,) log lengthscales, and their slope (d, d), which is zero where the bound holds.
+        """
         wanted, low = np.log(self.median) + self.root @ t, np.log(self.shortest)
         return np.maximum(wanted, low), self.root * (wanted > low)[:, None]
 
     def whitened(self, lengthscale: Floats) -> Floats:
-        """The inverse of `log_lengthscale`."""
+        """The inverse of `log_lengthscale`.
+
+        Args:
+            lengthscale: (d,).
+
+        Returns:
+            (d,) whitened coordinates.
+        """
         return np.asarray(np.linalg.solve(self.root, np.log(lengthscale / self.median)))
 
 
 class RestrictedPosterior:
-    """Negative log posterior and its gradient over [t (d,), log rho], up to a constant."""
+    """Negative log posterior and its gradient, up to a constant.
+
+    Its argument is [t (d,), log rho], t the whitened log lengthscales. It is made from X (n, d), Y (n, m), H (n, p),
+    the name of a kernel shape and a prior.
+    """
 
     def __init__(self, X: Floats, Y: Floats, H: Floats, shape: str, prior: LengthscalePrior) -> None:
         self.X, self.Y, self.H, self.shape, self.prior = X, Y, H, SHAPES[shape], prior
@@ -68,7 +92,14 @@ class RestrictedPosterior:
         self.evaluations = 0
 
     def __call__(self, theta: Floats) -> tuple[float, Floats]:
-        """The value and its gradient (d + 1,)."""
+        """The value and its gradient.
+
+        Args:
+            theta: (d + 1,) whitened log lengthscales and log rho.
+
+        Returns:
+            The value, and (d + 1,); a very large value with a zero gradient where the matrix is not positive definite.
+        """
         self.evaluations += 1
         n, m = self.Y.shape
         t, rho = theta[:-1], float(np.exp(theta[-1]))
@@ -110,8 +141,15 @@ def _inverse_from_factor(L: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Smoothness:
-    """What is learned: lengthscale (d,), noise_ratio (rho), and a root (d + 1, d + 1) of the covariance of
-    [log lengthscale, log rho]. value: the negative log posterior there."""
+    """What is learned of the kernel.
+
+    Attributes:
+        shape: A key of `SHAPES`.
+        lengthscale: (d,).
+        noise_ratio: rho.
+        root: (d + 1, d + 1) of the covariance of [log lengthscale, log rho].
+        value: The negative log posterior there.
+    """
 
     shape: str
     lengthscale: Floats
@@ -131,10 +169,20 @@ def most_probable(
     anew: bool = True,
     seed: int = 0,
 ) -> Smoothness:
-    """The most probable lengthscales and noise ratio of Y (n, m) at X (n, d) with the mean's functions H (n, p).
+    """The most probable lengthscales and noise ratio.
 
-    start: an earlier result of nearly the same data that the search goes on from; without `anew` only from there.
-    `seed` draws the part of many points that the search begins on.
+    Args:
+        X: (n, d) inputs.
+        Y: (n, m) outputs.
+        H: (n, p) functions of the mean.
+        shape: A key of `SHAPES`.
+        prior: Of the lengthscales.
+        start: An earlier result of nearly the same data to go on from.
+        anew: Whether to search from no guess as well; without `start` that is always done.
+        seed: Of the part of many points that a search begins on.
+
+    Raises:
+        NumericalError: No search succeeded.
     """
     n, d = X.shape
     everything = RestrictedPosterior(X, Y, H, shape, prior)
@@ -196,9 +244,17 @@ def _root_of_inverse(curvature: Floats) -> Floats:
 class Kriging:
     """The model conditioned on its data; build it with `condition`.
 
-    kernel: of unit variance. L: (n, n) factor of A = R + rho I. G: (p, p) factor of H^T A^-1 H. coefficients: (p, m)
-    the mean's, B. a: (n, m) A^-1 (Y - H B).
-    sigma: (m, m) covariance of an output whose factor is one, with what is uncertain of Sigma in it.
+    Attributes:
+        kernel: Of unit variance.
+        smoothness: Its lengthscales, the noise ratio, and how uncertain they are.
+        X: (n, d) inputs.
+        Y: (n, m) outputs.
+        H: (n, p) functions of the mean.
+        L: (n, n) factor of A = R + rho I.
+        G: (p, p) factor of H^T A^-1 H.
+        a: (n, m) A^-1 (Y - H B).
+        coefficients: (p, m) those of the mean, B.
+        sigma: (m, m) covariance of an output whose variance factor is one, the uncertainty of Sigma included.
     """
 
     kernel: Kernel
@@ -214,7 +270,17 @@ class Kriging:
 
     @classmethod
     def condition(cls, smoothness: Smoothness, X: Floats, Y: Floats, H: Floats) -> Kriging:
-        """Condition on outputs Y (n, m) at inputs X (n, d), the mean's functions being H (n, p)."""
+        """Condition on data.
+
+        Args:
+            smoothness: The lengthscales and the noise ratio.
+            X: (n, d) inputs.
+            Y: (n, m) outputs.
+            H: (n, p) functions of the mean.
+
+        Raises:
+            NumericalError: The covariance matrix is not positive definite.
+        """
         kernel = Kernel(smoothness.shape, 1.0, smoothness.lengthscale)
         K = kernel(X, X)
         K[np.diag_indices_from(K)] = 1.0 + smoothness.noise_ratio
@@ -235,20 +301,43 @@ class Kriging:
 
     @property
     def noise_variance(self) -> float:
-        """Of an output, in units of the kernel's variance."""
+        """Noise variance of an output, in units of the kernel's variance."""
         return self.smoothness.noise_ratio
 
     def explained(self, X: Floats) -> Floats:
-        """(n, k) V of k places: their covariance is `kernel + drift^T drift - V^T V`."""
+        """V of places: their covariance is `kernel + drift^T drift - V^T V`.
+
+        Args:
+            X: (k, d) inputs.
+
+        Returns:
+            (n, k).
+        """
         return solve_lower(self.L, self.kernel(self.X, X))
 
     def drift(self, H: Floats, explained: Floats) -> Floats:
-        """(p, k) what is uncertain of the mean at k places with its functions H (k, p)."""
+        """The uncertainty of the mean at places.
+
+        Args:
+            H: (k, p) functions of the mean there.
+            explained: (n, k) as of `explained`.
+
+        Returns:
+            (p, k).
+        """
         return solve_lower(self.G, H.T - solve_lower(self.L, self.H).T @ explained)
 
     def predict(self, X: Floats, H: Floats) -> tuple[Floats, Floats, Floats]:
-        """At X (k, d) with the mean's functions H (k, p): mean (k, m), the variance factor (k,) of the function, by
-        which `sigma` is to be multiplied, and what uncertain lengthscales add to the covariance (k, m, m)."""
+        """Predict the outputs at places, without the noise of a new output.
+
+        Args:
+            X: (k, d) inputs.
+            H: (k, p) functions of the mean there.
+
+        Returns:
+            (k, m) mean; (k,) variance factor, by which `sigma` is to be multiplied; (k, m, m) what uncertain
+            lengthscales add to the covariance.
+        """
         V = self.explained(X)
         W = self.drift(H, V)
         factor = 1.0 - np.einsum("ij,ij->j", V, V) + np.einsum("ij,ij->j", W, W)
@@ -274,8 +363,11 @@ class Kriging:
         return np.asarray(found)
 
     def leave_one_out(self) -> tuple[Floats, Floats]:
-        """Errors (n, m) of each output predicted from all others, and the factor (n,) of their covariance, noise
-        included: `(P Y)_i / P_ii` and `1 / P_ii`."""
+        """Each output predicted from all others: `(P Y)_i / P_ii` and `1 / P_ii`.
+
+        Returns:
+            (n, m) errors, and (n,) the factor of their covariance, noise included.
+        """
         whiteH = solve_lower(self.L, self.H)
         root = solve_lower(self.L, np.eye(len(self)))
         along = root.T @ np.linalg.solve(self.G, whiteH.T).T

@@ -1,4 +1,4 @@
-"""Cholesky factors that either succeed or say why not. No jitter is ever added in silence.
+"""Cholesky factors that either succeed or say why not. Jitter is never added.
 
 SciPy's Python wrappers of LAPACK keep the interpreter locked while they work, so two threads take turns. The costly
 calls therefore go to the same routines by their C pointers, which ctypes calls with the lock released.
@@ -18,7 +18,17 @@ from implicam.gp.kernels import Floats
 
 
 def cholesky(K: Floats) -> Floats:
-    """Lower L with `L L^T = K` (Rasmussen & Williams Alg. 2.1 line 2). K is overwritten if it is Fortran-ordered."""
+    """Lower L with `L L^T = K` (Rasmussen & Williams Alg. 2.1 line 2).
+
+    Args:
+        K: (n, n) symmetric; overwritten if it is Fortran-ordered.
+
+    Returns:
+        (n, n), zero above the diagonal.
+
+    Raises:
+        NumericalError: K is not finite, or not positive definite.
+    """
     L, info = lapack.dpotrf(K, lower=1, clean=1, overwrite_a=1)
     if info != 0:
         raise _reason(K, info)
@@ -41,7 +51,12 @@ def _reason(K: Floats, info: int) -> NumericalError:
 
 
 def routine(name: str, arguments: int) -> Any:
-    """A LAPACK routine by the pointer that SciPy publishes for C callers."""
+    """A LAPACK routine, by the pointer that SciPy publishes for C callers.
+
+    Args:
+        name: Of the routine.
+        arguments: How many it has.
+    """
     capsule = cython_lapack.__pyx_capi__[name]
     get_name, get_pointer = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
     get_name.restype, get_name.argtypes = ctypes.c_char_p, [ctypes.py_object]
@@ -54,27 +69,56 @@ _DPOTRF, _DPOTRI, _DTRTRS = routine("dpotrf", 5), routine("dpotri", 5), routine(
 
 
 def address(A: Floats) -> int:
-    """Where LAPACK finds the numbers of A."""
+    """The address of an array's numbers, for LAPACK.
+
+    Args:
+        A: Writeable, Fortran-ordered, float64.
+
+    Raises:
+        TypeError: It is not.
+    """
     if A.dtype != np.float64 or not A.flags.f_contiguous or not A.flags.writeable:
         raise TypeError("LAPACK works in place on writeable Fortran-ordered float64 arrays")
     return int(A.ctypes.data)
 
 
 def factor_in_place(A: Floats) -> int:
-    """Replace the lower triangle of A by its Cholesky factor; the upper is not touched. 0, or the row that failed."""
+    """Replace the lower triangle of a matrix by its Cholesky factor; the upper is not touched.
+
+    Args:
+        A: (n, n) as of `address`.
+
+    Returns:
+        0, or the number of the row that failed, from 1.
+    """
     n, info = c_int(len(A)), c_int(0)
     _DPOTRF(byref(c_char(b"L")), byref(n), address(A), byref(n), byref(info))
     return info.value
 
 
 def invert_in_place(L: Floats) -> None:
-    """Replace a Cholesky factor in the lower triangle by the inverse of the matrix it factors, lower triangle only."""
+    """Replace a Cholesky factor by the inverse of the matrix that it factors, lower triangle only.
+
+    Args:
+        L: (n, n) as of `address`.
+    """
     n, info = c_int(len(L)), c_int(0)
     _DPOTRI(byref(c_char(b"L")), byref(n), address(L), byref(n), byref(info))
 
 
 def solve_lower(L: Floats, B: Floats) -> Floats:
-    """`L^-1 B` for lower-triangular Fortran-ordered L; B is (n,) or (n, m)."""
+    """`L^-1 B` for a lower-triangular L.
+
+    Args:
+        L: (n, n); Fortran order avoids a copy.
+        B: (n,) or (n, m).
+
+    Returns:
+        The shape of B.
+
+    Raises:
+        NumericalError: There is a zero on the diagonal of L.
+    """
     x = np.array(B, dtype=np.float64, order="F")
     n, m, info = c_int(len(L)), c_int(1 if x.ndim == 1 else x.shape[1]), c_int(0)
     factor = np.asfortranarray(L)
@@ -86,6 +130,14 @@ def solve_lower(L: Floats, B: Floats) -> Floats:
 
 
 def solve(L: Floats, b: Floats) -> Floats:
-    """`(L L^T)^-1 b`."""
+    """`(L L^T)^-1 b` for a Cholesky factor L.
+
+    Args:
+        L: (n, n) lower.
+        b: (n,) or (n, m).
+
+    Returns:
+        The shape of b.
+    """
     x, _ = lapack.dpotrs(L, b, lower=1)
     return x  # type: ignore[no-any-return]

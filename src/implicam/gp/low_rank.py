@@ -26,14 +26,25 @@ _DPSTRF = routine("dpstrf", 9)
 
 @dataclass(frozen=True, eq=False)
 class LowRank:
-    """A kernel of unit variance and its inducing points (m, d)."""
+    """A kernel of unit variance and its inducing points.
+
+    Attributes:
+        kernel: The kernel.
+        inducing: (m, d) inputs.
+    """
 
     kernel: Kernel
     inducing: Floats
 
     @classmethod
     def of(cls, kernel: Kernel, X: Floats, tolerance: float) -> LowRank:
-        """Enough of the points X (n, d) as inducing points to leave less than `tolerance` of the variance at any."""
+        """Choose inducing points so that little variance is left at any point.
+
+        Args:
+            kernel: Of unit variance.
+            X: (n, d) points; of more than `MAX_DRAWN`, as many are drawn at random but always the same.
+            tolerance: The variance that may be left.
+        """
         drawn = X if len(X) <= MAX_DRAWN else X[np.random.default_rng(0).choice(len(X), MAX_DRAWN, replace=False)]
         pivots, _ = pivoted_cholesky(kernel(drawn, drawn), tolerance)
         return cls(kernel, drawn[pivots])
@@ -44,19 +55,49 @@ class LowRank:
         return cholesky(np.asfortranarray(self.kernel(self.inducing, self.inducing)))
 
     def features(self, X: Floats) -> Floats:
-        """(n, m) phi."""
+        """phi at inputs.
+
+        Args:
+            X: (n, d).
+
+        Returns:
+            (n, m).
+        """
         return self.features_from(self.kernel(X, self.inducing))
 
     def features_from(self, K: Floats) -> Floats:
-        """(n, m) phi, from the covariance (n, m) with the inducing points."""
+        """phi, from covariances.
+
+        Args:
+            K: (n, m) covariance with the inducing points.
+
+        Returns:
+            (n, m).
+        """
         return solve_lower(self.factor, K.T).T
 
     def coefficients(self, weights: Floats) -> Floats:
-        """(m, k) such that `K coefficients = phi weights`, for weights (m, k)."""
+        """The coefficients such that `K coefficients = phi weights`.
+
+        Args:
+            weights: (m, k) of the features.
+
+        Returns:
+            (m, k).
+        """
         return np.asarray(np.linalg.solve(self.factor.T, weights), dtype=np.float64)
 
     def slope(self, X: Floats, K: Floats, coefficients: Floats) -> Floats:
-        """(n, k, d) derivative of `K coefficients` with respect to X (n, d); the squared exponential only."""
+        """The derivative of `K coefficients` with respect to the inputs; for the squared exponential only.
+
+        Args:
+            X: (n, d) inputs.
+            K: (n, m) their covariance with the inducing points.
+            coefficients: (m, k).
+
+        Returns:
+            (n, k, d).
+        """
         scaled = X / self.kernel.lengthscale**2
         pulled = self.inducing / self.kernel.lengthscale**2
         value = K @ coefficients
@@ -66,7 +107,15 @@ class LowRank:
 
 
 def pivoted_cholesky(K: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
-    """Pivots (m,) and the factor (n, m), rows as in K, with `K - factor factor^T` below `tolerance` on the diagonal."""
+    """The pivoted Cholesky factor of a matrix, stopped when little is left on the diagonal.
+
+    Args:
+        K: (n, n) symmetric.
+        tolerance: What may be left on the diagonal of `K - factor factor^T`.
+
+    Returns:
+        (m,) pivots, and (n, m) the factor, rows as in K.
+    """
     A = np.array(K, order="F")
     n, rank, info = c_int(len(A)), c_int(0), c_int(0)
     pivots, work = np.zeros(len(A), dtype=np.int32), np.zeros(2 * len(A))

@@ -18,10 +18,16 @@ BLOCK_ENTRIES = 1 << 22  # of K_* at a time: 32 MB, so that a million prediction
 
 @dataclass(frozen=True, eq=False)
 class GaussianProcess:
-    """A Gaussian process conditioned on n values. Build it with `condition`.
+    """A Gaussian process conditioned on n values; build it with `condition`.
 
-    X: (n, d) inputs, y: (n,) noisy outputs, mean: the constant prior mean, noise_variance: of each output.
-    L: (n, n) lower Cholesky factor of K + noise_variance I; alpha: (K + noise_variance I)^-1 (y - mean).
+    Attributes:
+        kernel: The kernel.
+        noise_variance: Of each output.
+        mean: The constant prior mean.
+        X: (n, d) inputs.
+        y: (n,) noisy outputs.
+        L: (n, n) lower Cholesky factor of K + noise_variance I.
+        alpha: (n,) (K + noise_variance I)^-1 (y - mean).
     """
 
     kernel: Kernel
@@ -36,7 +42,18 @@ class GaussianProcess:
     def condition(
         cls, kernel: Kernel, noise_variance: float, X: Floats, y: Floats, mean: float = 0.0
     ) -> GaussianProcess:
-        """Condition on data; NumericalError with the reason where the matrix is not positive definite."""
+        """Condition on data.
+
+        Args:
+            kernel: The kernel.
+            noise_variance: Of each output.
+            X: (n, d) inputs.
+            y: (n,) noisy outputs.
+            mean: The constant prior mean.
+
+        Raises:
+            NumericalError: The matrix is not positive definite, the arrays do not fit together, or hold NaN.
+        """
         X, y = np.array(X, dtype=np.float64), np.array(y, dtype=np.float64)
         _check(kernel, X, y)
         K = kernel(X, X)
@@ -48,7 +65,14 @@ class GaussianProcess:
         return len(self.y)
 
     def predict(self, X: Floats) -> tuple[Floats, Floats]:
-        """Mean and variance (m,) of the function at X (m, d), without the noise of a new output."""
+        """Predict the function, without the noise of a new output.
+
+        Args:
+            X: (m, d) inputs.
+
+        Returns:
+            (m,) mean and (m,) variance.
+        """
         X = np.asarray(X, dtype=np.float64)
         mean, variance = np.empty(len(X)), np.empty(len(X))
         step = max(1, BLOCK_ENTRIES // max(1, len(self)))
@@ -62,7 +86,15 @@ class GaussianProcess:
         return mean, np.maximum(variance, 0.0)
 
     def add(self, x: Floats, y: float) -> GaussianProcess:
-        """The process conditioned on one more value, in O(n²): the factor grows by one row."""
+        """The process conditioned on one more value, in O(n²): the factor grows by one row.
+
+        Args:
+            x: (d,) its input.
+            y: The output.
+
+        Raises:
+            NumericalError: The matrix would be singular.
+        """
         x = np.asarray(x, dtype=np.float64)[None, :]
         row = solve_lower(self.L, self.kernel(self.X, x)[:, 0])
         pivot = self.kernel.signal_variance + self.noise_variance - row @ row
@@ -86,7 +118,7 @@ class GaussianProcess:
         return float(fit - np.log(np.diag(self.L)).sum() - 0.5 * len(self) * np.log(2 * np.pi))
 
     def leave_one_out(self) -> tuple[Floats, Floats]:
-        """Mean and variance (n,) of each output predicted from all others, noise included (eq. 5.12)."""
+        """(n,) mean and (n,) variance of each output predicted from all others, noise included (eq. 5.12)."""
         inverse = solve(self.L, np.eye(len(self)))
         precision = np.diag(inverse)
         return self.y - self.alpha / precision, 1.0 / precision
