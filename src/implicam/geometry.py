@@ -51,7 +51,12 @@ POOR_ERROR_RATIO = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A rigid motion `x_to = rotation x_from + translation`; rotation (3, 3), translation (3,)."""
+    """A rigid motion `x_to = rotation x_from + translation`.
+
+    Attributes:
+        rotation: (3, 3).
+        translation: (3,), in the length unit of the points.
+    """
 
     rotation: Floats
     translation: Floats
@@ -63,7 +68,14 @@ class Pose:
             object.__setattr__(self, name, array)
 
     def apply(self, points: Floats) -> Floats:
-        """Points (..., 3) of the one frame in the other."""
+        """Points of the one frame in the other.
+
+        Args:
+            points: (..., 3).
+
+        Returns:
+            (..., 3).
+        """
         return points @ self.rotation.T + self.translation
 
     def inverse(self) -> Pose:
@@ -81,7 +93,16 @@ class Pose:
 
 
 def look_at(centre: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Pose:
-    """`camera_from_world` of a camera at `centre` that looks at `target`, the image's up side towards `up`."""
+    """The pose of a camera that looks at a target.
+
+    Args:
+        centre: (3,) of the camera, in the world.
+        target: (3,) in the world.
+        up: (3,) direction in the world that is up in the image; where the camera looks along it, another is taken.
+
+    Returns:
+        `camera_from_world`.
+    """
     forward = _unit(np.subtract(target, centre))
     right = np.cross(forward, np.asarray(up, dtype=np.float64))
     if np.linalg.norm(right) < 1e-9 * np.linalg.norm(up):  # straight up or down: any sideways will do
@@ -92,20 +113,43 @@ def look_at(centre: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0
 
 
 def rotation_from_vector(vector: ArrayLike) -> Floats:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3): axis times angle in radians (OpenCV's rvec)."""
+    """Rotation matrices of rotation vectors (OpenCV's rvec).
+
+    Args:
+        vector: (..., 3) axis times angle in radians.
+
+    Returns:
+        (..., 3, 3).
+    """
     return np.asarray(Rotation.from_rotvec(np.asarray(vector, dtype=np.float64)).as_matrix(), dtype=np.float64)
 
 
 def vector_from_rotation(rotation: ArrayLike) -> Floats:
-    """Rotation vectors (..., 3) of rotation matrices (..., 3, 3)."""
+    """Rotation vectors of rotation matrices.
+
+    Args:
+        rotation: (..., 3, 3).
+
+    Returns:
+        (..., 3) axis times angle in radians.
+    """
     return np.asarray(Rotation.from_matrix(np.asarray(rotation, dtype=np.float64)).as_rotvec(), dtype=np.float64)
 
 
 def register(source: Floats, target: Floats) -> tuple[Pose, float]:
-    """`target_from_source` that brings points (n, 3) onto their partners with least squares, and the rms distance left.
+    """The rigid motion that brings points onto their partners, by least squares (Kabsch 1976).
 
-    Pairs with a NaN are left out. Kabsch 1976, with Umeyama's 1991 guard against a mirror image. FitError for fewer
-    than three pairs, or points on one line.
+    It is never a mirror image (Umeyama 1991). Pairs with a NaN are left out.
+
+    Args:
+        source: (n, 3).
+        target: (n, 3) their partners.
+
+    Returns:
+        `target_from_source`, and the root mean square of the distances that are left.
+
+    Raises:
+        FitError: There are fewer than three pairs, or the points lie on one line.
     """
     pair = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
     a, b = source[pair], target[pair]
@@ -121,10 +165,19 @@ def register(source: Floats, target: Floats) -> tuple[Pose, float]:
 
 
 def resect(xyz: Floats, uv: Floats) -> Floats:
-    """Camera matrix P (3, 4), `pixel_from_world`, from known points (n, 3) and their pixels (n, 2), NaN where not seen.
+    """The camera matrix from known points and their pixels: a pinhole without distortion.
 
-    The direct linear transformation with normalised coordinates (Alg. 7.1, without its non-linear step): a pinhole
-    without distortion. FitError for fewer than six points, or points that leave P undetermined (flat ones, say).
+    This is the direct linear transformation with normalised coordinates (Alg. 7.1, without its non-linear step).
+
+    Args:
+        xyz: (n, 3) known points in the world.
+        uv: (n, 2) pixels, NaN where not seen.
+
+    Returns:
+        P (3, 4), `pixel_from_world`.
+
+    Raises:
+        FitError: There are fewer than six points, or they leave P undetermined (flat ones, for example).
     """
     xyz, uv = _seen(xyz, uv)
     _check_spread(xyz)
@@ -140,10 +193,22 @@ def resect(xyz: Floats, uv: Floats) -> Floats:
 
 
 def resect_robustly(xyz: Floats, uv: Floats, *, subsets: bool = True) -> tuple[Floats, Bools]:
-    """As `resect`, where some views may be wrong; and the views (n,) that agree. Points (n, 3), all seen at (n, 2).
+    """As `resect`, where some views may be wrong.
 
-    Of random subsets of seven points the one with the least median error (always the same subsets), then three times
-    what agrees with it. Without `subsets` it starts from all points: ten times faster, for few wrong views.
+    Of random subsets of seven points (always the same) the one with the least median error is taken, then up to three
+    times what agrees with it.
+
+    Args:
+        xyz: (n, 3) known points in the world.
+        uv: (n, 2) pixels, all of them seen.
+        subsets: Whether to try random subsets; without them it starts from all points: ten times faster, for few wrong
+            views.
+
+    Returns:
+        P (3, 4), and (n,) which views agree with it.
+
+    Raises:
+        FitError: As `resect`.
     """
     inliers = _of_best_subset(xyz, uv) if subsets else np.ones(len(xyz), dtype=np.bool_)
     for _ in range(3):
@@ -187,10 +252,17 @@ def _linear_error(p: Floats, xyz: Floats, uv: Floats) -> Floats:
 
 
 def camera_from_linear(p: Floats) -> tuple[float, Floats, Floats, bool, Pose] | None:
-    """The parts of a camera matrix: focal length, pixel shape (2,) p and q, principal point (2,), mirrored, pose.
+    """The parts of a camera matrix (Hartley & Zisserman, section 6.2.4).
 
     `[fx skew; 0 fy]` up to a rotation about the axis is focal * exp([[p, q], [q, -p]]) (the polar decomposition), and a
-    negative determinant is a mirror: Hartley & Zisserman, section 6.2.4. None where the camera is at infinity.
+    negative determinant is a mirror.
+
+    Args:
+        p: (3, 4) camera matrix.
+
+    Returns:
+        Focal length in pixels, pixel shape (2,) p and q, principal point (2,) in pixels, whether it is mirrored,
+        `camera_from_world`. None where the camera is at infinity.
     """
     size = float(np.linalg.norm(p[2, :3]))
     if not size > 1e-12 * np.abs(p).max():
@@ -212,8 +284,15 @@ def camera_from_linear(p: Floats) -> tuple[float, Floats, Floats, bool, Pose] | 
 
 
 def pixel_shape_of(across: Floats) -> tuple[float, Floats, Floats] | None:
-    """The symmetric factor (2, 2) of the polar decomposition of a map (2, 3) to pixels, and its parts: the size f and
-    (p, q) of `f exp([[p, q], [q, -p]])`. None where it has no area."""
+    """The polar decomposition of a map to pixels.
+
+    Args:
+        across: (2, 3).
+
+    Returns:
+        The size f and the shape (2,) p and q of `f exp([[p, q], [q, -p]])`, and this symmetric factor (2, 2). None
+        where the map has no area.
+    """
     values, vectors = np.linalg.eigh(across @ across.T)
     if not values[0] > 1e-12 * values[1] > 0:
         return None
@@ -224,9 +303,17 @@ def pixel_shape_of(across: Floats) -> tuple[float, Floats, Floats] | None:
 
 
 def resect_affine(xyz: Floats, uv: Floats) -> tuple[Floats, Floats, Bools]:
-    """A (2, 3) and b (2,) of the parallel projection `A x + b` nearest to most views, and those (n,) that it explains.
+    """The parallel projection `A x + b` that is nearest to most views.
 
-    FitError for points that fix none.
+    Args:
+        xyz: (n, 3) known points in the world.
+        uv: (n, 2) pixels, all of them seen.
+
+    Returns:
+        A (2, 3), b (2,), and (n,) which views it explains.
+
+    Raises:
+        FitError: There are fewer than six points, or they lie on one plane.
     """
     _check_spread(xyz)
     inliers = np.ones(len(xyz), dtype=np.bool_)
@@ -242,17 +329,31 @@ def resect_affine(xyz: Floats, uv: Floats) -> tuple[Floats, Floats, Bools]:
 
 
 def camera_centre(p: Floats) -> Floats:
-    """(3,) centre of the camera with matrix P, in the world frame; not finite if the camera is at infinity."""
+    """The centre of a camera.
+
+    Args:
+        p: (3, 4) camera matrix.
+
+    Returns:
+        (3,) in the world; not finite if the camera is at infinity.
+    """
     centre = np.linalg.svd(p)[2][-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(centre[:3] / centre[3], dtype=np.float64)
 
 
 def triangulate(cameras: Floats, uv: Floats) -> Floats:
-    """Points (n, 3) from camera matrices (cameras, 3, 4) and pixels (n, cameras, 2), NaN where not seen.
+    """Points from camera matrices and pixels.
 
-    Least squares on the distances to the planes that a view's column and row span with the camera's centre: it does
-    not depend on the unit or the origin of the world. NaN for fewer than two views, or rays that (nearly) coincide.
+    Least squares on the distances to the planes that a view's column and row span with the camera's centre: it does not
+    depend on the unit or the origin of the world.
+
+    Args:
+        cameras: (cameras, 3, 4) matrices.
+        uv: (n, cameras, 2) pixels, NaN where not seen.
+
+    Returns:
+        (n, 3) in the world; NaN for fewer than two views, or rays that (nearly) coincide.
     """
     planes = uv[..., None] * cameras[:, None, 2] - cameras[:, :2]  # (n, cameras, 2, 4)
     planes = planes.reshape(len(uv), -1, 4)
@@ -265,11 +366,18 @@ def triangulate(cameras: Floats, uv: Floats) -> Floats:
 
 
 def depth_of_points(xyz: Floats, uv: Floats, sizes: Floats | None = None) -> Floats | None:
-    """(n,) how far the points are from the cameras: the mean over cameras of the distance, in the unit of the points.
+    """How far points are from the cameras; for grouping results by region, not for measuring.
 
-    For grouping results by region, not for measuring. Each camera's centre is estimated from the known points (n, 3)
-    and its pixels in uv (n, cameras, 2), whatever its lens. sizes: (cameras, 2) width and height in pixels, where
-    known. None where no camera can be placed: too few points, or flat ones.
+    Each camera's centre is estimated from the known points and its pixels, whatever its lens.
+
+    Args:
+        xyz: (n, 3) known points in the world.
+        uv: (n, cameras, 2) pixels, NaN where not seen.
+        sizes: (cameras, 2) width and height in pixels, where known.
+
+    Returns:
+        (n,) the mean over cameras of the distance, in the unit of the points. None where no camera can be placed: too
+        few points, or flat ones.
     """
     centres = []
     for c in range(uv.shape[1]):
@@ -284,10 +392,15 @@ def depth_of_points(xyz: Floats, uv: Floats, sizes: Floats | None = None) -> Flo
 
 
 class Resection(NamedTuple):
-    """A camera with an unknown lens, placed roughly: `focal` in pixels; `pinhole` says which of two lens models won.
+    """A camera with an unknown lens, placed roughly.
 
-    rms: in pixels, over the points `kept` (n,), those that were not far off. doubtful: many are far off, or all are;
-    wrong views, or a camera unlike both models.
+    Attributes:
+        camera_from_world: Its pose.
+        focal: Focal length, pixels.
+        pinhole: Whether the pinhole fits best; if not, the equidistant lens does.
+        rms: Root mean square error of the inliers, pixels.
+        inliers: (n,) which views were used and are not far off.
+        doubtful: Whether many views are far off, or all are: wrong views, or a camera unlike both lenses.
     """
 
     camera_from_world: Pose
@@ -299,13 +412,21 @@ class Resection(NamedTuple):
 
 
 def resect_any_lens(xyz: Floats, uv: Floats, *, middle: Floats | None = None, subsets: bool = True) -> Resection:
-    """Place a camera with an unknown lens; no starting guess.
+    """Place a camera with an unknown lens, without a starting guess.
 
-    Known points (n, 3), their pixels (n, 2), NaN where not seen. Pixels become rays by the equidistant and the
-    pinhole model for a ladder of focal lengths about `middle` (where the axis meets the image; else the middle of the
-    pixels), a linear resection follows, and the best wins. Views far off are then left out and it is done again; where
-    that is not enough, it starts from random `subsets` (RANSAC) too, which bears a third of wrong detections. At most
-    `MAX_RESECTION_POINTS` points are used, drawn at random but always the same. Fails as `resect`.
+    Pixels become rays by the equidistant and the pinhole lens for a ladder of focal lengths, a linear resection
+    follows, and the best wins. Views far off are then left out and it is done again. At most `MAX_RESECTION_POINTS`
+    points are used, drawn at random but always the same.
+
+    Args:
+        xyz: (n, 3) known points in the world.
+        uv: (n, 2) pixels, NaN where not seen.
+        middle: (2,) pixel where the lens's axis meets the image; None for the middle of the pixels.
+        subsets: Whether to start from random subsets (RANSAC) too where many views are far off; with them a third of
+            the views may be wrong.
+
+    Raises:
+        FitError: As `resect`.
     """
     rows, middle = _rows_and_middle(xyz, uv, middle)
     points, offset = xyz[rows], uv[rows] - middle
@@ -336,9 +457,20 @@ def _rows_and_middle(xyz: Floats, uv: Floats, middle: Floats | None) -> tuple[ND
 def resect_any_pixels(
     xyz: Floats, uv: Floats, *, middle: Floats | None = None, aspects: Sequence[float] = (1.0,)
 ) -> tuple[Resection, float]:
-    """As `resect_any_lens` for pixels that need not be square: what fits best, and its ratio fy / fx out of `aspects`.
+    """As `resect_any_lens`, for pixels that need not be square.
 
-    rms: in pixels of u. Where that ratio is 1, it is `resect_any_lens`."""
+    Args:
+        xyz: (n, 3) known points in the world.
+        uv: (n, 2) pixels, NaN where not seen.
+        middle: (2,) pixel where the lens's axis meets the image; None for the middle of the pixels.
+        aspects: Ratios fy / fx to try.
+
+    Returns:
+        The camera that fits best, its focal length and rms in pixels of u; and its ratio.
+
+    Raises:
+        FitError: As `resect`.
+    """
     rows, middle = _rows_and_middle(xyz, uv, middle)
 
     def off(aspect: float) -> float:
@@ -383,9 +515,19 @@ def _by_subsets(xyz: Floats, offset: Floats) -> list[Bools]:
 
 
 def resect_rays(xyz: Floats, rays: Floats) -> Pose:
-    """`camera_from_world` from known points (n, 3) and unit rays (n, 3) in the camera frame.
+    """The pose of a camera from known points and the rays on which it sees them.
 
     Linear: ray x (M x + t) = 0, then the rotation nearest to M, then the translation for that rotation.
+
+    Args:
+        xyz: (n, 3) known points in the world.
+        rays: (n, 3) unit vectors in the camera frame.
+
+    Returns:
+        `camera_from_world`.
+
+    Raises:
+        FitError: The points do not fix it.
     """
     rotations, translations, determined = _resect_many(xyz, rays[None])
     if not determined[0]:
@@ -394,11 +536,18 @@ def resect_rays(xyz: Floats, rays: Floats) -> Pose:
 
 
 def poses_from_rays(xyz: Floats, rays: Floats) -> list[Pose]:
-    """`camera_from_world` from four or more known points (n, 3), flat or not, and their unit rays (n, 3) in the camera
-    frame: all poses that are locally best, the best first, as few points may have more than one.
+    """All locally best poses of a camera that sees four or more known points, flat or not, on given rays.
 
     Orthogonal iteration (Lu, Hager & Mjolsness 2000): points are brought onto their rays in turn with the rotation that
-    fits best; here from 24 rotations that lie evenly, so that no guess is needed.
+    fits best; here from 24 evenly spread rotations, so that no guess is needed.
+
+    Args:
+        xyz: (n, 3) known points in the world.
+        rays: (n, 3) unit vectors in the camera frame.
+
+    Returns:
+        `camera_from_world` of each, the best first; few points may have more than one. Only poses with all points in
+        front of the camera are among them.
     """
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     solve = np.linalg.inv(across.mean(axis=0))
@@ -463,8 +612,16 @@ def _best_lens(xyz: Floats, lenses: tuple[Floats, Bools, Floats], keep: Bools) -
 
 
 def candidate_rays(offset: Floats, every: int = 1) -> tuple[Floats, Bools, Floats]:
-    """A ladder of lenses: focal lengths (k,) in pixels, pinhole or equidistant (k,), and the unit rays (k, n, 3) that
-    pixels (n, 2) off the middle then look along; every: only one rung in so many."""
+    """A ladder of lenses, and where their pixels look.
+
+    Args:
+        offset: (n, 2) pixels from where the lens's axis meets the image.
+        every: Take one rung of so many.
+
+    Returns:
+        (k,) focal lengths in pixels, (k,) whether the lens is a pinhole or else equidistant, and (k, n, 3) the unit
+        rays.
+    """
     radius = np.linalg.norm(offset, axis=1)
     plausible = radius <= MAX_PIXEL_DISTANCE_RATIO * np.quantile(radius, 0.75)  # no wild view decides
     outermost = float(radius[plausible].max()) or 1.0
