@@ -45,7 +45,15 @@ class Random(Acquisition):
     name: ClassVar[str] = "random"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """As of `Acquisition`: random numbers from 0 to 1."""
+        """Random numbers.
+
+        Args:
+            design: What is known now and what one more point would change, with m candidates.
+            rng: Random numbers.
+
+        Returns:
+            (m,) from 0 to 1.
+        """
         return rng.random(len(design.candidates))
 
 
@@ -57,7 +65,15 @@ class Sobol(Acquisition):
     same_candidates: ClassVar[bool] = True
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """As of `Acquisition`: the first candidate has the largest score."""
+        """The candidates in their own order.
+
+        Args:
+            design: What is known now and what one more point would change, with m candidates.
+            rng: Not used.
+
+        Returns:
+            (m,) the first candidate has the largest score.
+        """
         return np.arange(len(design.candidates), 0, -1, dtype=np.float64)
 
 
@@ -68,7 +84,15 @@ class MaximumVariance(Acquisition):
     name: ClassVar[str] = "variance"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """As of `Acquisition`: the mean standard deviation of x, y and z, in the length unit."""
+        """The mean standard deviation of x, y and z of a position measured at each candidate.
+
+        Args:
+            design: What is known now and what one more point would change, with m candidates.
+            rng: Not used.
+
+        Returns:
+            (m,) in the length unit; NaN where nothing can be measured.
+        """
         total = design.there.total
         return np.asarray(np.sqrt(np.diagonal(total, axis1=1, axis2=2)).mean(axis=1), dtype=np.float64)
 
@@ -80,7 +104,15 @@ class RelativeExcess(Acquisition):
     name: ClassVar[str] = "excess"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """As of `Acquisition`: the ratio of the variances, minus one."""
+        """The ratio of the total variance to that which pixel noise alone would leave, minus one.
+
+        Args:
+            design: What is known now and what one more point would change, with m candidates.
+            rng: Not used.
+
+        Returns:
+            (m,) scores; NaN where nothing can be measured.
+        """
         return np.asarray(np.maximum(design.there.excess**2 - 1, 0), dtype=np.float64)
 
 
@@ -101,7 +133,15 @@ class IntegratedVariance(Acquisition):
     name: ClassVar[str] = "integrated"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """As of `Acquisition`: the reduction of the weighted mean over the judged places."""
+        """By how much a known point at each candidate would reduce the weighted mean variance of the judged places.
+
+        Args:
+            design: What is known now and what one more point would change, with m candidates.
+            rng: Not used.
+
+        Returns:
+            (m,) scores; zero where a point is of no use.
+        """
         now = design.now
         floor = np.trace(now.floor, axis1=1, axis2=2) if self.relative else 1.0
         excess = np.trace(now.total, axis1=1, axis2=2) / floor
@@ -117,7 +157,15 @@ class DOptimal(Acquisition):
     name: ClassVar[str] = "d-optimal"
 
     def scores(self, design: DesignModel, rng: np.random.Generator) -> Floats:
-        """As of `Acquisition`: half the log of the ratio of the determinants."""
+        """Half the log of the ratio of the determinants, with a known point at each candidate and without.
+
+        Args:
+            design: What is known now and what one more point would change, with m candidates.
+            rng: Not used.
+
+        Returns:
+            (m,) nats; zero where a point is of no use.
+        """
         return design.information()
 
 

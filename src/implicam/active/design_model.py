@@ -257,10 +257,16 @@ class ForwardDesignModel:
         return PredictedCovariance(self._predicted.total[:m], lambda: self._predicted.floor[:m])
 
     def gain(self, weights: Floats) -> Floats:
-        """As of `DesignModel`: Cohn's criterion for a linear model with normal errors.
+        """How much a known point at each candidate would reduce the variance at the judged places, to first order.
 
-        A position is off by `A (error of the pixels)`, A = T D^T S^-1, and one more point reduces their covariance by
-        `K (S + place)^-1 K^T`.
+        Cohn's criterion for a linear model with normal errors: a position is off by `A (error of the pixels)`,
+        A = T D^T S^-1, and one more point reduces their covariance by `K (S + place)^-1 K^T`.
+
+        Args:
+            weights: (g,) of the judged places, NaN for those that do not count.
+
+        Returns:
+            (m,) by how much `sum weights * trace of the covariance` would fall; zero where a point is of no use.
         """
         m = len(self.candidates)
         total = self._predicted.total[m:]
@@ -291,9 +297,13 @@ class ForwardDesignModel:
         return np.asarray(D @ self.place @ D.swapaxes(1, 2), dtype=np.float64)
 
     def after(self, i: int) -> ForwardDesignModel:
-        """As of `DesignModel`: `half <- half (I - V diag(1 - 1/sqrt(1 + s^2)) V^T)`.
+        """The design when one candidate is a known point too.
 
-        s and V are the singular values and vectors of the candidate's whitened half.
+        `half <- half (I - V diag(1 - 1/sqrt(1 + s^2)) V^T)`, s and V the singular values and vectors of the candidate's
+        whitened half.
+
+        Args:
+            i: The number of the candidate.
         """
         parts = []
         for part in self.parts:
@@ -394,7 +404,16 @@ class InverseDesignModel:
         return self._predicted(slice(len(self.candidates)), self.candidates)
 
     def gain(self, weights: Floats) -> Floats:
-        """As of `DesignModel`, in closed form: covariance squared over the variance of a new output."""
+        """How much a known point at each candidate would reduce the variance at the judged places.
+
+        In closed form: the covariance squared over the variance of a new output.
+
+        Args:
+            weights: (g,) of the judged places, NaN for those that do not count.
+
+        Returns:
+            (m,) by how much `sum weights * trace of the covariance` would fall; zero where a point is of no use.
+        """
         m = len(self.candidates)
         weights = weights * self.at.widened[m:]
         good = np.isfinite(weights) & self.judged.seen.all(axis=1)
@@ -412,7 +431,11 @@ class InverseDesignModel:
         return np.where(self.useful, 0.5 * np.sum(ratios, axis=0), 0.0)
 
     def after(self, i: int) -> InverseDesignModel:
-        """As of `DesignModel`."""
+        """The design when one candidate is a known point too.
+
+        Args:
+            i: The number of the candidate.
+        """
         return replace(self, at=self.at.with_known(i))
 
 

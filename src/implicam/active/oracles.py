@@ -33,7 +33,14 @@ class SimulatedOracle:
     asked: int = field(default=0, init=False)
 
     def observe(self, target: Target) -> Answer:
-        """As of `Oracle`: one known point with the views of the cameras that see it."""
+        """Measure one known point with the views of the cameras that see it.
+
+        Args:
+            target: Where the ball is put.
+
+        Returns:
+            The point; or the reason why nothing was measured: the ball was not found, or no camera sees the place.
+        """
         self.asked += 1
         if np.random.default_rng([self.seed, self.asked, 7]).random() < self.fails:
             return Answer(None, "the ball was not found")
@@ -61,7 +68,14 @@ class RecordedOracle:
     used: set[str] = field(default_factory=set)
 
     def observe(self, target: Target) -> Answer:
-        """As of `Oracle`: the nearest point that is left."""
+        """Answer with the nearest point that is left.
+
+        Args:
+            target: Where a point is wanted.
+
+        Returns:
+            The point; or the reason why there is none: all are used.
+        """
         names = self.data.points.tolist()
         left = [i for i, name in enumerate(names) if name not in self.used]
         if not left:

@@ -66,7 +66,15 @@ class Both(Rule):
     second: Rule
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: both reasons."""
+        """Why to stop now: both reasons.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The reasons in words; empty where one rule is not met.
+        """
         one, two = self.first.met(history, unit), self.second.met(history, unit)
         return f"{one}, and {two}" if one and two else ""
 
@@ -79,7 +87,15 @@ class Either(Rule):
     second: Rule
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: the first reason there is."""
+        """Why to stop now: the first reason there is.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The reason in words; empty where neither rule is met.
+        """
         return self.first.met(history, unit) or self.second.met(history, unit)
 
 
@@ -115,7 +131,15 @@ class Below(Rule):
             raise UsageError(f"a stop below {self.value} is never reached.", fix="give a length greater than zero")
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: the uncertainty now."""
+        """Why to stop now: the uncertainty is small enough.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The uncertainty in words; empty where it is larger than `value`.
+        """
         now = getattr(history[-1], self.of) if history else math.nan
         return f"{now:.2g} {unit}".strip() + f" {OF[self.of]}{_where(history[-1])}" if now <= self.value else ""
 
@@ -142,7 +166,15 @@ class Within(Rule):
             )
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: the ratio now."""
+        """Why to stop now: pixel noise dominates.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The ratio in words; empty where it is larger than `times`.
+        """
         now = history[-1].excess if history else math.nan
         return f"{now:.2f} times what pixel noise alone leaves{_where(history[-1])}" if now <= self.times else ""
 
@@ -162,7 +194,15 @@ class Converged(Rule):
     of: str = "usual"
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: by how much it still changes."""
+        """Why to stop now: the uncertainty hardly changes.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The change in words; empty where it is larger than `change`, or there are too few steps.
+        """
         values = [getattr(step, self.of) for step in history]
         if len(values) <= self.over or not all(math.isfinite(v) for v in values[-self.over - 1 :]):
             return ""
@@ -178,7 +218,15 @@ class AtLeast(Rule):
     points: int
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: how many there are."""
+        """Why to stop now: there are enough points.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The number in words; empty where it is smaller than `points`.
+        """
         return f"{history[-1].points} points" if history and history[-1].points >= self.points else ""
 
 
@@ -187,7 +235,15 @@ class Budget(AtLeast):
     """When the budget of known points is spent."""
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: how many there were."""
+        """Why to stop now: the budget is spent.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The number in words; empty where it is smaller than `points`.
+        """
         return f"all {self.points} points of the budget are measured" if super().met(history, unit) else ""
 
 
@@ -198,7 +254,15 @@ class Time(Rule):
     seconds: float
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: how many have passed."""
+        """Why to stop now: the time is over.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            The time in words; empty where it is shorter than `seconds`.
+        """
         over = history and history[-1].seconds >= self.seconds
         return f"{history[-1].seconds:.0f} s have passed" if over else ""
 
@@ -208,5 +272,13 @@ class Never(Rule):
     """Until a person stops it."""
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
-        """As of `Rule`: always empty."""
+        """No reason, ever.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+
+        Returns:
+            Empty.
+        """
         return ""

@@ -55,7 +55,7 @@ class LowRank:
         return cholesky(np.asfortranarray(self.kernel(self.inducing, self.inducing)))
 
     def features(self, X: Floats) -> Floats:
-        """phi at inputs.
+        """The features phi at inputs.
 
         Args:
             X: (n, d).
@@ -66,7 +66,7 @@ class LowRank:
         return self.features_from(self.kernel(X, self.inducing))
 
     def features_from(self, K: Floats) -> Floats:
-        """phi, from covariances.
+        """The features phi, from covariances.
 
         Args:
             K: (n, m) covariance with the inducing points.

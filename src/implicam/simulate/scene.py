@@ -173,7 +173,15 @@ class Checkerboard:
     light: Light
 
     def paint(self, rays: Rays, ground: Patch) -> Patch:
-        """As `Ball.paint`."""
+        """Paint it over what is behind it; seen from behind it is plain grey.
+
+        Args:
+            rays: One for each sample.
+            ground: (rows, columns) brightness of what is behind it.
+
+        Returns:
+            (rows, columns) brightness.
+        """
         facing = np.cross(self.down, self.right)
         hit = _on_plane(rays, self.corner, facing / np.linalg.norm(facing))
         offset = hit - self.corner.astype(np.float32)
