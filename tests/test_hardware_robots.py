@@ -178,7 +178,7 @@ def test_what_halts_the_arm_on_its_way_is_named(controller: Controller, arm: URR
 def test_an_arm_that_does_not_arrive_is_found_out(
     controller: Controller, arm: URRobot, line: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("implicam.hardware.ur.STUCK", 0.5)
+    monkeypatch.setattr("implicam.hardware.ur.STANDSTILL_SECONDS", 0.5)
     controller.tell(line)
     with pytest.raises(HardwareError, match=r"stands (10|20)\.00 mm from its target"):
         arm.move(np.array([320.0, 200.0, 400.0]))

@@ -12,7 +12,7 @@ import numpy as np
 
 from implicam.errors import HardwareError, UsageError
 from implicam.hardware import Frame, FrameSource, RobotOptions, simulated_rig
-from implicam.hardware.protocol import Floats, incomplete, point
+from implicam.hardware.protocol import Floats, check_position, incomplete_spec_error
 from implicam.simulate import build_rig
 
 RIG = build_rig("stereo", seed=0)
@@ -29,7 +29,7 @@ class Gantry:
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
         if not rest:
-            raise incomplete("robot", cls, rest)
+            raise incomplete_spec_error("robot", cls, rest)
         if options.box is None:
             raise UsageError("the gantry needs a box.", why="it could collide", fix="give --workspace")
         return cls(rest, *options.box)
@@ -50,7 +50,7 @@ class Gantry:
 
     def move(self, xyz: Floats) -> Floats:
         self.open()
-        wish = point(xyz)
+        wish = check_position(xyz)
         if not ((wish >= self._low - 1e-9) & (wish <= self._high + 1e-9)).all():
             raise HardwareError(f"{wish} is out of the box.", why="a gantry ends there", fix="choose another place")
         PLACE[0] = wish
@@ -78,7 +78,7 @@ class GantryCamera:
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool) -> FrameSource:
         if not rest.isdecimal():
-            raise incomplete("camera", cls, rest)
+            raise incomplete_spec_error("camera", cls, rest)
         return cls(name, int(rest))
 
     def __init__(self, name: str, number: int) -> None:

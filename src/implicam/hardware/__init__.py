@@ -13,7 +13,7 @@ from implicam.errors import UsageError, did_you_mean
 from implicam.hardware.csv_player import CsvPlayer
 from implicam.hardware.folder_camera import FolderCamera
 from implicam.hardware.genicam import GenICamCamera
-from implicam.hardware.opencv_camera import STREAMS, OpenCVCamera
+from implicam.hardware.opencv_camera import STREAM_PREFIXES, OpenCVCamera
 from implicam.hardware.person import Person
 from implicam.hardware.protocol import (
     CameraDriver,
@@ -24,7 +24,7 @@ from implicam.hardware.protocol import (
     RobotDriver,
     RobotOptions,
     Trigger,
-    exposed,
+    take_frames,
 )
 from implicam.hardware.simulated import PhotographingCamera, SimulatedRobot, simulated_rig
 from implicam.hardware.trigger import NetworkTrigger, TriggerSimulator
@@ -51,10 +51,10 @@ __all__ = [
     "TriggerSimulator",
     "URRobot",
     "camera_from",
-    "exposed",
+    "list_specs",
     "robot_from",
     "simulated_rig",
-    "specs",
+    "take_frames",
     "trigger_from",
 ]
 
@@ -69,7 +69,7 @@ ROBOTS: Registry[type[RobotDriver]] = Registry(
 """Name -> driver."""
 
 
-def specs(drivers: Registry[Any]) -> str:
+def list_specs(drivers: Registry[Any]) -> str:
     """What the specs of all drivers look like, for help texts and errors.
 
     Args:
@@ -98,8 +98,8 @@ def camera_from(name: str, spec: str, *, triggered: bool = False) -> FrameSource
     for kind in CAMERAS.values():
         if kind.takes(spec):
             return kind.from_spec(name, spec, triggered=triggered)
-    known = (*CAMERAS, "/dev/video0", *STREAMS)
-    raise _unknown("camera", spec, known, CAMERAS, why="there is no such file or folder either")
+    known = (*CAMERAS, "/dev/video0", *STREAM_PREFIXES)
+    raise _unknown_error("camera", spec, known, CAMERAS, why="there is no such file or folder either")
 
 
 def robot_from(spec: str, **options: Any) -> Robot:
@@ -114,7 +114,7 @@ def robot_from(spec: str, **options: Any) -> Robot:
     """
     name, _, rest = spec.partition(":")
     if name not in ROBOTS:
-        raise _unknown("robot", spec, tuple(ROBOTS), ROBOTS)
+        raise _unknown_error("robot", spec, tuple(ROBOTS), ROBOTS)
     return ROBOTS[name].from_spec(rest, RobotOptions(**options))
 
 
@@ -130,6 +130,6 @@ def trigger_from(spec: str) -> Trigger:
     return NetworkTrigger(spec)
 
 
-def _unknown(what: str, spec: str, known: tuple[str, ...], drivers: Registry[Any], why: str = "") -> UsageError:
+def _unknown_error(what: str, spec: str, known: tuple[str, ...], drivers: Registry[Any], why: str = "") -> UsageError:
     hint = did_you_mean(spec, known) or did_you_mean(spec.partition(":")[0], [word.partition(":")[0] for word in known])
-    return UsageError(f"{spec!r} names no {what}{hint}.", why=why, fix=f"write {specs(drivers)}")
+    return UsageError(f"{spec!r} names no {what}{hint}.", why=why, fix=f"write {list_specs(drivers)}")

@@ -1,4 +1,4 @@
-"""Positions from a table: where somebody else's machine was, one row a shot, or the only places a slide has."""
+"""Positions from a table: where another machine was at each shot, or the only positions that a slide has."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import ClassVar, Self
 import numpy as np
 
 from implicam.errors import HardwareError, UsageError
-from implicam.hardware.protocol import Floats, RobotOptions, incomplete, point
+from implicam.hardware.protocol import Floats, RobotOptions, check_position, incomplete_spec_error
 
-COLUMNS, SD_COLUMNS = ("x", "y", "z"), ("sd_x", "sd_y", "sd_z")
-MAX_BYTES = 200_000_000
+POSITION_COLUMNS, SD_COLUMNS = ("x", "y", "z"), ("sd_x", "sd_y", "sd_z")
+MAX_FILE_BYTES = 200_000_000
 
 
 class CsvPlayer:
@@ -23,7 +23,7 @@ class CsvPlayer:
     """
 
     moves = True
-    alone = False  # somebody puts the target there; the table says where that is
+    alone = False  # a person or another machine puts the target there
     spec: ClassVar[str] = "csv:FILE"
 
     @classmethod
@@ -38,7 +38,7 @@ class CsvPlayer:
             UsageError: There is no path, or `options.sd` is given: the table says how well its positions are known.
         """
         if not rest:
-            raise incomplete("robot", cls, rest)
+            raise incomplete_spec_error("robot", cls, rest)
         if options.sd is not None:
             raise UsageError("the table says how well its positions are known.", fix="give it columns sd_x, sd_y, sd_z")
         return cls(rest)
@@ -87,7 +87,7 @@ class CsvPlayer:
         Raises:
             HardwareError: All rows have been used, the file cannot be read, or the wish is no position.
         """
-        wish = point(xyz)
+        wish = check_position(xyz)
         self.open()
         rows = np.flatnonzero(self._left)
         if len(rows) == 0:
@@ -101,7 +101,7 @@ class CsvPlayer:
         return self.position()
 
     def stop(self) -> None:
-        """A table stands still."""
+        """Nothing to stop."""
 
     def reachable(self) -> Floats:
         """(n, 3) the rows that are left."""
@@ -128,7 +128,7 @@ def read_positions(path: Path) -> Floats:
             error names the line.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if path.stat().st_size > MAX_FILE_BYTES:
             raise HardwareError(f"{path} is larger than 200 MB.", fix="give a table of positions, one row a shot")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -137,31 +137,31 @@ def read_positions(path: Path) -> Floats:
         ) from error
     reader = csv.reader(lines)
     head = [word.strip() for word in next(reader, [])]
-    missing = [word for word in COLUMNS if head.count(word) != 1]
+    missing = [word for word in POSITION_COLUMNS if head.count(word) != 1]
     if missing:
         raise HardwareError(
             f"{path}, line 1: there is no single column {', '.join(missing)}.",
             why=f"the columns are {', '.join(head) or 'none'}",
             fix="begin the file with the line x,y,z or x,y,z,sd_x,sd_y,sd_z",
         )
-    rows = [_row(path, reader.line_num, head, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    rows = [_read_row(path, reader.line_num, head, cells) for cells in reader if any(cell.strip() for cell in cells)]
     if not rows:
         raise HardwareError(f"{path} has no row of numbers.", fix="one position a line below x,y,z")
     return np.array(rows, dtype=np.float64)
 
 
-def _row(path: Path, line: int, head: list[str], cells: list[str]) -> list[float]:
+def _read_row(path: Path, line: int, head: list[str], cells: list[str]) -> list[float]:
     if len(cells) != len(head):
         raise HardwareError(
             f"{path}, line {line}: {len(cells)} cells under {len(head)} columns.", fix="give every column one cell"
         )
     table = dict(zip(head, cells, strict=True))
-    out = [_number(path, line, word, table[word]) for word in COLUMNS]
+    out = [_read_number(path, line, word, table[word]) for word in POSITION_COLUMNS]
     return out + [_sd(path, line, word, table.get(word, "")) for word in SD_COLUMNS]
 
 
 def _sd(path: Path, line: int, column: str, cell: str) -> float:
-    value = _number(path, line, column, cell) if cell.strip() else np.nan
+    value = _read_number(path, line, column, cell) if cell.strip() else np.nan
     if value <= 0:
         raise HardwareError(
             f"{path}, line {line}: {column} = {value:g}.",
@@ -171,7 +171,7 @@ def _sd(path: Path, line: int, column: str, cell: str) -> float:
     return value
 
 
-def _number(path: Path, line: int, column: str, cell: str) -> float:
+def _read_number(path: Path, line: int, column: str, cell: str) -> float:
     try:
         value = float(cell)
     except ValueError:

@@ -10,8 +10,8 @@ from implicam.errors import HardwareError, ImageError
 from implicam.hardware.protocol import Frame, Grey, wait_for
 from implicam.images import ENDINGS, in_order, read_picture
 
-FRESH_SECONDS = 10.0
-"""A file that was written to so recently may still be growing."""
+MAX_WRITE_PAUSE_SECONDS = 10.0
+"""A file that was written to less long ago may not be whole yet."""
 
 
 class _Stamp(NamedTuple):
@@ -57,7 +57,7 @@ class FolderCamera:
 
     def open(self) -> None:
         """HardwareError where there is no such folder."""
-        self._stamps()
+        self._read_stamps()
 
     def frame(self, timeout: float = 5.0) -> Frame:
         """The next picture that appears in the folder, once it is whole.
@@ -71,12 +71,12 @@ class FolderCamera:
         Raises:
             HardwareError: None came in time, or the folder cannot be read.
         """
-        before = self._stamps()
-        growing = {name for name, stamp in before.items() if self._growing(name, stamp)}
+        before = self._read_stamps()
+        growing = {name for name, stamp in before.items() if self._is_growing(name, stamp)}
         partial: dict[str, ImageError] = {}
 
         def look() -> tuple[Grey, float] | None:
-            for name, stamp in self._stamps().items():
+            for name, stamp in self._read_stamps().items():
                 old = before.get(name)
                 if old == stamp or (name in growing and old is not None and old.inode == stamp.inode):
                     continue
@@ -88,15 +88,15 @@ class FolderCamera:
 
         found = wait_for(look, timeout, pause=0.02)
         if found is None:
-            raise self._nothing_came(timeout, partial)
+            raise self._no_picture_error(timeout, partial)
         self._number += 1
         return Frame(found[0], self._number, found[1])
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to release."""
 
-    def _growing(self, name: str, stamp: _Stamp) -> bool:
-        if time.time() - stamp.changed / 1e9 > FRESH_SECONDS:
+    def _is_growing(self, name: str, stamp: _Stamp) -> bool:
+        if time.time() - stamp.changed / 1e9 > MAX_WRITE_PAUSE_SECONDS:
             return False
         try:
             read_picture(self.folder / name)
@@ -104,7 +104,7 @@ class FolderCamera:
             return True
         return False
 
-    def _stamps(self) -> dict[str, _Stamp]:
+    def _read_stamps(self) -> dict[str, _Stamp]:
         found: dict[str, _Stamp] = {}
         try:
             if not self.folder.is_dir():
@@ -123,7 +123,7 @@ class FolderCamera:
             ) from error
         return {name: found[name] for name in in_order(found)}
 
-    def _nothing_came(self, timeout: float, partial: dict[str, ImageError]) -> HardwareError:
+    def _no_picture_error(self, timeout: float, partial: dict[str, ImageError]) -> HardwareError:
         if partial:
             name, error = next(iter(partial.items()))
             return HardwareError(

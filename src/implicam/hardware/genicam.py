@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.errors import HardwareError, import_extra
-from implicam.hardware.protocol import Frame, Grey, incomplete
+from implicam.hardware.protocol import Frame, Grey, incomplete_spec_error
 from implicam.images import opencv
 
-BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
+MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
 BAYER_BITS = {"8": 8, "10": 10, "12": 12, "16": 16}
 # OpenCV names a mosaic by its second row and column, GenICam by its first: RG of the one is BG of the other.
 BAYER_CODES = {"RG": "BG", "BG": "RG", "GR": "GB", "GB": "GR"}
-COLOURS = {"RGB8": "RGB", "BGR8": "BGR", "RGB8Packed": "RGB", "BGR8Packed": "BGR"}
+COLOUR_ORDERS = {"RGB8": "RGB", "BGR8": "BGR", "RGB8Packed": "RGB", "BGR8Packed": "BGR"}
 
 
 class GenICamCamera:
@@ -52,7 +52,7 @@ class GenICamCamera:
         """
         serial, _, producer = rest.partition("@")
         if not serial or not producer:
-            raise incomplete("camera", cls, rest)
+            raise incomplete_spec_error("camera", cls, rest)
         return cls(name, serial, producer, triggered=triggered)
 
     def __init__(self, name: str, serial: str, producer: Path | str, *, triggered: bool = False) -> None:
@@ -78,11 +78,11 @@ class GenICamCamera:
         try:
             self._harvester.add_file(str(self.producer))
             self._harvester.update()
-            self._acquirer = self._created()
+            self._acquirer = self._create_acquirer()
             self._acquirer.start()
         except Exception as error:  # each producer has exceptions of its own
             self.close()
-            raise self._failed("cannot be opened", error) from error
+            raise self._device_error("cannot be opened", error) from error
 
     def frame(self, timeout: float = 5.0) -> Frame:
         """The first picture that was exposed after the call.
@@ -99,17 +99,17 @@ class GenICamCamera:
         self.open()
         end = time.monotonic() + timeout
         try:
-            while self._fetched(0.0) is not None:
-                pass  # what waited in the buffers is of before
+            while self._fetch(0.0) is not None:
+                pass  # drop old pictures from the buffers
             for _ in range(1 + self._skip):
-                found = self._fetched(max(0.001, end - time.monotonic()))
+                found = self._fetch(max(0.001, end - time.monotonic()))
                 if found is None:
                     break
         except HardwareError:
             raise
         except Exception as error:
             self.close()
-            raise self._failed("is gone", error) from error
+            raise self._device_error("is gone", error) from error
         if found is None:
             raise HardwareError(
                 f"camera {self.name}: no picture within {timeout:g} s.",
@@ -123,17 +123,17 @@ class GenICamCamera:
         """Stop the camera and unload the producer."""
         for thing, methods in ((self._acquirer, ("stop", "destroy")), (self._harvester, ("reset",))):
             for method in methods if thing is not None else ():
-                with suppress(Exception):  # an unplugged camera cannot be stopped; the rest must be given back
+                with suppress(Exception):  # an unplugged camera cannot be stopped; the rest must still be released
                     getattr(thing, method)()
         self._acquirer = self._harvester = None
 
-    def _created(self) -> Any:
+    def _create_acquirer(self) -> Any:
         found = [str(info.serial_number) for info in self._harvester.device_info_list]
         if self.serial not in found:
             raise LookupError(f"the producer sees {', '.join(found) or 'no camera'}, not {self.serial}")
         return self._harvester.create({"serial_number": self.serial})
 
-    def _fetched(self, timeout: float) -> Grey | None:
+    def _fetch(self, timeout: float) -> Grey | None:
         buffer = self._acquirer.try_fetch(timeout=timeout)
         if buffer is None:
             return None
@@ -143,7 +143,7 @@ class GenICamCamera:
         finally:
             buffer.queue()
 
-    def _failed(self, what: str, error: Exception) -> HardwareError:
+    def _device_error(self, what: str, error: Exception) -> HardwareError:
         if isinstance(error, HardwareError):
             return error
         return HardwareError(
@@ -169,21 +169,21 @@ def to_grey(data: NDArray[Any], width: int, height: int, pixel_format: str) -> G
         HardwareError: The pixel format is not known.
     """
     cv2 = opencv()
-    if pixel_format in BITS:
-        return _scaled(data.reshape(height, width), BITS[pixel_format])
-    if pixel_format in COLOURS:
-        code = getattr(cv2, f"COLOR_{COLOURS[pixel_format]}2GRAY")
-        return _scaled(cv2.cvtColor(np.ascontiguousarray(data.reshape(height, width, 3)), code), 8)
+    if pixel_format in MONO_BITS:
+        return _scale_to_one(data.reshape(height, width), MONO_BITS[pixel_format])
+    if pixel_format in COLOUR_ORDERS:
+        code = getattr(cv2, f"COLOR_{COLOUR_ORDERS[pixel_format]}2GRAY")
+        return _scale_to_one(cv2.cvtColor(np.ascontiguousarray(data.reshape(height, width, 3)), code), 8)
     if pixel_format.startswith("Bayer") and pixel_format[7:] in BAYER_BITS and pixel_format[5:7] in BAYER_CODES:
         code = getattr(cv2, f"COLOR_Bayer{BAYER_CODES[pixel_format[5:7]]}2GRAY")
         mosaic = np.ascontiguousarray(data.reshape(height, width))
-        return _scaled(cv2.cvtColor(mosaic, code), BAYER_BITS[pixel_format[7:]])
+        return _scale_to_one(cv2.cvtColor(mosaic, code), BAYER_BITS[pixel_format[7:]])
     raise HardwareError(
         f"the camera sends its pictures as {pixel_format}.",
-        why=f"known are {', '.join([*BITS, *COLOURS])} and BayerRG8 to BayerGB16",
+        why=f"known are {', '.join([*MONO_BITS, *COLOUR_ORDERS])} and BayerRG8 to BayerGB16",
         fix="set PixelFormat to Mono8 in the maker's viewer, and save it in the camera's user set",
     )
 
 
-def _scaled(values: NDArray[Any], bits: int) -> Grey:
+def _scale_to_one(values: NDArray[Any], bits: int) -> Grey:
     return np.asarray(values, np.float32) * np.float32(1 / (2**bits - 1))

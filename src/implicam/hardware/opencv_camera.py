@@ -20,8 +20,8 @@ from implicam.errors import HardwareError
 from implicam.hardware.protocol import Frame, Grey
 from implicam.images import opencv
 
-STREAMS = ("rtsp://", "rtsps://", "http://", "https://", "udp://")
-SKIP_DEVICE, SKIP_STREAM = 1, 2
+STREAM_PREFIXES = ("rtsp://", "rtsps://", "http://", "https://", "udp://")
+STALE_DEVICE_PICTURES, STALE_STREAM_PICTURES = 1, 2
 """Pictures after the call that may have been exposed before it: the one on its way, and the one in a stream's decoder,
 which knows that a picture is whole when the next begins."""
 
@@ -46,7 +46,7 @@ class OpenCVCamera:
         Args:
             spec: The words of the command line.
         """
-        return spec.isdecimal() or spec.startswith(("/dev/", *STREAMS)) or Path(spec).is_file()
+        return spec.isdecimal() or spec.startswith(("/dev/", *STREAM_PREFIXES)) or Path(spec).is_file()
 
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
@@ -63,11 +63,11 @@ class OpenCVCamera:
         self.name = name
         text = str(source)
         self.source: int | str = int(text) if text.isdecimal() else text
-        self._shown = re.sub("//[^/]*@", "//...@", text)  # no password in a message
+        self._source_text = re.sub("//[^/]*@", "//...@", text)  # no password in a message
         self._device = isinstance(self.source, int) or text.startswith("/dev/")
-        self._film = not self._device and not text.startswith(STREAMS)
+        self._film = not self._device and not text.startswith(STREAM_PREFIXES)
         self.live = not (triggered or self._film)
-        self._skip = 0 if triggered else SKIP_DEVICE if self._device else SKIP_STREAM
+        self._skip = 0 if triggered else STALE_DEVICE_PICTURES if self._device else STALE_STREAM_PICTURES
         self._number = 0
         self._capture: Any = None  # of a film
         self._grabber: _Grabber | None = None  # of a live camera
@@ -78,9 +78,9 @@ class OpenCVCamera:
             return
         self.close()
         if self._film:
-            self._capture = self._opened()
+            self._capture = self._open_capture()
         else:
-            self._grabber = _Grabber(self._opened(), f"camera {self.name}")
+            self._grabber = _Grabber(self._open_capture(), f"camera {self.name}")
 
     def frame(self, timeout: float = 5.0) -> Frame:
         """The next picture of a film, or one that a live camera took after the call.
@@ -95,21 +95,21 @@ class OpenCVCamera:
             HardwareError: None came in time, the camera is gone or cannot be opened, or the film is over.
         """
         self.open()
-        image, taken = self._next_of_film() if self._film else self._next_live(timeout)
+        image, taken = self._read_film() if self._film else self._read_live(timeout)
         self._number += 1
-        return Frame(_grey(image), self._number, taken)
+        return Frame(_to_grey(image), self._number, taken)
 
     def close(self) -> None:
-        """End the thread and give the camera back."""
+        """End the thread and release the camera."""
         if self._capture is not None:
             self._capture.release()
         if self._grabber is not None:
             self._grabber.end()
         self._capture = self._grabber = None
 
-    def _opened(self) -> Any:
+    def _open_capture(self) -> Any:
         cv2 = opencv()
-        with _quiet(cv2):
+        with _silence_opencv(cv2):
             if self._device:
                 capture = cv2.VideoCapture(self.source, cv2.CAP_V4L2)
                 capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
@@ -122,9 +122,9 @@ class OpenCVCamera:
         if capture.isOpened():
             return capture
         capture.release()
-        raise self._does_not_open()
+        raise self._cannot_open_error()
 
-    def _does_not_open(self) -> HardwareError:
+    def _cannot_open_error(self) -> HardwareError:
         if self._film:
             missing = not Path(str(self.source)).is_file()
             why = "there is no such file" if missing else "it is no film that OpenCV can decode"
@@ -135,9 +135,9 @@ class OpenCVCamera:
         else:
             why = f"nothing answers there within {SILENCE_MS / 1000:g} s, or what comes is no film"
             fix = "open the address in a film player, check user name and password in it, and the network"
-        return HardwareError(f"camera {self.name}: {self._shown} cannot be opened.", why=why, fix=fix)
+        return HardwareError(f"camera {self.name}: {self._source_text} cannot be opened.", why=why, fix=fix)
 
-    def _next_of_film(self) -> tuple[NDArray[np.uint8], float]:
+    def _read_film(self) -> tuple[NDArray[np.uint8], float]:
         good, image = self._capture.read()
         if not good:
             raise HardwareError(
@@ -147,7 +147,7 @@ class OpenCVCamera:
             )
         return image, time.time()
 
-    def _next_live(self, timeout: float) -> tuple[NDArray[np.uint8], float]:
+    def _read_live(self, timeout: float) -> tuple[NDArray[np.uint8], float]:
         assert self._grabber is not None
         found = self._grabber.after(self._skip, timeout)
         if found is not None:
@@ -160,7 +160,7 @@ class OpenCVCamera:
             )
         self.close()
         raise HardwareError(
-            f"camera {self.name} is gone: {self._shown} sends no more pictures.",
+            f"camera {self.name} is gone: {self._source_text} sends no more pictures.",
             why="it was unplugged, switched off, or the network failed",
             fix="plug it in again; the next picture opens it by itself",
         )
@@ -173,19 +173,19 @@ class _Grabber:
         self.running = True
         self._newest: tuple[NDArray[np.uint8], float] | None = None
         self._arrived = 0
-        self._came = threading.Condition()
+        self._arrival = threading.Condition()
         self._thread = threading.Thread(target=self._grab, args=(capture,), name=name, daemon=True)
         self._thread.start()
 
     def after(self, skip: int, timeout: float) -> tuple[NDArray[np.uint8], float] | None:
         """The newest picture once more than `skip` have arrived since the call, and when; None where they do not."""
-        with self._came:
+        with self._arrival:
             wanted = self._arrived + 1 + skip
-            self._came.wait_for(lambda: self._arrived >= wanted or not self.running, timeout)
+            self._arrival.wait_for(lambda: self._arrived >= wanted or not self.running, timeout)
             return self._newest if self._arrived >= wanted else None
 
     def end(self) -> None:
-        """A read that hangs is left to its own time limit."""
+        """Stop reading; a read that hangs ends by its own time limit."""
         self.running = False
         self._thread.join(SILENCE_MS / 1000 + 1)
 
@@ -195,19 +195,19 @@ class _Grabber:
                 good, image = capture.read()
                 if not good:
                     return
-                with self._came:
+                with self._arrival:
                     self._newest, self._arrived = (image, time.time()), self._arrived + 1
-                    self._came.notify_all()
+                    self._arrival.notify_all()
         finally:
             capture.release()
-            with self._came:
+            with self._arrival:
                 self.running = False
-                self._came.notify_all()
+                self._arrival.notify_all()
 
 
 @contextmanager
-def _quiet(cv2: Any) -> Iterator[None]:
-    """OpenCV's own lines on the screen say less than our error does."""
+def _silence_opencv(cv2: Any) -> Iterator[None]:
+    """Keep OpenCV from printing its own messages: our error says more."""
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
@@ -216,7 +216,7 @@ def _quiet(cv2: Any) -> Iterator[None]:
         cv2.utils.logging.setLogLevel(level)
 
 
-def _grey(image: NDArray[np.uint8]) -> Grey:
+def _to_grey(image: NDArray[np.uint8]) -> Grey:
     cv2 = opencv()
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 and image.shape[2] == 3 else image
     return np.asarray(grey, np.float32).reshape(image.shape[:2]) * np.float32(1 / 255)

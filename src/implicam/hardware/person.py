@@ -8,11 +8,11 @@ from typing import ClassVar, Self
 import numpy as np
 
 from implicam.errors import HardwareError
-from implicam.hardware.protocol import Floats, RobotOptions, incomplete, point
+from implicam.hardware.protocol import Floats, RobotOptions, check_position, incomplete_spec_error
 
 
 class Person:
-    """The `Robot` that has hands. ask: shown every wish, a position (3,); sd: of what is typed, in its unit."""
+    """A person who moves the target, as a `Robot`. ask: called with each position (3,); sd: of what is typed, (3,)."""
 
     moves = alone = False
     spec: ClassVar[str] = "person"
@@ -29,7 +29,7 @@ class Person:
             UsageError: Something follows the name, or there is no `ask`.
         """
         if rest or options.ask is None:
-            raise incomplete("robot", cls, rest)
+            raise incomplete_spec_error("robot", cls, rest)
         return cls(options.ask) if options.sd is None else cls(options.ask, options.sd)
 
     def __init__(self, ask: Callable[[Floats], None], sd: Sequence[float] = (np.nan, np.nan, np.nan)) -> None:
@@ -49,7 +49,7 @@ class Person:
         Raises:
             HardwareError: These are not three finite numbers.
         """
-        self._position = point(xyz)
+        self._position = check_position(xyz)
 
     def position(self) -> Floats:
         """(3,) where the target was said to be last; HardwareError where nothing was said since the last move."""
@@ -73,17 +73,17 @@ class Person:
         Raises:
             HardwareError: The wish is not three finite numbers.
         """
-        wish = point(xyz)
-        self._position = None  # what was true before is not true while hands move the target
+        wish = check_position(xyz)
+        self._position = None  # unknown while the target is being moved
         self._ask(wish)
         return wish.copy()
 
     def stop(self) -> None:
-        """A person stops by themselves."""
+        """Nothing to stop."""
 
     def reachable(self) -> Floats | None:
         """Anywhere."""
         return None
 
     def close(self) -> None:
-        """Nothing to hang up."""
+        """Nothing to disconnect."""

@@ -34,9 +34,9 @@ __all__ = [
     "RobotDriver",
     "RobotOptions",
     "Trigger",
-    "exposed",
-    "incomplete",
-    "point",
+    "check_position",
+    "incomplete_spec_error",
+    "take_frames",
     "wait_for",
 ]
 
@@ -77,7 +77,7 @@ class FrameSource(Protocol):
         """
 
     def close(self) -> None:
-        """Give the camera back. Closing twice is harmless; `open` opens it again."""
+        """Release the camera. Closing twice is harmless; `open` opens it again."""
 
 
 class CameraDriver(Protocol):
@@ -112,13 +112,13 @@ class Trigger(Protocol):
     """What exposes all cameras at the same instant."""
 
     def open(self) -> None:
-        """Say hello to the box. Opening twice is harmless. HardwareError with the cure."""
+        """Connect to the box. Opening twice is harmless. HardwareError with the cure."""
 
     def fire(self) -> None:
         """Expose the cameras once; returns when the box has acknowledged. HardwareError where it does not."""
 
     def close(self) -> None:
-        """Hang up. Closing twice is harmless."""
+        """Disconnect. Closing twice is harmless."""
 
 
 class Robot(Protocol):
@@ -228,7 +228,7 @@ class RobotDriver(Protocol):
         """
 
 
-def incomplete(what: str, driver: type[CameraDriver] | type[RobotDriver], rest: str) -> UsageError:
+def incomplete_spec_error(what: str, driver: type[CameraDriver] | type[RobotDriver], rest: str) -> UsageError:
     """The error of a spec that names a driver and does not say what it needs.
 
     Args:
@@ -244,8 +244,8 @@ def incomplete(what: str, driver: type[CameraDriver] | type[RobotDriver], rest: 
     return UsageError(f"{spec!r} names no {what}.", fix=f"write {driver.spec}")
 
 
-def point(xyz: Floats, what: str = "position") -> Floats:
-    """Check a position before a robot hears of it.
+def check_position(xyz: Floats, what: str = "position") -> Floats:
+    """Check a position before it is sent to a robot.
 
     Args:
         xyz: Three numbers.
@@ -265,11 +265,11 @@ def point(xyz: Floats, what: str = "position") -> Floats:
     return out
 
 
-ARMED = 0.05
+ARMING_SECONDS = 0.05
 """Seconds from asking the cameras for a picture until all of them wait for the trigger."""
 
 
-def exposed(cameras: Sequence[FrameSource], trigger: Trigger | None, timeout: float, pool: Executor) -> list[Frame]:
+def take_frames(cameras: Sequence[FrameSource], trigger: Trigger | None, timeout: float, pool: Executor) -> list[Frame]:
     """Take a new picture with each camera, all at one instant as far as they are triggered.
 
     Args:
@@ -287,7 +287,7 @@ def exposed(cameras: Sequence[FrameSource], trigger: Trigger | None, timeout: fl
     """
     waiting = [pool.submit(camera.frame, timeout) for camera in cameras]
     if trigger is not None:
-        time.sleep(ARMED)
+        time.sleep(ARMING_SECONDS)
         trigger.fire()
     wait(waiting)
     return [one.result() for one in waiting]

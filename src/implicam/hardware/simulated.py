@@ -12,10 +12,10 @@ import time
 import numpy as np
 
 from implicam.errors import HardwareError
-from implicam.hardware.protocol import Floats, Frame, point
+from implicam.hardware.protocol import Floats, Frame, check_position
 from implicam.simulate import Optics, Rig, Studio, Target
 
-NEXT_SEED = 1_000_003
+SEED_STEP = 1_000_003
 """From one picture's seed to the next one's: their noise is not the same."""
 
 
@@ -30,7 +30,7 @@ class SimulatedRobot:
     def __init__(self, start: Floats, *, sd: float, speed: float, rng: np.random.Generator) -> None:
         self.sd = (sd, sd, sd) if sd > 0 else (np.nan, np.nan, np.nan)
         self._speed, self._sd, self._rng = speed, sd, rng
-        self._reported = point(start)
+        self._reported = check_position(start)
         self._error = np.zeros(3)
         self._fails = False
         self._stop = threading.Event()
@@ -48,7 +48,7 @@ class SimulatedRobot:
         """Nothing to connect."""
 
     def position(self) -> Floats:
-        """(3,) where it believes to be."""
+        """(3,) where it reports to be."""
         return self._reported.copy()
 
     def move(self, xyz: Floats) -> Floats:
@@ -63,7 +63,7 @@ class SimulatedRobot:
         Raises:
             HardwareError: It was stopped, or told to fail, and stands somewhere on the way; or xyz is no position.
         """
-        target, start = point(xyz), self._reported
+        target, start = check_position(xyz), self._reported
         self._stop.clear()
         seconds = float(np.linalg.norm(target - start)) / self._speed
         fails, self._fails = self._fails, False
@@ -83,7 +83,7 @@ class SimulatedRobot:
         return self.position()
 
     def stop(self) -> None:
-        """Stand still."""
+        """Stop at once."""
         self._stop.set()
 
     def reachable(self) -> Floats | None:
@@ -91,7 +91,7 @@ class SimulatedRobot:
         return None
 
     def close(self) -> None:
-        """Nothing to hang up."""
+        """Nothing to disconnect."""
 
 
 class PhotographingCamera:
@@ -143,14 +143,14 @@ class PhotographingCamera:
             )
         hidden, self._covers = self._covers > 0, max(0, self._covers - 1)
         self._number += 1
-        here = _ball(self._behind() if hidden else self._robot.true_position)
-        studio = self._studio.showing(here, seed=self._studio.seed + NEXT_SEED * self._number)
+        here = _ball_at(self._hidden_place() if hidden else self._robot.true_position)
+        studio = self._studio.showing(here, seed=self._studio.seed + SEED_STEP * self._number)
         return Frame(studio.picture(self._camera, 0), self._number, time.time())
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Nothing to release."""
 
-    def _behind(self) -> Floats:
+    def _hidden_place(self) -> Floats:
         """(3,) a place that the camera cannot see."""
         pose = self._studio.rig.cameras[self._camera].camera_from_world
         return np.asarray(pose.centre - 10 * np.linalg.norm(self._studio.rig.volume.size) * pose.rotation[2])
@@ -180,10 +180,11 @@ def simulated_rig(
     """
     middle = rig.volume.world_from_box.translation if start is None else start
     robot = SimulatedRobot(middle, sd=sd, speed=speed, rng=np.random.default_rng([seed, 11]))
-    studio = Studio(rig, _ball(middle), optics or Optics(), seed).showing(_ball(middle), seed=seed)  # all looks, now
+    ball = _ball_at(middle)
+    studio = Studio(rig, ball, optics or Optics(), seed).showing(ball, seed=seed)
     return [PhotographingCamera(studio, c, robot) for c in range(len(rig.cameras))], robot
 
 
-def _ball(xyz: Floats) -> Target:
+def _ball_at(xyz: Floats) -> Target:
     name = np.array(["ball"])
     return Target("ball", name, name, np.array(xyz, dtype=np.float64).reshape(1, 3))

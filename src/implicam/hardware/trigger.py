@@ -22,10 +22,10 @@ from urllib.parse import urlsplit
 
 from implicam.errors import HardwareError, UsageError, did_you_mean
 
-VERSION = "IMPLICAM-TRIGGER 1 "
-HIGHEST = 2**31
-ATTEMPTS = 5
-LONGEST_LINE = 200
+GREETING_PREFIX = "IMPLICAM-TRIGGER 1 "
+PULSE_NUMBERS = 2**31
+MAX_ATTEMPTS = 5
+MAX_LINE_BYTES = 200
 
 
 class NetworkTrigger:
@@ -33,14 +33,14 @@ class NetworkTrigger:
 
     def __init__(self, address: str, timeout: float = 1.0) -> None:
         self.address, self._timeout = address, timeout
-        self._host, self._port, self._udp = _split(address)
+        self._host, self._port, self._udp = _split_address(address)
         self._socket: socket.socket | None = None
         self._buffer = b""
-        self._number = secrets.randbelow(HIGHEST)  # another than the last session's, which the box may remember
+        self._number = secrets.randbelow(PULSE_NUMBERS)  # not that of the last session, which the box may remember
         self.lines = 0
 
     def open(self) -> None:
-        """Connect and say hello."""
+        """Connect, and ask for the version of the protocol."""
         if self._socket is not None:
             return
         try:
@@ -51,18 +51,18 @@ class NetworkTrigger:
             self._socket.connect(place)
         except OSError as error:
             self.close()
-            raise self._silent(str(error)) from error
-        answer = self._ask("HELLO", VERSION)
+            raise self._no_answer_error(str(error)) from error
+        answer = self._ask("HELLO", GREETING_PREFIX)
         self.lines = int(answer) if answer.isdecimal() else 0
 
     def fire(self) -> None:
         """Pulse all lines once; asking again after a lost packet does not pulse again."""
         self.open()
-        self._number = (self._number + 1) % HIGHEST
+        self._number = (self._number + 1) % PULSE_NUMBERS
         self._ask(f"TRIG {self._number}", f"OK {self._number} ")
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect."""
         if self._socket is not None:
             self._socket.close()
         self._socket = None
@@ -70,12 +70,12 @@ class NetworkTrigger:
     def _ask(self, question: str, begins: str) -> str:
         """What follows `begins` in the answer; over UDP the question is repeated, over TCP the network does that."""
         assert self._socket is not None
-        attempts = ATTEMPTS if self._udp else 1
+        attempts = MAX_ATTEMPTS if self._udp else 1
         why = f"{question!r} was sent {attempts} times, and not answered within {self._timeout:g} s"
         try:
             for _ in range(attempts):
                 self._socket.sendall(f"{question}\n".encode())
-                answer = self._answer(begins, time.monotonic() + self._timeout / attempts)
+                answer = self._read_answer(begins, time.monotonic() + self._timeout / attempts)
                 if answer is not None:
                     return answer
         except OSError as error:
@@ -84,10 +84,10 @@ class NetworkTrigger:
             self.close()
             raise
         self.close()
-        raise self._silent(why)
+        raise self._no_answer_error(why)
 
-    def _answer(self, begins: str, end: float) -> str | None:
-        while (line := self._line(end)) is not None:
+    def _read_answer(self, begins: str, end: float) -> str | None:
+        while (line := self._read_line(end)) is not None:
             if line.startswith(begins):
                 return line.removeprefix(begins)
             if line.startswith("ERR"):
@@ -96,10 +96,10 @@ class NetworkTrigger:
                     why=line.removeprefix("ERR").strip() or "it does not say why",
                     fix="load the sketch of docs/hardware.md on it",
                 )
-            # else an answer to an earlier question, which took its time
+            # else a late answer to an earlier question
         return None
 
-    def _line(self, end: float) -> str | None:
+    def _read_line(self, end: float) -> str | None:
         assert self._socket is not None
         while b"\n" not in self._buffer:
             left = end - time.monotonic()
@@ -111,12 +111,12 @@ class NetworkTrigger:
             except TimeoutError:
                 return None
             if not data and not self._udp:
-                raise ConnectionError("it hung up")
-            self._buffer = (self._buffer + data)[-LONGEST_LINE * 20 :]
+                raise ConnectionError("it closed the connection")
+            self._buffer = (self._buffer + data)[-MAX_LINE_BYTES * 20 :]
         line, _, self._buffer = self._buffer.partition(b"\n")
         return line.decode("ascii", "replace").strip()
 
-    def _silent(self, why: str) -> HardwareError:
+    def _no_answer_error(self, why: str) -> HardwareError:
         return HardwareError(
             f"the trigger box at {self.address} does not answer.",
             why=why,
@@ -124,7 +124,7 @@ class NetworkTrigger:
         )
 
 
-def _split(address: str) -> tuple[str, int, bool]:
+def _split_address(address: str) -> tuple[str, int, bool]:
     try:
         parts = urlsplit(address)
         host, port = parts.hostname, parts.port
@@ -182,8 +182,8 @@ class TriggerSimulator:
         """
         word, _, number = question.strip().partition(" ")
         if word == "HELLO" and not number:
-            return f"{VERSION}{self.lines}\n"
-        if word != "TRIG" or not number.isdecimal() or int(number) >= HIGHEST:
+            return f"{GREETING_PREFIX}{self.lines}\n"
+        if word != "TRIG" or not number.isdecimal() or int(number) >= PULSE_NUMBERS:
             return f"ERR {question.strip()[:40]!r} is not understood\n"
         if int(number) != self._last[0]:
             self._last = int(number), time.monotonic_ns() // 1000
@@ -193,7 +193,7 @@ class TriggerSimulator:
     def _serve_udp(self) -> None:
         while not self._ending.is_set():
             try:
-                data, place = self._socket.recvfrom(LONGEST_LINE)
+                data, place = self._socket.recvfrom(MAX_LINE_BYTES)
             except TimeoutError:
                 continue
             if self.drop_questions > 0:
@@ -220,7 +220,7 @@ class TriggerSimulator:
         buffer = b""
         while not self._ending.is_set():
             try:
-                data = connection.recv(LONGEST_LINE)
+                data = connection.recv(MAX_LINE_BYTES)
             except TimeoutError:
                 continue
             except OSError:

@@ -1,10 +1,10 @@
-"""The library ur-rtde in a process of its own: this file, run as a program, is the far end.
+"""The library ur-rtde in a process of its own: this file, run as a program, is that process.
 
 When the robot falls silent, ur-rtde 1.6.5 waits with Python's lock held, reconnects by itself, uploads its program
 again, or aborts the whole process ("pthread_mutex_lock ... Assertion failed", seen when it is closed then). None of
-that may happen to a session, or move a robot that nobody looks at: here the process is ended.
+that may happen to a session, or move a robot unobserved: here the process is ended.
 Questions and answers are JSON lines: [7, "receive", "getTimestamp", []] -> {"id": 7, "value": 12.5} or {"id": 7,
-"error": "..."}. When the session itself dies, the far end stops the robot.
+"error": "..."}. When the session itself dies, the process stops the robot.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from typing import Any
 
 LIBRARIES = {"receive": ("rtde_receive", "RTDEReceiveInterface"), "control": ("rtde_control", "RTDEControlInterface")}
 
-LAST_WORDS = 5
-"""Seconds that the far end has to stop the robot once the session has died."""
+STOP_TIMEOUT_SECONDS = 5
+"""What the process has to stop the robot once the session has died."""
 
-DECELERATION = 2.0
-"""m/s² of a robot that is stopped."""
+DECELERATION_M_S2 = 2.0
+"""Of a robot that is stopped."""
 
 
 class Worker:
-    """The near end; `call` may be used from several threads, and is a TimeoutError once the far end is gone."""
+    """The process, as the session sees it; `call` may be used from several threads, and raises TimeoutError once it is
+    gone."""
 
     def __init__(self) -> None:
-        command = [sys.executable, "-P", __file__]  # -P: our neighbours in this folder are not libraries
+        command = [sys.executable, "-P", __file__]  # -P: modules of this folder must not hide libraries
         pipe = subprocess.PIPE
-        # A session of its own: Ctrl-C is for us, who then tell the robot to stop.
+        # A process group of its own: Ctrl-C reaches only us, and we tell the robot to stop.
         self._process = subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, bufsize=0, start_new_session=True
         )
@@ -66,14 +67,14 @@ class Worker:
             try:
                 assert self._process.stdin is not None
                 self._process.stdin.write((json.dumps([self._asked, thing, method, args]) + "\n").encode())
-                answer = self._answer(self._asked, time.monotonic() + timeout)
+                answer = self._wait_for_answer(self._asked, time.monotonic() + timeout)
             except (queue.Empty, OSError, ValueError) as error:
                 raise TimeoutError(f"no answer within {timeout:g} s") from error
         if "error" in answer:
             raise RuntimeError(answer["error"])
         return answer["value"]
 
-    def _answer(self, number: int, end: float) -> dict[str, Any]:
+    def _wait_for_answer(self, number: int, end: float) -> dict[str, Any]:
         """The answer to question `number`; one to a question that Ctrl-C interrupted is passed over."""
         while True:
             line = self._answers.get(timeout=max(0.0, end - time.monotonic()))
@@ -84,7 +85,7 @@ class Worker:
                 return answer
 
     def end(self) -> None:
-        """Now, whatever it is doing: the connections to the robot end with it."""
+        """End the process at once; the connections to the robot end with it."""
         self._process.kill()
         self._process.wait()
         self._reader.join()
@@ -100,32 +101,32 @@ class Worker:
 
 
 def _serve() -> None:
-    """The far end: answer until the near end closes the pipe."""
+    """The other process: answer until the session closes the pipe."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the library prints where the answers go
     things: dict[str, Any] = {}
-    with suppress(BrokenPipeError):  # the near end died before it read the answer
+    with suppress(BrokenPipeError):  # the session died before it read the answer
         for line in sys.stdin:
             number, thing, method, args = json.loads(line)
-            answers.write(json.dumps({"id": number, **_done(things, thing, method, args)}) + "\n")
+            answers.write(json.dumps({"id": number, **_answer_call(things, thing, method, args)}) + "\n")
             answers.flush()
     if hasattr(signal, "alarm"):
-        signal.alarm(LAST_WORDS)  # ends us even where the library waits, with Python's lock, for a robot that is gone
-    if "control" in things:  # nobody is there any more who knows why the robot moves
+        signal.alarm(STOP_TIMEOUT_SECONDS)  # ends us even where the library waits with Python's lock held
+    if "control" in things:  # the session is gone, so the robot must not go on moving
         with suppress(Exception):
-            things["control"].stopL(DECELERATION)
+            things["control"].stopL(DECELERATION_M_S2)
             things["control"].stopScript()
     os._exit(0)  # without the library's destructors
 
 
-def _done(things: dict[str, Any], thing: str, method: str, args: list[Any]) -> dict[str, Any]:
+def _answer_call(things: dict[str, Any], thing: str, method: str, args: list[Any]) -> dict[str, Any]:
     try:
         if method != "connect":
             return {"value": getattr(things[thing], method)(*args)}
         module, name = LIBRARIES[thing]
         things[thing] = getattr(__import__(module), name)(*args)
         return {"value": None}
-    except Exception as error:  # the far end has no one else to tell
+    except Exception as error:  # the session raises it again
         return {"error": str(error) or type(error).__name__}
 
 

@@ -29,7 +29,7 @@ from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observatio
 from implicam.detect import Detected, Detector, View, centred
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.formatting import json_safe
-from implicam.hardware import Frame, FrameSource, MovedByHand, Robot, Trigger, exposed
+from implicam.hardware import Frame, FrameSource, MovedByHand, Robot, Trigger, take_frames
 from implicam.images import blank
 from implicam.progress import Progress, silent
 from implicam.session.detections import Look, reject_implausible
@@ -481,7 +481,7 @@ class SessionController:
         self._show(phase="shown", looks=looks, position=where, message=words)
 
     def _frames(self, trigger: Trigger | None) -> list[Frame]:
-        return exposed(self.equipment.cameras, trigger, self.equipment.timeout, self._pool)
+        return take_frames(self.equipment.cameras, trigger, self.equipment.timeout, self._pool)
 
     def _looks(self, frames: Sequence[Frame]) -> tuple[Look, ...]:
         expected = self.state.target.uv if self.state.target is not None else np.full((len(frames), 2), np.nan)

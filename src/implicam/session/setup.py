@@ -25,9 +25,9 @@ from implicam.hardware import (
     Robot,
     Trigger,
     camera_from,
-    exposed,
     robot_from,
     simulated_rig,
+    take_frames,
     trigger_from,
 )
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
@@ -265,7 +265,7 @@ def _sized(setup: Setup, eyes: list[FrameSource], say: Callable[[str], None]) ->
         for device in needed:
             devices.callback(device.close)
             device.open()
-        frames = exposed(eyes, trigger, PATIENCE if trigger is None else 10.0, pool)
+        frames = take_frames(eyes, trigger, PATIENCE if trigger is None else 10.0, pool)
         sizes = [frame.picture.shape for frame in frames]
     return [Camera(source.name, width, height) for source, (height, width) in zip(eyes, sizes, strict=True)]
 
