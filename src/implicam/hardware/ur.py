@@ -288,7 +288,7 @@ class URRobot:
                 self.stop()
                 raise HardwareError(
                     f"the robot stands {off * 1e3:.2f} mm from its target {_format(target)} {self.unit}.",
-                    why=f"no motion for {STANDSTILL_SECONDS:g} s: out of reach, a joint limit, or the speed slider at 0",
+                    why=f"no motion for {STANDSTILL_SECONDS:g} s: out of reach, at a joint limit, or speed slider at 0",
                     fix="read the pendant's log, and choose another target",
                 )
 
