@@ -50,13 +50,14 @@ class Frame(StrEnum):
 
     robot = "robot"
     random = "random"
+    bench = "bench"
 
 
 @command("simulate")
 def simulate_command(
     out: Annotated[Path, typer.Argument(help="Folder to write the dataset to.")],
     rig: Annotated[
-        str, typer.Option(metavar="NAME", help="bar6 (the paper's), stereo, dome8, or any barN, domeN.")
+        str, typer.Option(metavar="NAME", help="bar6 (the paper's), grid9, dome8, any barN, gridAxB ..., or RIG.toml.")
     ] = "bar6",
     target: Annotated[
         Target, typer.Option(help="A ball on a robot, a board on a slide, boards held by hand.")
@@ -105,8 +106,10 @@ def simulate_command(
     image_blur: Annotated[
         float, typer.Option(min=0, max=10, metavar="PX", help="Blur of the photographs, standard deviation.")
     ] = 0.7,
-    frame: Annotated[Frame, typer.Option(help="World frame: axes along the bench, or any.")] = Frame.robot,
-    unit: Annotated[str, typer.Option(metavar="UNIT", help="mm or m.")] = "mm",
+    frame: Annotated[
+        Frame | None, typer.Option(help="World: axes along the bench (of names), any, as drawn (of RIG.toml).")
+    ] = None,
+    unit: Annotated[str | None, typer.Option(metavar="UNIT", help="mm (of rigs with names), or m.")] = None,
     seed: Seed = 0,
     shots_seed: Annotated[
         int | None, typer.Option(min=0, metavar="N", help="Record the same rig again with other noise.")
@@ -116,10 +119,10 @@ def simulate_command(
 ) -> None:
     """Write a dataset of a simulated rig, with the truth and the Cramer-Rao limit of every point beside it."""
     must_be_folder(out)
-    if unit not in ("mm", "m"):
+    if unit not in ("mm", "m", None):
         raise UsageError(f"a simulated rig has no unit {unit!r}.", fix="choose mm or m")
     built = build_rig(
-        rig, seed=seed, lens_error=lens_error, noise=noise, frame=frame.value, unit="mm" if unit == "mm" else "m",
+        rig, seed=seed, lens_error=lens_error, noise=noise, frame=frame and frame.value, unit=unit,  # type: ignore[arg-type]
         cameras=cameras, unusual=Unusual(tilt, mirror, aspect, window),
     )  # fmt: skip
     shots = seed if shots_seed is None else shots_seed

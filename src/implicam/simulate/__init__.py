@@ -20,8 +20,11 @@ from implicam.simulate.noise import (
     with_limit,
 )
 from implicam.simulate.photographs import BALL_RADIUS_MM, Optics, Recorded, Studio, record
-from implicam.simulate.rigs import CAMERA_SETS, SPECS, Box, Rig, Unusual, build_rig, write_rig
+from implicam.simulate.placements import SPECS, Placement, named_placement
+from implicam.simulate.rig_file import read_placement
+from implicam.simulate.rigs import CAMERA_SETS, Box, Rig, Unusual, build_rig, placement_of
 from implicam.simulate.targets import Target, ball_grid, held_boards, moving_board, random_positions
+from implicam.simulate.truth import write_rig
 from implicam.simulate.window import Window
 
 __all__ = [
@@ -30,6 +33,7 @@ __all__ = [
     "SPECS",
     "Box",
     "Optics",
+    "Placement",
     "Recorded",
     "Rig",
     "SimulatedCamera",
@@ -45,7 +49,10 @@ __all__ = [
     "each_and_pairs",
     "held_boards",
     "moving_board",
+    "named_placement",
+    "placement_of",
     "random_positions",
+    "read_placement",
     "record",
     "simulate",
     "simulate_boards",

@@ -1,33 +1,26 @@
-"""Simulated rigs: the paper's six cameras on a bar, a stereo pair, a dome.
+"""Simulated rigs: a placement as it would be built, each camera and lens a little different from the drawing.
 
-A rig is designed on a bench, in millimetres: the working volume's centre is the origin, x runs along the bar to the
-right, y down, z away from the cameras. Then it is moved into a world frame with another origin and orientation.
+A rig is built on the bench of its drawing (`placements`, `rig_file`), in millimetres. Then it is moved into a world
+frame with another origin and orientation; a rig drawn in a file stays in the frame of the file.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from implicam.dataset import Floats
 from implicam.errors import UsageError, did_you_mean
-from implicam.geometry import Pose, look_at, rotation_from_vector
+from implicam.geometry import Pose, rotation_from_vector
 from implicam.lenses import BrownConrady, KannalaBrandt, Lens
 from implicam.simulate.camera import SimulatedCamera, random_error
+from implicam.simulate.placements import Mount, Placement, named_placement
+from implicam.simulate.rig_file import is_rig_file, read_placement
 from implicam.simulate.window import Window
-
-BAR_FOCAL_MM = (1.55, 2.8, 2.8, 1.85, 2.2, 1.3)
-"""The paper's effective focal lengths of cam1 ... cam6."""
-BAR_X_MM = (-300.0, -75.0, 75.0, -180.0, 180.0, 300.0)
-"""Where cam1 ... cam6 sit on the bar: the two regular lenses in the middle. Our assumption; the paper does not say."""
-PIXEL_MM = 0.003
-"""Pixel pitch of the bar's cameras. Our assumption; the paper does not say."""
-PERSPECTIVE_FROM_PX = 850.0
-"""Shorter lenses are wide: Kannala-Brandt, not Brown-Conrady."""
 
 CAMERA_SETS = {
     "2R": ("cam2", "cam3"),
@@ -36,13 +29,21 @@ CAMERA_SETS = {
 }
 """The paper's sets of cameras of bar6: two regular, and two or four wide lenses."""
 
-SPECS = ("bar6", "stereo", "dome8")
-
 WATER_BEFORE_VOLUME_MM = 20.0
 """Water between the window and what is nearest to it of the working volume (of a dome: of the ball around it)."""
 STEEPEST_TILT_DEG, THICKEST_WINDOW_MM, EXTREME_ASPECT = 30.0, 100.0, 5.0
 """Beyond, the sensor would not see the volume, the glass would reach the cameras, the picture would be a stripe."""
 UNITS_PER_MM = {"mm": 1.0, "m": 1e-3}
+
+FOCAL_SPREAD_RATIO, ASPECT_SPREAD_RATIO, CENTRE_SPREAD_PX = 0.02, 0.001, 10.0
+"""Sds of a lens as built about the one that was drawn."""
+AIM_SPREAD_DEG, PLACE_SPREAD_MM = 1.2, 3.0
+"""Sds about and along each axis of a camera as mounted: about 2 degrees in all."""
+DISTORTION_SPREAD = {
+    KannalaBrandt.family: (0.02, 0.005, 0.001, 0.0002),
+    BrownConrady.family: (0.04, 0.01, 5e-4, 5e-4),
+}
+"""Farthest from those drawn that the first four numbers of a distortion are; bounds, for a lens must not fold."""
 
 # Rows: what forward, left and up of a robot's base are on the bench (x right, y down, z away).
 _ROBOT_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -70,9 +71,9 @@ class Unusual:
         mirror: Names of the cameras that look into a mirror, or see v counted from below, joined by commas; "all" for a
             left-handed world.
         aspect: fy / fx, the pictures resized in height.
-        window: Thickness in mm of a flat pane of acrylic glass with water behind it; 0 for none. Of a bar or a stereo
-            pair it is one pane across the bench, of a dome one in front of each camera, square to the line from there
-            to the middle.
+        window: Thickness in mm of a flat pane of acrylic glass with water behind it; 0 for none. Of a bar, a grid or
+            a stereo pair it is one pane across the bench, of a dome or a drawing in a file one in front of each camera,
+            square to the line from there to the middle.
 
     Raises:
         UsageError: A number is out of range.
@@ -124,185 +125,132 @@ class Rig:
         return UNITS_PER_MM[self.length_unit]
 
 
-@dataclass(frozen=True)
-class _Mount:
-    """One camera as designed: image size, focal length in pixels, and its place on the bench in mm."""
+def placement_of(spec: str) -> Placement:
+    """The placement of a rig, by its name or from a file.
 
-    width: int
-    height: int
-    focal: float
-    place: tuple[float, float, float]
+    Args:
+        spec: A name ("bar6", "grid9", "dome8", "stereo"), or the path of a file that ends in .toml.
+
+    Raises:
+        UsageError: There is no such rig, or its file is wrong.
+    """
+    return read_placement(Path(spec)) if is_rig_file(spec) else named_placement(spec)
 
 
 def build_rig(
-    spec: str,
+    spec: str | Placement,
     *,
     seed: int,
     lens_error: float = 0.5,
     noise: float = 0.2,
-    frame: Literal["robot", "random"] = "robot",
-    unit: Literal["mm", "m"] = "mm",
+    frame: Literal["robot", "random", "bench"] | None = None,
+    unit: Literal["mm", "m"] | None = None,
     cameras: str | None = None,
     unusual: Unusual = Unusual(),
+    as_drawn: bool = False,
 ) -> Rig:
     """A simulated rig; each seed gives slightly different cameras.
 
     Args:
-        spec: "bar6", "stereo", "dome8", or any "bar<N>" or "dome<N>".
-        seed: Of everything that differs from the design.
+        spec: "bar6", "grid9", "stereo", "dome8", any other "bar<N>", "grid<N>", "grid<COLUMNS>x<ROWS>" or "dome<N>"; a
+            set of the paper ("2R", "2R2W", "2R4W"); a file RIG.toml; or a placement.
+        seed: Of everything that differs from the drawing.
         lens_error: Root mean square in pixels of the smooth error that no lens model contains.
-        noise: Standard deviation in pixels of a view.
-        frame: "robot" for a world like a robot's base (z up, axes parallel to the bench, origin elsewhere), "random"
-            for any rotation and offset.
-        unit: Length unit of the world.
-        cameras: Names joined by commas, or a set of the paper ("2R", "2R2W", "2R4W"); None for all. The rig itself
-            stays the same.
+        noise: Standard deviation in pixels of a view, where the drawing has none.
+        frame: "robot": a world like a robot's base (z up, axes parallel to the bench, origin elsewhere); "random": any
+            rotation and offset; "bench": that of the drawing. None for the last where the drawing is a file, else the
+            first.
+        unit: Of the world; None for the drawing's own, which is mm for rigs with names.
+        cameras: Names joined by commas, or a set of the paper; the rig itself stays the same.
         unusual: Tilted sensors, mirrors, pixels that are not square, a window.
+        as_drawn: Poses and lenses exactly as drawn; only the smooth error is left to the seed.
 
     Raises:
         UsageError: There is no such rig or camera, or an option is out of range.
     """
-    _check_options(seed=seed, lens_error=lens_error, noise=noise, frame=frame, unit=unit)
-    mounts, size = _design(spec)
-    world_from_bench = _world_from_bench(np.random.default_rng([seed, 0]), frame)
+    if isinstance(spec, str) and spec in CAMERA_SETS and cameras is None:
+        spec, cameras = "bar6", spec
+    placement = placement_of(spec) if isinstance(spec, str) else spec
+    world, length_unit = _world_of(placement, frame, unit)
+    _check_options(seed=seed, lens_error=lens_error, noise=noise, frame=world, unit=length_unit)
+    if placement.size is None:
+        raise UsageError(
+            f"{placement.name} does not say what its cameras watch.",
+            fix="add to its file, for example, workspace = [[-120, 120], [-80, 80], [0, 240]]",
+        )
+    world_from_bench = _world_from_bench(np.random.default_rng([seed, 0]), world)
+    spread = 0.0 if as_drawn else placement.spread
     built = tuple(
         _camera(
-            f"cam{i + 1}",
             mount,
             np.random.default_rng([seed, 1, i]),
             world_from_bench,
             lens_error,
-            noise,
+            noise if mount.noise is None else mount.noise,
             aspect=unusual.aspect,
+            spread=spread,
         )
-        for i, mount in enumerate(mounts)
+        for i, mount in enumerate(placement.mounts)
     )
-    rig = Rig(spec, built, Box(world_from_bench, np.array(size)), "mm", frame, seed)
+    volume = Box(world_from_bench @ Pose(np.eye(3), placement.centre), placement.size)
+    rig = Rig(placement.name, built, volume, "mm", world, seed)
     if unusual != Unusual():
-        rig = _unusual(rig, unusual)
-    return _in_unit(_with_cameras(rig, cameras), unit)
+        rig = _unusual(rig, unusual, own_panes=placement.own_panes)
+    return _in_unit(_with_cameras(rig, cameras), length_unit)
 
 
-def write_rig(rig: Rig) -> dict[str, Any]:
-    """The truth about a rig as plain tables, for `truth.toml`: lenses, poses, noise, seed.
-
-    Of the smooth error only its size is written: `build_rig` makes the same one again from name, seed, frame and the
-    numbers here.
-
-    Args:
-        rig: The rig.
-    """
-    volume = rig.volume
-    return {
-        "name": rig.name,
-        "seed": rig.seed,
-        "frame": rig.frame,
-        "length_unit": rig.length_unit,
-        **{key: value for key, value in asdict(rig.unusual).items() if value != getattr(Unusual, key)},
-        "volume": {"size": volume.size.tolist(), "world_from_box": _pose_table(volume.world_from_box)},
-        "cameras": [_camera_table(camera) for camera in rig.cameras],
-    }
-
-
-def _camera_table(camera: SimulatedCamera) -> dict[str, Any]:
-    return {
-        "name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "noise_sd_px": camera.noise_sd,
-        "lens": {"model": type(camera.lens).__name__, **asdict(camera.lens)},
-        "camera_from_world": _pose_table(camera.camera_from_world),
-        "lens_error_rms_px": camera.error.rms,
-        **_unusual_table(camera),
-    }
-
-
-def _unusual_table(camera: SimulatedCamera) -> dict[str, Any]:
-    """What a camera has beyond lens and pose; nothing where it has nothing."""
-    table: dict[str, Any] = {}
-    if any(camera.tilt):
-        table["tilt_rotation_vector"] = list(camera.tilt)
-    if camera.mirrored:
-        table["mirrored"] = True
-    if camera.window is not None:
-        table["window"] = {**asdict(camera.window), "normal": camera.window.normal.tolist()}
-    return table
-
-
-def _pose_table(pose: Pose) -> dict[str, Any]:
-    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
-
-
-def _design(spec: str) -> tuple[list[_Mount], tuple[float, float, float]]:
-    """The mounts of a rig, and its working volume (x, y, z) in mm."""
-    if spec == "stereo":
-        return [_Mount(1280, 1024, 1200.0, (x, 0.0, -700.0)) for x in (-120.0, 120.0)], (300.0, 240.0, 240.0)
-    found = re.fullmatch(r"(bar|dome)([1-9][0-9]{0,2})", spec)
-    if not found or int(found[2]) < 2:
-        raise UsageError(
-            f"there is no rig {spec!r}{did_you_mean(spec, SPECS)}.",
-            why="a rig is stereo, bar<N> or dome<N>, with N from 2 to 999 cameras",
-            fix=f"use one of {', '.join(SPECS)}, or for example dome12",
-        )
-    n = int(found[2])
-    if found[1] == "dome":
-        return list(_dome(n)), (400.0, 400.0, 400.0)
-    return list(_bar(n)), (240.0, 160.0, 240.0)
-
-
-def _bar(n: int) -> Iterator[_Mount]:
-    places = BAR_X_MM if n == len(BAR_X_MM) else np.linspace(-300, 300, n)
-    for i in range(n):
-        yield _Mount(1280, 800, BAR_FOCAL_MM[i % len(BAR_FOCAL_MM)] / PIXEL_MM, (float(places[i]), 0.0, -380.0))
-
-
-def _dome(n: int) -> Iterator[_Mount]:
-    """Cameras all round at one metre, in turn low and high above the bench."""
-    for i in range(n):
-        around, up = 2 * np.pi * i / n, np.radians((25.0, 55.0)[i % 2])
-        place = 1000 * np.array([np.sin(around) * np.cos(up), -np.sin(up), -np.cos(around) * np.cos(up)])
-        yield _Mount(1280, 1024, 1200.0, (float(place[0]), float(place[1]), float(place[2])))
+def _world_of(placement: Placement, frame: str | None, unit: str | None) -> tuple[str, str]:
+    """Frame and unit of the world, where nothing was asked for those of the drawing."""
+    usual = "bench" if placement.drawn else "robot"
+    return usual if frame is None else frame, placement.length_unit if unit is None else unit
 
 
 def _camera(
-    name: str,
-    mount: _Mount,
+    mount: Mount,
     rng: np.random.Generator,
     world_from_bench: Pose,
     lens_error: float,
     noise: float,
     *,
     aspect: float,
+    spread: float,
 ) -> SimulatedCamera:
     """A camera as built: nothing is quite where the drawing says."""
-    aimed = look_at(mount.place, (0.0, 0.0, 0.0), up=(0.0, -1.0, 0.0))
-    turned = Pose(rotation_from_vector(rng.normal(scale=np.radians(1.2), size=3)), np.zeros(3))  # about 2° in all
-    moved = Pose(np.eye(3), rng.normal(scale=3.0, size=3))
-    camera_from_world = turned @ aimed @ moved @ world_from_bench.inverse()
-    lens, height = _random_lens(mount, rng), mount.height
+    aim = rng.normal(scale=np.radians(AIM_SPREAD_DEG) * spread, size=3)
+    turned = Pose(rotation_from_vector(aim), np.zeros(3))
+    moved = Pose(np.eye(3), rng.normal(scale=PLACE_SPREAD_MM * spread, size=3))
+    camera_from_world = turned @ mount.camera_from_bench @ moved @ world_from_bench.inverse()
+    lens, height = _random_lens(mount.lens, rng, spread), mount.height
     if aspect != 1:  # the same picture, resized
-        lens, height = replace(lens, fy=lens.fy * aspect, cy=(lens.cy + 0.5) * aspect - 0.5), round(height * aspect)
+        lens, height = _resized(lens, aspect), round(height * aspect)
     error = random_error(rng, mount.width, height, lens_error)
-    return SimulatedCamera(name, mount.width, height, lens, camera_from_world, error, noise)
+    return SimulatedCamera(mount.name, mount.width, height, lens, camera_from_world, error, noise)
 
 
-def _random_lens(mount: _Mount, rng: np.random.Generator) -> Lens:
-    """A lens near its design: focal length 2 %, centre 10 px, distortion within bounds, for it must not fold."""
-    fx = mount.focal * (1 + rng.normal(scale=0.02))
-    fy = fx * (1 + rng.normal(scale=0.001))
-    cx, cy = np.array([mount.width - 1, mount.height - 1]) / 2 + rng.normal(scale=10.0, size=2)
+def _random_lens(drawn: Lens, rng: np.random.Generator, spread: float) -> Lens:
+    """A lens near its design: focal length, centre, and distortion within bounds, for it must not fold."""
+    fx = drawn.fx * (1 + rng.normal(scale=FOCAL_SPREAD_RATIO * spread))
+    fy = fx * (drawn.fy / drawn.fx) * (1 + rng.normal(scale=ASPECT_SPREAD_RATIO * spread))
+    cx, cy = np.array([drawn.cx, drawn.cy]) + rng.normal(scale=CENTRE_SPREAD_PX * spread, size=2)
+    distortion = np.array(astuple(drawn)[4:])
     k = rng.uniform(-1, 1, size=4)
-    if mount.focal < PERSPECTIVE_FROM_PX:
-        return KannalaBrandt(
-            fx, fy, float(cx), float(cy), *(k * [0.02, 0.005, 0.001, 0.0002] - [0.01, 0, 0, 0]).tolist()
-        )
-    k1, k2, p1, p2 = (k * [0.04, 0.01, 5e-4, 5e-4] + [-0.08, 0.02, 0, 0]).tolist()
-    return BrownConrady(fx, fy, float(cx), float(cy), k1, k2, p1, p2)
+    bounds = DISTORTION_SPREAD.get(drawn.family)
+    if bounds is not None:
+        distortion[:4] = k * bounds * spread + distortion[:4]
+    return type(drawn)(fx, fy, float(cx), float(cy), *distortion.tolist())
+
+
+def _resized(lens: Lens, aspect: float) -> Lens:
+    """The lens of pictures that are resized in height."""
+    fx, fy, cx, cy, *distortion = astuple(lens)
+    return type(lens)(fx, fy * aspect, cx, (cy + 0.5) * aspect - 0.5, *distortion)
 
 
 def _world_from_bench(rng: np.random.Generator, frame: str) -> Pose:
     offset = rng.uniform(200, 600, size=3) * rng.choice([-1, 1], size=3)
     turn = rotation_from_vector(_random_rotation_vector(rng))
+    if frame == "bench":
+        return Pose(np.eye(3), np.zeros(3))
     return Pose(_ROBOT_AXES if frame == "robot" else turn, offset)
 
 
@@ -311,7 +259,7 @@ def _random_rotation_vector(rng: np.random.Generator) -> Floats:
     return axis / np.linalg.norm(axis) * rng.uniform(0.5, np.pi)
 
 
-def _unusual(rig: Rig, unusual: Unusual) -> Rig:
+def _unusual(rig: Rig, unusual: Unusual, *, own_panes: bool) -> Rig:
     """The rig with tilted sensors, mirrors and a window; its cameras stay where they are."""
     mirrored = _camera_names(rig, unusual.mirror) if unusual.mirror not in ("", "all") else []
     cameras = []
@@ -323,21 +271,27 @@ def _unusual(rig: Rig, unusual: Unusual) -> Rig:
                 camera,
                 tilt=(float(tilt[0]), float(tilt[1])),
                 mirrored=unusual.mirror == "all" or camera.name in mirrored,
-                window=_window(rig, camera, unusual.window) if unusual.window > 0 else None,
+                window=_window(rig, camera, unusual.window, own_panes) if unusual.window > 0 else None,
             )
         )
     return replace(rig, cameras=tuple(cameras), unusual=unusual)
 
 
-def _window(rig: Rig, camera: SimulatedCamera, thickness: float) -> Window:
+def _window(rig: Rig, camera: SimulatedCamera, thickness: float, own: bool) -> Window:
     """The pane before a camera, in its frame, in mm."""
     box = rig.volume
     place = box.world_from_box.inverse().apply(camera.camera_from_world.centre)
-    if rig.name.startswith("dome"):
+    if own:
         normal, water_side = -place / np.linalg.norm(place), 0.5 * float(np.linalg.norm(box.size))
     else:
         normal, water_side = np.array([0.0, 0.0, 1.0]), 0.5 * float(box.size[2])
     distance = -float(place @ normal) - water_side - WATER_BEFORE_VOLUME_MM - thickness
+    if distance <= 0:
+        raise UsageError(
+            f"{camera.name} would be behind the window or in the water.",
+            why=f"the glass ends {WATER_BEFORE_VOLUME_MM:g} mm before the working volume",
+            fix="move the camera back, or make the working volume smaller",
+        )
     camera_from_box = camera.camera_from_world @ box.world_from_box
     return Window(camera_from_box.rotation @ normal, distance, thickness)
 
@@ -389,7 +343,7 @@ def _check_options(*, seed: int, lens_error: float, noise: float, frame: str, un
     for what, value in (("lens_error", lens_error), ("noise", noise)):
         if not (np.isfinite(value) and value >= 0):
             raise UsageError(f"{what} = {value} px; it must be zero or more.", fix=f"for example {what} = 0.2")
-    for what, word, known in (("frame", frame, ("robot", "random")), ("unit", unit, tuple(UNITS_PER_MM))):
+    for what, word, known in (("frame", frame, ("robot", "random", "bench")), ("unit", unit, tuple(UNITS_PER_MM))):
         if word not in known:
             raise UsageError(
                 f"there is no {what} {word!r}{did_you_mean(word, known)}.", fix=f"use {' or '.join(known)}"
