@@ -42,7 +42,10 @@ def numbers(table: list[dict[str, str]], *columns: str) -> np.ndarray:
 def test_the_columns_are_those_of_the_contract(tmp_path: Path) -> None:
     measurement().write_csv(tmp_path / "measured.csv")
     text = (tmp_path / "measured.csv").read_bytes().decode("utf-8")
-    assert text.split("\n")[0] == "point,x,y,z,sd_x,sd_y,sd_z,cov_xy,cov_xz,cov_yz,views,consistency,reason"
+    assert (
+        text.split("\n")[0]
+        == "point,x,y,z,sd_x,sd_y,sd_z,cov_xy,cov_xz,cov_yz,views,consistency,reason,share_calibration"
+    )
     assert ",".join(MEASURED_COLUMNS) == text.split("\n")[0]
     assert "\r" not in text
     assert text.endswith("\n")

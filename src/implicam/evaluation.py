@@ -134,7 +134,7 @@ def _held_out_in_turn(
 def _stacked(parts: Iterable[Measurement]) -> Measurement:
     all_parts = list(parts)
 
-    names = ("points", "xyz", "cov", "views", "consistency", "reason")
+    names = ("points", "xyz", "cov", "views", "consistency", "reason", "share_calibration")
     columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in all_parts]) for name in names}
     return Measurement(**columns, length_unit=all_parts[0].length_unit)
 

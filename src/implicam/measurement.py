@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from implicam.files import write_text
 
 MEASURED_COLUMNS = (
     "point", "x", "y", "z", "sd_x", "sd_y", "sd_z", "cov_xy", "cov_xz", "cov_yz", "views", "consistency", "reason",
+    "share_calibration",
 )  # fmt: skip
 
 
@@ -33,6 +34,8 @@ class Measurement:
     that the views agree, NaN where it cannot be tested.
     alarm: what is wrong with the table as a whole, in a sentence: the rig is not the one that was calibrated. Then no
     number of it is to be trusted, and every reason begins with DOUBTFUL. Empty where nothing is.
+    share_calibration: (n,) from 0 to 1, the share of the variance (trace of cov) that more known points could remove;
+    the rest is the pixel noise of this measurement. NaN where the method cannot tell them apart.
     """
 
     points: Names
@@ -43,10 +46,13 @@ class Measurement:
     reason: Names
     length_unit: str
     alarm: str = ""
+    share_calibration: Floats = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         """A covariance is symmetric to the last bit, whatever order a method or a processor summed it in."""
         object.__setattr__(self, "cov", 0.5 * (self.cov + self.cov.swapaxes(1, 2)))
+        if len(self.share_calibration) != len(self.points):
+            object.__setattr__(self, "share_calibration", np.full(len(self.points), np.nan))
 
     def __len__(self) -> int:
         return len(self.points)
@@ -85,6 +91,8 @@ class Measurement:
         for i, name in enumerate(self.points):
             row = ["" if np.isnan(x) else repr(float(x)) for x in numbers[i]]
             p = self.consistency[i]
+            share = self.share_calibration[i]
             tail = [str(int(self.views[i])), "" if np.isnan(p) else repr(float(p)), str(self.reason[i])]
+            tail.append("" if np.isnan(share) else repr(float(share)))
             writer.writerow([str(name), *row, *tail])
         write_text(Path(path), buffer.getvalue())

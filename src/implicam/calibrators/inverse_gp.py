@@ -279,7 +279,7 @@ class InverseGPCalibration(CalibrationBase):
         reason = missing_view_reasons(seen, observations.camera_names, self.method).astype(object)
         complete = np.flatnonzero(seen.all(axis=1))
         n = len(observations)
-        xyz, cov = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
+        xyz, cov, share = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan), np.full(n, np.nan)
         uv = observations.uv[complete].reshape(-1, 2 * len(observations.cameras))
         far = self.farness(uv)
         reason[complete[far > self.farthest]] = [unlike_reason(f) for f in far[far > self.farthest]]
@@ -288,6 +288,8 @@ class InverseGPCalibration(CalibrationBase):
         scale, offset = self.positions.scale, self.positions.offset
         xyz[complete] = mean * scale + offset
         cov[complete] = covariance * np.outer(scale, scale) * far[:, None, None] ** 2
+        from_noise = np.sum(np.diag(self.map.noise) * scale**2)
+        share[complete] = np.clip(1 - from_noise / np.trace(cov[complete], axis1=1, axis2=2), 0.0, 1.0)
         return Measurement(
             observations.points,
             xyz,
@@ -296,6 +298,7 @@ class InverseGPCalibration(CalibrationBase):
             np.full(n, np.nan),  # a map from all pixels to a position cannot ask whether the views agree
             reason.astype(np.str_),
             self.data.length_unit,
+            share_calibration=share,
         )
 
     def position_processes(self, uv: Floats) -> PositionProcesses:

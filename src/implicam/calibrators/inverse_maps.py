@@ -63,6 +63,10 @@ class Map(Protocol):
     def predict(self, X: Floats) -> tuple[Floats, Floats]:
         """Mean (k, 3) and covariance (k, 3, 3) of a new noisy position, from standardised pixels (k, d)."""
 
+    @property
+    def noise(self) -> Floats:
+        """(3, 3) what is noise of the covariance that `predict` states: pixel noise, as it moves a position."""
+
     def leave_one_out(self) -> tuple[Floats, Floats]:
         """Errors (n, 3) of the known points, each predicted from all others, and their variances (n, 3)."""
 
@@ -100,6 +104,11 @@ class ThreeMaps:
         answers = side_by_side(one, self.processes)
         variances = np.stack([variance for _, variance in answers], axis=1)
         return np.stack([mean for mean, _ in answers], axis=1), variances[:, :, None] * np.eye(3)
+
+    @property
+    def noise(self) -> Floats:
+        """(3, 3) of each axis its own."""
+        return np.diag([gp.noise_variance for gp in self.processes])
 
     def leave_one_out(self) -> tuple[Floats, Floats]:
         """In closed form, hyperparameters kept."""
@@ -152,6 +161,11 @@ class SmoothMap:
             found = [self.kriging.predict(self.inputs(x), _with_one(x @ self.axes)) for x in pieces]
         mean, factor, moved = (np.concatenate(values) for values in zip(*found, strict=True))
         return mean, factor, moved
+
+    @property
+    def noise(self) -> Floats:
+        """(3, 3) with the covariance of the coordinates."""
+        return np.asarray(self.kriging.sigma * self.kriging.noise_variance, dtype=np.float64)
 
     def leave_one_out(self) -> tuple[Floats, Floats]:
         """In closed form, lengthscales kept."""

@@ -51,7 +51,7 @@ from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import must_be_no_folder, toml_text
-from implicam.formatting import decimal_number
+from implicam.formatting import decimal_number, percent
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
 __all__ = ["EXAMPLES", "app"]
@@ -170,9 +170,12 @@ def measure_command(
         progress("measuring", 1, 1)
     measured.write_csv(output)
     count, typical = int(measured.measured.sum()), _typical(measured.sd)
+    known = measured.share_calibration[np.isfinite(measured.share_calibration)]
+    share = float(np.median(known)) if len(known) else math.nan
     if json:
         show.emit_json(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
+             "median_share_calibration": share,
              "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
              "views_left_out": show.left_out(measured), "notes": list(data.notes), "alarm": measured.alarm}
         )  # fmt: skip
@@ -182,6 +185,8 @@ def measure_command(
         text += f", typical sd {', '.join(f'{a} {decimal_number(v)}' for a, v in zip('xyz', typical, strict=True))} "
         text += measured.length_unit
     show.line(text)
+    if math.isfinite(share):
+        show.line(f"more known points could remove {percent(share)} of the variance (median); the rest is pixel noise")
     if judged in (DOUBTFUL, NOT_USABLE):
         show.note(f"this calibration was found {judged} when it was made: implicam info {calibration} says why")
     show.notes(data.notes)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from implicam.dataset import Floats, Names
 from implicam.figures.style import GREY, INK, SKY, VERMILLION, figure_3d, plain, points_3d
-from implicam.formatting import number
+from implicam.formatting import number, percent
 
 _FACTORS = (1, 10, 100, 1000, 10_000)
 # A line is seen from about a fiftieth of the scene; then neighbours do not yet tangle.
@@ -30,6 +30,7 @@ def scene(
     true_xyz: Floats | None = None,
     error: Floats | None = None,
     cameras: Mapping[str, ArrayLike] | None = None,
+    share_calibration: Floats | None = None,
 ) -> Any:
     """An interactive Plotly figure of n measured points.
 
@@ -37,18 +38,24 @@ def scene(
     colour; without it the colour is the stated uncertainty. Size grows with the stated uncertainty. true_xyz: (n, 3)
     draws a line from each measured point towards its truth, exaggerated by the factor on the buttons. known_xyz: (m, 3)
     the points the rig was calibrated from. cameras: name -> (3,) centre, hidden until clicked in the legend.
+    share_calibration: (n,) the share of each variance that more known points could remove, another colour to choose.
     """
     i = np.isfinite(measured_xyz).all(axis=1)
     spread = np.linalg.norm(sd[i], axis=1)
-    texts = _hover(np.asarray(names)[i], np.asarray(views)[i], sd[i], None if error is None else error[i], unit)
+    off = None if error is None else error[i]
+    share = None if share_calibration is None or not np.isfinite(share_calibration[i]).any() else share_calibration[i]
+    texts = _hover(np.asarray(names)[i], np.asarray(views)[i], sd[i], off, share, unit)
     traces = [] if known_xyz is None else [_known(known_xyz)]
-    traces.append(_measured(measured_xyz[i], spread, None if error is None else error[i], texts, unit))
+    colours = _colours(spread, off, share, unit)
+    traces.append(_measured(measured_xyz[i], spread, colours[0], texts))
     lines, menus = [], []
     if true_xyz is not None and i.any():
         chosen = _factor(measured_xyz[i], true_xyz[i])
         factors = [factor for factor in _FACTORS if factor <= 10 * chosen]
         lines = [_lines(measured_xyz[i], true_xyz[i], factor, factor == chosen) for factor in factors]
         menus = [_buttons(len(traces), factors, chosen)]
+    if len(colours) > 1:
+        menus.append(_colour_menu(len(traces) - 1, colours))
     traces += lines
     if cameras:
         traces.append(_cameras(cameras))
@@ -64,20 +71,60 @@ def _known(xyz: Floats) -> Any:
     )
 
 
-def _measured(xyz: Floats, spread: Floats, error: Floats | None, texts: list[str], unit: str) -> Any:
-    value, what = (spread, "stated uncertainty") if error is None else (error, "error")
-    # The top of the scale is a high quantile, so that one blunder does not paint all others alike.
-    top = float(np.nanquantile(value, 0.98)) if np.isfinite(value).any() else 1.0
+class _Colour(NamedTuple):
+    """What the points may be coloured by: its name, its title at the scale, values (n,), and the top of the scale."""
+
+    name: str
+    title: str
+    values: Floats
+    top: float
+
+
+def _colours(spread: Floats, error: Floats | None, share: Floats | None, unit: str) -> list[_Colour]:
+    """What there is to choose from, the usual one first."""
+    lengths = [("stated uncertainty", spread)] if error is None else [("error", error), ("stated uncertainty", spread)]
+    found = [_Colour(name, f"{name}<br>({plain(unit)})", values, _scale_top(values)) for name, values in lengths]
+    if share is not None:
+        title = "share from lack of<br>known points (%)"
+        found.append(_Colour("lack of known points", title, 100 * share, _scale_top(100 * share)))
+    return found
+
+
+def _scale_top(values: Floats) -> float:
+    """A high quantile, so that one blunder does not paint all others alike."""
+    top = float(np.nanquantile(values, 0.98)) if np.isfinite(values).any() else 1.0
+    return top or 1.0
+
+
+def _measured(xyz: Floats, spread: Floats, colour: _Colour, texts: list[str]) -> Any:
     bar = {
-        "title": {"text": f"{what}<br>({plain(unit)})", "side": "top"},
+        "title": {"text": colour.title, "side": "top"},
         "thickness": 14, "len": 0.75, "outlinewidth": 0, "ticks": "outside", "tickformat": ".3~g", "x": 0.9,
     }  # fmt: skip
     marker = {
-        "size": _sizes(spread), "color": value, "colorscale": "Cividis", "cmin": 0.0, "cmax": top or 1.0,
+        "size": _sizes(spread), "color": colour.values, "colorscale": "Cividis", "cmin": 0.0, "cmax": colour.top,
         "colorbar": bar, "line": {"width": 0.5, "color": GREY}, "opacity": 1.0,
     }  # fmt: skip
     name = f"measured points ({len(xyz)})"
     return points_3d(xyz, name, marker=marker, text=texts, hovertemplate="%{text}<extra></extra>")
+
+
+def _colour_menu(trace: int, colours: list[_Colour]) -> dict[str, Any]:
+    """A list to choose the colour of the measured points from."""
+
+    def entry(colour: _Colour) -> dict[str, Any]:
+        look = {
+            "marker.color": [colour.values.tolist()],
+            "marker.cmax": [colour.top],
+            "marker.colorbar.title.text": [colour.title],
+        }
+        return {"label": f"colour: {colour.name}", "method": "restyle", "args": [look, [trace]]}
+
+    return {
+        "type": "dropdown", "direction": "up", "x": 0, "xanchor": "left", "y": 0, "yanchor": "bottom",
+        "font": {"color": INK, "size": 12}, "bgcolor": "#d5dee8", "bordercolor": GREY,
+        "buttons": [entry(colour) for colour in colours],
+    }  # fmt: skip
 
 
 def _lines(start: Floats, true: Floats, factor: int, visible: bool) -> Any:
@@ -127,14 +174,16 @@ def _factor(start: Floats, true: Floats) -> int:
     return next((f for f in _FACTORS if f * typical >= _VISIBLE_SHARE * size), _FACTORS[-1] if typical else 1)
 
 
-def _hover(names: Any, views: Any, sd: Floats, error: Floats | None, unit: str) -> list[str]:
+def _hover(names: Any, views: Any, sd: Floats, error: Floats | None, share: Floats | None, unit: str) -> list[str]:
     texts = []
     for k, name in enumerate(names):
         off = "" if error is None or not np.isfinite(error[k]) else f"error {number(error[k])} {plain(unit)}<br>"
         x, y, z = (number(float(s)) for s in sd[k])
-        texts.append(
-            f"<b>{plain(name)}</b><br>{off}sd x {x}, y {y}, z {z} {plain(unit)}<br>from {_views(int(views[k]))}"
+        lack = (
+            "" if share is None or not np.isfinite(share[k]) else f"<br>{percent(share[k])} from lack of known points"
         )
+        sds = f"sd x {x}, y {y}, z {z} {plain(unit)}{lack}"
+        texts.append(f"<b>{plain(name)}</b><br>{off}{sds}<br>from {_views(int(views[k]))}")
     return texts
 
 

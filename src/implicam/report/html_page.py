@@ -60,7 +60,7 @@ def _draw_plots(data: ReportData) -> dict[str, Markup | None]:
     m = data.measurement
     scene = figures.scene(
         m.xyz, data.sd, names=m.points, views=m.views, unit=data.unit, known_xyz=data.known_xyz, true_xyz=data.true_xyz,
-        error=data.error, cameras=data.cameras,
+        error=data.error, cameras=data.cameras, share_calibration=m.share_calibration,
     )  # fmt: skip
     plots: dict[str, Markup | None] = {"scene": figure_json(scene), "reliability": None, "error": None}
     if data.coverage is not None and data.coverage.overall.n:

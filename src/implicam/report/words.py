@@ -97,9 +97,10 @@ def tiles(data: ReportData) -> list[tuple[str, str, str]]:
     count = ("points measured", f"{measured:,} of {len(m):,}", "the others are listed below, with the reason")
     if measured == len(m):
         count = ("points measured", f"{measured:,}", "none was left out")
+    sources = _sources(data)
     if data.coverage is None or data.coverage.overall.n == 0:
         x, y, z = (number(_median(sd)) for sd in data.sd.T)
-        return [count, (f"stated sd, median ({unit})", f"{x} / {y} / {z}", "in x, y and z")]
+        return [count, (f"stated sd, median ({unit})", f"{x} / {y} / {z}", "in x, y and z"), *sources]
     row = data.coverage.overall
     found = [
         ("rms error, 3D", f"{number(row.rmse)} {unit}", f"the error bars predict {number(row.stated_rms)} {unit}"),
@@ -114,7 +115,18 @@ def tiles(data: ReportData) -> list[tuple[str, str, str]]:
     if math.isfinite(row.rmse_over_limit):
         times = f"{number(row.rmse_over_limit)}×"
         found.append(("rms error over the Cramér–Rao limit", times, "1× is the best these pixels allow on average"))
-    return [*found, count]
+    return [*found, *sources, count]
+
+
+def _sources(data: ReportData) -> list[tuple[str, str, str]]:
+    """The tile of what the uncertainty comes from; none where the method cannot tell."""
+    share = data.measurement.share_calibration
+    if not np.isfinite(share).any():
+        return []
+    variance = data.spread**2
+    noise, lack = (_median(np.sqrt(variance * part)) for part in (1 - share, share))
+    note = f"medians in 3D; more known points could remove the second, {percent(_median(share))} of the variance"
+    return [("from pixel noise / lack of known points", f"{number(noise)} / {number(lack)} {data.unit}", note)]
 
 
 def _judgement(row: Summary) -> str:

@@ -93,6 +93,7 @@ class FittedRig:
             found.p,
             self._reasons(observations, seen, found),
             self.length_unit,
+            share_calibration=found.share,
         )
         cameras = tuple(self.trained.cameras[c] for c in self.cameras)
         table = Table(

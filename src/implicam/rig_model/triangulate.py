@@ -35,12 +35,14 @@ STEPS_TO_MEND, HOPELESS_CHI_SQUARED = 3, 1e4
 
 class Located(NamedTuple):
     """xyz (n, 3) and cov (n, 3, 3), NaN where the point has no position; p (n,) that the views agree, NaN where it
-    cannot be tested; left_out (n, C) the views not used."""
+    cannot be tested; left_out (n, C) the views not used; share (n,) of the variance that perfectly known cameras would
+    not have, eq. (22a)."""
 
     xyz: Floats
     cov: Floats
     p: Floats
     left_out: Bools
+    share: Floats
 
 
 class Labels(NamedTuple):
@@ -89,7 +91,8 @@ def locate(
         Positions in the working frame, NaN where a point has none.
     """
     if len(uv) == 0:
-        return Located(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(uv.shape[:2], dtype=np.bool_))
+        none = np.zeros(uv.shape[:2], dtype=np.bool_)
+        return Located(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), none, np.zeros(0))
     parts = [slice(i, i + POINTS_PER_CHUNK) for i in range(0, len(uv), POINTS_PER_CHUNK)]
 
     def one(part: slice) -> Located:
@@ -110,7 +113,7 @@ def _locate(points: _Seen) -> Located:
             xyz[rows], cov[rows], p[rows], left_out[rows] = better.xyz, better.cov, better.p, better.left_out
     impossible = p < points.settings.min_p_value
     xyz[impossible], cov[impossible] = np.nan, np.nan
-    return Located(xyz, cov, p, left_out)
+    return Located(xyz, cov, p, left_out, points.calibration_share(xyz, cov, seen & ~left_out))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +159,27 @@ class _Seen:
         distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
         p[good] = consistency(distance, seen, degrees)
         return xyz, cov, p
+
+    def calibration_share(self, x: Floats, cov: Floats, seen: Bools) -> Floats:
+        """(n,) share of the variance of positions x (n, 3) that perfectly known cameras would not have, eq. (22a)."""
+        share = np.full(len(x), np.nan)
+        rows = np.flatnonzero(np.isfinite(x).all(axis=1))
+        x, cov, seen, noise = x[rows], cov[rows], seen[rows], self.noise[rows]
+        if self.degrees is None:
+            D = _residuals(self.posterior, x, self.uv[rows], seen)[1]
+        else:
+            linear = self.linearise(rows, x, seen)
+            D, scale = linear.D, noise
+            distance = np.einsum("nci,ncij,ncj->nc", linear.r, linear.each, linear.r)
+            noise = equivalent_normal_noise(noise, distance, seen, self.degrees)
+            if linear.joint is None:  # cov was integrated: its linear counterpart has the same weights as the noise
+                more = (noise**2 - scale**2)[..., None, None] * np.eye(2)
+                weight = np.linalg.inv(np.linalg.inv(linear.each) + np.where(seen[..., None, None], more, 0))
+                cov = invert_stack(np.einsum("ncki,nckl,nclj->nij", D, weight, D))
+        from_noise = invert_stack(np.einsum("ncki,nc,nckj->nij", D, noise**-2.0, D))
+        parts = np.trace(from_noise, axis1=1, axis2=2) / np.trace(cov, axis1=1, axis2=2)
+        share[rows] = np.clip(1 - parts, 0.0, 1.0)
+        return share
 
     def linearise(
         self, rows: NDArray[np.int64], x: Floats, seen: Bools, before: LinearisedViews | None = None
