@@ -46,7 +46,12 @@ MADE_HERE = "# made by implicam demo, which may replace this folder\n"
 
 @dataclass(frozen=True, eq=False)
 class DemoRow:
-    """One line of the demo's table."""
+    """One line of the demo's table.
+
+    Attributes:
+        cameras: The set of cameras, in words.
+        trial: The numbers.
+    """
 
     cameras: str
     trial: Trial
@@ -54,7 +59,20 @@ class DemoRow:
 
 @dataclass(frozen=True, eq=False)
 class Demo:
-    """What the demo made: the table, how many photographs show the ball and how exactly (pixels), and the files."""
+    """What the demo made.
+
+    Attributes:
+        rows: The table.
+        unit: Of lengths.
+        photographs: How many photographs there are.
+        found: In how many the ball was found.
+        typical_sd: How exactly: the median standard uncertainty, pixels.
+        dataset: The folder.
+        calibration: The calibration file.
+        measured: The table of measured positions.
+        report: The HTML page.
+        photographs_seen: The sheet that shows what was found in the photographs.
+    """
 
     rows: list[DemoRow]
     unit: str
@@ -69,7 +87,17 @@ class Demo:
 
 
 def run(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Demo:
-    """Run the demo into `folder`, a new one or that of an earlier demo, which it replaces."""
+    """Run the demo: photograph, detect, calibrate, measure, report.
+
+    Args:
+        folder: A new folder, or that of an earlier demo, which is replaced.
+        seed: Of the rig, the positions and the noise.
+        progress: Called as the work goes on.
+
+    Raises:
+        UsageError: The folder was not made by the demo.
+        MissingExtraError: A library for photographs or for the report is not installed.
+    """
     if not may_replace(folder):
         raise UsageError(
             f"{folder} exists and was not made by the demo.", fix="give another folder: implicam demo OTHER-NAME"
@@ -142,7 +170,11 @@ def _found(*runs: DetectionRun) -> tuple[int, float]:
 
 
 def may_replace(folder: Path) -> bool:
-    """Whether nothing of anybody else stands there: nothing at all, or an earlier demo."""
+    """Whether a folder is empty, missing, or an earlier demo.
+
+    Args:
+        folder: The folder.
+    """
     if not folder.is_dir():
         return not folder.exists()
     truth = folder / "truth.toml"

@@ -26,24 +26,43 @@ class Fits(Protocol):
     """Anything that turns data into a calibration: a calibrator, or a calibration's `refit`."""
 
     def __call__(self, data: Dataset, progress: Progress = silent) -> Calibration:
-        """Fit."""
+        """Fit.
+
+        Args:
+            data: Known points.
+            progress: Called as the fit goes on.
+        """
 
 
 @runtime_checkable
 class KnowsLabelErrors(Protocol):
-    """A calibration that has found how far known positions are off."""
+    """A calibration that has estimated how far known positions are off."""
 
     def known_position_covariance(self, xyz: Floats) -> Floats:
-        """(n, 3, 3) of the error of a known position near each of xyz (n, 3); zero where none seems off."""
+        """The covariance of the error of a known position.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            (n, 3, 3) of a known position near each; zero where none seems off.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """Held-out points, measured, and what their errors say.
 
-    data: the held-out points, rows as in measurement. true_xyz: (n, 3) where they were: the simulated truth where the
-    dataset carries it, else the known positions; `against` says which. known_xyz: (m, 3) the points the calibration
-    learned from (all of them, where each was held out in turn). how: one sentence on what was held out.
+    Attributes:
+        method: Of the calibration.
+        data: The held-out points, rows as in `measurement`.
+        measurement: Their measured positions.
+        true_xyz: (n, 3) where they were: the simulated truth where the dataset carries it, else the known positions.
+        known_xyz: (m, 3) the points that the calibration was fitted to (all of them, where each was held out in turn).
+        coverage: How well covariances agree with errors.
+        how: What was held out, in words.
+        against: What `true_xyz` is, in words.
+        notes: What should be known before the numbers are trusted.
     """
 
     method: str
@@ -58,9 +77,15 @@ class Evaluation:
 
 
 def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -> Evaluation:
-    """Evaluate on the known points that the calibration was not fitted from.
+    """Evaluate a calibration on the known points that it was not fitted to.
 
-    Finding the depth of each point for the regions takes longer than everything else; `regions=False` leaves it out.
+    Args:
+        calibration: The calibration.
+        data: Known points; those that were used in the fit are left out.
+        regions: Whether to group the points by depth and number of views; the depth takes longer than everything else.
+
+    Raises:
+        DatasetError: There are no known positions, the length units differ, or all points were used in the fit.
     """
     _ = data.positions
     if data.length_unit != calibration.data.length_unit:
@@ -93,14 +118,36 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
 
 
 def cross_validate(fit: Fits, data: Dataset, k: int, *, seed: int = 0, progress: Progress = silent) -> Evaluation:
-    """Hold each of `k` random folds out in turn: a fit to the others measures it."""
+    """Hold each of several random folds out in turn: a fit to the others measures it.
+
+    Args:
+        fit: Makes a calibration from data.
+        data: Known points; copies of others are left out.
+        k: How many folds.
+        seed: Of the folds.
+        progress: Called after each fit.
+
+    Raises:
+        FitError: A fit without a fold fails.
+        DatasetError: There are fewer positions than folds, or fewer than two folds.
+    """
     how = f"{k}-fold cross-validation (seed {seed})"
     data, how = _each_once(data, how)
     return _held_out_in_turn(fit, data, list(data.folds(k, seed=seed)), how, progress)
 
 
 def leave_out_shots(fit: Fits, data: Dataset, *, progress: Progress = silent) -> Evaluation:
-    """Hold each shot (a board, a plane) out in turn: a fit to the others measures it."""
+    """Hold each shot (a board, a plane) out in turn: a fit to the others measures it.
+
+    Args:
+        fit: Makes a calibration from data.
+        data: Known points; copies of others are left out.
+        progress: Called after each fit.
+
+    Raises:
+        FitError: A fit without a shot fails.
+        DatasetError: There is only one shot.
+    """
     data, more = _each_once(data, "")
     rounds = list(data.leave_out_shots())
     return _held_out_in_turn(fit, data, rounds, f"each of {len(rounds)} shots left out in turn{more}", progress)
@@ -172,7 +219,15 @@ def _label_covariance(calibration: Calibration, data: Dataset) -> Floats:
 
 
 def known_position_covariance(calibration: Calibration, data: Dataset) -> Floats:
-    """(n, 3, 3) of the errors of known positions: as declared, or else as the calibration has estimated them."""
+    """The covariance of the errors of known positions: as declared, or else as the calibration has estimated them.
+
+    Args:
+        calibration: The calibration.
+        data: Known points.
+
+    Returns:
+        (n, 3, 3); zero where nothing is known of them.
+    """
     if _declared(data) or not isinstance(calibration, KnowsLabelErrors):
         return np.asarray(np.nan_to_num(data.positions.sd)[:, :, None] ** 2 * np.eye(3), dtype=np.float64)
     return calibration.known_position_covariance(data.xyz)

@@ -51,7 +51,17 @@ _MAX_NPY_HEADER_BYTES = 10_000
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside `path`; on leaving without error, rename it into place."""
+    """Give a temporary path beside a path; on leaving without error, rename it into place.
+
+    Args:
+        path: The file to write; missing folders above it are made.
+
+    Yields:
+        The temporary path, an empty file.
+
+    Raises:
+        ImplicamError: There is a folder of this name, or the system refuses to write.
+    """
     path = Path(path)
     must_be_no_folder(path)
     parent = _existing_folder(path.parent)
@@ -67,7 +77,14 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def must_be_no_folder(path: Path) -> None:
-    """ImplicamError where a file is to be written and a folder has its name."""
+    """Check that a file can have a name.
+
+    Args:
+        path: The file to be written.
+
+    Raises:
+        ImplicamError: There is a folder of this name.
+    """
     if path.is_dir():
         raise ImplicamError(
             f"{path} is a folder, and a file is to be written.", fix=f"name a file, {path / 'NAME'} say"
@@ -76,10 +93,21 @@ def must_be_no_folder(path: Path) -> None:
 
 @contextmanager
 def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """`replacing` for a folder. An existing one is refused unless `overwrite`, and is swapped when all is ready.
+    """As `replacing`, for a folder; an existing one is swapped when all is ready.
 
     Where the system cannot swap two folders in one step, a kill in the instant between two renames leaves the old
     folder beside its place; `left_behind` finds it, and nothing is lost.
+
+    Args:
+        path: The folder to write.
+        overwrite: Whether to replace a folder that is not empty.
+
+    Yields:
+        The temporary path, an empty folder.
+
+    Raises:
+        ImplicamError: There is a file of this name, or a folder that must not be replaced, or the system refuses to
+            write.
     """
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
@@ -144,7 +172,14 @@ def _partial_path(path: Path, parent: Path) -> Path:
 
 
 def left_behind(path: Path) -> Path | None:
-    """The old folder that a kill in the middle of `replacing_folder` left beside `path`, or None."""
+    """The old folder that a kill in the middle of `replacing_folder` left behind.
+
+    Args:
+        path: The folder that is missing.
+
+    Returns:
+        The old folder beside it; None where there is none, or `path` exists.
+    """
     path = Path(path).absolute()
     if path.exists() or not path.parent.is_dir():
         return None
@@ -158,7 +193,15 @@ def left_behind(path: Path) -> Path | None:
 
 @contextmanager
 def failing_to_write(what: str, check: str = "the name, the permissions and the free space") -> Iterator[None]:
-    """What the system refuses while it writes `what`, as an ImplicamError that says what to check."""
+    """Turn an error of the system into an ImplicamError that says what to check.
+
+    Args:
+        what: What is written, in words.
+        check: What to check, in words.
+
+    Raises:
+        ImplicamError: The system refuses to write.
+    """
     try:
         yield
     except OSError as error:
@@ -183,27 +226,51 @@ def _flush(path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
+    """Write a text file, whole or not at all.
+
+    Args:
+        path: The file.
+        text: Its content.
+
+    Raises:
+        ImplicamError: It cannot be written.
+    """
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
 
 
 def toml_text(table: Mapping[str, Any]) -> str:
-    """A dict as TOML."""
+    """A dict as TOML.
+
+    Args:
+        table: Plain values.
+    """
     import tomli_w  # late, so that `import implicam` needs NumPy and SciPy only
 
     return tomli_w.dumps(table)
 
 
 def write_zip(file: Path | io.BytesIO, members: Mapping[str, bytes]) -> None:
-    """Write an uncompressed zip whose bytes depend on the members only (no dates)."""
+    """Write an uncompressed zip whose bytes depend on the members only (no dates).
+
+    Args:
+        file: Where to.
+        members: Name -> content.
+    """
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, content in members.items():
             archive.writestr(zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0)), content)
 
 
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Arrays as the bytes of an .npz, the same bytes for the same arrays."""
+    """Arrays as the bytes of an .npz, the same bytes for the same arrays.
+
+    Args:
+        arrays: Name -> array; no objects.
+
+    Raises:
+        ValueError: An array holds objects.
+    """
     members = {}
     for name, array in arrays.items():
         buffer = io.BytesIO()
@@ -228,6 +295,9 @@ def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -
 
     Returns:
         Name of the member -> its content.
+
+    Raises:
+        ImplicamError: What `refuse` makes: the zip is damaged, too large, encrypted, or names a member twice.
     """
     try:
         with zipfile.ZipFile(source if isinstance(source, Path) else io.BytesIO(source)) as archive:
@@ -240,7 +310,11 @@ def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -
 
 
 def inflated_bytes(size: int) -> int:
-    """How many bytes a zip of `size` bytes can plausibly hold."""
+    """How many bytes a zip can plausibly hold.
+
+    Args:
+        size: Of the zip, bytes.
+    """
     return MIN_INFLATED_BYTES + MAX_INFLATION_RATIO * size
 
 
@@ -267,7 +341,19 @@ def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
 
 
 def read_npz(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz; no pickles, and no array larger than the bytes it came in."""
+    """The arrays of an .npz; no pickles, and no array larger than the bytes it came in.
+
+    Args:
+        source: The .npz, or where it is.
+        refuse: Makes the error from a reason.
+        most: How many bytes all arrays may have together; None for what a file of this size can plausibly hold.
+
+    Returns:
+        Name -> array.
+
+    Raises:
+        ImplicamError: What `refuse` makes: as `read_zip`, or an array is damaged or holds objects.
+    """
     members = read_zip(source, refuse, most=most)
     for name in members:
         if not name.endswith(".npy"):

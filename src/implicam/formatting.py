@@ -15,9 +15,18 @@ MAX_DECIMALS = 9
 
 
 def number(value: float | None, digits: int = 3, *, sign: bool = False, minus: str = "-") -> str:
-    """A number with so many significant digits, without an exponent where it is readable; "–" where there is none.
+    """A number with a number of significant digits, for pages and figures.
 
-    For pages and figures. sign: a plus before numbers above zero. minus: the sign before those below.
+    It has no exponent from 1e-4 up to 1e7.
+
+    Args:
+        value: None or not finite for none.
+        digits: Significant digits.
+        sign: Whether to write a plus before numbers above zero.
+        minus: The sign before numbers below zero.
+
+    Returns:
+        The text; "–" where there is no number.
     """
     if value is None or not math.isfinite(value):
         return "–"
@@ -30,9 +39,16 @@ def number(value: float | None, digits: int = 3, *, sign: bool = False, minus: s
 
 
 def decimal_number(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, never in powers of ten where people would not write them; "-" for none.
+    """A number with a number of significant digits, for terminals: ASCII, without an exponent down to 1e-8.
 
-    For terminals: ASCII only. A number that rounds up to the next power of ten keeps a digit more (9.996 is 10.00).
+    A number that rounds up to the next power of ten keeps a digit more (9.996 is 10.00).
+
+    Args:
+        value: The number.
+        digits: Significant digits.
+
+    Returns:
+        The text; "-" where the number is not finite.
     """
     if not math.isfinite(value):
         return "-"
@@ -45,14 +61,22 @@ def decimal_number(value: float, digits: int = 3) -> str:
 
 
 def percent(share: float | None, decimals: int = 0, *, none: str = "–") -> str:
-    """A share of one in per cent; `none` where there is none."""
+    """A share in per cent.
+
+    Args:
+        share: Of one; None or not finite for none.
+        decimals: After the point.
+        none: What to return where there is none.
+    """
     return none if share is None or not math.isfinite(share) else f"{100 * share:.{decimals}f} %"
 
 
 def json_safe(value: Any, digits: int | None = None) -> Any:
-    """Tables and lists as JSON has them: keys are text, and numbers that do not exist are null.
+    """Tables and lists as JSON has them: keys are text, and numbers that are not finite are null.
 
-    digits: how many significant ones a float keeps; all, unless given.
+    Args:
+        value: Mappings, lists, tuples and plain values, nested.
+        digits: Significant digits that a float keeps; None for all.
     """
     if isinstance(value, Mapping):
         return {str(key): json_safe(item, digits) for key, item in value.items()}
@@ -66,7 +90,14 @@ def json_safe(value: Any, digits: int | None = None) -> Any:
 
 
 def json_default(value: Any) -> Any:
-    """What `json.dumps` cannot write itself: NumPy's numbers and arrays, and paths; TypeError for anything else."""
+    """What `json.dumps` cannot write itself: NumPy's numbers and arrays, and paths.
+
+    Args:
+        value: The value.
+
+    Raises:
+        TypeError: It is anything else.
+    """
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     if isinstance(value, Path):
@@ -78,9 +109,9 @@ def list_some(names: Sequence[str], most: int = 5, total: int | None = None) -> 
     """The first few names of a list, with commas, and how many more there are.
 
     Args:
-        names: all of them, or as many as are told.
-        most: how many are told.
-        total: how many there are, where `names` are not all.
+        names: All of them, or as many as are known.
+        most: How many are written.
+        total: How many there are, where `names` are not all.
     """
     more = (len(names) if total is None else total) - min(len(names), most)
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

@@ -30,13 +30,17 @@ PATTERN = "{camera}/{shot}"
 
 
 def opencv() -> Any:
-    """The module cv2, or a MissingExtraError that says how to get it."""
+    """The module cv2.
+
+    Raises:
+        MissingExtraError: It is not installed; says how to get it.
+    """
     return import_extra("cv2", "images", "reading and writing photographs")
 
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """For many pictures side by side: OpenCV starts no threads of its own, and does not write on the screen."""
+    """For many pictures side by side: OpenCV starts no threads of its own, and prints nothing."""
     cv2 = opencv()
     threads, level = cv2.getNumThreads(), cv2.utils.logging.getLogLevel()
     cv2.setNumThreads(1)
@@ -49,10 +53,18 @@ def one_thread_each() -> Iterator[None]:
 
 
 def read_picture(path: Path) -> Grey:
-    """A photograph as grey values from 0 to 1: PNG, JPEG or TIFF, grey or colour, 8 or 16 bits.
+    """Read a photograph: PNG, JPEG or TIFF, grey or colour, 8 or 16 bits.
 
-    ImageError for what cannot be read, is cut off, or has another form. A rotation that only the file's EXIF tag asks
-    for is not done: pixels are those of the sensor.
+    A rotation that only the file's EXIF tag asks for is not done: pixels are those of the sensor.
+
+    Args:
+        path: The file.
+
+    Returns:
+        (height, width) grey values from 0 to 1.
+
+    Raises:
+        ImageError: It cannot be read, is cut off, or has another form.
     """
     cv2 = opencv()
     data = _read_bytes(path)
@@ -131,7 +143,17 @@ def _to_grey(image: NDArray[Any], path: Path) -> Grey:
 
 
 def write_picture(path: Path, picture: NDArray[Any], *, bits: int = 8) -> None:
-    """Write a grey picture from 0 to 1 (or a uint8 array as it is, colour as blue, green, red); the ending chooses."""
+    """Write a picture; the ending of the file chooses its format.
+
+    Args:
+        path: The file; it is replaced whole.
+        picture: (height, width) grey from 0 to 1, or uint8 as it is; colour is (height, width, 3) blue, green, red.
+        bits: 8, or anything else for 16, of a picture that is not uint8.
+
+    Raises:
+        UsageError: The ending is none of `ENDINGS`.
+        ImplicamError: The file cannot be written.
+    """
     cv2 = opencv()
     if picture.dtype != np.uint8:
         most, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
@@ -147,7 +169,14 @@ def write_picture(path: Path, picture: NDArray[Any], *, bits: int = 8) -> None:
 
 
 def eight_bit(picture: Grey) -> NDArray[np.uint8]:
-    """The picture as OpenCV's detectors want it: its darkest and brightest per mille become 0 and 255."""
+    """The picture as OpenCV's detectors need it: its darkest and brightest per mille become 0 and 255.
+
+    Args:
+        picture: (height, width) grey.
+
+    Returns:
+        (height, width).
+    """
     sample = picture[::7, ::7]
     low, high = np.quantile(sample, (0.001, 0.999))
     scale = 255 / max(float(high - low), 1e-3)
@@ -156,10 +185,16 @@ def eight_bit(picture: Grey) -> NDArray[np.uint8]:
 
 
 def blank(picture: Grey) -> str:
-    """What a picture without anything in it is: "black", "white" or "uniformly grey"; empty where there is something.
+    """What a picture without anything in it is.
 
-    The means of blocks of 8 x 8 pixels differ by no more than the noise from pixel to pixel makes them differ: that is
-    the root mean square of Immerkaer's operator (1996); the few edges of a small target hardly enlarge it.
+    It is blank where the means of blocks of 8 x 8 pixels differ by no more than the noise from pixel to pixel explains.
+    The noise is the root mean square of Immerkaer's operator (1996); the few edges of a small target hardly enlarge it.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+
+    Returns:
+        "black", "white" or "uniformly grey"; empty where there is something in it.
     """
     cv2 = opencv()
     height, width = picture.shape
@@ -175,19 +210,22 @@ def blank(picture: Grey) -> str:
 
 
 def find_pictures(folder: Path, pattern: str = PATTERN, cameras: Sequence[str] = ()) -> dict[str, dict[str, Path]]:
-    """The files by camera and shot: {camera: {shot: path}}, both sorted as people count (2 before 10).
+    """The files by camera and shot, both in natural order (2 before 10).
 
     Hidden files and folders are left out.
 
     Args:
-        folder: where to look.
-        pattern: the path below `folder` with {camera} and {shot}, without the ending: "{camera}/{shot}" (a folder per
+        folder: Where to look.
+        pattern: The path below `folder` with {camera} and {shot}, without the ending: "{camera}/{shot}" (a folder per
             camera), "{shot}_{camera}", ...
-        cameras: names to look for first, as in "cam_1_003" it is not clear where the camera ends.
+        cameras: Names to look for first, because in "cam_1_003" it is not clear where the camera ends.
+
+    Returns:
+        {camera: {shot: path}}.
 
     Raises:
-        UsageError: the pattern lacks {camera} or {shot}.
-        ImageError: there are no pictures, or two files claim one place.
+        UsageError: The pattern lacks {camera} or {shot}.
+        ImageError: There are no pictures, or two files are the same camera and shot.
     """
     expression = _compile_pattern(pattern, cameras)
     if not folder.is_dir():
@@ -230,7 +268,11 @@ def _walk_pictures(folder: Path, depth: int) -> Iterator[Path]:
 
 
 def in_order(names: Sequence[str] | dict[str, Any]) -> list[str]:
-    """Names as people count: img2 before img10."""
+    """Names in natural order: img2 before img10.
+
+    Args:
+        names: In any order.
+    """
 
     def key(name: str) -> tuple[list[str | int], str]:
         parts = re.split(r"(\d+)", name)  # text, digits, text, digits, ..., text

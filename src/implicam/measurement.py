@@ -27,15 +27,19 @@ DOUBTFUL = "doubtful: the table as a whole contradicts the calibration"
 class Measurement:
     """Positions of n points, in the world frame and length unit of the calibration.
 
-    xyz: (n, 3), NaN where the point could not be measured; reason then says why. Of a point that was
-    measured it names the views that were left out, else it is empty.
-    cov: (n, 3, 3) covariance of the *position*, everything included: pixel noise of this measurement, lack of
-    calibration data, parameters. views: (n,) number of views used. consistency: (n,) p-value of the chi-squared test
-    that the views agree, NaN where it cannot be tested.
-    alarm: what is wrong with the table as a whole, in a sentence: the rig is not the one that was calibrated. Then no
-    number of it is to be trusted, and every reason begins with DOUBTFUL. Empty where nothing is.
-    share_calibration: (n,) from 0 to 1, the share of the variance (trace of cov) that more known points could remove;
-    the rest is the pixel noise of this measurement. NaN where the method cannot tell them apart.
+    Attributes:
+        points: (n,) names.
+        xyz: (n, 3); NaN where the point could not be measured.
+        cov: (n, 3, 3) covariance of the *position*, everything included: pixel noise of this measurement, lack of
+            calibration data, parameters.
+        views: (n,) number of views used.
+        consistency: (n,) p-value of the chi-squared test that the views agree; NaN where it cannot be tested.
+        reason: (n,) why a point was not measured; of a measured one, which views were left out, or empty.
+        length_unit: Of the positions.
+        alarm: What is wrong with the table as a whole, in a sentence: the rig is not the one that was calibrated. Then
+            no number of it can be trusted, and every reason begins with `DOUBTFUL`. Empty where nothing is wrong.
+        share_calibration: (n,) from 0 to 1, the share of the variance (trace of cov) that more known points could remove;
+            the rest is the pixel noise of this measurement. NaN where the method cannot tell them apart.
     """
 
     points: Names
@@ -64,13 +68,17 @@ class Measurement:
 
     @property
     def own_reason(self) -> Names:
-        """(n,) the reasons without what an alarm puts before them."""
+        """(n,) the reasons without what an alarm adds in front of them."""
         return np.array(
             [str(reason).removeprefix(DOUBTFUL).removeprefix("; ") for reason in self.reason], dtype=np.str_
         )
 
     def with_alarm(self, alarm: str) -> Measurement:
-        """The same, every row marked as doubtful; itself where there is no alarm."""
+        """The same measurement with every row marked as doubtful.
+
+        Args:
+            alarm: What is wrong, in a sentence; empty for none, which returns the measurement itself.
+        """
         if not alarm:
             return self
         reasons = [f"{DOUBTFUL}; {reason}" if reason else DOUBTFUL for reason in map(str, self.own_reason)]
@@ -78,11 +86,18 @@ class Measurement:
 
     @property
     def sd(self) -> Floats:
-        """(n, 3) standard uncertainties."""
+        """(n, 3) standard uncertainties of x, y and z."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
 
     def write_csv(self, path: str | Path) -> None:
-        """Write measured.csv: every point keeps its row; one that was not measured has empty numbers and a reason."""
+        """Write measured.csv: every point keeps its row; one that was not measured has empty numbers and a reason.
+
+        Args:
+            path: The file; it is replaced whole.
+
+        Raises:
+            ImplicamError: It cannot be written.
+        """
         buffer = io.StringIO(newline="")
         writer = csv.writer(buffer, lineterminator="\n")
         writer.writerow(MEASURED_COLUMNS)

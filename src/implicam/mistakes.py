@@ -1,8 +1,8 @@
-"""Mistakes that people make with known points, and that the numbers themselves give away, named before all else.
+"""Mistakes that people make with known points, and that can be seen in the numbers; they are named before all else.
 
 Positions partly in another unit, and views that belong to other rows: of most cameras, and then the positions are in
-another order, or of some, whose rows row_order.py looks at one by one. No such sentence is a guess: with the mistake
-undone the numbers fit, and as they are they do not.
+another order, or of some, whose rows row_order.py checks one camera at a time. None of these sentences is a guess: with
+the mistake corrected the numbers fit, and without they do not.
 """
 
 from __future__ import annotations
@@ -35,8 +35,13 @@ WIDTH_RATIO_RANGE = (0.1, 3.0)
 
 
 class Finding(NamedTuple):
-    """Something that speaks against a calibration, with its cure; grave where no number can be right. cameras: those it
-    is about, where it is about some."""
+    """Something that speaks against a calibration, with its cure.
+
+    Attributes:
+        grave: Whether no number can be right.
+        reason: What it is and what to do, in sentences.
+        cameras: The cameras it is about, where it is about some.
+    """
 
     grave: bool
     reason: str
@@ -44,7 +49,14 @@ class Finding(NamedTuple):
 
 
 def mistakes_in(data: Dataset) -> list[Finding]:
-    """What is plainly wrong with the known points; empty where nothing is, or where there are none."""
+    """What is plainly wrong with known points.
+
+    Args:
+        data: The dataset; its copies are left out.
+
+    Returns:
+        Findings; empty where nothing is wrong, or there are no known points.
+    """
     if data.known is None:
         return []
     data = without_copies(data)
@@ -53,7 +65,16 @@ def mistakes_in(data: Dataset) -> list[Finding]:
 
 @contextmanager
 def mistakes_named(data: Dataset) -> Iterator[None]:
-    """Where a fit fails: a mistake of the whole rig is its reason; those of single cameras stand beside its reasons."""
+    """Add to the error of a failing fit which mistake in the data causes it.
+
+    A mistake of the whole rig replaces the reason of the error; those of single cameras are added to it.
+
+    Args:
+        data: The known points that are fitted to.
+
+    Raises:
+        FitError: The fit failed.
+    """
     try:
         yield
     except FitError as error:
@@ -138,7 +159,12 @@ def _other_rows(data: Dataset) -> Iterator[Finding]:
 
 
 def of_rows(camera: str, why: str) -> Finding:
-    """What row_order.py says of one camera, with the cure."""
+    """What is wrong with the rows of one camera, as a finding.
+
+    Args:
+        camera: Its name.
+        why: What is wrong, in words.
+    """
     return Finding(
         False,
         f"{camera}: {why}. Look at its pictures and the order of its rows, or leave it out with --without {camera}.",

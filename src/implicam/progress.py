@@ -9,8 +9,20 @@ class Progress(Protocol):
     """Called as work goes on; `done` of `total` steps of `what` are finished."""
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Take note."""
+        """Take note of a step.
+
+        Args:
+            what: The work, in words.
+            done: Steps that are finished.
+            total: Steps in all.
+        """
 
 
 def silent(what: str, done: int, total: int) -> None:
-    """Report to nobody."""
+    """Report nothing.
+
+    Args:
+        what: The work, in words.
+        done: Steps that are finished.
+        total: Steps in all.
+    """

@@ -1,9 +1,9 @@
 """Why no camera sees the known points at these pixels: rows that do not belong together, by one camera's own views.
 
 A video that starts a picture late, a frame that was dropped, a row that slipped in a spreadsheet, a table read from its
-end, a camera that was knocked half-way, pictures of two sizes: of each a plain camera tells, if it fits well once the
-rows are put right. A linear one is enough: it needs no guess, and what a lens bends is little beside what a wrong row
-is off by. What a whole rig says is in mistakes.py.
+end, a camera that was moved half-way, pictures of two sizes: each shows in a linear camera, if it fits well once the
+rows are corrected. A linear one is enough: it needs no guess, and lens distortion is small beside the error of a wrong
+row. What concerns a whole rig is in mistakes.py.
 """
 
 from __future__ import annotations
@@ -47,25 +47,41 @@ MAX_ROWS = 1000
 
 
 class Order(NamedTuple):
-    """The pixels belong to other rows. rows: by how many they are late, below zero early, or REVERSED; fit: how well
-    they fit once that is undone, in words."""
+    """The order that a camera's pixels are in, where it is not that of the points.
+
+    Attributes:
+        rows: By how many rows they are late, below zero early; or `REVERSED`.
+        fit: How well they fit once that is corrected, in words.
+    """
 
     rows: int
     fit: str
 
     @property
     def how(self) -> str:
-        """What they are, in words."""
+        """The order in words."""
         return "in the order from the last row to the first" if self.rows == REVERSED else describe_shift(self.rows)
 
 
 def describe_shift(rows: int) -> str:
-    """A number of rows in words, of which late ones are above zero."""
+    """A number of rows in words.
+
+    Args:
+        rows: Above zero for late, below for early.
+    """
     return f"{abs(rows)} row{'s' * (abs(rows) > 1)} {'late' if rows > 0 else 'early'}"
 
 
 def shift_rows(values: Floats, rows: int) -> Floats:
-    """Each row (n, ...) with the values of the one `rows` after it; NaN where there is none."""
+    """Give each row the values of a later one.
+
+    Args:
+        values: (n, ...).
+        rows: How many rows later; below zero earlier.
+
+    Returns:
+        (n, ...), NaN where there is no such row.
+    """
     out = np.full_like(values, np.nan)
     if abs(rows) >= len(values):
         return out
@@ -77,7 +93,11 @@ def shift_rows(values: Floats, rows: int) -> Floats:
 
 
 def describe_moved_camera(row: int) -> str:
-    """What is said of a camera that moved before the row of this number, counted from zero."""
+    """A camera that moved, in words, with the cure.
+
+    Args:
+        row: The first row after the move, from zero.
+    """
     return (
         f"from row {row + 1} on it sees like another camera: was it moved, turned or refocused there? Then take the "
         "known points before it, or those after it"
@@ -85,8 +105,15 @@ def describe_moved_camera(row: int) -> str:
 
 
 def order_of(points: Floats, uv: Floats) -> Order | None:
-    """Of known points (n, 3) in the order they were seen in, at pixels (n, 2), NaN where not seen: the order that the
-    pixels are in; None where it is that of the points."""
+    """The order that a camera's pixels are in.
+
+    Args:
+        points: (n, 3) known points, in the order in which they were seen.
+        uv: (n, 2) pixels of one camera, NaN where not seen.
+
+    Returns:
+        The order; None where it is that of the points, or cannot be told.
+    """
     ways = {rows: shift_rows(uv, rows)[:MAX_ROWS] for rows in _shifts()} | {REVERSED: uv[::-1][:MAX_ROWS]}
     points, uv = points[:MAX_ROWS], uv[:MAX_ROWS]
     as_is = _errors_seen(points, uv, at_best=True)  # wrong detections alone must not make the order look wrong
@@ -117,18 +144,37 @@ def order_of(points: Floats, uv: Floats) -> Order | None:
 
 
 def describe_order(order: Order) -> str:
-    """Of one camera."""
+    """The order of one camera in words.
+
+    Args:
+        order: As of `order_of`.
+    """
     return f"its pixels are {order.how}: put right {order.fit}"
 
 
 def change_of(points: Floats, uv: Floats) -> str:
-    """Of points and pixels as of `order_of`: what is wrong from some row on, or in some rows, in words; empty where
-    nothing is."""
+    """What is wrong with a camera from some row on, or in some rows.
+
+    Args:
+        points: (n, 3) known points, in the order in which they were seen.
+        uv: (n, 2) pixels of one camera, NaN where not seen.
+
+    Returns:
+        It in words; empty where nothing is wrong.
+    """
     return _repeated(points, uv) or _in_two_parts(points, uv)
 
 
 def what_is_wrong(points: Floats, uv: Floats) -> str:
-    """The same of a camera that misses its known points, for whatever reason that its rows show."""
+    """What is wrong with the rows of a camera that misses its known points: their order, or `change_of`.
+
+    Args:
+        points: (n, 3) known points, in the order in which they were seen.
+        uv: (n, 2) pixels of one camera, NaN where not seen.
+
+    Returns:
+        It in words; empty where the rows show nothing.
+    """
     order = order_of(points, uv)
     return change_of(points, uv) if order is None else describe_order(order)
 

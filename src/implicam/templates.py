@@ -20,15 +20,15 @@ def render(package: str, name: str, **values: Any) -> str:
     """Fill a template.
 
     Args:
-        package: the package whose folder `templates` has the file.
-        name: of the file. In an .html file every value is escaped, so that a name with tags in it stays text.
-        values: what the template calls by these names; one that is missing is an error, not an empty place.
+        package: The package whose folder `templates` has the file.
+        name: Of the file. In an .html file every value is escaped, so that a name with tags in it stays text.
+        values: What the template calls by these names; one that is missing is an error, not an empty place.
 
     Returns:
         The text.
 
     Raises:
-        MissingExtraError: without Jinja2.
+        MissingExtraError: Jinja2 is not installed.
     """
     jinja2 = import_extra("jinja2", "report", "a report")
     environment = jinja2.Environment(

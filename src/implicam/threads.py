@@ -31,7 +31,11 @@ def cores() -> int:
 
 @contextmanager
 def at_most(count: int) -> Iterator[None]:
-    """Let the work inside use so many cores at most; what goes on in other threads meanwhile keeps its own number."""
+    """Limit the cores of the work inside; work in other threads keeps its own number.
+
+    Args:
+        count: The largest number.
+    """
     token = _MOST_CORES.set(count)
     try:
         yield
@@ -41,7 +45,11 @@ def at_most(count: int) -> Iterator[None]:
 
 @contextmanager
 def blas_threads(count: int) -> Iterator[None]:
-    """Limit every BLAS to `count` threads for a while."""
+    """Limit the threads of every BLAS library for the work inside.
+
+    Args:
+        count: The largest number.
+    """
     with _controller(len(sys.modules)).limit(limits=count, user_api="blas"):
         yield
 
@@ -56,10 +64,20 @@ def _controller(modules: int) -> Any:
 
 
 def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """`work` on each item, results in order, on all cores.
+    """Do some work on each item, on all cores.
 
     It helps where NumPy works, or LAPACK through implicam.gp.linalg: they release the interpreter. SciPy's own wrappers
     of LAPACK do not.
+
+    Args:
+        work: Called with each item, in threads.
+        items: What to work on.
+
+    Returns:
+        The results, in the order of the items.
+
+    Raises:
+        Exception: The first error of `work`.
     """
     tasks = list(items)
     workers = max(1, min(len(tasks), cores()))

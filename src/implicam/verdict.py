@@ -89,9 +89,14 @@ all, is off by 1."""
 class HeldOut:
     """Known points measured by fits that had not seen them; lengths in the dataset's unit.
 
-    points: measured with all their views. rms, stated: their error, and what the error bars say it is. nees: mean
-    without the worst TRIMMED_SHARE, right near 2.6. inside: share in the 95 % ellipsoids. contradicting: share of all
-    that were held out whose views contradict each other. how: in words.
+    Attributes:
+        points: How many were measured with all their views.
+        rms: Their root mean square error in 3D.
+        stated: What the error bars say it should be.
+        nees: Mean of e' C^-1 e without the worst `TRIMMED_SHARE`; near 2.6 is right.
+        inside: The share in their 95 % ellipsoids.
+        contradicting: The share of all held-out points whose views contradict each other.
+        how: How they were held out, in words.
     """
 
     points: int
@@ -105,7 +110,13 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Verdict:
-    """word: "usable", "doubtful" or "not usable"; reasons: sentences with their cures, the gravest first."""
+    """Whether a calibration is to be used.
+
+    Attributes:
+        word: "usable", "doubtful" or "not usable".
+        reasons: Sentences with their cures, the gravest first.
+        held_out: Known points that were held out; None where none could be.
+    """
 
     word: str
     reasons: tuple[str, ...]
@@ -120,7 +131,12 @@ class Verdict:
 
 
 def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
-    """Judge a calibration by its known points: a few fits without some of them, and what the data show."""
+    """Judge a calibration by its known points: a few fits without some of them, and what the data show.
+
+    Args:
+        calibration: The calibration.
+        progress: Called before each fit.
+    """
     held_out, failed = _held_out(calibration, progress)
     sds = list(_of_stated_sds(calibration))
     cure = _SDS if _declared(calibration.data) and not sds else _LOOK
