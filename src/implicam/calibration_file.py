@@ -59,7 +59,7 @@ _UPGRADES: dict[int, Callable[[dict[str, Any], dict[str, NDArray[Any]]], None]] 
 
 
 class Savable(Protocol):
-    """What a calibration must tell of itself to be saved."""
+    """What a calibration must offer to be saved."""
 
     @property
     def method(self) -> str:
@@ -67,7 +67,7 @@ class Savable(Protocol):
 
     @property
     def data(self) -> Dataset:
-        """The data it was fitted from."""
+        """The data it was fitted to."""
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Its options as a readable table, and its arrays."""
@@ -78,7 +78,15 @@ class Savable(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """What a calibration file holds: everything that the method needs to restore itself."""
+    """What a calibration file holds: everything that the method needs to restore itself.
+
+    Attributes:
+        path: The file.
+        method: Its name.
+        data: The data that the calibration was fitted to.
+        options: The method's readable table.
+        arrays: The method's arrays, by name.
+    """
 
     path: Path
     method: str
@@ -88,7 +96,16 @@ class Contents:
 
 
 def save(calibration: Savable, path: str | Path, verdict: Mapping[str, Any] | None = None) -> None:
-    """Write the calibration, whole or not at all; verdict: what `judge` says of it, for the readable table."""
+    """Write a calibration, whole or not at all.
+
+    Args:
+        calibration: The calibration.
+        path: The file; it is replaced.
+        verdict: What `judge` says of it, for the readable table; None for nothing.
+
+    Raises:
+        ImplicamError: The file cannot be written.
+    """
     path = Path(path)
     method_table, method_arrays = calibration.state()
     arrays = {_DATA + name: array for name, array in arrays_from_dataset(calibration.data).items()}
@@ -137,7 +154,14 @@ def package_version() -> str:
 
 
 def read(path: str | Path) -> Contents:
-    """Read a calibration file; CalibrationFileError for anything that is not one, whole and unchanged."""
+    """Read a calibration file.
+
+    Args:
+        path: The file.
+
+    Raises:
+        CalibrationFileError: It is not a calibration file, not whole, changed, or from a newer version.
+    """
     path = Path(path)
     members = _members(path)
     table = _table(path, members[TOML])
@@ -159,7 +183,14 @@ def read(path: str | Path) -> Contents:
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Turn whatever a wrong value causes while a calibration is restored into a CalibrationFileError."""
+    """Turn whatever a wrong value causes while a calibration is restored into a CalibrationFileError.
+
+    Args:
+        path: The file that it is restored from.
+
+    Raises:
+        CalibrationFileError: A value was missing or wrong.
+    """
     try:
         yield
     except ImplicamError as error:
@@ -171,7 +202,14 @@ def refusing(path: Path) -> Iterator[None]:
 
 
 def describe(path: str | Path) -> dict[str, Any]:
-    """What calibration.toml says, without loading the arrays."""
+    """The readable table of a calibration file, without loading the arrays.
+
+    Args:
+        path: The file.
+
+    Raises:
+        CalibrationFileError: It is not a calibration file, or from a newer version.
+    """
     path = Path(path)
     return _table(path, _members(path)[TOML])
 
@@ -215,7 +253,12 @@ def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[
 
 
 def refusal(path: Path, reason: str) -> CalibrationFileError:
-    """The error for a file that cannot be used, with the reason."""
+    """The error for a file that cannot be used.
+
+    Args:
+        path: The file.
+        reason: Why, in words.
+    """
     return CalibrationFileError(
         f"{path} is not a usable calibration file.",
         why=reason,

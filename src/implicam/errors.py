@@ -22,7 +22,13 @@ from types import ModuleType
 
 
 class ImplicamError(Exception):
-    """What happened; `why`, the cause where we know it; `fix`, what the reader can do about it."""
+    """An error that says what happened, why, and how to fix it.
+
+    Attributes:
+        what: What happened.
+        why: The cause, where it is known.
+        fix: What the reader can do about it.
+    """
 
     def __init__(self, what: str, *, why: str = "", fix: str = "") -> None:
         super().__init__(what, why, fix)
@@ -70,13 +76,30 @@ class UsageError(ImplicamError):
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """`" (did you mean 'cam1'?)"` where a known word is close, else nothing."""
+    """A hint at a known word that is close to another.
+
+    Args:
+        word: That was given.
+        known: The words that would do.
+
+    Returns:
+        `" (did you mean 'cam1'?)"`; empty where no word is close.
+    """
     close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def import_extra(module: str, extra: str, purpose: str) -> ModuleType:
-    """Import an optional library late, or say which extra brings it."""
+    """Import an optional library when it is needed.
+
+    Args:
+        module: The dotted name to import.
+        extra: The extra of implicam that brings it.
+        purpose: What needs it, in words.
+
+    Raises:
+        MissingExtraError: It is not installed; says which extra brings it.
+    """
     try:
         return importlib.import_module(module)
     except ImportError as error:

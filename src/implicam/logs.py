@@ -22,7 +22,11 @@ _FORMAT = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 @contextmanager
 def log_to_stream(stream: TextIO) -> Iterator[None]:
-    """Show what is logged, without times, while the block runs."""
+    """Show what is logged, without times, while the block runs.
+
+    Args:
+        stream: Where to.
+    """
     handler = logging.StreamHandler(stream)
     handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
     with _handling(handler):
@@ -34,8 +38,8 @@ def log_to_file(path: Path, begin: str) -> Iterator[None]:
     """Append what is logged to a file while the block runs; an error that ends the block goes there with its traceback.
 
     Args:
-        path: the file; its folder is made.
-        begin: the first line, such as the command.
+        path: The file; its folder is made.
+        begin: The first line, such as the command.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     handler = RotatingFileHandler(path, maxBytes=MAX_BYTES, backupCount=1, encoding="utf-8", delay=True)

@@ -38,8 +38,8 @@ class Measurement:
         length_unit: Of the positions.
         alarm: What is wrong with the table as a whole, in a sentence: the rig is not the one that was calibrated. Then
             no number of it can be trusted, and every reason begins with `DOUBTFUL`. Empty where nothing is wrong.
-        share_calibration: (n,) from 0 to 1, the share of the variance (trace of cov) that more known points could remove;
-            the rest is the pixel noise of this measurement. NaN where the method cannot tell them apart.
+        share_calibration: (n,) from 0 to 1, the share of the variance (trace of cov) that more known points could
+            remove; the rest is the pixel noise of this measurement. NaN where the method cannot tell them apart.
     """
 
     points: Names

@@ -20,9 +20,9 @@ class Option(NamedTuple):
     """An option of the command line that a part brings with it.
 
     Attributes:
-        help: what `--help` says of it.
-        metavar: what stands for its value there.
-        minimum: the least value, of a number.
+        help: What `--help` says of it.
+        metavar: What stands for its value there.
+        minimum: The least value, of a number.
     """
 
     help: str
@@ -34,10 +34,10 @@ class Registry(Mapping[str, Part]):
     """Parts of one kind by name, in the order they were added; entry points of other packages come last.
 
     Args:
-        kind: what an error calls a part: "lens", "robot".
-        parts: name -> part.
-        group: the group of entry points that other packages add parts under, such as "implicam.lenses". One is
-            imported when it is asked for, not before.
+        kind: What an error calls a part: "lens", "robot".
+        parts: Name -> part.
+        group: The group of entry points that other packages add parts under, such as "implicam.lenses". One is imported
+            when it is asked for, not before.
     """
 
     def __init__(self, kind: str, parts: Mapping[str, Part], group: str) -> None:
@@ -47,8 +47,12 @@ class Registry(Mapping[str, Part]):
     def register(self, name: str, part: Part) -> None:
         """Add a part.
 
+        Args:
+            name: Its name.
+            part: The part.
+
         Raises:
-            ValueError: the name is taken, or holds a colon, which separates a name from its variant.
+            ValueError: The name is empty, taken, or holds a colon, which separates a name from its variant.
         """
         if name in self._parts or ":" in name or not name:
             raise ValueError(f"{name!r} cannot name a {self.kind}: it is empty, taken, or has a colon")
@@ -57,8 +61,14 @@ class Registry(Mapping[str, Part]):
     def find(self, spec: str) -> tuple[Part, str]:
         """The part that a spec names, and what the spec says after the first colon: "ur:10.0.0.2" -> (ur, "10.0.0.2").
 
+        Args:
+            spec: A name, or a name, a colon and a variant.
+
+        Returns:
+            The part, and the variant; empty where the spec has none.
+
         Raises:
-            UsageError: there is no part of this name; the error says which there are.
+            UsageError: There is no part of this name; the error says which there are.
         """
         name, _, variant = spec.partition(":")
         if name not in self:

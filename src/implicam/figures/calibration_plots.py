@@ -1,4 +1,4 @@
-"""Do the error bars tell the truth? Two figures, each with the line an honest instrument follows."""
+"""Do the error bars tell the truth? Two figures, each with the line on which right error bars lie."""
 
 from __future__ import annotations
 
@@ -17,7 +17,17 @@ TOOLBAR_PX = 36
 
 
 def reliability(coverage: Coverage) -> Any:
-    """Observed against nominal coverage with 95 % intervals, in per cent: the 3D ellipsoid, and all axes together."""
+    """Observed against nominal coverage in per cent, with 95 % intervals: the 3D ellipsoid, and all axes together.
+
+    Args:
+        coverage: Its overall row is drawn.
+
+    Returns:
+        A Plotly figure.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
+    """
     go = graph_objects()
     levels = coverage.overall.levels
     nominal = [100 * level.nominal for level in levels]
@@ -49,10 +59,23 @@ def reliability(coverage: Coverage) -> Any:
 
 
 def error_against_sd(error: Floats, spread: Floats, *, names: Names | Sequence[str], unit: str) -> Any:
-    """Each point's error (n,) against its stated uncertainty `spread` (n,), both distances in 3D, on log axes.
+    """Each point's error against its stated uncertainty, both distances in 3D, on log axes.
 
-    `spread` is sqrt(trace of the covariance). Lines: error = 1, 2, 3 times the stated uncertainty. An instrument that
-    knows itself has its cloud along the lines: more than half below the first, hardly any above the third.
+    Lines: error = 1, 2, 3 times the stated uncertainty. With right error bars, more than half of the points lie below
+        the
+    first, hardly any above the third.
+
+    Args:
+        error: (n,) in `unit`; points whose error is not a positive number are not drawn.
+        spread: (n,) sqrt(trace of the covariance), in `unit`.
+        names: (n,) of the points.
+        unit: Of length.
+
+    Returns:
+        A Plotly figure.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
     """
     go = graph_objects()
     i = np.isfinite(error) & np.isfinite(spread) & (error > 0) & (spread > 0)

@@ -1,4 +1,4 @@
-"""Methods compared, for print: error, honesty and time against the number of known points, or what was left out."""
+"""Methods compared, for print: error, coverage and time against the number of known points, or what was left out."""
 
 from __future__ import annotations
 
@@ -20,15 +20,24 @@ Row = Mapping[str, Any]
 
 
 def compare_figure(table: Iterable[Row], *, unit: str) -> Any:
-    """A matplotlib Figure of methods side by side; save with `figure.savefig(path)`, .png, .pdf or .svg.
+    """Methods side by side.
 
-    table: one row per trial, with the keys `method`, `known` (points trained on), `rmse` (in `unit`), `ellipsoid_95`
-    (share of points in their 95 % ellipsoid), `fit_seconds` (each None or NaN where there is none), and optionally
-    `limit` (the Cramer-Rao rms), `split`, `left_out` and `all_others` (as in `implicam.compare.Trial`).
+    Random splits are drawn against the number of points. Where shots or planes were left out there is a line per method
+    (and kind of plane), each left-out shot a faint dot. Markers are means, bars one standard error of the mean over
+    seeds, shots or planes: the numbers of the table. Nothing touches pyplot's global state.
 
-    Random splits are drawn against the number of points. Where shots or planes were left out there is a line per
-    method (and kind of plane), each left-out shot a faint dot. Markers are means, bars one standard error of the mean
-    over seeds, shots or planes: the numbers of the table. Nothing touches pyplot's global state.
+    Args:
+        table: One row per trial, with the keys `method`, `known` (points trained on), `rmse` (in `unit`),
+            `ellipsoid_95` (share of points in their 95 % ellipsoid), `fit_seconds` (each None or NaN where there is
+            none), and optionally `limit` (the Cramer-Rao rms), `split`, `left_out` and `all_others` (as in
+            `implicam.compare.Trial`).
+        unit: Of length.
+
+    Returns:
+        A matplotlib Figure; save it with `figure.savefig(path)`, .png, .pdf or .svg.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
     """
     rows = list(table)
     kinds = {str(row.get("split", RANDOM)) for row in rows}

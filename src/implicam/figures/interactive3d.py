@@ -37,9 +37,20 @@ _VIEW = {"eye": {"x": 1.05, "y": -1.8, "z": 1.2}, "center": {"x": 0, "y": 0, "z"
 
 
 def panels_3d(panels: Iterable[Panel], *, scales: Scales | None = None, every: int = 1) -> Any:
-    """A Plotly figure that shows one of the panels at a time, chosen from a menu; all in the same room and scale.
+    """One of several panels at a time, chosen from a menu; all with the same axes and scales.
 
-    One scene, since a browser gives a page some eight to sixteen of them and experiment 3 has twelve panels.
+    It is one scene, because a browser gives a page some eight to sixteen of them and experiment 3 has twelve panels.
+
+    Args:
+        panels: As of `implicam.figures.panels3d`.
+        scales: What colour and size mean; None for scales of the panels.
+        every: Draw one test point of so many.
+
+    Returns:
+        A Plotly figure.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
     """
     chosen = list(panels)
     scales = scales or scales_of(chosen)
@@ -55,7 +66,20 @@ def panels_3d(panels: Iterable[Panel], *, scales: Scales | None = None, every: i
 def draw_alignment_3d(
     true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2"
 ) -> Any:
-    """A Plotly figure of explicit calibration's points before and after alignment; see `panels3d.draw_alignment`."""
+    """Explicit calibration's points before and after alignment; as `panels3d.draw_alignment`.
+
+    Args:
+        true_xyz: (n, 3) the robot's positions, mm.
+        aligned_xyz: (n, 3) explicit calibration's, moved onto them, mm.
+        camera_xyz: (n, 3) the same points in the frame of `camera`, before they were moved, mm.
+        camera: The name of that camera.
+
+    Returns:
+        A Plotly figure.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
+    """
     parts: list[tuple[Floats | None, str, str, str]] = [
         (true_xyz, "robot's positions", "cross", BLUE),
         (aligned_xyz, "explicit, aligned", "circle-open", GREEN),
@@ -70,7 +94,16 @@ def draw_alignment_3d(
 
 
 def html_page(figure: Any, *, title: str, caption: str = "") -> str:
-    """A figure as one HTML page that works offline (about 5 MB, nearly all of it plotly.js); same figure, same text."""
+    """A figure as one HTML page that works offline (about 5 MB, nearly all of it plotly.js); same figure, same text.
+
+    Args:
+        figure: A Plotly figure.
+        title: Of the page.
+        caption: Below the figure.
+
+    Raises:
+        MissingExtraError: Plotly or Jinja2 is not installed.
+    """
     return render(
         __package__,
         "figure.html",
@@ -83,12 +116,23 @@ def html_page(figure: Any, *, title: str, caption: str = "") -> str:
 
 
 def plotly_js(purpose: str) -> Markup:
-    """Plotly's own script, for a page that loads nothing. MissingExtraError, which names the purpose, without it."""
+    """Plotly's own script, for a page that loads nothing.
+
+    Args:
+        purpose: What needs it, in words.
+
+    Raises:
+        MissingExtraError: Plotly is not installed; says the purpose.
+    """
     return Markup(import_extra("plotly.offline", "report", purpose).get_plotlyjs())
 
 
 def figure_json(figure: Any) -> Markup:
-    """A Plotly figure as JSON that may stand inside a script element of a page."""
+    """A Plotly figure as JSON that may stand inside a script element of a page.
+
+    Args:
+        figure: The figure.
+    """
     # Only "<" can end a script element; in JSON it stands in strings only, where \u003c is the same.
     return Markup(figure.to_json().replace("<", "\\u003c"))
 

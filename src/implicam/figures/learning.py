@@ -25,8 +25,14 @@ _WORDS = {"variance": "variance (the paper's rule)", "own start": "integrated, e
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """title and what is drawn upwards, log; rules: name -> (points, mean, standard error), (k,) each; line: a value
-    and its name, None for none."""
+    """One panel: a quantity, on a log scale, against the number of known points.
+
+    Attributes:
+        title: Over the panel.
+        ylabel: What is drawn upwards.
+        rules: Name -> (points, mean, standard error), (k,) each.
+        line: A value to be drawn as a line, and its name; None for none.
+    """
 
     title: str
     ylabel: str
@@ -35,7 +41,17 @@ class Panel:
 
 
 def learning(rows: Sequence[Sequence[Panel]]) -> Any:
-    """A matplotlib Figure with rows of panels; bands and bars are one standard error of the mean."""
+    """Rows of panels; bands and bars are one standard error of the mean.
+
+    Args:
+        rows: The panels of each row.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
     columns = max(map(len, rows))
     figure = new_figure(4.4 * columns, 3.7 * len(rows) + 0.7)
     grid = figure.subplots(len(rows), columns, squeeze=False)

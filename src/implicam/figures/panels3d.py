@@ -30,9 +30,12 @@ Panel = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Scales:
-    """What colour and size mean (mm): colour runs from error 0 to `error_top`, size over the range `sd` of the sd.
+    """What colour and size mean; values beyond an end are drawn as that end.
 
-    Values beyond an end are drawn as that end. sizes: the diameters at the ends, in pixels of a panel 400 wide.
+    Attributes:
+        error_top: Colour runs from error 0 to this, mm.
+        sd: Size runs over this range of the standard deviation, mm.
+        sizes: The diameters at the ends, in pixels of a panel 400 wide.
     """
 
     error_top: float
@@ -40,7 +43,15 @@ class Scales:
     sizes: tuple[float, float] = (7.0, 30.0)
 
     def diameters(self, sd: Floats | None, n: int) -> Floats:
-        """(n,) diameters; the smallest where no uncertainty is stated."""
+        """The diameters of points.
+
+        Args:
+            sd: (n,) stated standard deviations, mm; None where none is stated.
+            n: How many points.
+
+        Returns:
+            (n,) pixels of a panel 400 wide; the smallest where no uncertainty is stated.
+        """
         low, high = self.sd
         share = np.zeros(n) if sd is None else (np.asarray(sd, dtype=np.float64) - low) / max(high - low, 1e-300)
         return np.asarray(np.interp(np.nan_to_num(share, posinf=1.0), [0, 1], self.sizes), dtype=np.float64)
@@ -57,7 +68,15 @@ COLOUR_MAP = "cividis_r"
 
 @dataclass(frozen=True)
 class PanelPoints:
-    """The points of a panel that were measured: k of n. error: (k,) distances from the truth (mm)."""
+    """The points of a panel that were measured: k of n.
+
+    Attributes:
+        true: (k, 3) true positions, mm.
+        xyz: (k, 3) measured positions, mm.
+        error: (k,) distances between them, mm.
+        sd: (k,) stated standard deviations, mm; None where none is stated.
+        missing: How many test points were not measured.
+    """
 
     true: Floats
     xyz: Floats
@@ -67,7 +86,12 @@ class PanelPoints:
 
 
 def select_points(panel: Panel, every: int = 1) -> PanelPoints:
-    """Every so many-th test point of a panel, without those that were not measured (their number is `missing`)."""
+    """The test points of a panel that are drawn: one of so many, without those that were not measured.
+
+    Args:
+        panel: As in the head of this module.
+        every: Take one test point of so many; 1 for all.
+    """
     true, xyz = (np.asarray(panel[key], dtype=np.float64).reshape(-1, 3) for key in ("true_xyz", "xyz"))
     sd = None if panel.get("sd") is None else np.asarray(panel["sd"], dtype=np.float64).ravel()[::every]
     measured = np.asarray(np.isfinite(xyz).all(axis=1))
@@ -77,7 +101,11 @@ def select_points(panel: Panel, every: int = 1) -> PanelPoints:
 
 
 def scales_of(panels: Iterable[Panel]) -> Scales:
-    """One scale for all panels: colour up to the 98th percentile of the errors, so that one blunder does not rule."""
+    """One scale for all panels: colour up to the 98th percentile of the errors, so that one blunder does not set it.
+
+    Args:
+        panels: As in the head of this module.
+    """
     found = [select_points(panel) for panel in panels]
     errors = np.concatenate([np.zeros(0), *(d.error for d in found)])
     sd = np.concatenate([np.zeros(0), *(d.sd[np.isfinite(d.sd)] for d in found if d.sd is not None)])
@@ -87,18 +115,42 @@ def scales_of(panels: Iterable[Panel]) -> Scales:
 
 
 def title_of(panel: Panel, found: PanelPoints | None) -> str:
-    """The panel's title, and how many points are not shown because they were not measured."""
+    """The panel's title, and how many points are not shown because they were not measured.
+
+    Args:
+        panel: As in the head of this module.
+        found: Its points; None where it is empty.
+    """
     left_out = f" ({found.missing} not measured)" if found and found.missing else ""
     return f"{panel.get('title', '')}{left_out}"
 
 
 def line_segments(start: Floats, end: Floats) -> Floats:
-    """(3 n, 3) corners of n separate lines from start to end, with NaN after each."""
+    """Separate lines as one curve with gaps.
+
+    Args:
+        start: (n, 3) where each begins.
+        end: (n, 3) where each ends.
+
+    Returns:
+        (3 n, 3) start, end, NaN of each.
+    """
     return np.stack([start, end, np.full(start.shape, np.nan)], axis=1).reshape(-1, 3)
 
 
 def clouds(panels: Iterable[Panel], *, scales: Scales | None = None) -> Any:
-    """A matplotlib Figure of panels side by side, with one scale for all (the paper's Figure 7)."""
+    """Panels side by side, with one scale for all (the paper's Figure 7).
+
+    Args:
+        panels: As in the head of this module.
+        scales: What colour and size mean; None for scales of the panels.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
     chosen = list(panels)
     figure = new_figure(1.4 + 4.1 * max(len(chosen), 1), 4.8)
     axes = figure.subplots(1, max(len(chosen), 1), squeeze=False, subplot_kw={"projection": _projection()})[0]
@@ -106,10 +158,19 @@ def clouds(panels: Iterable[Panel], *, scales: Scales | None = None) -> Any:
 
 
 def board_panels(panels: Iterable[Panel], *, scales: Scales | None = BOARD_SCALES, every: int = TEST_POINT_STEP) -> Any:
-    """A matplotlib Figure: a row of panels for each set, a column for each number of boards (the paper's Figure 11).
+    """A row of panels for each set of cameras, a column for each number of boards (the paper's Figure 11).
 
-    scales: the paper's, or None for those of the panels. Each panel has the keys `set` and `boards` besides; without a
-    title it gets them as title. A combination that is not there stays an empty panel.
+    Args:
+        panels: As in the head of this module, with the keys `set` and `boards` besides; without a title they get these
+            as title. A combination that is missing is an empty panel.
+        scales: What colour and size mean: the paper's scales, or None for scales of the panels.
+        every: Draw one test point of so many.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
     """
     cells = {(str(panel["set"]), int(panel["boards"])): panel for panel in panels}
     sets, boards = sorted({name for name, _ in cells}), sorted({count for _, count in cells})
@@ -123,10 +184,19 @@ def board_panels(panels: Iterable[Panel], *, scales: Scales | None = BOARD_SCALE
 def draw_alignment(
     true_xyz: Floats, aligned_xyz: Floats, camera_xyz: Floats | None = None, *, camera: str = "cam2"
 ) -> Any:
-    """A matplotlib Figure of explicit calibration's points before and after alignment (the paper's Figure 4).
+    """Explicit calibration's points before and after alignment (the paper's Figure 4).
 
-    true_xyz: (n, 3) the robot's positions, crosses. aligned_xyz: (n, 3) explicit calibration's, moved onto them.
-    camera_xyz: (n, 3) the same points in the frame of `camera`, before they were moved. All mm; NaN is not drawn.
+    Args:
+        true_xyz: (n, 3) the robot's positions, mm; NaN is not drawn.
+        aligned_xyz: (n, 3) explicit calibration's, moved onto them, mm.
+        camera_xyz: (n, 3) the same points in the frame of `camera`, before they were moved, mm.
+        camera: The name of that camera.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
     """
     figure = new_figure(6.4, 5.2)
     axes = figure.add_subplot(projection=_projection())
@@ -179,18 +249,41 @@ def _fill(
 
 
 def known_of(panel: Panel) -> Floats:
-    """(m, 3) training points of a panel; none where it has none."""
+    """The training points of a panel.
+
+    Args:
+        panel: As in the head of this module.
+
+    Returns:
+        (m, 3) mm; m = 0 where it has none.
+    """
     known = panel.get("known_xyz")
     return np.zeros((0, 3)) if known is None else np.asarray(known, dtype=np.float64).reshape(-1, 3)
 
 
 def points_in_view(panel: Panel, found: PanelPoints, scales: Scales) -> list[Floats]:
-    """The points that the room must hold: all but those measured farther off than the colours reach."""
+    """The points that the axes must hold: all but those measured farther off than the colours reach.
+
+    Args:
+        panel: As in the head of this module.
+        found: Its points.
+        scales: What colour means.
+
+    Returns:
+        Arrays (k, 3), mm.
+    """
     return [known_of(panel), found.true, found.xyz[found.error <= scales.error_top]]
 
 
 def bounding_box(clouds: Iterable[Floats]) -> Floats:
-    """(2, 3) lowest and highest corner of a box around all points, with a margin; a unit box where there are none."""
+    """A box around all points, with a margin.
+
+    Args:
+        clouds: Arrays (k, 3); NaN is left out.
+
+    Returns:
+        (2, 3) lowest and highest corner; a unit box where there are no points.
+    """
     points = np.concatenate([np.zeros((0, 3)), *(np.asarray(c, dtype=np.float64).reshape(-1, 3) for c in clouds)])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):

@@ -49,9 +49,16 @@ _LABEL_GAP_SHARE = 0.085  # of a panel's height, between labels beside it
 def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     """Error against training points, log scale: a panel for each set, a line for each method (the paper's Figure 5).
 
-    rows: keys set, method, known, rmse. Rows of "explicit" have `budget` ("50+10": pictures of each camera and of each
-    pair) in place of known, and become a horizontal line at their median. total: number of points to split; the axis
-    then shows the share trained on as well.
+    Args:
+        rows: Keys set, method, known, rmse. Rows of "explicit" have `budget` ("50+10": pictures of each camera and of
+            each pair) in place of known, and become a horizontal line at their median.
+        total: Number of points to split; the axis then shows the share trained on as well.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
     """
     table = list(rows)
     learners = [row for row in table if row["method"] != EXPLICIT]
@@ -78,8 +85,18 @@ def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
 def sd_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     """Average stated standard deviation against training points, log scale (the paper's Figure 6).
 
-    rows: keys set, method, known, mean_sd. A panel for each method that states one, a line for each set; "explicit",
-    which has no training points, is left out. total: as in rmse_curves.
+    There is a panel for each method that states one, a line for each set; "explicit", which has no training points, is
+    left out.
+
+    Args:
+        rows: Keys set, method, known, mean_sd.
+        total: As in `rmse_curves`.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
     """
     table = [row for row in rows if row["method"] != EXPLICIT and len(values([row], "mean_sd"))]
     methods = list(choose_looks(_words(table, "method")))
@@ -104,10 +121,19 @@ def sd_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
 def sd_against_rmse(rows: Iterable[Row], *, floor: float | None = None) -> Any:
     """Average stated standard deviation against error, both on log scales: does the uncertainty follow the error?
 
-    rows: keys set, method, known (or budget), rmse, mean_sd. A panel for each set; a faint dot for each run and, for
-    each method, a line through the medians of the runs with the same `known` or budget, in ascending order. The
-    diagonal is where a method states what it does: the rms of a distance is root 3 times the standard deviation of an
-    axis. floor: standard deviation (mm) below which a method cannot state one, drawn as a line.
+    There is a panel for each set, a faint dot for each run and, for each method, a line through the medians of the runs
+    with the same `known` or budget, in ascending order. On the diagonal the stated uncertainty is right: the rms of a
+    distance is root 3 times the standard deviation of an axis.
+
+    Args:
+        rows: Keys set, method, known (or budget), rmse, mean_sd.
+        floor: Standard deviation below which a method cannot state one, drawn as a line, mm.
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
     """
     table = [row for row in rows if len(values([row], "rmse")) and len(values([row], "mean_sd"))]
     sets = _words(table, "set")
@@ -131,9 +157,17 @@ def sd_against_rmse(rows: Iterable[Row], *, floor: float | None = None) -> Any:
 def active_curves(rows: Iterable[Row]) -> Any:
     """Uncertainty against points added by active learning (the paper's Figure 8).
 
-    rows: keys set, method, repeat (which start), added (points added so far), max_sd and mean_sd (largest and mean,
-    over the points that are left, of the standard deviation averaged over x, y, z). A row of panels for each method, a
-    column for each set, a thin line for each repeat.
+    There is a row of panels for each method, a column for each set, a thin line for each repeat.
+
+    Args:
+        rows: Keys set, method, repeat (which start), added (points added so far), max_sd and mean_sd (largest and mean,
+            over the points that are left, of the standard deviation averaged over x, y, z).
+
+    Returns:
+        A matplotlib Figure.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
     """
     table = list(rows)
     methods, sets = list(choose_looks(_words(table, "method"))) or [""], _words(table, "set") or [""]

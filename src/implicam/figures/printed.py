@@ -29,13 +29,28 @@ _OTHERS: tuple[dict[str, Any], ...] = (
 
 
 def new_figure(width: float, height: float) -> Any:
-    """An empty matplotlib Figure of so many inches; nothing touches pyplot's global state."""
+    """An empty matplotlib Figure; nothing touches pyplot's global state.
+
+    Args:
+        width: Inches.
+        height: Inches.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
     module = import_extra("matplotlib.figure", "report", PURPOSE)
     return module.Figure(figsize=(width, height), layout="constrained")
 
 
 def choose_looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Colour, marker and dash of each method, the same in every figure for the methods we know; those come first."""
+    """Colour, marker and dash of each method; a method of the paper or of ours looks the same in every figure.
+
+    Args:
+        methods: Their names.
+
+    Returns:
+        Name -> matplotlib's words for its look; the methods of the paper and ours come first.
+    """
     names = set(methods)
     others = sorted(names - set(_LOOKS))
     known = {name: look for name, look in _LOOKS.items() if name in names}
@@ -43,14 +58,23 @@ def choose_looks(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def style_axes(axes: Any) -> None:
-    """A light grid behind the data, and no box around them."""
+    """A light grid behind the data, and no box around them.
+
+    Args:
+        axes: A matplotlib Axes.
+    """
     axes.grid(True, color="0.9", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def plain_log(axis: Any, *, name: str) -> None:
-    """Make the x or y axis (`name`) logarithmic, with plain numbers: 1, 2, 5 where there is room, else decades."""
+    """Make an axis logarithmic, with plain numbers: 1, 2, 5 where there is space, else decades.
+
+    Args:
+        axis: A matplotlib Axis.
+        name: "x" or "y".
+    """
     ticker = import_extra("matplotlib.ticker", "report", PURPOSE)
     axis.axes.set(**{f"{name}scale": "log"})
     axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
@@ -64,18 +88,37 @@ def plain_log(axis: Any, *, name: str) -> None:
 
 
 def values(rows: Iterable[Mapping[str, Any]], key: str) -> Floats:
-    """The numbers of a column that are there and finite."""
+    """The numbers of a column that are there and finite.
+
+    Args:
+        rows: Rows of a table.
+        key: The column.
+
+    Returns:
+        (k,).
+    """
     found = [float(row[key]) for row in rows if row.get(key) is not None]
     return np.array([value for value in found if np.isfinite(value)], dtype=np.float64)
 
 
 def mark_empty(axes: Any) -> None:
-    """Say in an empty panel that it is empty on purpose."""
+    """Write into an empty panel that there is no result.
+
+    Args:
+        axes: A matplotlib Axes.
+    """
     axes.text(0.5, 0.5, "no result", ha="center", va="center", color="0.4", transform=axes.transAxes)
 
 
 def place_legend(figure: Any, panels: Iterable[Any], title: str, columns: int = 4) -> None:
-    """One legend below all panels, each label once; outside, so that it hides nothing."""
+    """One legend below all panels, each label once.
+
+    Args:
+        figure: A matplotlib Figure.
+        panels: The Axes whose labels are collected.
+        title: Of the legend.
+        columns: How many at most.
+    """
     found: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):

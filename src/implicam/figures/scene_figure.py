@@ -1,4 +1,4 @@
-"""The 3D scene: where the points are, how far off each is, and how sure it was."""
+"""The 3D scene: where the points are, how far off each is, and how certain it is."""
 
 from __future__ import annotations
 
@@ -32,13 +32,29 @@ def scene(
     cameras: Mapping[str, ArrayLike] | None = None,
     share_calibration: Floats | None = None,
 ) -> Any:
-    """An interactive Plotly figure of n measured points.
+    """An interactive figure of n measured points.
 
-    measured_xyz and sd: (n, 3) in `unit`, NaN where not measured (not drawn). error: (n,) distance from the truth, the
-    colour; without it the colour is the stated uncertainty. Size grows with the stated uncertainty. true_xyz: (n, 3)
-    draws a line from each measured point towards its truth, exaggerated by the factor on the buttons. known_xyz: (m, 3)
-    the points the rig was calibrated from. cameras: name -> (3,) centre, hidden until clicked in the legend.
-    share_calibration: (n,) the share of each variance that more known points could remove, another colour to choose.
+    Size grows with the stated uncertainty. Colour is the error, or without it the stated uncertainty.
+
+    Args:
+        measured_xyz: (n, 3) in `unit`, NaN where not measured (not drawn).
+        sd: (n, 3) standard uncertainties in `unit`.
+        names: (n,) of the points.
+        views: (n,) how many views each was measured with.
+        unit: Of length.
+        known_xyz: (m, 3) the points that the rig was calibrated from.
+        true_xyz: (n, 3) draws a line from each measured point towards its truth, exaggerated by the factor on the
+            buttons.
+        error: (n,) distance from the truth.
+        cameras: Name -> (3,) centre; hidden until clicked in the legend.
+        share_calibration: (n,) the share of each variance that more known points could remove, another colour to
+            choose.
+
+    Returns:
+        A Plotly figure.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
     """
     i = np.isfinite(measured_xyz).all(axis=1)
     spread = np.linalg.norm(sd[i], axis=1)

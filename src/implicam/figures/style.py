@@ -25,17 +25,29 @@ CLEAR = "rgba(0,0,0,0)"
 
 
 def graph_objects() -> ModuleType:
-    """Plotly's, or a MissingExtraError that says how to get it."""
+    """Plotly's module of that name.
+
+    Raises:
+        MissingExtraError: Plotly is not installed; says how to get it.
+    """
     return import_extra("plotly.graph_objects", "report", "an interactive figure")
 
 
 def plain(text: object) -> str:
-    """User text as text: Plotly reads <b> and <a href> in labels, and a point's name must not become a link."""
+    """Text from a user, escaped: Plotly reads <b> and <a href> in labels, and a point's name must not become a link.
+
+    Args:
+        text: Anything; it becomes text.
+    """
     return html.escape(str(text), quote=True)
 
 
 def layout(**more: Any) -> dict[str, Any]:
-    """A layout without background or margins, in the page's own font."""
+    """A layout without background or margins, in the page's own font.
+
+    Args:
+        more: Entries to add or replace, in Plotly's words.
+    """
     return {
         "template": "none",
         "paper_bgcolor": CLEAR,
@@ -50,28 +62,48 @@ def layout(**more: Any) -> dict[str, Any]:
 
 
 def axis(title: str, **more: Any) -> dict[str, Any]:
-    """A quiet axis."""
+    """An axis with thin grey lines.
+
+    Args:
+        title: Its name.
+        more: Entries to add or replace, in Plotly's words.
+    """
     lines = {"gridcolor": GRID, "linecolor": GREY, "zerolinecolor": GRID, "showline": True, "ticks": "outside"}
     return {"title": {"text": plain(title)}, "automargin": True, "tickcolor": GREY, **lines, **more}
 
 
 def points_3d(xyz: Floats, name: str, **look: Any) -> Any:
-    """A Plotly trace of points (n, 3) in a 3D scene; markers, unless `look` says otherwise."""
+    """A trace of points in a 3D scene; markers, unless `look` says otherwise.
+
+    Args:
+        xyz: (n, 3); NaN is a gap.
+        name: In the legend.
+        look: In Plotly's words.
+
+    Returns:
+        A Plotly trace.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
+    """
     x, y, z = xyz.T
     return graph_objects().Scatter3d(x=x, y=y, z=z, name=name, **{"mode": "markers", **look})
 
 
 def figure_3d(traces: list[Any], unit: str, camera: Mapping[str, Any], **more: Any) -> Any:
-    """A Plotly figure of one 3D scene with quiet axes.
+    """A figure of one 3D scene with thin grey axes.
 
     Args:
-        traces: what it shows.
-        unit: of length, as the axes name it.
-        camera: from where the scene is seen, in Plotly's words.
-        more: of the layout; a `scene` in it is joined with ours.
+        traces: What it shows.
+        unit: Of length, as the axes name it.
+        camera: From where the scene is seen, in Plotly's words.
+        more: Of the layout; a `scene` in it is merged with ours.
 
     Returns:
-        The figure. It has no margins but room for buttons at the top, and a legend without background.
+        A Plotly figure. It has no margins but space for buttons at the top, and a legend without background.
+
+    Raises:
+        MissingExtraError: Plotly is not installed.
     """
     scene: dict[str, Any] = {"aspectmode": "data", "camera": camera}
     for name in "xyz":
