@@ -29,11 +29,14 @@ def markdown(summary: Summary, *, figures: str = "figures") -> str:
     """Write the account.
 
     Args:
-        summary: what `reproduction.reproduce` writes as summary.json.
-        figures: where the pictures are, as the text links them.
+        summary: What `reproduction.reproduce` writes as summary.json.
+        figures: Where the pictures are, as the text links them.
 
     Returns:
         The text, as Markdown.
+
+    Raises:
+        MissingExtraError: Jinja2 is not installed.
     """
     ball, bias = summary.get("ball", ()), summary.get("flattery", ())
     lattice = _select(ball, trained=BALL, judged=BALL)

@@ -28,7 +28,12 @@ POINTS_PER_CHECK = 5
 
 
 def cells(source: Source, plan: Plan) -> list[Cell]:
-    """One for each set, method and start; the networks of all starts are trained as one batch."""
+    """The cells of experiment 2: one for each set, method and start; the networks of all starts are trained as one batch.
+
+    Args:
+        source: The data.
+        plan: How much is computed.
+    """
     found = []
     for method in METHODS:
         repeats = list(range(plan.repeats[method]))
@@ -60,11 +65,24 @@ def grow(
     additions: int,
     lot: int,
 ) -> Values:
-    """The rows of some starts, side by side: uncertainty and error in mm of the positions that are left, and
-    (`check_...`) at random positions, where there are such.
+    """The rows of some starts, side by side.
 
-    A new fit after every `lot` points. Between two fits a Gaussian process takes each point with its hyperparameters
-    kept; another method has no row there, and the points of a lot are the least certain of its last fit.
+    A new fit comes after every `lot` points. Between two fits a Gaussian process takes each point with its
+    hyperparameters kept; another method has no row there, and the points of a lot are the least certain of its last
+    fit.
+
+    Args:
+        source: The data: `Source.options`.
+        cameras: A set of cameras.
+        method: Its name.
+        repeats: The numbers of the starts.
+        start: How many points each begins with.
+        additions: How many points are added.
+        lot: How many points are added between two fits.
+
+    Returns:
+        "rows": uncertainty and error in mm of the positions that are left, and ("check_...") at random positions, where
+        there are such.
     """
     of = Source(**source)
     data = of.data(BALL, cameras)

@@ -30,7 +30,15 @@ _COST = {NETWORK: 30.0, PAPER: 12.0, GP: 5.0, FORWARD: 8.0}  # of a run, in prop
 
 
 def cells(source: Source, plan: Plan) -> list[Cell]:
-    """Of the learners, of the explicit lines, and of the two figures in 3D."""
+    """The cells of experiment 1: of the learners, of the explicit lines, and of the two figures in 3D.
+
+    Args:
+        source: The data.
+        plan: How much is computed.
+
+    Returns:
+        The cells that take longest first.
+    """
     parts, found = source.parts, list[tuple[float, Cell]]()
     for trained, shares, runs in (
         (BALL, plan.shares, plan.runs),
@@ -81,12 +89,29 @@ def _cell(work: Any, name: str, source: Source, **options: Any) -> Cell:
 
 
 def sizes(total: int, shares: tuple[int, ...]) -> list[int]:
-    """Numbers of training points: of 175, the paper's 157 to 17."""
+    """Numbers of training points: of 175, the paper's 157 to 17.
+
+    Args:
+        total: How many points there are.
+        shares: Per cent of them.
+    """
     return [max(1, total * share // 100) for share in shares]
 
 
 def learn(source: Mapping[str, Any], trained: str, cameras: str, method: str, known: int, runs: int) -> Values:
-    """The rows of `runs` random splits of one learner; lengths in mm."""
+    """The rows of some random splits of one learner.
+
+    Args:
+        source: The data: `Source.options`.
+        trained: The part to train on.
+        cameras: A set of cameras.
+        method: Its name.
+        known: How many points to train on.
+        runs: How many splits.
+
+    Returns:
+        "rows": one for each split and each part that it is judged at; lengths in mm.
+    """
     of = Source(**source)
     data = of.data(trained, cameras)
     splits = [Split(trained, *data.split(known, seed=run), run) for run in range(runs)]
@@ -105,14 +130,30 @@ def learn(source: Mapping[str, Any], trained: str, cameras: str, method: str, kn
 
 
 def numbers(trial: Any, scale: float) -> Values:
-    """What a run says, in mm, as plain values."""
+    """The numbers of a trial, in mm, as plain values.
+
+    Args:
+        trial: The trial.
+        scale: How many mm a length unit of the trial is.
+    """
     lengths = {key: getattr(trial, key) * scale for key in ("rmse", "median", "limit", "mean_sd")}
     others = {key: getattr(trial, key) for key in ("ellipsoid_95", "nees", "fit_seconds", "failure")}
     return {**lengths, **others, "measured": 1 - trial.unmeasured / trial.held_out if trial.held_out else 0.0}
 
 
 def line(source: Mapping[str, Any], cameras: str, each: int, pairs: int, subset: int) -> Values:
-    """The rows of `explicit` from a subset of the pictures; lengths in mm."""
+    """The rows of `explicit` from a subset of the pictures.
+
+    Args:
+        source: The data: `Source.options`.
+        cameras: A set of cameras.
+        each: Pictures by each camera alone.
+        pairs: Pictures by each pair of cameras.
+        subset: The number of the subset.
+
+    Returns:
+        "rows": one for each part that it is judged at; lengths in mm.
+    """
     of = Source(**source)
     data = of.data(BALL, cameras)
     fit: Calibration | ImplicamError
@@ -126,7 +167,19 @@ def line(source: Mapping[str, Any], cameras: str, each: int, pairs: int, subset:
 
 
 def explicit_of(source: Source, cameras: str, each: int, pairs: int, subset: int) -> Calibration:
-    """`explicit` from a subset of the pictures, aligned to all positions of the lattice, as in the paper."""
+    """`explicit` from a subset of the pictures, aligned to all positions of the lattice, as in the paper.
+
+    Args:
+        source: The data.
+        cameras: A set of cameras.
+        each: Pictures by each camera alone.
+        pairs: Pictures by each pair of cameras.
+        subset: The number of the subset.
+
+    Raises:
+        DatasetError: There are too few pictures.
+        FitError: They do not fix the cameras.
+    """
     boards = source.boards(cameras, each, pairs, subset)
     if boards is None:
         raise DatasetError(
@@ -144,7 +197,15 @@ def _errors(fit: Calibration | ImplicamError, data: Dataset) -> Values:
 
 
 def errors(measured: Measurement, data: Dataset) -> Values:
-    """Error and stated standard deviation of the points that were measured, in mm; or why there are none."""
+    """Error and stated standard deviation of the points that were measured.
+
+    Args:
+        measured: The points.
+        data: Their true positions, rows as in `measured`.
+
+    Returns:
+        Numbers in mm; or why there are none.
+    """
     good, scale = measured.measured, millimetres(data)
     squares = ((measured.xyz - true_positions(data))[good] ** 2).sum(axis=1)
     if not len(squares):
@@ -159,13 +220,32 @@ def errors(measured: Measurement, data: Dataset) -> Values:
 
 
 def example(source: Mapping[str, Any], cameras: str, method: str, known: int) -> Values:
-    """One run to be drawn: positions and their stated standard deviations, in mm."""
+    """One run to be drawn.
+
+    Args:
+        source: The data: `Source.options`.
+        cameras: A set of cameras.
+        method: Its name.
+        known: How many points to train on.
+
+    Returns:
+        As `measure_panel`.
+    """
     train, held_out = Source(**source).data(BALL, cameras).split(known, seed=0)
     return measure_panel(calibrator_from_name(method).fit(train), train, held_out)
 
 
 def measure_panel(fit: Calibration, train: Dataset, held_out: Dataset) -> Values:
-    """The arrays of a panel, in mm."""
+    """The arrays of a panel, in mm.
+
+    Args:
+        fit: The calibration.
+        train: The points that it was fitted to.
+        held_out: The n points to measure.
+
+    Returns:
+        xyz (n, 3), sd (n,), true_xyz (n, 3), known_xyz (m, 3).
+    """
     measured, scale = fit.measure(held_out.observations), millimetres(train)
     return {
         "xyz": measured.xyz * scale,
@@ -176,7 +256,15 @@ def measure_panel(fit: Calibration, train: Dataset, held_out: Dataset) -> Values
 
 
 def alignment(source: Mapping[str, Any], cameras: str) -> Values:
-    """The cloud of `explicit` in the frame of its first camera, and as it was moved onto the lattice; in mm."""
+    """The points of `explicit` in the frame of its first camera, and as they were moved onto the lattice.
+
+    Args:
+        source: The data: `Source.options`.
+        cameras: A set of cameras.
+
+    Returns:
+        true_xyz, aligned_xyz, camera_xyz (n, 3) in mm, and the name of the camera.
+    """
     of = Source(**source)
     data, scale = of.data(BALL, cameras), millimetres(of.data(BALL, cameras))
     calibration = explicit_of(of, cameras, *BUDGETS[0], 0)

@@ -27,7 +27,18 @@ NAME = "board"
 
 
 def cells(source: Source, plan: Plan) -> list[Cell]:
-    """One for each set, number of boards and method; GPyTorch with the most boards takes longest and comes first."""
+    """The cells of experiment 3: one for each set, number of boards and method.
+
+    Args:
+        source: The data.
+        plan: How much is computed.
+
+    Returns:
+        GPyTorch with the most boards takes longest and comes first; none where the data have no board.
+
+    Raises:
+        DatasetError: There are too few boards.
+    """
     if BOARD not in source.parts:
         return []
     of = shots(source.data(BOARD, next(iter(source.sets))))
@@ -50,7 +61,11 @@ def cells(source: Source, plan: Plan) -> list[Cell]:
 
 
 def shots(data: Dataset) -> list[str]:
-    """The boards, nearest first: in the order of their names, in which numbers count as numbers."""
+    """The boards, nearest first: in the natural order of their names (2 before 10).
+
+    Args:
+        data: The part with the board.
+    """
 
     def parts(name: str) -> list[tuple[int, str]]:
         return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", name)]
@@ -59,12 +74,27 @@ def shots(data: Dataset) -> list[str]:
 
 
 def training(of: list[str], count: int) -> list[str]:
-    """The first and the last of the boards, and those between them at equal distances."""
+    """The first and the last of the boards, and those between them at equal distances.
+
+    Args:
+        of: The names of the boards, nearest first.
+        count: How many.
+    """
     return [of[i] for i in np.unique(np.round(np.linspace(0, len(of) - 1, count)).astype(np.int64))]
 
 
 def learn(source: Mapping[str, Any], cameras: str, boards: int, method: str) -> Values:
-    """The rows of one method, and its panel: arrays in mm."""
+    """The rows of one method, and its panel.
+
+    Args:
+        source: The data: `Source.options`.
+        cameras: A set of cameras.
+        boards: How many boards to train on.
+        method: Its name.
+
+    Returns:
+        "rows", with lengths in mm; and the arrays of `ball.measure_panel`.
+    """
     of = Source(**source)
     data = of.data(BOARD, cameras)
     names = shots(data)

@@ -35,11 +35,15 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}(/[A-Za-z0-9][A-Za-z0-9._+-
 class Cell:
     """One independent piece of a sweep.
 
-    work: a top-level function of a module, or its name "package.module:function". It is called as work(**options) in
-    another process, perhaps on another machine, and returns a dict of plain JSON values and NumPy arrays. Its numbers
-    must depend on the options only: a seed is an option.
-    name: unique in the sweep and the path of its result, such as "ball/2R/inverse-gp/157".
-    options: plain JSON values, as `work` gets them: a tuple becomes a list.
+    Attributes:
+        work: A top-level function of a module, or its name "package.module:function". It is called as work(**options)
+            in another process, perhaps on another machine, and returns a dict of plain JSON values and NumPy arrays.
+            Its numbers must depend on the options only: a seed is an option.
+        name: Unique in the sweep and the path of its result, such as "ball/2R/inverse-gp/157".
+        options: Plain JSON values, as `work` gets them: a tuple becomes a list.
+
+    Raises:
+        UsageError: The name cannot be a path, the options are not JSON, or the function cannot be found by its name.
     """
 
     work: str | Work
@@ -66,7 +70,7 @@ class Cell:
 
     @property
     def task(self) -> Task:
-        """The cell as a worker is sent it."""
+        """The cell as it is sent to a worker."""
         return Task(str(self.work), self.name, canonical(self.options))
 
 
@@ -92,9 +96,12 @@ def _dotted_name(work: str | Work) -> str:
 class Results:
     """What a sweep has, by the names of its cells, in their order.
 
-    values: of each cell that has a result. seconds: what its work took. failures: why a cell has none, in three lines
-    (what, why, fix); the traceback is in <folder>/<name>.failed.txt. already: results that were there before.
-    notes: what should be known before the numbers are trusted.
+    Attributes:
+        values: Of each cell that has a result.
+        seconds: That its work took.
+        failures: Why a cell has none, in three lines (what, why, fix); the traceback is in <folder>/<name>.failed.txt.
+        already: How many results were there before.
+        notes: What should be known before the numbers are trusted.
     """
 
     values: Mapping[str, Values]
@@ -112,12 +119,21 @@ def run(
     scheduler: str | None = None,
     progress: Progress = silent,
 ) -> Results:
-    """Compute the cells that have no result in `folder` yet; failed ones are tried again.
+    """Compute the cells that have no result yet; failed ones are tried again.
 
-    A result counts when its file is whole and its work and options are those of the cell. jobs: processes on this
-    machine, by default one a core; scheduler: the address of a Dask scheduler whose workers compute instead. Interrupt
-    it at any time: what is done is kept. Two runs on one folder may compute a cell twice, and do no other harm.
-    UsageError for two cells of one name; ImplicamError where the folder cannot be written, or there is no scheduler.
+    A result counts when its file is whole and its work and options are those of the cell. Interrupt it at any time:
+    what is done is kept. Two runs on one folder may compute a cell twice, and do no other harm.
+
+    Args:
+        cells: What to compute.
+        folder: Where results are.
+        jobs: Processes on this machine; None for one a core.
+        scheduler: The address of a Dask scheduler whose workers compute instead.
+        progress: Called after each cell.
+
+    Raises:
+        UsageError: Two cells have one name, or both `jobs` and `scheduler` are given.
+        ImplicamError: The folder cannot be written, or there is no scheduler.
     """
     _check_arguments(cells, jobs, scheduler)
     folder = Path(folder)
@@ -141,7 +157,12 @@ def run(
 
 
 def load_results(cells: Sequence[Cell], folder: str | Path) -> Results:
-    """The results that are stored, and count; computes nothing."""
+    """The results that are stored, and count; computes nothing.
+
+    Args:
+        cells: Whose results.
+        folder: Where they are.
+    """
     stored, notes = _read_stored(cells, Path(folder))
     return _collect(cells, stored, {}, len(stored), notes)
 

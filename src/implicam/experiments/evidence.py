@@ -20,7 +20,15 @@ Rows = Sequence[Row]
 
 @dataclass(frozen=True)
 class Case:
-    """A number that a finding rests on, in words; it supports the finding above `least`."""
+    """A number that a finding rests on.
+
+    Attributes:
+        value: The number; it supports the finding above `least`.
+        low: The lower end of its 95 % interval.
+        high: The upper end.
+        words: The number in words.
+        least: The threshold.
+    """
 
     value: float
     low: float
@@ -30,7 +38,7 @@ class Case:
 
     @property
     def verdict(self) -> str:
-        """HOLDS, FAILS or OPEN."""
+        """`HOLDS`, `FAILS` or `OPEN`."""
         return HOLDS if self.low > self.least else FAILS if self.high < self.least else OPEN
 
 
@@ -39,26 +47,51 @@ Test = Callable[[Rows, str, Sequence[str]], list[Case]]
 
 
 def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:
-    """The rows with these values, of runs that did not fail."""
+    """The rows with some values, of runs that did not fail.
+
+    Args:
+        rows: Rows of a table.
+        wanted: Column = value.
+    """
     return [row for row in rows if not row.get("failure") and all(row.get(k) == v for k, v in wanted.items())]
 
 
 def column(rows: Iterable[Row], key: str) -> Floats:
-    """The numbers of a column."""
+    """The numbers of a column.
+
+    Args:
+        rows: n rows, all of which have it.
+        key: The column.
+
+    Returns:
+        (n,).
+    """
     return np.array([float(row[key]) for row in rows], dtype=np.float64)
 
 
 def ratio(above: Floats, below: Floats, words: str, *, least: float = 1.0) -> Case:
-    """Geometric mean of above / below (n,) over pairs, with its 95 % interval."""
+    """The geometric mean of ratios over pairs, with its 95 % interval.
+
+    Args:
+        above: (n,).
+        below: (n,); a pair whose ratio is not a positive number is left out.
+        words: The case in words, with {} for the number.
+        least: The threshold.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(above / below)
     return _case([logs[np.isfinite(logs)]], words, least)
 
 
 def unpaired(above: Floats, below: Floats, words: str, *, least: float = 1.0, alone: float = 0.0) -> Case:
-    """Ratio of the geometric means of two samples that have nothing to do with each other, with its 95 % interval.
+    """The ratio of the geometric means of two independent samples, with its 95 % interval.
 
-    alone: standard deviation of the logarithm of a sample of one.
+    Args:
+        above: (n,).
+        below: (m,).
+        words: The case in words, with {} for the number.
+        least: The threshold.
+        alone: Standard deviation of the logarithm of a sample of one.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = [np.log(sample) for sample in (above, 1 / below)]
@@ -76,7 +109,12 @@ def _case(samples: Sequence[Floats], words: str, least: float, alone: float = 0.
 
 
 def half_width(sample: Floats, alone: float = 0.0) -> float:
-    """Of the 95 % interval of a mean, after Student; of a sample of one from the standard deviation `alone`."""
+    """Half the width of the 95 % interval of a mean, after Student.
+
+    Args:
+        sample: (n,).
+        alone: Standard deviation, for a sample of one.
+    """
     n = len(sample)
     if n == 1:
         return 1.96 * alone
@@ -84,13 +122,28 @@ def half_width(sample: Floats, alone: float = 0.0) -> float:
 
 
 def interval(value: float, low: float, high: float) -> str:
-    """A number with its interval: three digits each, four where it is nearly one."""
+    """A number with its interval in words: three digits each, four where it is nearly one.
+
+    Args:
+        value: The number.
+        low: The lower end.
+        high: The upper end.
+    """
     digits = 4 if abs(value - 1) < 0.05 else 3
     return f"{number(value, digits)} [{number(low, digits)}, {number(high, digits)}]"
 
 
 def share_of_drop(first: Floats, then: Floats, last: Floats, words: str) -> Case:
-    """How many % of a drop (n,) have come early, the least of it half; a rise is no drop and decides nothing."""
+    """How many % of a drop have come early; it supports a finding above half.
+
+    A rise is no drop and decides nothing.
+
+    Args:
+        first: (n,) at the start.
+        then: (n,) early.
+        last: (n,) at the end.
+        words: The case in words, with {} for the number.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 100 * (first - then) / (first - last)
     if not len(share) or not (first > last).all():
@@ -101,7 +154,15 @@ def share_of_drop(first: Floats, then: Floats, last: Floats, words: str) -> Case
 
 
 def stages(parts: Sequence[Mapping[int, Row]], key: str) -> tuple[Floats, Floats, Floats]:
-    """A column at the start, early and at the end, of the runs that have all three."""
+    """A column at the start, early and at the end, of the runs that have all three.
+
+    Args:
+        parts: At each of the three, number of a run -> its row.
+        key: The column.
+
+    Returns:
+        (n,) each.
+    """
     runs = sorted(set.intersection(*(set(part) for part in parts)))
     first, then, last = (column([part[run] for run in runs], key) for part in parts)
     return first, then, last

@@ -23,9 +23,15 @@ Values = Mapping[str, Mapping[str, Any]]
 
 
 def draw(rows: Mapping[str, Sequence[Row]], values: Values, folder: Path) -> Iterator[tuple[str, str]]:
-    """Draw what there are results for; yields the name of each figure, without ending, and what it shows.
+    """Draw the figures for which there are results.
 
-    rows: of each experiment; values: of all cells, by name. Lengths in mm.
+    Args:
+        rows: Of each experiment, lengths in mm.
+        values: Of all cells, by name, lengths in mm.
+        folder: Where to write the figures.
+
+    Yields:
+        The name of each figure, without ending, and what it shows.
     """
     if rows.get("ball"):
         yield from _ball(rows["ball"], values, folder)

@@ -16,7 +16,11 @@ DRAWN_METHODS = (PAPER, NETWORK, FORWARD)
 
 
 def slug(method: str) -> str:
-    """A method as part of the name of a file."""
+    """A method as part of the name of a file.
+
+    Args:
+        method: Its name.
+    """
     return method.replace(":", "-")
 
 
@@ -34,11 +38,19 @@ def _counts(**others: int) -> dict[str, int]:
 class Plan:
     """The experiments' sizes; the paper's by default, with fewer runs of the methods that it does not have.
 
-    shares: % of the ball's positions to train on; runs: random splits of each, by method. random_shares, random_runs:
-    of the same with training positions off the lattice. subsets: of the pictures, for the smaller budgets of
-    `explicit`. additions: points added by active learning to start_share %, in `repeats` runs, by method; lot: points
-    added between two fits, by method (a Gaussian process takes those between with its hyperparameters kept). boards:
-    to train on.
+    Attributes:
+        name: Of the plan.
+        shares: Per cent of the ball's positions to train on.
+        runs: Random splits of each share, by method.
+        random_shares: As `shares`, with training positions off the lattice.
+        random_runs: As `runs`, for `random_shares`.
+        subsets: Of the pictures, for the smaller budgets of `explicit`.
+        start_share: Per cent of the positions that active learning begins with.
+        additions: Points that active learning adds.
+        repeats: Runs of active learning, by method.
+        lot: Points added between two fits, by method (a Gaussian process takes those between with its hyperparameters
+            kept).
+        boards: Numbers of boards to train on.
     """
 
     name: str = "full"
@@ -54,7 +66,11 @@ class Plan:
     boards: tuple[int, ...] = (2, 3, 5, 9)
 
     def with_runs(self, runs: int) -> Plan:
-        """So many runs of every method."""
+        """The same plan with a number of runs of every method.
+
+        Args:
+            runs: How many.
+        """
         each = dict.fromkeys(METHODS, runs)
         return replace(self, name=f"{self.name}-{runs}-runs", runs=each, random_runs=each, repeats=each)
 

@@ -45,7 +45,14 @@ EXTRA_OF_LIBRARY = {
 
 @dataclass(frozen=True)
 class Reproduction:
-    """summary: all tables and verdicts as plain values; files: what was written, by what it is."""
+    """What a run of the experiments made.
+
+    Attributes:
+        summary: All tables and verdicts as plain values.
+        files: What was written, by what it is.
+        failures: Cells without a result, and why.
+        notes: What should be known before the numbers are trusted.
+    """
 
     summary: Mapping[str, Any]
     files: Mapping[str, Path]
@@ -63,10 +70,23 @@ def reproduce(
     scheduler: str | None = None,
     progress: Progress = silent,
 ) -> Reproduction:
-    """Run some of EXPERIMENTS into `folder`; what was computed before, by the same plan on the same data, is kept.
+    """Run some experiments; what was computed before, by the same plan on the same data, is kept.
 
-    The account is of all experiments that have been computed whole, this time or before. DatasetError where the data
-    have nothing for any; ImplicamError where every cell failed.
+    The account is of all experiments that have been computed whole, this time or before.
+
+    Args:
+        experiments: Some of `EXPERIMENTS`.
+        folder: Where results are kept and written.
+        source: The data.
+        plan: How much is computed.
+        jobs: Processes on this machine; None for one a core.
+        scheduler: The address of a Dask scheduler whose workers compute instead.
+        progress: Called as the work goes on.
+
+    Raises:
+        DatasetError: The data have nothing for any of the experiments.
+        MissingExtraError: A library is not installed.
+        ImplicamError: Every cell failed.
     """
     for library, extra in EXTRA_OF_LIBRARY.items():
         if find_spec(library) is None:  # said before the work, not after; importing them all takes seconds

@@ -55,7 +55,13 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Source:
-    """The simulated rig of a seed; or, where `folder` is given, measured data. stamp: of the content of its files."""
+    """The simulated rig of a seed; or, where a folder is given, measured data.
+
+    Attributes:
+        seed: Of the simulated rig.
+        folder: Of the measured data; empty for none.
+        stamp: A digest of the content of its files.
+    """
 
     seed: int = 0
     folder: str = ""
@@ -63,7 +69,15 @@ class Source:
 
     @classmethod
     def of(cls, folder: Path | None, seed: int) -> Source:
-        """Measured data where a folder is given, else the rig of this seed; DatasetError where there are no data."""
+        """Measured data where a folder is given, else the rig of a seed.
+
+        Args:
+            folder: With the measured data; None for none.
+            seed: Of the simulated rig.
+
+        Raises:
+            DatasetError: The folder has no data.
+        """
         if folder is None:
             return cls(seed)
         places = {part: _place(folder, part) for part in PARTS}
@@ -78,17 +92,17 @@ class Source:
 
     @property
     def options(self) -> dict[str, Any]:
-        """As an option of a cell."""
+        """Plain values, as an option of a cell."""
         return asdict(self)
 
     @property
     def name(self) -> str:
-        """For a folder of results: another for other data."""
+        """For a folder of results; other data have another name."""
         return f"measured-{self.stamp}" if self.folder else f"{RIG}-{self.seed}"
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Which of PARTS there are."""
+        """The ones of `PARTS` that there are."""
         if not self.folder:
             return PARTS
         return tuple(part for part in PARTS if _place(Path(self.folder), part) is not None)
@@ -102,14 +116,33 @@ class Source:
         return CAMERA_SETS if set(names) == set(CAMERA_SETS["2R4W"]) else {ALL_CAMERAS: names}
 
     def data(self, part: str, cameras: str) -> Dataset:
-        """A part as a set of cameras saw it; DatasetError where it is not there."""
+        """A part as a set of cameras saw it.
+
+        Args:
+            part: One of `PARTS`.
+            cameras: A key of `sets`.
+
+        Raises:
+            DatasetError: There is no such part, or it lacks a camera or known positions.
+        """
         return _of_set(self, part, cameras)
 
     def boards(self, cameras: str, each: int, pairs: int, seed: int) -> Dataset | None:
-        """Pictures of a board, drawn at random; None where there are fewer.
+        """Pictures of a board, drawn at random.
 
-        each: of every camera of the set alone; pairs: of every group of them that took some together. A group that took
-        one or two only is a chance, and left out.
+        A group of cameras that took only one or two pictures together did so by chance, and is left out.
+
+        Args:
+            cameras: A key of `sets`.
+            each: Pictures by each camera alone.
+            pairs: Pictures by each group of cameras that took some together.
+            seed: Of the draw.
+
+        Returns:
+            The corners; None where there are fewer pictures.
+
+        Raises:
+            DatasetError: There is no such part.
         """
         drawn, rows = np.random.default_rng([seed, each, pairs]), list[Rows]()
         for group, shots in _groups(self).items():
@@ -185,7 +218,14 @@ def _simulated(seed: int, part: str) -> Dataset:
 
 
 def each_and_every_pair(rig: Rig) -> list[tuple[str, ...]]:
-    """The paper's largest budget: pictures by every camera alone and by every two, the board whole in both."""
+    """The paper's largest budget: pictures by every camera alone and by every two, the board whole in both.
+
+    Args:
+        rig: The cameras.
+
+    Returns:
+        For each picture, the names of the cameras that take it.
+    """
     (each, pairs), names = BUDGETS[0], [camera.name for camera in rig.cameras]
     return [(name,) for name in names for _ in range(each)] + [
         pair for pair in combinations(names, 2) for _ in range(pairs)
@@ -223,10 +263,24 @@ def _stamp(places: Mapping[str, Path]) -> str:
 
 
 def true_positions(data: Dataset) -> Floats:
-    """(n, 3) what errors are measured against: the simulated truth where there is one, else the known positions."""
+    """What errors are measured against: the simulated truth where there is one, else the known positions.
+
+    Args:
+        data: n known points.
+
+    Returns:
+        (n, 3) in the length unit of the data.
+    """
     return data.xyz if data.truth is None else data.truth.xyz
 
 
 def millimetres(data: Dataset) -> float:
-    """How many mm a length unit of the data is."""
+    """How many mm a length unit of the data is.
+
+    Args:
+        data: The dataset.
+
+    Raises:
+        DatasetError: Its unit is not known.
+    """
     return 1000 * data.metres_per_unit

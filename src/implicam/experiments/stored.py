@@ -29,7 +29,15 @@ _NUMBERS_AND_TEXT = "fiubU"  # the kinds of arrays that `files.read_npz` reads
 
 @dataclass(frozen=True)
 class Stored:
-    """A result as it is in its file. options: canonical JSON text; seconds: of the work; version: of implicam."""
+    """A result as it is in its file.
+
+    Attributes:
+        work: The name of the function that made it.
+        options: Its options as canonical JSON text.
+        version: Of implicam.
+        seconds: That the work took.
+        values: The result.
+    """
 
     work: str
     options: str
@@ -39,12 +47,31 @@ class Stored:
 
 
 def canonical(options: Mapping[str, Any]) -> str:
-    """Options as the one JSON text that equal options share; TypeError or ValueError where they are no JSON."""
+    """Options as the one JSON text that equal options share.
+
+    Args:
+        options: Plain values.
+
+    Raises:
+        TypeError: A value has no form in JSON.
+        ValueError: A list or dict contains itself.
+    """
     return json.dumps(dict(options), sort_keys=True)
 
 
 def encode(work: str, options: str, seconds: float, values: Mapping[str, Any]) -> bytes:
-    """The bytes of a result file; TypeError or ValueError for values that it cannot keep."""
+    """The bytes of a result file.
+
+    Args:
+        work: The name of the function that made it.
+        options: Its options as canonical JSON text.
+        seconds: That the work took.
+        values: The result: plain values, and arrays of numbers or text.
+
+    Raises:
+        TypeError: A value cannot be kept.
+        ValueError: A list or dict contains itself.
+    """
     if not isinstance(values, Mapping):
         raise TypeError(f"{work} returned a {type(values).__name__}; a cell returns a dict")
     odd = [key for key in values if not isinstance(key, str)]
@@ -79,7 +106,14 @@ def _number(value: object) -> Any:
 
 
 def decode(source: bytes | Path) -> Stored:
-    """What `encode` made bytes of; ImplicamError, with the reason in `why`, for anything damaged or strange."""
+    """The inverse of `encode`.
+
+    Args:
+        source: The bytes, or the file.
+
+    Raises:
+        ImplicamError: The file is damaged, or no result file; `why` has the reason.
+    """
     members = read_npz(source, _damaged)
     try:
         head = json.loads(members[_HEAD].tobytes())
@@ -96,17 +130,36 @@ def _damaged(reason: str) -> ImplicamError:
 
 
 def result_file(folder: Path, name: str) -> Path:
-    """Where the result of a cell is."""
+    """Where the result of a cell is.
+
+    Args:
+        folder: Of the results.
+        name: Of the cell.
+    """
     return folder / f"{name}.npz"
 
 
 def failure_file(folder: Path, name: str) -> Path:
-    """Where it is written why a cell failed, with the traceback."""
+    """The file that says why a cell failed, with the traceback.
+
+    Args:
+        folder: Of the results.
+        name: Of the cell.
+    """
     return folder / f"{name}.failed.txt"
 
 
 def write_result(folder: Path, name: str, content: bytes) -> None:
-    """Keep a result, whole; an earlier failure is forgotten."""
+    """Write a result, whole; the file of an earlier failure is removed.
+
+    Args:
+        folder: Of the results.
+        name: Of the cell.
+        content: As of `encode`.
+
+    Raises:
+        ImplicamError: It cannot be written.
+    """
     with replacing(result_file(folder, name)) as temporary:
         temporary.write_bytes(content)
     failure_file(folder, name).unlink(missing_ok=True)

@@ -19,7 +19,11 @@ Table = list[dict[str, Any]]
 
 
 def ball_table(rows: Sequence[Row]) -> Table:
-    """A line for each set, method and number of points: quartiles of the rms errors of its runs, in mm."""
+    """A line for each set, method and number of points: quartiles of the rms errors of its runs, in mm.
+
+    Args:
+        rows: Of experiment 1.
+    """
     keys = ("trained", "judged", "set", "method", "known", "budget")
     table = []
     for key, runs in _grouped(rows, keys):
@@ -33,8 +37,14 @@ def ball_table(rows: Sequence[Row]) -> Table:
 
 
 def active_table(rows: Sequence[Row]) -> Table:
-    """A line for each set, method and stage (the start, 20 points added, the end): over the starts, lowest, median and
-    highest, in mm."""
+    """A line for each set, method and stage (the start, 20 points added, the end), in mm.
+
+    Args:
+        rows: Of experiment 2.
+
+    Returns:
+        Lowest, median and highest over the starts.
+    """
     table = []
     steps = {0, EARLY_POINTS, max((int(row["added"]) for row in rows), default=0)}
     for key, runs in _grouped(rows, ("set", "method", "added", "known")):
@@ -48,14 +58,22 @@ def active_table(rows: Sequence[Row]) -> Table:
 
 
 def board_table(rows: Sequence[Row]) -> Table:
-    """A line for each set, number of boards and method: mean and standard deviation over the test points, in mm."""
+    """A line for each set, number of boards and method: mean and standard deviation over the test points, in mm.
+
+    Args:
+        rows: Of experiment 3.
+    """
     names = ("error", "error_sd", "sd", "sd_sd", "rmse", "mean_sd", "ellipsoid_95", "limit", "measured", "failure")
     keys = ("set", "boards", "method", "judged", "known", *names)
     return [{key: row[key] for key in keys if key in row} for row in rows]
 
 
 def published_beside(rows: Sequence[Row]) -> Table:
-    """The paper's table, and ours beside it: a line for each of its rows that was computed."""
+    """The paper's table, and ours beside it: a line for each of its rows that was computed.
+
+    Args:
+        rows: Of experiment 3.
+    """
     table = []
     for row in published.load("board").table:
         line: dict[str, Any] = {"set": row.set, "boards": row.boards}
@@ -72,7 +90,12 @@ def published_beside(rows: Sequence[Row]) -> Table:
 def tenfold(rows: Sequence[Row]) -> Table:
     """forward-gp with the fewest points against inverse-gp, at random positions: with the most points, and at its best.
 
-    times: ratio of the geometric means of the runs' errors, with its 95 % interval.
+    Args:
+        rows: Of experiment 1.
+
+    Returns:
+        For each set and part to train on; `times` is the ratio of the geometric means of the runs' errors, with its 95
+        % interval.
     """
     table = []
     for cameras in dict.fromkeys(str(row["set"]) for row in rows):
@@ -96,9 +119,12 @@ def tenfold(rows: Sequence[Row]) -> Table:
 
 
 def lattice_bias(rows: Sequence[Row]) -> Table:
-    """What a lattice hides: rms error over the limit, at held-out positions of the lattice and at random ones.
+    """Rms error over the limit, at held-out positions of the lattice and at random ones: a lattice hides errors.
 
-    Only where the data have a Cramer-Rao limit: positions differ in how exactly anybody can measure them.
+    Only where the data have a Cramer-Rao limit: positions differ in how exactly they can be measured at all.
+
+    Args:
+        rows: Of experiment 1.
     """
     table = []
     for key, runs in _grouped(where(rows, trained=BALL), ("set", "method", "known")):
@@ -115,7 +141,11 @@ def lattice_bias(rows: Sequence[Row]) -> Table:
 
 
 def nearness(rows: Sequence[Row]) -> Table:
-    """Stated standard deviation and error of the nearest third of the test boards, over those of the farthest."""
+    """Stated standard deviation and error of the nearest third of the test boards, over those of the farthest.
+
+    Args:
+        rows: Of experiment 3.
+    """
     table = []
     for row in where(rows, judged=BOARD):
         line = {key: row[key] for key in ("set", "boards", "method")}
@@ -127,7 +157,11 @@ def nearness(rows: Sequence[Row]) -> Table:
 
 
 def by_board(rows: Sequence[Row]) -> Table:
-    """A line for each test board: mean error and mean stated standard deviation of its corners, in mm."""
+    """A line for each test board: mean error and mean stated standard deviation of its corners, in mm.
+
+    Args:
+        rows: Of experiment 3.
+    """
     return [
         {**{key: row[key] for key in ("set", "boards", "method")}, "board": number + 1, "error": error, "sd": sd}
         for row in where(rows, judged=BOARD)
@@ -136,7 +170,14 @@ def by_board(rows: Sequence[Row]) -> Table:
 
 
 def quartiles(values: Floats) -> list[float]:
-    """The quartiles of (n,) numbers; NaN where there are none."""
+    """The quartiles of numbers.
+
+    Args:
+        values: (n,); what is not finite is left out.
+
+    Returns:
+        Three numbers; NaN where there are none.
+    """
     values = values[np.isfinite(values)]
     return [float(q) for q in np.quantile(values, [0.25, 0.5, 0.75])] if len(values) else [float("nan")] * 3
 
@@ -147,7 +188,15 @@ def _range(values: Floats) -> list[float]:
 
 
 def numbers(rows: Iterable[Row], key: str) -> Floats:
-    """A column; NaN where a row has no such number."""
+    """A column of a table.
+
+    Args:
+        rows: n rows.
+        key: The column.
+
+    Returns:
+        (n,), NaN where a row has no such number.
+    """
     return column([{key: row.get(key, np.nan)} for row in rows], key)
 
 

@@ -40,7 +40,13 @@ _ONE_THREAD = dict.fromkeys(
 
 
 class Task(NamedTuple):
-    """What a worker is sent: the dotted name of the function, the cell's name, its options as JSON text."""
+    """What is sent to a worker.
+
+    Attributes:
+        work: The dotted name of the function.
+        name: Of the cell.
+        options: As JSON text.
+    """
 
     work: str
     name: str
@@ -48,7 +54,14 @@ class Task(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """What comes back: the bytes of the result file, or why there are none (three lines) and the traceback."""
+    """What comes back from a worker.
+
+    Attributes:
+        name: Of the cell.
+        content: The bytes of the result file; empty where there is no result.
+        failure: Why there is none, in three lines.
+        trace: The traceback.
+    """
 
     name: str
     content: bytes = b""
@@ -57,7 +70,11 @@ class Attempt(NamedTuple):
 
 
 def attempt(task: Task) -> Attempt:
-    """Compute one cell in this process; never raises an error of the cell's own."""
+    """Compute one cell in this process; an error of the cell is returned, not raised.
+
+    Args:
+        task: The cell.
+    """
     with _ONE_CELL_AT_A_TIME, _one_thread():
         start = time.perf_counter()
         try:
@@ -100,8 +117,10 @@ def _one_thread() -> Iterator[None]:
 class Workers(Protocol):
     """Processes that compute.
 
-    at_once: how many tasks they are given at a time. death: what a future raises where its process died. retries: how
-    often a task that may have been the cause is tried alone.
+    Attributes:
+        at_once: How many tasks they are given at a time.
+        death: What a future raises where its process died.
+        retries: How often a task that may have been the cause is tried alone.
     """
 
     at_once: int
@@ -109,17 +128,36 @@ class Workers(Protocol):
     retries: int
 
     def submit(self, task: Task) -> Future[Attempt]:
-        """Start `attempt(task)` somewhere."""
+        """Start `attempt` somewhere.
+
+        Args:
+            task: The cell.
+        """
 
     def check(self) -> None:
-        """Called while no result comes; ImplicamError where none can come any more."""
+        """Called while no result comes.
+
+        Raises:
+            ImplicamError: None can come any more.
+        """
 
     def close(self) -> None:
         """Stop what still runs."""
 
 
 def compute_all(workers: Workers, tasks: Sequence[Task]) -> Generator[Attempt, None, None]:
-    """Compute all tasks; the attempts in the order in which they end. Close it to stop the workers early."""
+    """Compute all tasks. Close the generator to stop the workers early.
+
+    Args:
+        workers: What computes.
+        tasks: The cells.
+
+    Yields:
+        The attempts, in the order in which they end.
+
+    Raises:
+        ImplicamError: No result can come any more.
+    """
     suspects: list[Task] = []
     try:
         for task, done in _compute(workers, tasks):
@@ -177,8 +215,10 @@ def _compute_alone(workers: Workers, task: Task) -> Attempt:
 
 
 class LocalProcesses:
-    """So many processes on this machine, by joblib. A cell whose process dies three times, twice of them alone, has
-    failed."""
+    """Processes on this machine, by joblib.
+
+    A cell whose process dies three times, twice of them alone, has failed.
+    """
 
     death: type[Exception] = BrokenProcessPool
     retries = 2
@@ -193,12 +233,16 @@ class LocalProcesses:
         warnings.filterwarnings("ignore", "A worker stopped while some jobs were given to the executor", UserWarning)
 
     def submit(self, task: Task) -> Future[Attempt]:
-        """Start `attempt(task)`; where a process has died, in new ones."""
+        """Start `attempt`; where a process has died, in new ones.
+
+        Args:
+            task: The cell.
+        """
         future: Future[Attempt] = self._pool().submit(attempt, task)
         return future
 
     def check(self) -> None:
-        """Nothing to see: loky itself notices when a process dies."""
+        """Do nothing: loky itself notices when a process dies."""
 
     def close(self) -> None:
         """End the processes, whatever they do."""
@@ -210,11 +254,11 @@ class LocalProcesses:
 
 
 class DaskCluster:
-    """The workers of the Dask scheduler at an address such as tcp://10.0.0.5:8786; they need implicam installed.
+    """The workers of a Dask scheduler at an address such as tcp://10.0.0.5:8786; they need implicam installed.
 
     Dask itself tries a cell again where its worker died (`distributed.scheduler.allowed-failures`, 3 times); what it
-    gives up, perhaps for the sake of another cell on the same worker, is tried once more alone. All cells are handed
-    over at once, so that a cluster that adapts sees how much there is.
+    gives up, perhaps because of another cell on the same worker, is tried once more alone. All cells are handed over at
+    once, so that a cluster that adapts its size sees how many there are.
     """
 
     at_once, retries = sys.maxsize, 1
@@ -240,12 +284,20 @@ class DaskCluster:
         self._executor = self._client.get_executor(pure=False)
 
     def submit(self, task: Task) -> Future[Attempt]:
-        """Start `attempt(task)` on any worker."""
+        """Start `attempt` on any worker.
+
+        Args:
+            task: The cell.
+        """
         future: Future[Attempt] = self._executor.submit(attempt, task)
         return future
 
     def check(self) -> None:
-        """A cluster without workers would keep us waiting for ever; for a while, they may be starting."""
+        """Give up where the cluster has had no workers for a while; at first they may be starting.
+
+        Raises:
+            ImplicamError: It has had none for `NO_WORKER_SECONDS`.
+        """
         has_workers = False
         with suppress(OSError, ValueError):  # the scheduler does not answer
             has_workers = bool(self._client.nthreads())
@@ -258,5 +310,5 @@ class DaskCluster:
             )
 
     def close(self) -> None:
-        """Let go of the cluster; what still runs there is cancelled."""
+        """Disconnect from the cluster; what still runs there is cancelled."""
         self._client.close()

@@ -28,9 +28,17 @@ FINDINGS_WITHOUT_GP = ("few_boards_hurt_explicit", "budget_matters_with_six_came
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a finding for a set of cameras (or several) and a Gaussian process ("" where none is meant).
+    """What became of a finding for a set of cameras (or several) and a Gaussian process.
 
-    number: the case that decides; remark: where the paper's own table says otherwise.
+    Attributes:
+        experiment: Its name.
+        key: Of the finding.
+        statement: The finding in words.
+        sets: The sets of cameras.
+        method: The Gaussian process; empty for a finding that is about none.
+        verdict: `HOLDS`, `FAILS` or `OPEN`.
+        number: The case that decides, in words.
+        remark: Where the paper's own table says otherwise.
     """
 
     experiment: str
@@ -44,9 +52,12 @@ class Verdict:
 
 
 def verdicts(rows: Mapping[str, Rows]) -> list[Verdict]:
-    """Of all findings of the experiments ("ball", "active", "board") that have rows, for each Gaussian process.
+    """The verdicts on all findings of the experiments that have rows, for each Gaussian process.
 
-    Data of another rig have other sets of cameras: a finding is then asked of each of those.
+    Data of another rig have other sets of cameras: a finding is then judged for each of those.
+
+    Args:
+        rows: "ball", "active" or "board" -> rows.
     """
     found = []
     for experiment, tests in TESTS.items():

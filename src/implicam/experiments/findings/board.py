@@ -96,7 +96,18 @@ def _nearer(key: str, what: str) -> Test:
 
 
 def nearest_and_farthest(rows: Rows, method: str, cameras: str, boards: int, key: str) -> tuple[Floats, Floats]:
-    """Means over the corners of each test board: of the nearest third of them, and of the farthest."""
+    """Means over the corners of each test board, of the nearest third of the boards and of the farthest.
+
+    Args:
+        rows: Of experiment 3.
+        method: Its name.
+        cameras: A set of cameras.
+        boards: How many boards it was trained on.
+        key: "error" or "sd".
+
+    Returns:
+        (k,) of the nearest and (k,) of the farthest, mm; empty where there is no such row.
+    """
     found = _by_board(rows, method, cameras, boards, key)
     values = np.array([found[number] for number in sorted(found)], dtype=np.float64)
     third = max(1, len(values) // 3)

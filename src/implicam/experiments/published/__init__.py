@@ -22,7 +22,15 @@ EXPERIMENTS = ("setup", "ball", "active", "board")
 
 @dataclass(frozen=True)
 class Number:
-    """A number, or a list of numbers, that the paper states; unit is empty for a count or a share."""
+    """A number, or a list of numbers, that the paper states.
+
+    Attributes:
+        key: Its name in our data.
+        value: The number or numbers.
+        meaning: In words.
+        place: Where it is in the paper.
+        unit: Empty for a count or a share.
+    """
 
     key: str
     value: float | tuple[float, ...]
@@ -33,9 +41,15 @@ class Number:
 
 @dataclass(frozen=True)
 class Finding:
-    """What the paper concludes, for which sets of cameras; numbers: keys of the numbers it names.
+    """What the paper concludes.
 
-    remark: where the paper's own table says otherwise.
+    Attributes:
+        key: Its name in our data.
+        statement: In words.
+        sets: For which sets of cameras.
+        place: Where it is in the paper.
+        numbers: Keys of the numbers that it names.
+        remark: Where the paper's own table says otherwise.
     """
 
     key: str
@@ -48,7 +62,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and standard deviation over test points (mm)."""
+    """Mean and standard deviation over test points.
+
+    Attributes:
+        mean: mm.
+        sd: mm.
+    """
 
     mean: float
     sd: float
@@ -56,10 +75,18 @@ class Spread:
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of the paper's Table 1 (mm): a set of cameras, trained on so many boards with `known` corners in all.
+    """A row of the paper's Table 1, mm.
 
-    gp_sd is the posterior standard deviation averaged over the axes. The paper does not say whether the "RMSE" of a
-    point is its distance from the truth or that over root 3, the rms over its axes.
+    The paper does not say whether the "RMSE" of a point is its distance from the truth or that over root 3, the rms
+    over its axes.
+
+    Attributes:
+        set: The set of cameras.
+        boards: How many boards train.
+        known: How many corners these have in all.
+        gp_rmse: Error of the Gaussian process.
+        gp_sd: Its posterior standard deviation, averaged over the axes.
+        network_rmse: Error of the network.
     """
 
     set: str
@@ -72,7 +99,15 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Published:
-    """What the paper says about one experiment; numbers and findings by key, in the paper's order."""
+    """What the paper says about one experiment.
+
+    Attributes:
+        experiment: Its name.
+        place: Where it is in the paper.
+        numbers: By key, in the paper's order.
+        findings: By key, in the paper's order.
+        table: The rows of its table, where it has one.
+    """
 
     experiment: str
     place: str
@@ -82,7 +117,14 @@ class Published:
 
 
 def load(experiment: str) -> Published:
-    """What the paper says about one of EXPERIMENTS. Raises UsageError for another name."""
+    """What the paper says about an experiment.
+
+    Args:
+        experiment: One of `EXPERIMENTS`.
+
+    Raises:
+        UsageError: It is none of them.
+    """
     if experiment not in EXPERIMENTS:
         raise UsageError(
             f"The paper has no experiment {experiment!r}{did_you_mean(experiment, EXPERIMENTS)}.",
