@@ -28,7 +28,7 @@ POINTS_PER_CHECK = 5
 
 
 def cells(source: Source, plan: Plan) -> list[Cell]:
-    """The cells of experiment 2: one for each set, method and start; the networks of all starts are trained as one batch.
+    """The cells of experiment 2: one for each set, method and start; networks of all starts are trained as one batch.
 
     Args:
         source: The data.
