@@ -37,7 +37,11 @@ _AIMS, _FOCALS = ("look_at", "rotation", "rotation_vector"), ("focal_px", "focal
 
 
 def is_rig_file(spec: str) -> bool:
-    """Whether a rig is named as a file is."""
+    """Whether a rig is named as a file is.
+
+    Args:
+        spec: As of `build_rig`.
+    """
     return spec.lower().endswith(SUFFIX)
 
 

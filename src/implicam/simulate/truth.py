@@ -13,7 +13,11 @@ from implicam.simulate.rigs import Rig, Unusual
 def write_rig(rig: Rig) -> dict[str, Any]:
     """The truth about a rig as plain tables, for `truth.toml`: lenses, poses, noise, seed.
 
-    Of the smooth error only its size: `build_rig` makes the same one again from name, seed, frame and the numbers here.
+    Of the smooth error only its size is written: `build_rig` makes the same one again from name, seed, frame and the
+    numbers here.
+
+    Args:
+        rig: The rig.
     """
     volume = rig.volume
     return {
