@@ -461,10 +461,28 @@ def test_an_oracle_that_never_answers_ends_the_run(rig: Rig, room: Workspace) ->
     assert 8 <= len(loop.skipped) <= 20
 
 
-def test_a_list_of_places_is_used_up_and_then_the_loop_ends(rig: Rig, room: Workspace) -> None:
+@pytest.mark.parametrize("rule", [name for name in ACQUISITIONS])
+def test_a_list_of_places_is_used_up_and_then_the_loop_ends(rule: str, rig: Rig, room: Workspace) -> None:
     places = room.candidates(14, 3)
-    loop = Loop(ForwardGP(), Workspace.only(places)).run(SimulatedOracle(rig))
+    loop = Loop(ForwardGP(), Workspace.only(places), acquisition(rule)).run(SimulatedOracle(rig))
     assert sorted(map(tuple, loop.data.xyz)) == sorted(map(tuple, places))  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("rule", ["sobol", "integrated"])
+def test_each_place_of_a_list_is_asked_for_once_though_targets_stand_beside_it(
+    rule: str, rig: Rig, room: Workspace
+) -> None:
+    """A person puts a target near a place, and types where it is: it was asked for again, and others never."""
+    grid = room.candidates(12, 3)
+    loop, asked = Loop(ForwardGP(), Workspace.only(grid), acquisition(rule)), []
+    oracle, rng = SimulatedOracle(rig), np.random.default_rng(4)
+    for _ in range(len(grid)):
+        (target,) = loop.ask()
+        asked.append(tuple(target.xyz))
+        loop.tell(oracle.observe(replace(target, xyz=target.xyz + rng.normal(scale=0.3, size=3))))
+    assert sorted(asked) == sorted(map(tuple, grid))
+    with pytest.raises(UsageError, match="no place of the workspace is left"):
+        loop.ask()
 
 
 def test_points_can_be_taken_back(rig: Rig, known: Dataset, room: Workspace) -> None:

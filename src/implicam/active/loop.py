@@ -16,6 +16,7 @@ from itertools import count, islice
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from implicam.active.acquisitions import DEFAULT, Acquisition, Choice, acquisition, choose
 from implicam.active.design_model import (
@@ -42,6 +43,10 @@ for inverse-gp."""
 
 FEW_POINTS = 16
 """So few points say little of where the best fit is: each fit is one from no guess."""
+
+REFUSED_RADIUS_RATIO, RELATIVE_PLACE_TOLERANCE = 0.05, 1e-6
+"""Part of the workspace's size: so near to a place where no target could be measured none is asked for again; and, of a
+list of places, how far rounding may move one."""
 
 MAX_SKIPPED = 20
 """So many targets in a row that nobody could measure are no accident."""
@@ -297,6 +302,8 @@ class Loop:
         pool = self.pool.xyz if self.pool is not None else self.workspace.design(self.start, self.seed)
         if self.pool is None and len(used) + number > len(pool):
             pool = self.workspace.candidates(self.candidates, self.seed)
+        if self.pool is None and self.workspace.places is not None:
+            pool = self._not_visited(pool)
         targets: list[Target] = []
         nowhere = np.full((self._cameras, 2), np.nan)
         for k in range(number):
@@ -326,11 +333,7 @@ class Loop:
         if self.pool is not None:
             candidates = Places.recorded(self.pool.select(self._unused()))
         else:
-            # Others each time, or what is between the candidates would never be measured.
-            candidates = self.workspace.candidates(self.candidates, 1000 * self.seed + self._asked)
-            if self.acquisition.same_candidates:
-                candidates = self.workspace.candidates(self.candidates, self.seed)[self.points :]
-            candidates = self._not_refused(candidates)
+            candidates = self._free_candidates()
         return design_model_of(self.calibration, candidates, self._judged(), self._forward())
 
     def _unused(self) -> list[int]:
@@ -346,17 +349,40 @@ class Loop:
             raise UsageError("every point of the pool is used.", fix="record more, or stop here")
         return left
 
-    def _not_refused(self, candidates: Floats) -> Floats:
-        """Without the surroundings of what could not be measured, and without the very places that are known."""
+    def _free_candidates(self) -> Floats:
+        """Places where the next target may be: without the surroundings of what could not be measured, and of a list
+        of places without those that are known."""
+        same, places = self.acquisition.same_candidates, self.workspace.places
+        # Others each time, or what is between the candidates would never be measured.
+        seed = self.seed if same else 1000 * self.seed + self._asked
+        number = self.candidates + (self.points if same else 0)
+        if places is not None:  # all of a list: one by one they are used up, whatever the rule
+            number = max(number, len(places))
+        candidates = self.workspace.candidates(number, seed)
         size = self.workspace.size
-        away = [(xyz, 0.05 * size) for xyz, _ in self._refused]
-        if self.workspace.places is not None and self.data is not None:
-            away = [(xyz, 1e-6 * size) for xyz, _ in self._refused] + [(xyz, 1e-6 * size) for xyz in self.data.xyz]
-        for place, radius in away:
+        if places is not None:
+            candidates = self._not_visited(candidates)
+            radius = RELATIVE_PLACE_TOLERANCE * size
+        else:
+            candidates = candidates[self.points :] if same else candidates
+            radius = REFUSED_RADIUS_RATIO * size
+        for place, _ in self._refused:
             candidates = candidates[np.linalg.norm(candidates - place, axis=1) > radius]
         if not len(candidates):
             raise UsageError("no place of the workspace is left.", fix="give a larger one (--workspace)")
-        return candidates
+        return candidates[: self.candidates]
+
+    def _not_visited(self, places: Floats) -> Floats:
+        """The places (n, 3) of a list that no known point stands for. A known point is where the target really was, so
+        it stands for the nearest place, if that is nearer than half way to the next."""
+        if self.data is None or len(places) < 2:
+            return places
+        tree = cKDTree(places)
+        spacing = tree.query(places, k=2)[0][:, 1]
+        distance, nearest = tree.query(self.data.xyz)
+        visited = np.zeros(len(places), dtype=np.bool_)
+        visited[nearest[distance <= 0.5 * spacing[nearest]]] = True
+        return places[~visited]
 
     def _forward(self) -> Calibration | None:
         """For a method that does not predict pixels, a forward model of the same points that does; else None."""
