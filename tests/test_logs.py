@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from command_line import Cli, cli  # noqa: F401  a fixture
+from implicam.cli import show
 from implicam.logs import log_to_file
 
 SIMULATE = ["simulate", "rig", "--cameras", "2R", "--positions", "random", "--points", "20", "--seed", "1"]
@@ -47,3 +48,26 @@ def test_an_error_is_in_the_log_with_its_traceback(tmp_path: Path) -> None:
     assert "_ = 1 / 0" in text
     assert text.index("begun") < text.index("again")
     assert not logging.getLogger("implicam").handlers
+
+
+def test_without_a_terminal_long_work_says_a_line_now_and_then(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Not a line a step, and not silence for minutes."""
+    clock = [100.0]
+    monkeypatch.setattr(show.time, "monotonic", lambda: clock[0])
+    with show.progress() as progress:
+        for done in range(101):
+            progress("fitting", done, 100)
+            clock[0] += 1
+    lines = capfd.readouterr().err.splitlines()
+    assert lines == [
+        "fitting: 10 of 100, about 2 min left",
+        "fitting: 40 of 100, about 1 min left",
+        "fitting: 70 of 100, about 1 min left",
+        "fitting: 100 of 100",
+    ]
+    with show.progress(quiet=True) as progress:
+        clock[0] += 1000
+        progress("fitting", 1, 2)
+    assert capfd.readouterr().err == ""

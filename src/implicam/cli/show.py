@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -38,6 +39,8 @@ from implicam.progress import Progress
 from implicam.verdict import Verdict
 
 MOST_NOTES = 6
+FIRST_LINE_SECONDS, SECONDS_BETWEEN_LINES = 10.0, 30.0
+"""Of progress where there is no terminal."""
 _LOG = logging.getLogger(__name__)
 err = Console(stderr=True, highlight=False)
 
@@ -49,9 +52,10 @@ def out(width: int | None = None) -> Console:
 
 @contextmanager
 def progress(quiet: bool = False) -> Iterator[Progress]:
-    """A progress bar on stderr with the time left, where there is a terminal; each step is logged."""
+    """A progress bar on stderr with the time left where there is a terminal, else a line now and then; each step is
+    logged."""
     if quiet or not err.is_terminal:
-        yield _log_step
+        yield _log_step if quiet else _LinesNowAndThen()
         return
     times = (TimeElapsedColumn(), TimeRemainingColumn())
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times)
@@ -65,6 +69,27 @@ def progress(quiet: bool = False) -> Iterator[Progress]:
             bars.update(tasks[what], completed=done, total=total)
 
         yield step
+
+
+class _LinesNowAndThen:
+    """Progress of long work where there is no terminal, such as a log of a batch job: silence for minutes looks like a
+    hang, and a line for each step would fill pages."""
+
+    def __init__(self) -> None:
+        self._began: dict[str, float] = {}
+        self._next = time.monotonic() + FIRST_LINE_SECONDS
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        _log_step(what, done, total)
+        now = time.monotonic()
+        began = self._began.setdefault(what, now)
+        if now < self._next:
+            return
+        self._next = now + SECONDS_BETWEEN_LINES
+        left = (
+            f", about {max(1, round((now - began) / done * (total - done) / 60))} min left" if 0 < done < total else ""
+        )
+        say(f"{what}: {done} of {total}{left}")
 
 
 def _log_step(what: str, done: int, total: int) -> None:
