@@ -461,7 +461,7 @@ def test_an_oracle_that_never_answers_ends_the_run(rig: Rig, room: Workspace) ->
     assert 8 <= len(loop.skipped) <= 20
 
 
-@pytest.mark.parametrize("rule", [name for name in ACQUISITIONS])
+@pytest.mark.parametrize("rule", list(ACQUISITIONS))
 def test_a_list_of_places_is_used_up_and_then_the_loop_ends(rule: str, rig: Rig, room: Workspace) -> None:
     places = room.candidates(14, 3)
     loop = Loop(ForwardGP(), Workspace.only(places), acquisition(rule)).run(SimulatedOracle(rig))
