@@ -461,6 +461,21 @@ def test_an_oracle_that_never_answers_ends_the_run(rig: Rig, room: Workspace) ->
     assert 8 <= len(loop.skipped) <= 20
 
 
+@pytest.mark.parametrize("method", [ForwardGP(), InverseGP()])
+def test_in_view_is_what_every_camera_of_the_true_rig_sees(
+    method: ForwardGP | InverseGP, rig: Rig, known: Dataset
+) -> None:
+    found = suggest(method.fit(known), None, count=3, rule=acquisition("variance"))
+    inside = found.workspace.judged(500)
+    seen = [camera.pixel_from_world(inside)[1] for camera in rig.cameras]
+    assert np.mean(np.all(seen, axis=0)) > 0.97
+    assert np.prod(np.ptp(found.workspace.vertices, axis=0)) > 1.2 * np.prod(np.ptp(known.xyz, axis=0))
+    for target in found.targets:
+        assert np.isfinite(target.uv).all()
+        true = [camera.pixel_from_world(target.xyz[None])[0][0] for camera in rig.cameras]
+        np.testing.assert_allclose(target.uv, true, atol=8.0)  # at the edge of the picture, far from 24 known points
+
+
 @pytest.mark.parametrize("rule", list(ACQUISITIONS))
 def test_a_list_of_places_is_used_up_and_then_the_loop_ends(rule: str, rig: Rig, room: Workspace) -> None:
     places = room.candidates(14, 3)

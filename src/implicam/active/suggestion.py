@@ -24,16 +24,18 @@ class Suggestion:
         targets: In the order in which to visit them.
         now: The uncertainty over the workspace now.
         then: The uncertainty to be expected when all targets are known points.
+        workspace: Where targets can be.
     """
 
     targets: list[Target]
     now: Step
     then: Step
+    workspace: Workspace
 
 
 def suggest(
     calibration: Calibration,
-    workspace: Workspace,
+    workspace: Workspace | None,
     *,
     count: int = 5,
     rule: Acquisition | None = None,
@@ -47,7 +49,8 @@ def suggest(
 
     Args:
         calibration: That of the rig.
-        workspace: Where targets can be, and where the calibration has to be good.
+        workspace: Where targets can be, and where the calibration has to be good; None for all that every camera sees
+            near the known points.
         count: How many targets.
         rule: What scores the candidates; None for the default acquisition.
         here: (3,) where the target is now, in the world; with it, the targets are ordered to a short path.
@@ -61,7 +64,10 @@ def suggest(
     """
     if not designs_experiments(calibration):
         raise cannot_design(calibration.method)
-    pilot = None if isinstance(calibration, PredictsPixels) else ForwardGP().fit(calibration.data)
+    rig: PredictsPixels = calibration if isinstance(calibration, PredictsPixels) else ForwardGP().fit(calibration.data)
+    pilot = None if rig is calibration else rig
+    if workspace is None:
+        workspace = Workspace.in_view(rig, calibration.data.xyz)
     places = workspace.candidates(candidates, seed)
     design = design_model_of(calibration, places, workspace.judged(judged, seed), pilot)
     if not design.now.measured.any():
@@ -74,4 +80,5 @@ def suggest(
     chosen = choose(design, rule or acquisition(DEFAULT), rng, count=count, here=here, reach=reach)
     known = len(calibration.data)
     then = step_of(chosen.after.now, known + len(chosen.index))
-    return Suggestion(targets_of(design.candidates, chosen, calibration.data), step_of(design.now, known), then)
+    targets = targets_of(design.candidates, chosen, calibration.data)
+    return Suggestion(targets, step_of(design.now, known), then, workspace)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.stats import qmc
 
+from implicam.active.design_model import on_image
+from implicam.calibrators import PredictsPixels
 from implicam.dataset import Floats
 from implicam.errors import HardwareError, UsageError
 from implicam.hardware.csv_player import read_positions
@@ -24,6 +26,9 @@ MIN_INSIDE_SHARE = 0.05
 
 START_DISTANCE_RATIO = 0.9
 """The places to begin with are so much nearer to the centre than candidates: nobody knows yet what the cameras see."""
+
+VIEW_GROWTH, PLACES_IN_VIEW = 2.0, 8192
+"""What the cameras see is looked for in the box of the known points made so many times as large, at so many places."""
 
 RELATIVE_TOLERANCE = 1e-9
 """Part of the size by which a point may be outside and still counts as inside."""
@@ -103,6 +108,33 @@ class Workspace:
         """
         points = np.asarray(xyz, dtype=np.float64)
         return cls._of(points, points, f"{len(points)} places")
+
+    @classmethod
+    def in_view(cls, rig: PredictsPixels, xyz: ArrayLike) -> Workspace:
+        """What every calibrated camera sees, not farther beyond the known points than they reach themselves.
+
+        With it an acquisition is evaluated on the dense set of pixel combinations that a position can have, whatever
+        the axes of the world are: for targets that are given as pixels.
+
+        Args:
+            rig: A calibration that predicts pixels.
+            xyz: (n, 3) known points in the world.
+
+        Raises:
+            UsageError: No volume near them is seen by every camera.
+        """
+        points = np.asarray(xyz, dtype=np.float64)
+        centre, half = 0.5 * (points.min(axis=0) + points.max(axis=0)), 0.5 * np.ptp(points, axis=0)
+        around = cls.box(centre - VIEW_GROWTH * half, centre + VIEW_GROWTH * half)
+        places = around.judged(PLACES_IN_VIEW)
+        used = np.array([name in rig.camera_names for name in rig.trained.camera_names])
+        seen = places[on_image(rig.trained, rig.predict(places))[:, used].all(axis=1)]
+        if len(seen) < 4:
+            raise UsageError(
+                "no volume near the known points is seen by every camera.",
+                fix="give a box, --workspace x0:x1,y0:y1,z0:z1",
+            )
+        return replace(cls._of(seen, None, ""), name="what every camera sees")
 
     @classmethod
     def _of(cls, points: Floats, places: Floats | None, name: str) -> Workspace:

@@ -27,7 +27,7 @@ Room = Annotated[
     typer.Option(
         "--workspace",
         metavar="WHERE",
-        help="x0:x1,y0:y1,z0:z1, a CSV of places (x,y,z), or box or hull of the known points.",
+        help="x0:x1,y0:y1,z0:z1, a CSV of places (x,y,z), or box or hull of the known points; suggest: or view.",
     ),
 ]
 Rule = Annotated[str | None, typer.Option("--acquisition", metavar="NAME", help=f"{RULES}.")]
@@ -63,7 +63,7 @@ def suggest_command(
     fitted = load_calibration(calibration)
     if reach is not None and not reach > 0:
         raise UsageError(f"a reach of {reach:g} is no length.", fix="give one greater than zero")
-    room = workspace_from(workspace or "box", fitted.data.xyz)
+    room = None if workspace == "view" else workspace_from(workspace or "box", fitted.data.xyz)
     place = None if here is None else _place(here)
     found = suggest(
         fitted,
@@ -88,7 +88,7 @@ def suggest_command(
             for t in found.targets
         ]
         steps = {"now": asdict(found.now), "expected": asdict(found.then)}
-        show.emit_json({"length_unit": unit, "workspace": room.name, "targets": targets, **steps})
+        show.emit_json({"length_unit": unit, "workspace": found.workspace.name, "targets": targets, **steps})
         return
     rows = [[str(i), *(f"{x:.5g}" for x in t.xyz)] for i, t in enumerate(found.targets, start=1)]
     show.line(f"Where to put the next known points, in {unit}:")
@@ -96,7 +96,7 @@ def suggest_command(
     seen = [[str(i), *(_pixel(uv) for _, uv in _pairs(cameras, t.uv))] for i, t in enumerate(found.targets, start=1)]
     show.line("Where each camera will see them, in pixels:")
     show.table(show.text_table("", ["", *cameras], seen))
-    show.line(f"95 % uncertainty in 95 % of the workspace ({room.name}):")
+    show.line(f"95 % uncertainty in 95 % of the workspace ({found.workspace.name}):")
     for words, step in (("now", found.now), (f"then, with all {len(found.targets)}", found.then)):
         times = f"{decimal_number(step.excess)} times what pixel noise alone leaves"
         show.line(f"  {words:<18} {decimal_number(step.usual)} {unit}, {times}")
