@@ -13,7 +13,7 @@ from implicam import registry
 from implicam.calibrators import load_calibration
 from implicam.errors import HardwareError, UsageError
 from implicam.hardware import CAMERAS, ROBOTS, camera_from, robot_from
-from implicam.session.controller import CALIBRATION
+from implicam.session.controller import CALIBRATION_FILE
 from implicam.session.setup import Setup, open_session
 from toy_robot import RIG, Gantry, GantryCamera
 
@@ -84,7 +84,7 @@ def test_a_session_is_run_with_it_and_goes_on(tmp_path: Path) -> None:
         controller.run()
         assert controller.state.phase == "done", controller.state.message
         assert controller.loop.points == 9
-    made = load_calibration(tmp_path / "s" / CALIBRATION)
+    made = load_calibration(tmp_path / "s" / CALIBRATION_FILE)
     np.testing.assert_allclose(made.data.known.sd[0], 0.01)
 
 

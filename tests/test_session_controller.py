@@ -18,7 +18,7 @@ from implicam.detect import Ball, Detected
 from implicam.errors import FitError, HardwareError, ImplicamError, UsageError
 from implicam.hardware import Person
 from implicam.session import Session
-from implicam.session.controller import CALIBRATION, REPORT, Equipment, SessionController
+from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, Equipment, SessionController
 from implicam.session.setup import Setup, changed, open_session
 
 SETUP = Setup(rig="stereo", budget=12, speed=1e6)
@@ -63,7 +63,7 @@ def test_a_session_from_start_to_report(controller: SessionController) -> None:
         assert controller.state.message.startswith(f"point {i}")
         controller.go()
         phases.append(controller.state.phase)
-        assert controller.state.seen == ["cam1", "cam2"]
+        assert controller.state.cameras_with_ball == ["cam1", "cam2"]
         assert np.allclose(controller.state.position, controller.state.target.xyz)
         controller.accept()
         assert controller.session.data is not None
@@ -72,10 +72,10 @@ def test_a_session_from_start_to_report(controller: SessionController) -> None:
     assert controller.state.stop == "all 12 points of the budget are measured"
     saved = controller.finish()
     assert controller.state.phase == "done"
-    assert saved == controller.session.folder / CALIBRATION
+    assert saved == controller.session.folder / CALIBRATION_FILE
     calibration = load_calibration(saved)
     assert len(calibration.data) == 12
-    assert (controller.session.folder / REPORT).stat().st_size > 10_000
+    assert (controller.session.folder / REPORT_FILE).stat().st_size > 10_000
     on_disk = read_dataset(controller.session.folder)
     assert np.array_equal(on_disk.xyz, calibration.data.xyz)
     pictures = sorted(path.name for path in (controller.session.folder / "images" / "cam1").iterdir())
@@ -99,7 +99,7 @@ def test_the_live_ball_is_measured(controller: SessionController, after_ten: Ses
 def test_a_covered_camera_costs_one_view(controller: SessionController) -> None:
     controller.equipment.cameras[0].cover()  # type: ignore[attr-defined]
     controller.go()
-    assert controller.state.seen == ["cam2"]
+    assert controller.state.cameras_with_ball == ["cam2"]
     assert controller.state.looks[0].found.reason.startswith("no ball")
     controller.accept()
     assert controller.session.data is not None
@@ -116,7 +116,7 @@ def test_a_ball_that_nobody_finds_cannot_be_accepted(controller: SessionControll
         controller.accept()
     assert controller.state.phase == "shown"
     controller.redo()
-    assert controller.state.seen == ["cam1", "cam2"]
+    assert controller.state.cameras_with_ball == ["cam1", "cam2"]
     controller.accept()
     assert controller.loop.points == 1
 
@@ -352,7 +352,7 @@ def test_triggered_cameras_are_asked_only_when_the_trigger_fires(controller: Ses
     triggered.live()
     assert triggered.state.phase == "aim"
     triggered.go()
-    assert triggered.state.seen == ["cam1", "cam2"]
+    assert triggered.state.cameras_with_ball == ["cam1", "cam2"]
 
 
 def test_a_session_goes_on_where_it_was(tmp_path: Path) -> None:
@@ -433,7 +433,7 @@ def test_a_person_types_where_the_ball_is(tmp_path: Path) -> None:
         assert "type where it is" in controller.state.message
         assert controller.state.target is not None
         xyz = hand.move(controller.state.target.xyz + np.array([3.0, -2.0, 1.0]))
-        controller.arrived(xyz)
+        controller.report_position(xyz)
         assert controller.state.phase == "shown"
         controller.accept()
         data = controller.session.data
@@ -475,7 +475,7 @@ def test_another_thing_is_not_taken_for_the_ball(after_ten: SessionController, k
     if keeps:  # the ball was second: it is where it must be
         assert np.linalg.norm(look.uv - look.expected) < 5
     else:
-        assert controller.state.seen == ["cam1"]
+        assert controller.state.cameras_with_ball == ["cam1"]
         assert "px from where the ball must be" in look.found.reason
 
 

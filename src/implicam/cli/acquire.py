@@ -315,11 +315,11 @@ def _cameras(words: list[str] | None) -> tuple[tuple[str, str], ...] | None:
 
 
 def _tell(controller: Any, json: bool) -> None:
-    from implicam.session.controller import CALIBRATION
+    from implicam.session.controller import CALIBRATION_FILE
 
     state, folder = controller.state, controller.session.folder
     step = state.history[-1] if state.history else None
-    saved = folder / CALIBRATION
+    saved = folder / CALIBRATION_FILE
     if json:
         show.emit_json({
             "session": str(folder), "points": step.points if step else 0, "stopped": state.stop,

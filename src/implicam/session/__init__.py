@@ -1,4 +1,4 @@
-"""The guided session: what was accepted, on disk before anyone says so."""
+"""The guided session: each accepted point is on disk before the session says so."""
 
 from implicam.session.database import DATABASE
 from implicam.session.folder import UNDONE, is_session

@@ -37,16 +37,16 @@ from implicam.session.journal import Session
 
 _LOG = logging.getLogger(__name__)
 
-CALIBRATION, REPORT = "calibration.implicam", "report.html"
+CALIBRATION_FILE, REPORT_FILE = "calibration.implicam", "report.html"
 
-MAX_TARGETS_IN_VAIN = 5
-"""Targets in a row without a ball, after which a session does not go on by itself."""
+MAX_TARGETS_WITHOUT_BALL = 5
+"""In a row, after which a session does not go on by itself."""
 
-HALTING_SECONDS = 2.0
-"""Seconds during which a robot that was to stop is told so again."""
+STOP_REPEAT_SECONDS = 2.0
+"""For so long a robot that is to stop is told so again and again."""
 
-HISTORY = "history"
-"""The setting of the session that keeps the curve."""
+HISTORY_KEY = "history"
+"""The setting of the session that holds the curve of the uncertainty."""
 
 MIN_REPORTED_POINTS = 12
 """Known points from which a report by cross-validation says anything."""
@@ -90,7 +90,7 @@ class State:
     version: int = 0
 
     @property
-    def seen(self) -> list[str]:
+    def cameras_with_ball(self) -> list[str]:
         """The cameras that see the ball."""
         return [look.camera for look in self.looks if len(look.found)]
 
@@ -110,11 +110,11 @@ class SessionController:
         self.session, self.equipment, self.loop = session, equipment, loop
         self.state = State(auto=auto)
         self._changed = threading.Condition()
-        self._eyes = threading.Lock()  # a camera answers one thread at a time
-        self._halted = threading.Event()  # somebody pressed stop: nothing moves until somebody says go
-        self._in_vain = 0
+        self._camera_lock = threading.Lock()  # a camera answers one thread at a time
+        self._halted = threading.Event()  # stop was pressed: nothing moves until `go`
+        self._targets_without_ball = 0
         self._live = equipment.trigger is None and all(source.live for source in equipment.cameras)
-        loop.history = _remembered(session)
+        loop.history = _read_history(session)
         for skipped in session.skipped:
             loop.refuse(skipped.xyz, skipped.reason)
         self._pool = ThreadPoolExecutor(max(1, len(names)))
@@ -125,32 +125,32 @@ class SessionController:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    # what a page calls
+    # called by a page
 
     def start(self) -> None:
-        """Open cameras and robot, take up what the session has already, and name the first target."""
+        """Open cameras and robot, fit the points that the session has, and propose the first target."""
         with self._working("starting", "connecting to the cameras and the robot"):
-            for device in self._devices():
+            for device in self._list_devices():
                 device.open()
             self._fit()
             self._aim()
 
     def go(self) -> None:
-        """Send the robot to the target, and look. UsageError where a person moves the ball: see `arrived`."""
+        """Send the robot to the target, and take pictures. UsageError where a person moves the ball."""
         self._halted.clear()
         self._move()
 
     def _move(self) -> None:
-        target = self._target()
+        target = self._require_target()
         if not self.equipment.robot.moves:
             raise UsageError("nothing moves the ball but you.", fix="put it there, and type where it is")
         with self._working("moving", "the robot is on its way"):
             if self._halted.is_set():
                 raise HardwareError("the robot was stopped by hand.", fix="press Go when it may move again")
             where = self.equipment.robot.move(target.xyz)
-            self._shown(where)
+            self._take_pictures(where)
 
-    def arrived(self, xyz: Floats) -> None:
+    def report_position(self, xyz: Floats) -> None:
         """Say where the ball is, as measured by a person, and take pictures of it.
 
         Args:
@@ -159,29 +159,29 @@ class SessionController:
         with self._working("moving", "looking"):
             if isinstance(self.equipment.robot, MovedByHand):
                 self.equipment.robot.set_position(np.asarray(xyz, dtype=np.float64))
-            self._shown(self.equipment.robot.position())
+            self._take_pictures(self.equipment.robot.position())
 
     def redo(self) -> None:
-        """Look again, at the same place."""
+        """Take pictures again, at the same position."""
         with self._working("moving", "looking again"):
-            self._shown(self.equipment.robot.position())
+            self._take_pictures(self.equipment.robot.position())
 
     def accept(self) -> None:
-        """Keep what is shown: on disk first, then fit again and name the next target."""
+        """Keep what is shown: write it to disk, fit again, and propose the next target."""
         state = self.state
         if state.phase != "shown":
             raise UsageError("there is nothing to accept.", fix="take a picture first")
-        if not state.seen:
+        if not state.cameras_with_ball:
             raise UsageError("no camera found the ball.", fix="redo it, or skip this target")
         if self.equipment.dry_run:
             raise UsageError(
                 "this is a dry run: nothing moves, so nothing is kept.", fix="skip, to see the next target"
             )
-        point = self._point(state)
+        point = self._make_point(state)
         pictures = {look.camera: look.frame.picture for look in state.looks if look.frame is not None}
         with self._working("fitting", "fitting with everything"):
-            self.session.accept(point, pictures=pictures, notes=_notes(state))
-            self._in_vain = 0
+            self.session.accept(point, pictures=pictures, notes=_make_notes(state))
+            self._targets_without_ball = 0
             self._fit()
             self._aim()
 
@@ -194,7 +194,7 @@ class SessionController:
         Raises:
             UsageError: There is no target now.
         """
-        target = self._target()
+        target = self._require_target()
         with self._working("fitting", "choosing another target"):
             self.session.skip(target.xyz, reason)
             self.loop.refuse(target.xyz, reason)
@@ -209,18 +209,18 @@ class SessionController:
         return name
 
     def retry(self) -> None:
-        """After trouble: connect again, and go on where it was."""
+        """After trouble: connect again, and go on."""
         with self._working("starting", "connecting again"):
-            for device in self._devices():
+            for device in self._list_devices():
                 device.open()
             self._fit()
             self._aim()
 
     def stop_robot(self) -> None:
-        """At once, from any thread; nothing goes by itself after that, and nothing moves until `go`."""
+        """Stop the robot at once, from any thread; automatic mode ends, and nothing moves until `go`."""
         self._halted.set()
         self._show(auto=False)
-        end = time.monotonic() + HALTING_SECONDS
+        end = time.monotonic() + STOP_REPEAT_SECONDS
         try:
             self.equipment.robot.stop()
             while self.state.phase == "moving" and time.monotonic() < end:  # a move may have been about to begin
@@ -253,7 +253,7 @@ class SessionController:
         """Calibrate with everything, save and report; the calibration's file, which is not there after trouble."""
         from implicam.report import report_of, write_report
 
-        path = self.session.folder / CALIBRATION
+        path = self.session.folder / CALIBRATION_FILE
         with self._working("fitting", "calibrating, and writing the report"):
             if self.loop.calibration is None or self.loop.data is None:
                 raise UsageError(
@@ -261,14 +261,16 @@ class SessionController:
                     why=str(self.loop.problem.what) if self.loop.problem else "",
                     fix=f"accept at least {self.loop.start}",
                 )
-            calibration = self.loop.calibrator.fit(self.loop.data)  # from no guess, whatever way led here
+            calibration = self.loop.calibrator.fit(self.loop.data)  # from scratch: the order of points must not matter
             calibration.save(path)
-            report = self.session.folder / REPORT
-            report.unlink(missing_ok=True)  # that of an earlier, other calibration
+            report = self.session.folder / REPORT_FILE
+            report.unlink(missing_ok=True)  # it may be of an earlier calibration
             words = f"{self.loop.points} points. Saved: {path}"
             try:
                 if len(calibration.data) >= MIN_REPORTED_POINTS:
-                    write_report(report, report_of(_judged(calibration), f"{self.session.name}: a guided calibration"))
+                    write_report(
+                        report, report_of(_evaluate(calibration), f"{self.session.name}: a guided calibration")
+                    )
                     words += f" and {report}"
             except ImplicamError as error:
                 words += f". No report: {error.what}"
@@ -297,44 +299,44 @@ class SessionController:
         return self.finish() if self.state.phase == "aim" and self.loop.calibration is not None else None
 
     def step(self) -> None:
-        """One target, without being asked: go, look, and accept or skip. After some in a row without a ball it gives
-        up: that is no accident."""
+        """One target in automatic mode: move, take pictures, and accept or skip. After some targets in a row without a
+        ball it stops: something is wrong."""
         if self.state.phase == "aim":
             self._move()
         if self.state.phase != "shown":
             return
-        if self.state.seen:
+        if self.state.cameras_with_ball:
             self.accept()
             return
-        self._in_vain += 1
-        if self._in_vain < MAX_TARGETS_IN_VAIN:
+        self._targets_without_ball += 1
+        if self._targets_without_ball < MAX_TARGETS_WITHOUT_BALL:
             self.skip("the ball was not found")
             return
-        self._in_vain = 0
+        self._targets_without_ball = 0
         reasons = "; ".join(f"{look.camera}: {look.found.reason}" for look in self.state.looks)
-        self._trouble(
+        self._report_trouble(
             HardwareError(
-                f"the ball was not found at {MAX_TARGETS_IN_VAIN} targets in a row.",
+                f"the ball was not found at {MAX_TARGETS_WITHOUT_BALL} targets in a row.",
                 why=reasons,
                 fix="look at the pictures, and retry",
             )
         )
 
     def live(self) -> None:
-        """New pictures of all cameras, for the eye; nothing where the session is busy, a picture is being judged, or
-        the cameras have none to spare (a film, a folder, a trigger)."""
+        """Take new pictures with all cameras to be shown; nothing happens where the session is busy, a picture is being
+        judged, or the cameras do not run freely (a film, a folder, a trigger)."""
         phase = self.state.phase
-        if not self._live or phase not in ("aim", "done") or not self._eyes.acquire(blocking=False):
+        if not self._live or phase not in ("aim", "done") or not self._camera_lock.acquire(blocking=False):
             return
         try:
-            looks = self._looks(self._frames(None))
+            looks = self._detect_all(self._take_frames(None))
             if self.state.phase == phase:
                 self._show(looks=looks)
         except Exception as error:
-            if self.state.phase == phase:  # else a command is at work, and will find out by itself
-                self._trouble(error) if isinstance(error, HardwareError) else self._surprise(error)
+            if self.state.phase == phase:  # else a command is running, and will meet the error itself
+                self._report_trouble(error) if isinstance(error, HardwareError) else self._report_unexpected(error)
         finally:
-            self._eyes.release()
+            self._camera_lock.release()
 
     def wait(self, version: int, timeout: float) -> State:
         """Wait until the state changes.
@@ -351,9 +353,9 @@ class SessionController:
         return self.state
 
     def close(self) -> None:
-        """Let go of the equipment and the session; harmless twice."""
-        with self._eyes:
-            for device in self._devices():
+        """Close the equipment and the session; closing twice is harmless."""
+        with self._camera_lock:
+            for device in self._list_devices():
                 device.close()
         self._pool.shutdown()
         self.session.close()
@@ -362,19 +364,20 @@ class SessionController:
     def measured_live(self) -> Floats:
         """(3,) where the calibration sees the ball in the live pictures; NaN where it cannot."""
         calibration = self.state.calibration
-        if calibration is None or len(self.state.seen) < 2:
+        if calibration is None or len(self.state.cameras_with_ball) < 2:
             return np.full(3, np.nan)
-        return np.asarray(calibration.measure(self._observations("live", self.state.looks)).xyz[0], dtype=np.float64)
+        measured = calibration.measure(self._make_observations("live", self.state.looks))
+        return np.asarray(measured.xyz[0], dtype=np.float64)
 
     # inside
 
-    def _devices(self) -> Iterator[FrameSource | Robot | Trigger]:
+    def _list_devices(self) -> Iterator[FrameSource | Robot | Trigger]:
         yield from self.equipment.cameras
         yield self.equipment.robot
         if self.equipment.trigger is not None:
             yield self.equipment.trigger
 
-    def _target(self) -> Target:
+    def _require_target(self) -> Target:
         if self.state.target is None:
             raise UsageError("there is no target now.", fix="start the session, or retry after trouble")
         return self.state.target
@@ -390,15 +393,15 @@ class SessionController:
             if isinstance(error, UsageError):  # nothing happened: what was shown is shown again
                 self._show(phase=before.phase, message=before.message)
                 raise
-            self._trouble(error)
-        except Exception as error:  # a library's own: the session waits, and says so, whatever it was
-            self._surprise(error)
+            self._report_trouble(error)
+        except Exception as error:  # an error of a library: the session waits, and shows it
+            self._report_unexpected(error)
 
-    def _surprise(self, error: Exception) -> None:
-        """An error that nobody foresaw."""
+    def _report_unexpected(self, error: Exception) -> None:
+        """An error of another kind than ours."""
         with suppress(ImplicamError):
             self.session.log("unexpected", traceback="".join(traceback.format_exception(error)))
-        self._trouble(
+        self._report_trouble(
             ImplicamError(
                 f"something unexpected happened: {type(error).__name__}: {error}.",
                 why="the details are in session.db, in the table of events",
@@ -406,7 +409,7 @@ class SessionController:
             )
         )
 
-    def _trouble(self, error: ImplicamError) -> None:
+    def _report_trouble(self, error: ImplicamError) -> None:
         self._show(phase="trouble", message=str(error), problem=error, auto=False)
         with suppress(ImplicamError):  # the disk may be what is wrong
             self.session.log("trouble", what=error.what, why=error.why, fix=error.fix)
@@ -421,22 +424,22 @@ class SessionController:
         if data is not None and len(data) == 0:
             data = None
         if data is not None and self.equipment.radius is not None:
-            data = self._centred(data)
+            data = self._correct_outlines(data)
         self.loop.reset(data)
-        self.session.set(HISTORY, [json_safe(asdict(step)) for step in self.loop.history])
+        self.session.set(HISTORY_KEY, [json_safe(asdict(step)) for step in self.loop.history])
         self._show(
             data=data, calibration=self.loop.calibration, predicted=self.loop.predicted,
             history=tuple(self.loop.history), stop=self.loop.stop,
         )  # fmt: skip
 
-    def _centred(self, data: Dataset) -> Dataset:
+    def _correct_outlines(self, data: Dataset) -> Dataset:
         """The pixels of the ball's middle, for those of its outline; by the last calibration, where there is one."""
         assert self.equipment.radius is not None
         last = self.loop.calibration
         return centred(data, self.equipment.radius, last if isinstance(last, PredictsPixels) else None)[0]
 
     def _aim(self, before: str = "") -> None:
-        """Name the next target; where there is none left, say so."""
+        """Propose the next target; where there is none left, say so."""
         try:
             here = self.equipment.robot.position()
         except HardwareError:
@@ -455,11 +458,11 @@ class SessionController:
         self._show(
             phase="aim",
             target=replace(target, name=self.session.next_name()),
-            message=words + self._uncalibrated(),
+            message=words + self._explain_uncalibrated(),
             problem=None,
         )
 
-    def _uncalibrated(self) -> str:
+    def _explain_uncalibrated(self) -> str:
         """Which cameras have not seen enough of the known points yet, in words."""
         calibration, data = self.loop.calibration, self.loop.data
         if not isinstance(calibration, PredictsPixels) or data is None:
@@ -468,11 +471,11 @@ class SessionController:
         missing = [name for name in seen if name not in calibration.camera_names]
         return "".join(f". {name} is not calibrated yet: it has seen {seen[name]} points" for name in missing)
 
-    def _shown(self, where: Floats) -> None:
-        with self._eyes:
-            frames = self._frames(self.equipment.trigger)
+    def _take_pictures(self, where: Floats) -> None:
+        with self._camera_lock:
+            frames = self._take_frames(self.equipment.trigger)
         looks = reject_implausible(
-            self._looks(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration
+            self._detect_all(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration
         )
         count = sum(len(look.found) > 0 for look in looks)
         words = f"found in {count} of {len(looks)} cameras"
@@ -480,31 +483,31 @@ class SessionController:
             words = "the ball was not found in any camera: redo, or skip this target"
         self._show(phase="shown", looks=looks, position=where, message=words)
 
-    def _frames(self, trigger: Trigger | None) -> list[Frame]:
+    def _take_frames(self, trigger: Trigger | None) -> list[Frame]:
         return take_frames(self.equipment.cameras, trigger, self.equipment.timeout, self._pool)
 
-    def _looks(self, frames: Sequence[Frame]) -> tuple[Look, ...]:
+    def _detect_all(self, frames: Sequence[Frame]) -> tuple[Look, ...]:
         expected = self.state.target.uv if self.state.target is not None else np.full((len(frames), 2), np.nan)
         names = [source.name for source in self.equipment.cameras]
-        found = list(self._pool.map(self._detected, names, frames))
+        found = list(self._pool.map(self._detect, names, frames))
         return tuple(Look(n, f, d, e) for n, f, d, e in zip(names, frames, found, expected, strict=True))
 
-    def _detected(self, camera: str, frame: Frame) -> Detected:
+    def _detect(self, camera: str, frame: Frame) -> Detected:
         why = blank(frame.picture)
         if why:
             return Detected(reason=f"the picture is {why}")
         return self.equipment.detector.detect(frame.picture, View(camera, "live"))
 
-    def _point(self, state: State) -> Dataset:
+    def _make_point(self, state: State) -> Dataset:
         """What is shown, as a known point."""
         assert state.target is not None
         name = state.target.name
-        observations = self._observations(name, state.looks)
+        observations = self._make_observations(name, state.looks)
         sd = np.array([self.equipment.robot.sd], dtype=np.float64)
         known = KnownPositions(np.array([name]), state.position[None], sd)
         return Dataset(self.session.name, self.session.length_unit, observations, known)
 
-    def _observations(self, name: str, looks: Sequence[Look]) -> Observations:
+    def _make_observations(self, name: str, looks: Sequence[Look]) -> Observations:
         uv, sd = np.full((1, len(looks), 2), np.nan), np.full((1, len(looks), 2), np.nan)
         for c, look in enumerate(looks):
             if len(look.found):
@@ -513,7 +516,7 @@ class SessionController:
         return Observations(np.array([name]), tuple(cameras), uv, sd)
 
 
-def _notes(state: State) -> Mapping[str, Any]:
+def _make_notes(state: State) -> Mapping[str, Any]:
     target = state.target
     return {
         "target": [] if target is None else target.xyz.tolist(),
@@ -521,16 +524,16 @@ def _notes(state: State) -> Mapping[str, Any]:
     }
 
 
-def _remembered(session: Session) -> list[Step]:
+def _read_history(session: Session) -> list[Step]:
     """The curve as far as it was when the session was left; the last point is computed again."""
     kept = 0 if session.data is None else len(session.data) - 1
-    rows = session.settings.get(HISTORY, [])
+    rows = session.settings.get(HISTORY_KEY, [])
     known: list[dict[str, Any]] = [{key: math.nan if x is None else x for key, x in row.items()} for row in rows]
     steps = [Step(**row) for row in known]
     return [step for step in steps if step.points <= kept]
 
 
-def _judged(calibration: Calibration) -> Any:
+def _evaluate(calibration: Calibration) -> Any:
     from implicam.evaluation import cross_validate
 
     return cross_validate(calibration.refit, calibration.data, min(10, len(calibration.data)))

@@ -36,8 +36,8 @@ from implicam.files import toml_text
 from implicam.formatting import json_default
 
 DATABASE = "session.db"
-VERSION = 1
-APPLICATION = int.from_bytes(b"impc", "big")
+TABLES_VERSION = 1
+APPLICATION_ID = int.from_bytes(b"impc", "big")
 
 # Numbers have no declared type: a column that is REAL turns -0.0 into 0.0, and what is accepted comes back bit by bit.
 _TABLES = (
@@ -56,7 +56,7 @@ _TABLES = (
 
 
 class Database:
-    """The one connection to a session's database; nobody else can open it until `close`, or the end of the process.
+    """The one connection to a session's database, which is locked until `close`, or the end of the process.
 
     Every failure is an ImplicamError that says what to do. The caller sees to it that one thread uses it at a time.
     """
@@ -66,7 +66,7 @@ class Database:
 
     @classmethod
     def create(cls, path: Path) -> Database:
-        """Create a database, locked, inside a transaction that `made` ends.
+        """Create a database, locked, inside a transaction that `write_tables` ends.
 
         Args:
             path: The file.
@@ -89,7 +89,7 @@ class Database:
                 )
         return database
 
-    def made(self, name: str, length_unit: str, cameras: Sequence[Camera], settings: Mapping[str, str]) -> None:
+    def write_tables(self, name: str, length_unit: str, cameras: Sequence[Camera], settings: Mapping[str, str]) -> None:
         """Write the tables and what a session begins with, all or nothing.
 
         Args:
@@ -112,8 +112,8 @@ class Database:
                 )
             for key, value in settings.items():
                 self.run("INSERT INTO settings VALUES (?, ?, ?)", key, value, now())
-            self.run(f"PRAGMA application_id = {APPLICATION}")
-            self.run(f"PRAGMA user_version = {VERSION}")
+            self.run(f"PRAGMA application_id = {APPLICATION_ID}")
+            self.run(f"PRAGMA user_version = {TABLES_VERSION}")
             self.run("COMMIT")
 
     @classmethod
@@ -138,7 +138,7 @@ class Database:
         with database._closing_on_error():
             database.run("BEGIN EXCLUSIVE")
             database._check()
-            database.run("UPDATE session SET opened = ?", now())  # a disk that takes no writes says so now
+            database.run("UPDATE session SET opened = ?", now())  # a disk that cannot be written to shows now
             database.run("COMMIT")
         return database
 
@@ -149,7 +149,7 @@ class Database:
         On Unix such a lock is also lost when this process opens and closes session.db by any other way than SQLite.
 
         A rollback journal and no write-ahead log: between two points session.db alone is the whole session, for one
-        who copies it, and a point is committed every few seconds, so a second flush costs nothing that one could feel.
+        who copies it, and a point is committed every few seconds, so a second flush costs nothing that is noticed.
         EXTRA is FULL, and the folder is flushed too when the journal goes: else a power cut could bring it back, and
         with it the state before the last point.
         """
@@ -157,7 +157,7 @@ class Database:
             uri = f"{path.absolute().as_uri()}?mode={mode}"
             connection = sqlite3.connect(uri, uri=True, timeout=0, isolation_level=None, check_same_thread=False)
         except sqlite3.Error as error:
-            raise _explained(path, error) from error
+            raise _explain_sqlite_error(path, error) from error
         database = cls(path, connection)
         with database._closing_on_error():
             for setting in ("trusted_schema = OFF", "locking_mode = EXCLUSIVE", "synchronous = EXTRA"):
@@ -172,22 +172,22 @@ class Database:
                 why="the program was stopped while it began the session, or the file was cut off",
                 fix=f"remove it and begin again; where {POINTS} is beside it, keep that, and begin in another folder",
             )
-        if application != APPLICATION:
+        if application != APPLICATION_ID:
             raise DatasetError(
                 f"{self._path} is no session.", why="another program made this database", fix="choose another folder"
             )
-        if version > VERSION:
+        if version > TABLES_VERSION:
             raise DatasetError(
                 f"{self._path} was written by a newer implicam.",
-                why=f"its tables have the version {version}; this one knows up to {VERSION}",
+                why=f"its tables have the version {version}; this one knows up to {TABLES_VERSION}",
                 fix="update implicam: pip install --upgrade implicam",
             )
         faults = self.rows("PRAGMA integrity_check(1)")
         if faults != [("ok",)]:
-            raise damaged(self._path, str(faults[0][0]))
+            raise damaged_error(self._path, str(faults[0][0]))
         (pages,), (page_bytes,) = self.rows("PRAGMA page_count") + self.rows("PRAGMA page_size")
         if self._path.stat().st_size < pages * page_bytes:  # SQLite would take zeros for the rest of the last page
-            raise damaged(self._path, "its end is cut off")
+            raise damaged_error(self._path, "its end is cut off")
 
     def run(self, sql: str, *values: Any) -> None:
         """Execute one statement.
@@ -216,7 +216,7 @@ class Database:
         try:
             return self._connection.execute(sql, values).fetchall()
         except sqlite3.Error as error:
-            raise _explained(self._path, error) from error
+            raise _explain_sqlite_error(self._path, error) from error
         except (UnicodeEncodeError, OverflowError) as error:
             raise UsageError(
                 "a text or a number cannot be kept in a session.", why=str(error), fix="correct the text or the number"
@@ -235,7 +235,7 @@ class Database:
             raise
 
     def close(self) -> None:
-        """Free the session for others."""
+        """Unlock the session and close it."""
         self._connection.close()
 
     @contextmanager
@@ -247,7 +247,7 @@ class Database:
             raise
 
 
-def _explained(path: Path, error: sqlite3.Error) -> ImplicamError:
+def _explain_sqlite_error(path: Path, error: sqlite3.Error) -> ImplicamError:
     """SQLite's errors, by their names, as ours."""
     name, why = getattr(error, "sqlite_errorname", None) or "", str(error)
     if isinstance(error, sqlite3.ProgrammingError) and "closed" in why:
@@ -264,10 +264,10 @@ def _explained(path: Path, error: sqlite3.Error) -> ImplicamError:
             why=why,
             fix="check the permissions and the free space; every point accepted before is kept",
         )
-    return damaged(path, why)
+    return damaged_error(path, why)
 
 
-def damaged(path: Path, why: str) -> DatasetError:
+def damaged_error(path: Path, why: str) -> DatasetError:
     """The error for a database that cannot be trusted.
 
     Args:
@@ -336,16 +336,16 @@ def insert_shot(database: Database, data: Dataset, notes: str) -> None:
     known, seen = data.positions, data.observations
     for i, point in enumerate(data.points.tolist()):
         more = json_text({key: str(text[i]) for key, text in known.extra.items()}, "a column")
-        numbers = _cells(known.xyz[i], known.sd[i])
+        numbers = _nulls_for_nan(known.xyz[i], known.sd[i])
         database.run("INSERT INTO points VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", shot, i, point, *numbers, more)
     for i, k in np.argwhere(seen.seen):
         more = json_text({key: str(text[i, k]) for key, text in seen.extra.items()}, "a column")
         place = shot, str(data.points[i]), data.cameras[k].name
-        numbers = _cells(seen.uv[i, k], seen.sd[i, k])
+        numbers = _nulls_for_nan(seen.uv[i, k], seen.sd[i, k])
         database.run("INSERT INTO views VALUES (?, ?, ?, ?, ?, ?, ?, ?)", *place, *numbers, more)
 
 
-def _cells(*arrays: Floats) -> list[float | None]:
+def _nulls_for_nan(*arrays: Floats) -> list[float | None]:
     """Numbers in a row; NULL for NaN."""
     return [None if value != value else value for array in arrays for value in array.tolist()]
 
@@ -380,19 +380,19 @@ def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
         np.array([row[0] for row in points], dtype=np.str_),
         numbers[:, :3],
         numbers[:, 3:],
-        _columns(points, (len(points),)),
+        _read_extra_columns(points, (len(points),)),
     )
     row_of = {name: i for i, name in enumerate(names)}
     camera_of = {name: k for k, name in enumerate(empty.observations.camera_names)}
     i, k = np.array([(row_of[row[1]], camera_of[row[2]]) for row in views], dtype=np.intp).reshape(-1, 2).T
     table = np.full((len(names), len(camera_of), 4), np.nan)
     table[i, k] = np.array([row[3:7] for row in views], dtype=np.float64).reshape(-1, 4)
-    extra = _columns(views, table.shape[:2], (i, k))
+    extra = _read_extra_columns(views, table.shape[:2], (i, k))
     observations = Observations(np.array(names), empty.cameras, table[..., :2], table[..., 2:], extra)
     return Dataset(empty.name, empty.length_unit, observations, known)
 
 
-def _columns(rows: list[tuple[Any, ...]], shape: tuple[int, ...], at: Any = slice(None)) -> dict[str, Names]:
+def _read_extra_columns(rows: list[tuple[Any, ...]], shape: tuple[int, ...], at: Any = slice(None)) -> dict[str, Names]:
     """The further columns, from the last cell of each row, spread over `shape`; empty where a row has none."""
     cells = [json.loads(row[-1]) for row in rows]
     columns = {}

@@ -1,4 +1,4 @@
-"""What the cameras show of the ball, and which of it can be believed."""
+"""What the cameras show of the ball, and which detections are plausible."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from implicam.dataset import Floats
 from implicam.detect import Detected
 from implicam.hardware import Frame
 
-FAR_SDS = 6.0
-"""A detection that is so many standard deviations from where it must be is another thing ..."""
+MAX_DISTANCE_SDS = 6.0
+"""A detection farther than this from the prediction is of another object ..."""
 
-FAR_PX = 8.0
-"""... if it is so many pixels away, too."""
+MAX_DISTANCE_PX = 8.0
+"""... if it is also farther than this."""
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
     """What one camera shows: its picture, what was found in it, why nothing was; where the target is expected, (2,)
-    pixels, NaN where nobody knows or it is not in view."""
+    pixels, NaN where that is not known or it is not in view."""
 
     camera: str
     frame: Frame | None
@@ -58,21 +58,21 @@ def reject_implausible(
         variance += (part.slope[0] ** 2) @ where_sd**2
         sd[list(part.cameras)] = np.sqrt(variance.reshape(-1, 2).mean(axis=1))
     plausible = []
-    for look, there, spread in zip(looks, uv, sd, strict=True):
-        far = max(FAR_PX, FAR_SDS * spread) if np.isfinite(spread) else np.inf
-        near = _nearest(look.found, there)
-        if near is None or np.linalg.norm(near.uv[0] - there) <= far or not np.isfinite(there).all():
+    for look, predicted, sd_px in zip(looks, uv, sd, strict=True):
+        far = max(MAX_DISTANCE_PX, MAX_DISTANCE_SDS * sd_px) if np.isfinite(sd_px) else np.inf
+        near = _find_nearest(look.found, predicted)
+        if near is None or np.linalg.norm(near.uv[0] - predicted) <= far or not np.isfinite(predicted).all():
             plausible.append(replace(look, found=look.found if near is None else near))
             continue
-        away = float(np.linalg.norm(near.uv[0] - there))
+        away = float(np.linalg.norm(near.uv[0] - predicted))
         reason = f"what was found is {away:.0f} px from where the ball must be: left out"
         plausible.append(replace(look, found=Detected(reason=reason)))
     return tuple(plausible)
 
 
-def _nearest(found: Detected, there: Floats) -> Detected | None:
+def _find_nearest(found: Detected, uv: Floats) -> Detected | None:
     """Of what may be the ball, the nearest to a pixel; None where nothing was found."""
     options = [one for one in (found, *found.others) if len(one)]
-    if not options or not np.isfinite(there).all():
+    if not options or not np.isfinite(uv).all():
         return found if len(found) else None
-    return min(options, key=lambda one: float(np.linalg.norm(one.uv[0] - there)))
+    return min(options, key=lambda one: float(np.linalg.norm(one.uv[0] - uv)))

@@ -1,4 +1,4 @@
-"""The files of a session's folder: its tables, its pictures, and what is no part of it any more."""
+"""The files of a session's folder: its tables, its pictures, and what was taken back."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from implicam.images import Grey, write_picture
 from implicam.session.database import DATABASE
 
 UNDONE = "undone"
-"""The folder of what is no part of the dataset any more: undone/<camera>/<shot>.png, tables edited by hand."""
+"""The folder of what was taken out of the dataset: undone/<camera>/<shot>.png, and tables edited by hand."""
 
-_PARTIAL = ".*.partial-*"  # what a kill leaves of `files.replacing`
-_LONGEST = 200  # bytes of a name that becomes a file's; most disks take 255, and `replacing` adds some
+_PARTIAL_PATTERN = ".*.partial-*"  # left by `files.replacing` in a process that was killed
+_MAX_NAME_BYTES = 200  # bytes of a name that becomes a file's; most disks take 255, and `replacing` adds some
 
 
 def is_session(folder: Path) -> bool:
@@ -55,7 +55,7 @@ def stale_tables(folder: Path, data: Dataset | None, empty: Dataset) -> dict[str
         File name -> text.
     """
     files = folder_files(data) if data else {DESCRIPTION: description_text(empty)}
-    return {name: text for name, text in files.items() if _content(folder / name) != text.encode()}
+    return {name: text for name, text in files.items() if _read_or_none(folder / name) != text.encode()}
 
 
 def write_beside(beside: ExitStack, folder: Path, files: Mapping[str, str]) -> None:
@@ -101,20 +101,20 @@ def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> No
     if data is None:  # these two will be removed
         right |= {VIEWS: "", POINTS: ""}
     for name, text in right.items():
-        old = _content(folder / name)
+        old = _read_or_none(folder / name)
         if old and not text.encode().startswith(old):  # else only the last points are missing: a kill
-            shutil.copyfile(folder / name, _free(folder / UNDONE / name))
+            shutil.copyfile(folder / name, _find_free_path(folder / UNDONE / name))
 
 
 def remove_partial(folder: Path, cameras: Sequence[Camera]) -> None:
     """Delete half-written files that a killed process left.
 
     Args:
-        folder: Of the session, which must be locked: nobody else is writing then.
+        folder: Of the session, which must be locked, so that no other process is writing.
         cameras: The folders of their pictures are cleaned as well.
     """
     for place in [folder, *(folder / IMAGES / camera.name for camera in cameras)]:
-        for partial in list(place.glob(_PARTIAL)):
+        for partial in list(place.glob(_PARTIAL_PATTERN)):
             partial.unlink()
 
 
@@ -128,7 +128,7 @@ def write_pictures(folder: Path, shot: str, pictures: Mapping[str, Grey]) -> Non
     """
     for camera, picture in pictures.items():
         path = folder / IMAGES / camera / f"{shot}.png"
-        write_picture(path, picture, bits=_bits(picture))
+        write_picture(path, picture, bits=_choose_bits(picture))
         for place in (path.parent, folder / IMAGES, folder):
             flush_folder(place)
 
@@ -145,7 +145,7 @@ def set_pictures_aside(folder: Path, shots: Iterable[str], cameras: Sequence[Cam
         for camera in cameras:
             picture = folder / IMAGES / camera.name / f"{shot}.png"
             if picture.exists():
-                picture.rename(_free(folder / UNDONE / camera.name / picture.name))
+                picture.rename(_find_free_path(folder / UNDONE / camera.name / picture.name))
 
 
 def make_folder(folder: Path) -> None:
@@ -185,11 +185,11 @@ def check_file_name(name: str, what: str) -> None:
     Raises:
         DatasetError: It has a slash or a backslash, begins with a dot, or is too long.
     """
-    if set("/\\") & set(name) or name.startswith(".") or len(name.encode()) > _LONGEST:
+    if set("/\\") & set(name) or name.startswith(".") or len(name.encode()) > _MAX_NAME_BYTES:
         raise DatasetError(
             f"the {what} name {name[:60]!r} cannot name a file.",
             why="its pictures are kept under this name",
-            fix=f"leave out slashes, backslashes and a leading dot; at most {_LONGEST} bytes",
+            fix=f"leave out slashes, backslashes and a leading dot; at most {_MAX_NAME_BYTES} bytes",
         )
 
 
@@ -223,7 +223,7 @@ def check_pictures(pictures: Mapping[str, Grey], cameras: Sequence[Camera]) -> N
             )
 
 
-def _bits(picture: Grey) -> int:
+def _choose_bits(picture: Grey) -> int:
     """8 where such a file reads back to the same values, else 16."""
     if picture.dtype == np.uint8:
         return 8
@@ -231,11 +231,11 @@ def _bits(picture: Grey) -> int:
     return 8 if np.array_equal(steps * np.float32(1 / 255), picture) else 16
 
 
-def _content(path: Path) -> bytes | None:
+def _read_or_none(path: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def _free(path: Path) -> Path:
+def _find_free_path(path: Path) -> Path:
     """The path, or one with a number where something is there; its folder exists."""
     path.parent.mkdir(parents=True, exist_ok=True)
     number, free = 1, path

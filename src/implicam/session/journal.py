@@ -34,7 +34,7 @@ from implicam.session import folder as files
 from implicam.session.database import (
     DATABASE,
     Database,
-    damaged,
+    damaged_error,
     insert_shot,
     json_text,
     now,
@@ -72,10 +72,10 @@ class Session:
         self._lock = threading.RLock()
         self._database = database
         self.folder = folder
-        with self._trusting():
+        with self._reporting_damage():
             ((self.name, self.length_unit),) = database.rows("SELECT name, length_unit FROM session")
             self.cameras = read_cameras(database)
-            self._empty = _without_points(self.name, self.length_unit, self.cameras)
+            self._empty = _make_empty_dataset(self.name, self.length_unit, self.cameras)
             self._data = read_accepted(database, self._empty)
             self._settings = {key: json.loads(text) for key, text in database.rows("SELECT key, value FROM settings")}
 
@@ -98,15 +98,15 @@ class Session:
             ImplicamError: The folder cannot be written.
         """
         folder = Path(folder).absolute()
-        description_text(_without_points(name, length_unit, cameras))  # refuses what a dataset cannot hold
+        description_text(_make_empty_dataset(name, length_unit, cameras))  # refuses what a dataset cannot hold
         for camera in cameras:
             files.check_file_name(camera.name, "camera")
         values = {key: json_text(value, f"the setting {key!r}") for key, value in settings.items()}
         files.make_folder(folder)
         database = Database.create(folder / DATABASE)
-        database.made(name, length_unit, cameras, values)
+        database.write_tables(name, length_unit, cameras, values)
         files.flush_folder(folder.parent)
-        return cls._ready(folder, database)
+        return cls._start(folder, database)
 
     @classmethod
     def open(cls, folder: Path) -> Session:
@@ -121,13 +121,13 @@ class Session:
             ImplicamError: The folder cannot be written.
         """
         folder = Path(folder).absolute()
-        return cls._ready(folder, Database.open(folder / DATABASE))
+        return cls._start(folder, Database.open(folder / DATABASE))
 
     @classmethod
-    def _ready(cls, folder: Path, database: Database) -> Session:
+    def _start(cls, folder: Path, database: Database) -> Session:
         try:
             session = cls(folder, database)
-            session._heal()
+            session._repair()
         except BaseException:
             database.close()
             raise
@@ -140,7 +140,7 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Let others open the session; nothing is left to be written."""
+        """Close the session, so that another process can open it; nothing is left to be written."""
         with self._lock:
             self._database.close()
 
@@ -172,7 +172,7 @@ class Session:
             ImplicamError: The disk is full or cannot be written.
         """
         with self._lock:
-            shot = self._checked(point)
+            shot = self._check_shot(point)
             name = str(shot.shots[0])
             files.check_pictures(pictures, self.cameras)
             noted = json_text(dict(notes), "a note")
@@ -180,14 +180,14 @@ class Session:
             try:
                 with self._adding(data):
                     if pictures:
-                        self._begin(name)
+                        self._commit_begun(name)
                         files.write_pictures(self.folder, name, pictures)
                     with self._database.transaction():
                         insert_shot(self._database, shot, noted)
                     self._data = data
             except BaseException:
                 with suppress(ImplicamError):  # the next opening does it
-                    self._set_aside()
+                    self._set_pictures_aside()
                 raise
 
     def undo(self) -> str | None:
@@ -199,8 +199,8 @@ class Session:
             with self._database.transaction():
                 self._database.run("UPDATE shots SET state = 'undone', time = ? WHERE name = ?", now(), last)
             self._data = read_accepted(self._database, self._empty)
-            self._afterwards(self._rewrite)
-            self._afterwards(self._set_aside)
+            self._run_after_commit(self._rewrite_tables)
+            self._run_after_commit(self._set_pictures_aside)
             return last
 
     def skip(self, xyz: ArrayLike, reason: str) -> None:
@@ -256,7 +256,7 @@ class Session:
         """The targets that were not measured, in order."""
         with self._lock:
             rows = self._database.rows("SELECT x, y, z, reason, time FROM skipped ORDER BY number")
-        with self._trusting():
+        with self._reporting_damage():
             return [Skipped(np.array(xyz, dtype=float), why, datetime.fromisoformat(time)) for *xyz, why, time in rows]
 
     @property
@@ -264,7 +264,7 @@ class Session:
         """What happened, in order."""
         with self._lock:
             rows = self._database.rows("SELECT what, more, time FROM events ORDER BY number")
-        with self._trusting():
+        with self._reporting_damage():
             return [Event(what, json.loads(more), datetime.fromisoformat(time)) for what, more, time in rows]
 
     def next_name(self) -> str:
@@ -274,14 +274,14 @@ class Session:
         numbers = [int(name[1:]) for (name,) in rows if re.fullmatch("p[0-9]{1,18}", name)]
         return f"p{max(numbers, default=0) + 1:03d}"
 
-    def _checked(self, point: Dataset) -> Dataset:
+    def _check_shot(self, point: Dataset) -> Dataset:
         """The shot as the session keeps it; DatasetError where it does not fit."""
         names = sorted(set(point.shots.tolist()))
         if len(names) != 1:
             raise DatasetError(f"{len(names)} shots at once: {', '.join(names[:5])}.", fix="accept one after the other")
         files.check_file_name(names[0], "shot")
-        if self._begun():  # of an `accept` that failed, and could not clean up either
-            self._set_aside()
+        if self._list_begun_shots():  # of an `accept` that failed, and could not clean up either
+            self._set_pictures_aside()
         states = self._database.rows("SELECT state FROM shots WHERE name = ?", names[0])
         if states:
             raise DatasetError(
@@ -302,15 +302,15 @@ class Session:
         return Dataset(self.name, self.length_unit, observations, point.positions)
 
     @contextmanager
-    def _trusting(self) -> Iterator[None]:
+    def _reporting_damage(self) -> Iterator[None]:
         """Values that cannot be read are a damaged database."""
         try:
             yield
         except (DatasetError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            raise damaged(self.folder / DATABASE, str(error)) from error
+            raise damaged_error(self.folder / DATABASE, str(error)) from error
 
-    def _begin(self, shot: str) -> None:
-        """Commit that files of this name are about to appear, so that a kill leaves none that nobody knows."""
+    def _commit_begun(self, shot: str) -> None:
+        """Commit that files of this name are about to appear, so that a kill leaves none unknown."""
         with self._database.transaction():
             self._database.run("INSERT INTO shots (name, state, time) VALUES (?, 'begun', ?)", shot, now())
 
@@ -320,9 +320,9 @@ class Session:
         with ExitStack() as beside:
             files.write_beside(beside, self.folder, files.stale_tables(self.folder, data, self._empty))
             yield
-            self._afterwards(beside.close)
+            self._run_after_commit(beside.close)
 
-    def _afterwards(self, step: Callable[[], None]) -> None:
+    def _run_after_commit(self, step: Callable[[], None]) -> None:
         """What follows a commit. The point is safe, so a failure is an event, and the next opening tries again."""
         try:
             step()
@@ -330,10 +330,10 @@ class Session:
             with suppress(ImplicamError):
                 self.log("files", problem=str(error))
 
-    def _rewrite(self) -> None:
+    def _rewrite_tables(self) -> None:
         files.rewrite_tables(self.folder, self._data, self._empty)
 
-    def _set_aside(self) -> None:
+    def _set_pictures_aside(self) -> None:
         """Move the pictures of shots that are no points to undone/, and forget the shots that were only begun."""
         shots = [name for (name,) in self._database.rows("SELECT name FROM shots WHERE state != 'accepted'")]
         with files.writing_into(self.folder):
@@ -341,21 +341,21 @@ class Session:
         with self._database.transaction():
             self._database.run("DELETE FROM shots WHERE state = 'begun'")
 
-    def _begun(self) -> list[str]:
+    def _list_begun_shots(self) -> list[str]:
         return [name for (name,) in self._database.rows("SELECT name FROM shots WHERE state = 'begun'")]
 
-    def _heal(self) -> None:
-        """Finish what a kill has interrupted."""
-        for shot in self._begun():
+    def _repair(self) -> None:
+        """Finish what was interrupted when a process was killed."""
+        for shot in self._list_begun_shots():
             self.log("interrupted", shot=shot)
         with files.writing_into(self.folder):
             files.remove_partial(self.folder, self.cameras)
-            self._set_aside()
+            self._set_pictures_aside()
             files.keep_edited_tables(self.folder, self._data, self._empty)
-            self._rewrite()
+            self._rewrite_tables()
 
 
-def _without_points(name: str, length_unit: str, cameras: Sequence[Camera]) -> Dataset:
+def _make_empty_dataset(name: str, length_unit: str, cameras: Sequence[Camera]) -> Dataset:
     none = np.empty((0, len(cameras), 2))
     return Dataset(name, length_unit, Observations(np.array([], dtype=np.str_), tuple(cameras), none, none))
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from implicam.errors import ImplicamError, UsageError, import_extra
-from implicam.session.controller import CALIBRATION, REPORT, SessionController, State
+from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, SessionController, State
 from implicam.viewer import words
 from implicam.viewer.front import Front
 from implicam.viewer.legend import EXCESS, EXCESS_SCALE, U95, across, chart, curve, legend
@@ -171,7 +171,7 @@ class Page:
         if word == "go" and controller.state.phase in ("trouble", "done"):
             return controller.retry
         if word == "go" and not self._moves:
-            return functools.partial(controller.arrived, np.array(self._place.value, dtype=np.float64))
+            return functools.partial(controller.report_position, np.array(self._place.value, dtype=np.float64))
         return {
             "go": controller.go, "accept": controller.accept, "redo": controller.redo, "undo": controller.undo,
             "finish": controller.finish,
@@ -361,7 +361,7 @@ def serve(
     """
     page = Page(controller)
     folder = controller.session.folder
-    files = {"/report.html": folder / REPORT, "/calibration.implicam": folder / CALIBRATION}
+    files = {"/report.html": folder / REPORT_FILE, "/calibration.implicam": folder / CALIBRATION_FILE}
     front = Front(host=host, port=port, behind=("127.0.0.1", page.port), token=token, files=files, origin=page.origin)
     try:
         front.start()

@@ -29,11 +29,11 @@ class Headline:
 
 def headline(state: State, moves: bool) -> Headline:
     """What to do now. moves: whether a robot moves the ball, or a person."""
-    found = f"Found in {len(state.seen)} of {len(state.looks)} cameras"
+    found = f"Found in {len(state.cameras_with_ball)} of {len(state.looks)} cameras"
     point = f"Point {state.target.name.lstrip('p0') or '?'}" if state.target is not None else "No target"
     if state.phase == "aim":
         return _aim(state, point, moves)
-    if state.phase == "shown" and not state.seen:
+    if state.phase == "shown" and not state.cameras_with_ball:
         return Headline("The ball was not found", "Redo it when the ball is in sight, or skip this target.", VERMILLION)
     if state.phase == "trouble":
         problem = state.problem
@@ -146,7 +146,7 @@ def allowed(state: State, moves: bool) -> dict[str, bool]:
     return {
         "go": state.phase in ("trouble", "done")
         or (state.phase == "aim" and state.target is not None and not state.auto),
-        "accept": state.phase == "shown" and bool(state.seen) and not state.auto,
+        "accept": state.phase == "shown" and bool(state.cameras_with_ball) and not state.auto,
         "redo": state.phase == "shown" and not state.auto,
         "skip": ready and state.target is not None,
         "undo": ready and state.data is not None and len(state.data) > 0,
@@ -161,7 +161,7 @@ def proposed(state: State) -> str:
     if state.phase == "aim":
         return "finish" if state.stop and state.calibration is not None else "go"
     if state.phase == "shown":
-        return "accept" if state.seen else "redo"
+        return "accept" if state.cameras_with_ball else "redo"
     return {"trouble": "go", "done": "finish"}.get(state.phase, "")
 
 
