@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from implicam.errors import DatasetError, ImplicamError, UsageError
-from implicam.exchange import FORMATS, UNKNOWN, ExplicitCamera, Rig, dlt, export_cameras, import_cameras
+from implicam.exchange import FORMATS, UNKNOWN_UNIT, ExplicitCamera, Rig, dlt, export_cameras, import_cameras
 from implicam.exchange.colmap import MODELS
 from implicam.geometry import Pose, look_at, resect, rotation_from_vector
 from implicam.lenses import BrownConrady, KannalaBrandt
@@ -139,7 +139,7 @@ def test_the_unit_is_asked_for_and_checked(tmp_path):
     foreign = tmp_path / "foreign.toml"
     foreign.write_text(path.read_text().replace('length_unit = "mm"\n', ""))
     unknown = import_cameras(foreign)
-    assert unknown.length_unit == UNKNOWN
+    assert unknown.length_unit == UNKNOWN_UNIT
     assert "length unit" in unknown.notes[-1]
     assert import_cameras(foreign, unit="mm").length_unit == "mm"
     with pytest.raises(DatasetError, match="is in 'mm', not in 'm'"):
@@ -414,7 +414,7 @@ def test_every_model_that_colmap_writes_is_read(tmp_path, model):
     made.write_text(tmp_path)
     rig = import_cameras(tmp_path)
     assert [c.name for c in rig.cameras] == ["left"]
-    assert rig.length_unit == UNKNOWN
+    assert rig.length_unit == UNKNOWN_UNIT
     image = made.images[1]
     seen = image.camera.img_from_cam(image.cam_from_world() * points())
     np.testing.assert_allclose(rig.cameras[0].pixel_from_world(points())[0], seen - 0.5, atol=1e-6, rtol=0)
@@ -557,7 +557,7 @@ def test_dlt_states_what_a_lens_costs(tmp_path):
     """The cost is that of the best fit: of the whole image at any distance, or at given points, where it is smaller."""
     camera = random_rig(2, n=1, fisheye=False).cameras[0]
     camera = replace(camera, lens=BrownConrady(1000.0, 1010.0, 650.0, 390.0, -0.2, 0.05, 1e-3, -1e-3))
-    column, cost = dlt.coefficients(camera)
+    column, cost = dlt.find_coefficients(camera)
     uv = np.stack(np.meshgrid(np.linspace(-0.5, 1279.5, 25), np.linspace(-0.5, 799.5, 25)), -1).reshape(-1, 2)
     rays = camera.lens.ray_from_pixel(uv)[0]
     for distance in (0.5, 50.0):
@@ -567,7 +567,7 @@ def test_dlt_states_what_a_lens_costs(tmp_path):
         assert off.max() == pytest.approx(cost.largest, rel=1e-6)
     xyz = points(1, 60)
     uv = camera.pixel_from_world(xyz)[0]
-    column, at_points = dlt.coefficients(camera, xyz)
+    column, at_points = dlt.find_coefficients(camera, xyz)
 
     def rms(column):
         return np.sqrt(np.mean(np.sum((from_coefficients(column, xyz) - 1 - uv) ** 2, axis=1)))

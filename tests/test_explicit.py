@@ -21,7 +21,7 @@ from implicam.coverage import assess
 from implicam.dataset import Dataset, KnownPositions, Observations, arrays_from_dataset
 from implicam.errors import CalibrationFileError, DatasetError, FitError, UsageError
 from implicam.evaluation import evaluate
-from implicam.exchange import UNKNOWN, ExplicitCamera
+from implicam.exchange import UNKNOWN_UNIT, ExplicitCamera
 from implicam.exchange import Rig as ExchangeRig
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.lenses import BrownConrady
@@ -650,7 +650,7 @@ def test_cameras_that_cannot_measure_are_refused() -> None:
     with pytest.raises(UsageError, match="there is one camera"):
         calibration_of(ExchangeRig((one,), "mm"), "x", 0.3)
     with pytest.raises(UsageError, match="does not say what its lengths are in"):
-        calibration_of(ExchangeRig((one, other), UNKNOWN), "x", 0.3)
+        calibration_of(ExchangeRig((one, other), UNKNOWN_UNIT), "x", 0.3)
 
 
 def test_evaluate_takes_it_like_any_other() -> None:

@@ -11,7 +11,7 @@ from implicam.calibrators import load_calibration
 from implicam.calibrators.explicit import calibration_of, rig_of
 from implicam.cli import show
 from implicam.cli.app import Json, command, must_be_calibration, must_not_replace
-from implicam.exchange import FORMATS, UNKNOWN, export_cameras, import_cameras
+from implicam.exchange import FORMATS, UNKNOWN_UNIT, export_cameras, import_cameras
 
 
 @command("export")
@@ -51,7 +51,7 @@ def import_command(
     must_be_calibration(output)
     must_not_replace(output, cameras)
     rig = import_cameras(cameras, kind)
-    rig = rig.in_unit(unit) if unit and rig.length_unit != UNKNOWN else import_cameras(cameras, kind, unit=unit)
+    rig = rig.in_unit(unit) if unit and rig.length_unit != UNKNOWN_UNIT else import_cameras(cameras, kind, unit=unit)
     calibration = calibration_of(rig, cameras.stem, noise)
     calibration.save(output)
     if json:

@@ -1,7 +1,7 @@
 """Explicit cameras in other programs' files: what each format is, how it is written and how it is read.
 
 To add a format: write a file with `write(rig, path) -> notes` and `read(path) -> Rig`, its conventions in its head; add
-it to `FORMATS`, to `_kind` if its content tells what it is, to the table of docs/exchange.md, and to the tests.
+it to `FORMATS`, to `_find_kind` if its content tells what it is, to the table of docs/exchange.md, and to the tests.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.exchange import anipose, colmap, dlt, kalibr, opencv
 from implicam.exchange.checks import read_text
-from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
+from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.lenses import BrownConrady, KannalaBrandt
 
-__all__ = ["FORMATS", "UNKNOWN", "ExplicitCamera", "Format", "Rig", "export_cameras", "import_cameras"]
+__all__ = ["FORMATS", "UNKNOWN_UNIT", "ExplicitCamera", "Format", "Rig", "export_cameras", "import_cameras"]
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
         DatasetError: The format cannot hold the rig; the error names one that can.
         ImplicamError: The file cannot be written.
     """
-    form = _format(to)
+    form = _find_format(to)
     for camera in rig.cameras:
         if not (form.fits_lenses or isinstance(camera.lens, BrownConrady | KannalaBrandt)):
             raise DatasetError(
@@ -88,16 +88,16 @@ def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | Non
     """
     path = Path(path)
     try:
-        rig = _format(kind or _kind(path)).read(path)
+        rig = _find_format(kind or _find_kind(path)).read(path)
     except OSError as error:
         raise DatasetError(
             f"{path} cannot be read.", why=str(error), fix="check the name and the permissions"
         ) from error
-    if unit is None and rig.length_unit == UNKNOWN:
+    if unit is None and rig.length_unit == UNKNOWN_UNIT:
         return replace(rig, notes=(*rig.notes, "The file does not say its length unit: state it before you measure."))
     if unit is None or unit == rig.length_unit:
         return rig
-    if rig.length_unit != UNKNOWN:
+    if rig.length_unit != UNKNOWN_UNIT:
         raise DatasetError(
             f"{path} is in {rig.length_unit!r}, not in {unit!r}.",
             why="the file, or its format, states the unit",
@@ -106,7 +106,7 @@ def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | Non
     return replace(rig, length_unit=unit)
 
 
-def _format(name: str) -> Format:
+def _find_format(name: str) -> Format:
     if name not in FORMATS:
         raise UsageError(
             f"there is no format {name!r}{did_you_mean(name, FORMATS)}.", fix=f"choose one of {', '.join(FORMATS)}"
@@ -114,9 +114,9 @@ def _format(name: str) -> Format:
     return FORMATS[name]
 
 
-def _kind(path: Path) -> str:
+def _find_kind(path: Path) -> str:
     """The format of a file or folder, by what is in it."""
-    if path.is_dir() or path.name in (colmap.CAMERAS, colmap.IMAGES):
+    if path.is_dir() or path.name in (colmap.CAMERAS_FILE, colmap.IMAGES_FILE):
         return "colmap"
     text = read_text(path)
     if text.startswith("%YAML") or "opencv-matrix" in text:
@@ -124,7 +124,7 @@ def _kind(path: Path) -> str:
     if re.search(r"^cam0\s*:", text, re.MULTILINE):
         return "kalibr"
     if re.search(r"^\s*\[[^\]\n]+\]\s*$", text, re.MULTILINE):
-        return _kind_of_toml(path)
+        return _find_kind_of_toml(path)
     if re.fullmatch(r"[-+0-9.,eE\s]+", text):
         return "dlt"
     raise DatasetError(
@@ -134,7 +134,7 @@ def _kind(path: Path) -> str:
     )
 
 
-def _kind_of_toml(path: Path) -> str:
+def _find_kind_of_toml(path: Path) -> str:
     """Pose2Sim writes four coefficients and never a fisheye; aniposelib five, or a fisheye."""
     cameras = anipose.camera_tables(anipose.read_toml(path)).values()
     lengths = [len(c["distortions"]) for c in cameras if isinstance(c.get("distortions"), list)]

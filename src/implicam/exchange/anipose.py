@@ -23,21 +23,21 @@ from implicam.errors import DatasetError
 from implicam.exchange.checks import (
     MAX_CAMERAS,
     as_table,
-    entry,
-    image_size,
+    check_text,
+    get_entry,
     lens_from_matrix,
-    numbers,
+    read_image_size,
+    read_numbers,
     read_text,
-    shown,
-    text_entry,
+    shorten,
 )
-from implicam.exchange.fits import four_coefficients
-from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
+from implicam.exchange.fits import fit_four_coefficients
+from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.files import toml_text, write_text
 from implicam.geometry import Pose, rotation_from_vector, vector_from_rotation
 from implicam.lenses import KannalaBrandt, Lens
 
-NOT_CAMERAS = ("metadata", "capture_volume", "charuco", "checkerboard")
+NON_CAMERA_TABLES = ("metadata", "capture_volume", "charuco", "checkerboard")
 """Tables that Pose2Sim and others leave out when they look for cameras."""
 
 
@@ -56,7 +56,7 @@ def write_aniposelib(rig: Rig, path: Path) -> list[str]:
         ImplicamError: The file cannot be written.
     """
     width = len(str(len(rig.cameras) - 1))  # aniposelib sorts the tables as text
-    tables = {f"cam_{i:0{width}}": _table(camera, camera.lens) for i, camera in enumerate(rig.cameras)}
+    tables = {f"cam_{i:0{width}}": _camera_table(camera, camera.lens) for i, camera in enumerate(rig.cameras)}
     metadata = {"adjusted": False, "error": 0.0, "length_unit": rig.length_unit}
     write_text(path, toml_text({**tables, "metadata": metadata}))
     return []
@@ -80,19 +80,19 @@ def write_pose2sim(rig: Rig, path: Path) -> list[str]:
     if rig.length_unit != "m":
         notes.append(f"Lengths are in metres; the rig's unit was {rig.length_unit}.")
     for camera in metres.cameras:
-        if camera.name in NOT_CAMERAS:
+        if camera.name in NON_CAMERA_TABLES:
             raise DatasetError(f"Pose2Sim takes {camera.name!r} for something else than a camera.", fix="rename it")
-        lens, cost = four_coefficients(camera)
+        lens, cost = fit_four_coefficients(camera)
         if cost:
             notes.append(f"Camera {camera.name!r}: Pose2Sim has k1, k2, p1, p2 only; fitted again with these: {cost}.")
-        table = _table(camera, lens)
+        table = _camera_table(camera, lens)
         sides = [float(side) for side in camera.size]  # as Pose2Sim writes them
         tables[camera.name] = {**table, "size": sides, "distortions": table["distortions"][:4], "fisheye": False}
     write_text(path, toml_text({**tables, "metadata": {"adjusted": False, "error": 0.0}}))
     return notes
 
 
-def _table(camera: ExplicitCamera, lens: Lens) -> dict[str, Any]:
+def _camera_table(camera: ExplicitCamera, lens: Lens) -> dict[str, Any]:
     pose = camera.camera_from_world
     numbers = {
         "matrix": [[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]],
@@ -115,7 +115,8 @@ def read_aniposelib(path: Path) -> Rig:
     """
     table = read_toml(path)
     metadata = as_table(table.get("metadata", {}), f"{path}: metadata")
-    return _rig(table, path, text_entry(metadata.get("length_unit", UNKNOWN), f"{path}: metadata.length_unit"))
+    unit = check_text(metadata.get("length_unit", UNKNOWN_UNIT), f"{path}: metadata.length_unit")
+    return _read_rig(table, path, unit)
 
 
 def read_pose2sim(path: Path) -> Rig:
@@ -127,7 +128,7 @@ def read_pose2sim(path: Path) -> Rig:
     Raises:
         DatasetError: The file has a mistake; the error names the key.
     """
-    return _rig(read_toml(path), path, "m")
+    return _read_rig(read_toml(path), path, "m")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -154,28 +155,28 @@ def camera_tables(table: dict[str, Any]) -> dict[str, dict[str, Any]]:
         table: The whole file, as `read_toml` gives it.
 
     Returns:
-        Key -> table; what `NOT_CAMERAS` names is left out.
+        Key -> table; what `NON_CAMERA_TABLES` names is left out.
     """
-    return {key: value for key, value in table.items() if isinstance(value, dict) and key not in NOT_CAMERAS}
+    return {key: value for key, value in table.items() if isinstance(value, dict) and key not in NON_CAMERA_TABLES}
 
 
-def _rig(table: dict[str, Any], path: Path, unit: str) -> Rig:
+def _read_rig(table: dict[str, Any], path: Path, unit: str) -> Rig:
     cameras = camera_tables(table)
     if not 0 < len(cameras) <= MAX_CAMERAS:
         raise DatasetError(f"{path}: it has {len(cameras)} tables of cameras.", fix="each camera is a table, [cam_0]")
     with naming(str(path)):
-        return Rig(tuple(_camera(key, value, f"{path}: [{key}]") for key, value in cameras.items()), unit)
+        return Rig(tuple(_read_camera(key, value, f"{path}: [{key}]") for key, value in cameras.items()), unit)
 
 
-def _camera(key: str, table: dict[str, Any], place: str) -> ExplicitCamera:
+def _read_camera(key: str, table: dict[str, Any], place: str) -> ExplicitCamera:
     def array(name: str, *shape: int) -> Any:
-        return numbers(entry(table, name, place), shape, f"{place} {name}")
+        return read_numbers(get_entry(table, name, place), shape, f"{place} {name}")
 
     fisheye = table.get("fisheye", False)
     if not isinstance(fisheye, bool):
-        raise DatasetError(f"{place}: fisheye = {shown(fisheye)} must be true or false.", fix="correct the value")
+        raise DatasetError(f"{place}: fisheye = {shorten(fisheye)} must be true or false.", fix="correct the value")
     matrix = array("matrix", 3, 3)
     lens = lens_from_matrix(matrix, array("distortions", -1).tolist(), fisheye=fisheye, place=place)
-    width, height = image_size(entry(table, "size", place), f"{place} size")
+    width, height = read_image_size(get_entry(table, "size", place), f"{place} size")
     pose = Pose(rotation_from_vector(array("rotation", 3)), array("translation", 3))
-    return ExplicitCamera(text_entry(table.get("name", key), f"{place} name"), width, height, lens, pose)
+    return ExplicitCamera(check_text(table.get("name", key), f"{place} name"), width, height, lens, pose)

@@ -16,9 +16,9 @@ from implicam.lenses import BrownConrady, Floats, KannalaBrandt, Lens
 MAX_BYTES = 1 << 18  # YAML takes seconds for more
 MAX_COEFFICIENTS = 14  # of OpenCV's largest lens model
 MAX_CAMERAS = 1000
-MAX_WHOLE = 1 << 53  # every smaller float that is whole is exact
+MAX_EXACT_INTEGER = 1 << 53  # every smaller float that is whole is exact
 
-ROUNDED, WRONG = 1e-9, 1e-3
+ROTATION_ROUNDING, MAX_ROTATION_ERROR = 1e-9, 1e-3
 """A rotation matrix off orthogonal by less than the first is kept, by less than the second is made orthogonal."""
 
 
@@ -96,7 +96,7 @@ def as_table(value: object, place: str) -> dict[str, Any]:
         DatasetError: It is something else.
     """
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
-        raise DatasetError(f"{place}: {shown(value)} is no table of named values.", fix="export the file again")
+        raise DatasetError(f"{place}: {shorten(value)} is no table of named values.", fix="export the file again")
     return value
 
 
@@ -112,12 +112,12 @@ def as_list(value: object, place: str) -> list[Any]:
     """
     if not isinstance(value, list) or not 0 < len(value) <= MAX_CAMERAS:
         raise DatasetError(
-            f"{place}: {shown(value)} is no list of cameras.", fix=f"give from 1 to {MAX_CAMERAS} cameras"
+            f"{place}: {shorten(value)} is no list of cameras.", fix=f"give from 1 to {MAX_CAMERAS} cameras"
         )
     return value
 
 
-def entry(table: Mapping[str, Any], key: str, place: str) -> Any:
+def get_entry(table: Mapping[str, Any], key: str, place: str) -> Any:
     """A value that must be in a table.
 
     Args:
@@ -136,7 +136,7 @@ def entry(table: Mapping[str, Any], key: str, place: str) -> Any:
     return table[key]
 
 
-def text_entry(value: object, place: str) -> str:
+def check_text(value: object, place: str) -> str:
     """Check that a value is text.
 
     Args:
@@ -147,11 +147,11 @@ def text_entry(value: object, place: str) -> str:
         DatasetError: It is something else.
     """
     if not isinstance(value, str):
-        raise DatasetError(f"{place} = {shown(value)} must be text.", fix="write it in quotes")
+        raise DatasetError(f"{place} = {shorten(value)} must be text.", fix="write it in quotes")
     return value
 
 
-def whole(value: object, place: str) -> int:
+def read_integer(value: object, place: str) -> int:
     """Read a whole number, which some programs write as 1280.0.
 
     Args:
@@ -161,13 +161,13 @@ def whole(value: object, place: str) -> int:
     Raises:
         DatasetError: It is no whole number, or is too large to be exact.
     """
-    number = _number(value, place)
-    if not (number.is_integer() and abs(number) < MAX_WHOLE):
-        raise DatasetError(f"{place} = {shown(value)} must be a whole number.", fix="correct the value")
+    number = _read_number(value, place)
+    if not (number.is_integer() and abs(number) < MAX_EXACT_INTEGER):
+        raise DatasetError(f"{place} = {shorten(value)} must be a whole number.", fix="correct the value")
     return int(number)
 
 
-def image_size(value: object, place: str) -> tuple[int, int]:
+def read_image_size(value: object, place: str) -> tuple[int, int]:
     """Read width and height in pixels from a pair.
 
     Args:
@@ -178,11 +178,11 @@ def image_size(value: object, place: str) -> tuple[int, int]:
         DatasetError: It is something else.
     """
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise DatasetError(f"{place} = {shown(value)} must be [width, height] in pixels.", fix="correct the value")
-    return whole(value[0], f"{place}[0]"), whole(value[1], f"{place}[1]")
+        raise DatasetError(f"{place} = {shorten(value)} must be [width, height] in pixels.", fix="correct the value")
+    return read_integer(value[0], f"{place}[0]"), read_integer(value[1], f"{place}[1]")
 
 
-def numbers(value: object, shape: tuple[int, ...], place: str) -> Floats:
+def read_numbers(value: object, shape: tuple[int, ...], place: str) -> Floats:
     """Read finite numbers as an array.
 
     The lengths are checked on the way down, so that a file whose lists repeat each other cannot grow without end.
@@ -198,21 +198,21 @@ def numbers(value: object, shape: tuple[int, ...], place: str) -> Floats:
     Raises:
         DatasetError: The shape is another, or a number is none or not finite.
     """
-    return np.array(_numbers(value, shape, place), dtype=np.float64)
+    return np.array(_read_nested(value, shape, place), dtype=np.float64)
 
 
-def _numbers(value: object, shape: tuple[int, ...], place: str) -> Any:
+def _read_nested(value: object, shape: tuple[int, ...], place: str) -> Any:
     if not shape:
-        return _number(value, place)
+        return _read_number(value, place)
     wanted, size = shape[0], len(value) if isinstance(value, list | tuple) else None
     if size is None or not (size <= MAX_COEFFICIENTS if wanted == -1 else size == wanted):
         many = f"at most {MAX_COEFFICIENTS}" if wanted == -1 else f"{wanted}"
-        raise DatasetError(f"{place} = {shown(value)} must be a list of {many}.", fix="correct the value")
+        raise DatasetError(f"{place} = {shorten(value)} must be a list of {many}.", fix="correct the value")
     assert isinstance(value, Sequence)
-    return [_numbers(item, shape[1:], f"{place}[{i}]") for i, item in enumerate(value)]
+    return [_read_nested(item, shape[1:], f"{place}[{i}]") for i, item in enumerate(value)]
 
 
-def _number(value: object, place: str) -> float:
+def _read_number(value: object, place: str) -> float:
     try:
         if isinstance(value, bool) or not isinstance(value, int | float | str):
             raise ValueError
@@ -222,7 +222,7 @@ def _number(value: object, place: str) -> float:
         if not np.isfinite(number):
             raise ValueError
     except (ValueError, OverflowError):
-        raise DatasetError(f"{place} = {shown(value)} is not a finite number.", fix="correct the value") from None
+        raise DatasetError(f"{place} = {shorten(value)} is not a finite number.", fix="correct the value") from None
     return number
 
 
@@ -234,20 +234,20 @@ def rotation_matrix(matrix: Floats, place: str) -> Floats:
         place: Where it stands, for the error.
 
     Returns:
-        (3, 3); orthogonal to rounding where it was off by `ROUNDED` or more.
+        (3, 3); orthogonal to rounding where it was off by `ROTATION_ROUNDING` or more.
 
     Raises:
         DatasetError: It is no rotation, or it mirrors.
     """
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if not off < WRONG or np.linalg.det(matrix) < 0:
-        mirror = off < WRONG
+    if not off < MAX_ROTATION_ERROR or np.linalg.det(matrix) < 0:
+        mirror = off < MAX_ROTATION_ERROR
         raise DatasetError(
             f"{place} is not a rotation matrix.",
             why="it mirrors: its determinant is -1" if mirror else f"R R^T differs from the identity by {off:.2g}",
             fix="correct the signs of its rows" if mirror else "write it with more digits, or export it again",
         )
-    if off < ROUNDED:
+    if off < ROTATION_ROUNDING:
         return matrix
     u, _, vt = np.linalg.svd(matrix)
     return np.asarray(u @ vt, dtype=np.float64)
@@ -263,7 +263,7 @@ def pose_from_matrix(value: object, place: str) -> Pose:
     Raises:
         DatasetError: It is no such matrix.
     """
-    matrix = numbers(value, (4, 4), place)
+    matrix = read_numbers(value, (4, 4), place)
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise DatasetError(f"{place}: the last row must be 0, 0, 0, 1.", fix="correct the value")
     return Pose(rotation_matrix(matrix[:3, :3], place), matrix[:3, 3])
@@ -284,7 +284,7 @@ def lens_from_matrix(matrix: Floats, coefficients: Sequence[float], *, fisheye: 
     skew = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1)
     if any(skew):
         raise DatasetError(
-            f"{place}: the camera matrix {shown(matrix.tolist())} has entries beside fx, fy, cx, cy.",
+            f"{place}: the camera matrix {shorten(matrix.tolist())} has entries beside fx, fy, cx, cy.",
             why="it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; the lens models here have no skew",
             fix="calibrate without skew",
         )
@@ -316,7 +316,7 @@ def lens_from_numbers(linear: Sequence[float], coefficients: Sequence[float], fi
         return KannalaBrandt(*focal, *given)
     if any(given[5:]):
         raise DatasetError(
-            f"{place}: distortion coefficients beyond k3 are not zero: {shown(given[5:])}.",
+            f"{place}: distortion coefficients beyond k3 are not zero: {shorten(given[5:])}.",
             why="the rational, thin-prism and tilted lens models of OpenCV are not supported; supported are "
             "Brown-Conrady (k1, k2, p1, p2, k3) and Kannala-Brandt (fisheye, k1 ... k4)",
             fix="calibrate with five coefficients, or with the fisheye model",
@@ -324,7 +324,7 @@ def lens_from_numbers(linear: Sequence[float], coefficients: Sequence[float], fi
     return BrownConrady(*focal, *given[:5])
 
 
-def shown(value: object) -> str:
+def shorten(value: object) -> str:
     """A value as an error message shows it, at most 80 characters.
 
     Args:

@@ -21,14 +21,23 @@ from implicam.dataset.model import Camera
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
 from implicam.exchange.anipose import read_toml
-from implicam.exchange.checks import as_list, as_table, entry, numbers, read_text, shown, text_entry, whole
-from implicam.exchange.fits import Cost, nearest_matrix, pinhole_from_matrix
+from implicam.exchange.checks import (
+    as_list,
+    as_table,
+    check_text,
+    get_entry,
+    read_integer,
+    read_numbers,
+    read_text,
+    shorten,
+)
+from implicam.exchange.fits import Cost, fit_projection_matrix, pinhole_from_matrix
 from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.files import toml_text, write_text
 from implicam.lenses import Floats
 
 ORIGINS = ("upper-left", "lower-left")
-COEFFICIENTS = 11
+COEFFICIENTS_PER_CAMERA = 11
 
 
 def write(rig: Rig, path: Path, points: Floats | None = None) -> list[str]:
@@ -51,19 +60,19 @@ def write(rig: Rig, path: Path, points: Floats | None = None) -> list[str]:
     """
     columns, notes = [], []
     for camera in rig.cameras:
-        column, cost = coefficients(camera, points)
+        column, cost = find_coefficients(camera, points)
         columns.append(column)
         if cost:
             where = "over the image" if points is None else "at the given points"
             notes.append(f"Camera {camera.name!r}: DLT has no lens distortion; the nearest is off {where}: {cost}.")
     tables = [{"name": c.name, "width": c.size[0], "height": c.size[1]} for c in rig.cameras]
     head = {"length_unit": rig.length_unit, "image_origin": "upper-left", "cameras": tables}
-    write_text(_description(path), toml_text(head))
+    write_text(_description_path(path), toml_text(head))
     write_text(path, "".join(",".join(map(repr, row)) + "\n" for row in np.column_stack(columns).tolist()))
     return notes
 
 
-def coefficients(camera: ExplicitCamera, points: Floats | None = None) -> tuple[Floats, Cost | None]:
+def find_coefficients(camera: ExplicitCamera, points: Floats | None = None) -> tuple[Floats, Cost | None]:
     """The coefficients of one camera, for pixels from the upper left, and what the format costs.
 
     Args:
@@ -76,7 +85,7 @@ def coefficients(camera: ExplicitCamera, points: Floats | None = None) -> tuple[
     Raises:
         DatasetError: The camera has no such form, or sees fewer than 12 of the points.
     """
-    p, cost = nearest_matrix(camera, points)
+    p, cost = fit_projection_matrix(camera, points)
     p = np.linalg.inv(_ours_from_dlt("upper-left", camera.size[1])) @ p
     if abs(p[2, 3]) < 1e-9 * np.abs(p[2]).max():
         raise DatasetError(
@@ -84,7 +93,7 @@ def coefficients(camera: ExplicitCamera, points: Floats | None = None) -> tuple[
             why="the origin of the world lies beside the camera, in the plane through its centre: L12 would be zero",
             fix="choose an origin in front of the cameras",
         )
-    return (p / p[2, 3]).ravel()[:COEFFICIENTS], cost
+    return (p / p[2, 3]).ravel()[:COEFFICIENTS_PER_CAMERA], cost
 
 
 def read(path: Path) -> Rig:
@@ -99,11 +108,11 @@ def read(path: Path) -> Rig:
     Raises:
         DatasetError: There is no description, or one of the files has a mistake.
     """
-    columns = _columns(path)
-    unit, origin, tables = _described(path, len(columns))
+    columns = _read_columns(path)
+    unit, origin, tables = _read_description(path, len(columns))
     cameras, notes = [], []
     for i, (table, column) in enumerate(zip(tables, columns, strict=True), 1):
-        camera, cost = _camera(table, column, origin, f"{path}, column {i}")
+        camera, cost = _make_camera(table, column, origin, f"{path}, column {i}")
         cameras.append(camera)
         if cost:
             notes.append(f"Camera {camera.name!r}: its axes were not at right angles; made so, pixels move: {cost}.")
@@ -113,9 +122,9 @@ def read(path: Path) -> Rig:
         return Rig(tuple(cameras), unit, tuple(notes))
 
 
-def _described(path: Path, columns: int) -> tuple[str, str, list[dict[str, Any]]]:
+def _read_description(path: Path, columns: int) -> tuple[str, str, list[dict[str, Any]]]:
     """The unit, where the pixels begin, and a table for each column, from the description beside the coefficients."""
-    beside = _description(path)
+    beside = _description_path(path)
     if not beside.is_file():
         raise DatasetError(
             f"{path} says nothing of names, image sizes, unit and origin of the pixels.",
@@ -124,11 +133,11 @@ def _described(path: Path, columns: int) -> tuple[str, str, list[dict[str, Any]]
             'DLTdv and easyWand) or "upper-left", and for each column [[cameras]] with name, width and height',
         )
     head, place = read_toml(beside), str(beside)
-    unit = text_entry(entry(head, "length_unit", place), f"{place}: length_unit")
-    origin = entry(head, "image_origin", place)
+    unit = check_text(get_entry(head, "length_unit", place), f"{place}: length_unit")
+    origin = get_entry(head, "image_origin", place)
     if origin not in ORIGINS:
-        raise DatasetError(f"{place}: image_origin = {shown(origin)}.", fix=f"write one of {', '.join(ORIGINS)}")
-    tables = as_list(entry(head, "cameras", place), f"{place}: cameras")
+        raise DatasetError(f"{place}: image_origin = {shorten(origin)}.", fix=f"write one of {', '.join(ORIGINS)}")
+    tables = as_list(get_entry(head, "cameras", place), f"{place}: cameras")
     if len(tables) != columns:
         raise DatasetError(
             f"{path} has {columns} columns, and {beside.name} names {len(tables)} cameras.",
@@ -137,9 +146,9 @@ def _described(path: Path, columns: int) -> tuple[str, str, list[dict[str, Any]]
     return unit, origin, [as_table(table, f"{place}: cameras[{i}]") for i, table in enumerate(tables)]
 
 
-def _camera(table: dict[str, Any], column: Floats, origin: str, place: str) -> tuple[ExplicitCamera, Cost | None]:
-    name = text_entry(entry(table, "name", place), f"{place}: name")
-    width, height = (whole(entry(table, key, place), f"{place}: {key}") for key in ("width", "height"))
+def _make_camera(table: dict[str, Any], column: Floats, origin: str, place: str) -> tuple[ExplicitCamera, Cost | None]:
+    name = check_text(get_entry(table, "name", place), f"{place}: name")
+    width, height = (read_integer(get_entry(table, key, place), f"{place}: {key}") for key in ("width", "height"))
     p = np.append(column, 1.0).reshape(3, 4)
     with naming(place):
         Camera(name, width, height)  # refuses a size that is none
@@ -153,20 +162,21 @@ def _ours_from_dlt(origin: str, height: int) -> Floats:
     return np.array([[1.0, 0, -1], [0, -1, height], [0, 0, 1]])
 
 
-def _columns(path: Path) -> list[Floats]:
+def _read_columns(path: Path) -> list[Floats]:
     """The columns (11,) of the file; a header is refused."""
     rows = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
-    if len(rows) != COEFFICIENTS:
+    if len(rows) != COEFFICIENTS_PER_CAMERA:
         raise DatasetError(
-            f"{path} has {len(rows)} rows; DLT coefficients are {COEFFICIENTS} rows, one column a camera.",
-            why="it is turned on its side" if rows and len(rows[0]) == COEFFICIENTS else "",
+            f"{path} has {len(rows)} rows; DLT coefficients are {COEFFICIENTS_PER_CAMERA} rows, one column a camera.",
+            why="it is turned on its side" if rows and len(rows[0]) == COEFFICIENTS_PER_CAMERA else "",
             fix="give a CSV without header, L1 to L11 from top to bottom",
         )
     values = [
-        numbers([cell.strip() for cell in row], (len(rows[0]),), f"{path}, row {i}") for i, row in enumerate(rows, 1)
+        read_numbers([cell.strip() for cell in row], (len(rows[0]),), f"{path}, row {i}")
+        for i, row in enumerate(rows, 1)
     ]
     return list(np.array(values).T)
 
 
-def _description(path: Path) -> Path:
+def _description_path(path: Path) -> Path:
     return path.with_name(path.name + ".toml")

@@ -17,16 +17,16 @@ from implicam.exchange.model import ExplicitCamera, has_distortion
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.lenses import BrownConrady, Floats, KannalaBrandt
 
-LATTICE = 25
-"""Pixels along each side of the image."""
+LATTICE_POINTS_PER_SIDE = 25
+"""Pixels of the lattice along each side of the image."""
 
-TOLERABLE = 1.0
-"""Pixels. A lens that another cannot imitate better anywhere in the image is refused, not written."""
+MAX_LENS_DIFFERENCE_PX = 1.0
+"""A lens that the nearest one of the format misses by more, anywhere in the image, is refused."""
 
-ROUNDING = 1e-6
-"""Pixels. A smaller difference is none."""
+ROUNDING_PX = 1e-6
+"""A smaller difference is none."""
 
-SIDEWAYS = 0.1
+MIN_FORWARD_COSINE = 0.1
 """Least forward part of a unit ray that a plane image can hold: 84 degrees off the axis."""
 
 
@@ -64,7 +64,7 @@ def pixel_lattice(camera: ExplicitCamera) -> Floats:
     Raises:
         DatasetError: The image size is not known.
     """
-    u, v = (np.linspace(-0.5, size - 0.5, LATTICE) for size in camera.size)
+    u, v = (np.linspace(-0.5, size - 0.5, LATTICE_POINTS_PER_SIDE) for size in camera.size)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
@@ -84,7 +84,7 @@ def image_rays(camera: ExplicitCamera, form: str) -> tuple[Floats, Floats]:
     uv = pixel_lattice(camera)
     rays, valid = camera.lens.ray_from_pixel(uv)
     rays, uv = rays[valid], uv[valid]
-    if not len(rays) or rays[:, 2].min() < SIDEWAYS:
+    if not len(rays) or rays[:, 2].min() < MIN_FORWARD_COSINE:
         raise DatasetError(
             f"camera {camera.name!r} cannot be written as {form}.",
             why="a part of its image looks sideways or backwards, which a perspective lens cannot hold"
@@ -95,7 +95,7 @@ def image_rays(camera: ExplicitCamera, form: str) -> tuple[Floats, Floats]:
     return rays / rays[:, 2:], uv
 
 
-def four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None]:
+def fit_four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None]:
     """The lens with k1, k2, p1, p2 alone that is nearest over the image, by Gauss-Newton on all eight parameters.
 
     Args:
@@ -105,7 +105,7 @@ def four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None
         The lens; and the cost, None where it is the same lens.
 
     Raises:
-        DatasetError: It is off by more than `TOLERABLE` pixels somewhere.
+        DatasetError: It is off by more than `MAX_LENS_DIFFERENCE_PX` pixels somewhere.
     """
     lens = camera.lens
     if isinstance(lens, BrownConrady) and lens.k3 == 0:
@@ -120,7 +120,7 @@ def four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None
         found = BrownConrady(*(np.array(astuple(found)[:8]) + step).tolist())
     at, valid = found.pixel_from_camera_point(rays)
     cost = Cost.between(at, uv) if valid.all() else Cost(np.inf, np.inf)
-    if not cost.largest <= TOLERABLE:
+    if not cost.largest <= MAX_LENS_DIFFERENCE_PX:
         known = isinstance(lens, BrownConrady | KannalaBrandt)
         raise DatasetError(
             f"camera {camera.name!r} cannot be written as {form}.",
@@ -132,7 +132,7 @@ def four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | None
     return found, cost
 
 
-def camera_matrix(camera: ExplicitCamera) -> Floats:
+def projection_matrix(camera: ExplicitCamera) -> Floats:
     """The projection matrix of the camera without its distortion.
 
     Args:
@@ -146,7 +146,7 @@ def camera_matrix(camera: ExplicitCamera) -> Floats:
     return np.asarray(k @ np.column_stack([pose.rotation, pose.translation]), dtype=np.float64)
 
 
-def nearest_matrix(camera: ExplicitCamera, points: Floats | None = None) -> tuple[Floats, Cost | None]:
+def fit_projection_matrix(camera: ExplicitCamera, points: Floats | None = None) -> tuple[Floats, Cost | None]:
     """The direct linear transformation that comes nearest to the camera, by least squares in pixels.
 
     Args:
@@ -161,13 +161,13 @@ def nearest_matrix(camera: ExplicitCamera, points: Floats | None = None) -> tupl
         DatasetError: The camera looks sideways somewhere, or sees fewer than 12 of the points.
     """
     if not has_distortion(camera.lens):
-        return camera_matrix(camera), None
+        return projection_matrix(camera), None
     if points is None:
         q, uv = image_rays(camera, "a direct linear transformation")
     else:
-        q, uv = _in_view(camera, points)
-    k = camera_matrix(replace(camera, camera_from_world=Pose(np.eye(3), np.zeros(3))))[:, :3]
-    centred = np.linalg.inv(_spread(uv))
+        q, uv = _select_in_view(camera, points)
+    k = projection_matrix(replace(camera, camera_from_world=Pose(np.eye(3), np.zeros(3))))[:, :3]
+    centred = np.linalg.inv(_normalising_similarity(uv))
     depth = float(np.median(q[:, 2]))
 
     def matrix(x: Floats) -> tuple[Floats, Floats]:
@@ -175,20 +175,20 @@ def nearest_matrix(camera: ExplicitCamera, points: Floats | None = None) -> tupl
         change = np.eye(3) + np.append(x[:8], 0).reshape(3, 3)
         return np.linalg.inv(centred) @ change @ centred @ k, depth * x[8:] if len(x) > 8 else np.zeros(3)
 
-    def seen(x: Floats) -> Floats:
+    def project(x: Floats) -> Floats:
         homography, shift = matrix(x)
         w = (q - shift) @ homography.T
         return np.asarray(w[:, :2] / w[:, 2:], dtype=np.float64)
 
     start = np.zeros(8 if points is None else 11)
-    x = least_squares(lambda x: (seen(x) - uv).ravel(), start, x_scale=0.01, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    x = least_squares(lambda x: (project(x) - uv).ravel(), start, x_scale=0.01, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
     homography, shift = matrix(x)
     pose = camera.camera_from_world
     p = homography @ np.column_stack([pose.rotation, pose.translation - shift])
-    return p, Cost.between(seen(x), uv)
+    return p, Cost.between(project(x), uv)
 
 
-def _in_view(camera: ExplicitCamera, points: Floats) -> tuple[Floats, Floats]:
+def _select_in_view(camera: ExplicitCamera, points: Floats) -> tuple[Floats, Floats]:
     """The points (n, 3) that fall into the image, in the camera frame, and their pixels (n, 2)."""
     q = camera.camera_from_world.apply(np.asarray(points, dtype=np.float64))
     uv, valid = camera.lens.pixel_from_camera_point(q)
@@ -201,7 +201,7 @@ def _in_view(camera: ExplicitCamera, points: Floats) -> tuple[Floats, Floats]:
     return q[inside], uv[inside]
 
 
-def _spread(uv: Floats) -> Floats:
+def _normalising_similarity(uv: Floats) -> Floats:
     """The similarity (3, 3) that brings [-1, 1] to where the pixels (n, 2) are."""
     low, high = uv.min(axis=0), uv.max(axis=0)
     half = float((high - low).max()) / 2 or 1.0
@@ -241,25 +241,25 @@ def pinhole_from_matrix(name: str, size: tuple[int, int], p: Floats, place: str)
     camera = ExplicitCamera(name, *size, lens, Pose(rotation, translation))
     if abs(k[0, 1]) < 1e-9 * k[0, 0]:
         return camera, None
-    return _without_skew(camera, np.linalg.inv(k))
+    return _remove_skew(camera, np.linalg.inv(k))
 
 
-def _without_skew(camera: ExplicitCamera, ray_from_pixel: Floats) -> tuple[ExplicitCamera, Cost | None]:
+def _remove_skew(camera: ExplicitCamera, ray_from_pixel: Floats) -> tuple[ExplicitCamera, Cost | None]:
     """The camera at the same place whose pixels are nearest to those of a skewed one, and what that costs."""
     uv = pixel_lattice(camera)
     rays = np.column_stack([uv, np.ones(len(uv))]) @ ray_from_pixel.T
     start = np.array(astuple(camera.lens)[:4])
     scale = np.append(np.full(4, start[0]), np.ones(3))
 
-    def turned(x: Floats) -> tuple[Floats, Floats]:
+    def project_turned(x: Floats) -> tuple[Floats, Floats]:
         lens, turn = start + scale[:4] * x[:4], rotation_from_vector(x[4:])
         at = rays @ turn.T
         return lens, np.asarray(lens[:2] * at[:, :2] / at[:, 2:] + lens[2:], dtype=np.float64)
 
-    x = least_squares(lambda x: (turned(x)[1] - uv).ravel(), np.zeros(7), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
-    lens, at = turned(x)
+    x = least_squares(lambda x: (project_turned(x)[1] - uv).ravel(), np.zeros(7), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    lens, at = project_turned(x)
     turn, pose = rotation_from_vector(x[4:]), camera.camera_from_world
     moved = Pose(turn @ pose.rotation, turn @ pose.translation)
     cost = Cost.between(at, uv)
     found = replace(camera, lens=BrownConrady(*lens.tolist()), camera_from_world=moved)
-    return found, cost if cost.largest > ROUNDING else None
+    return found, cost if cost.largest > ROUNDING_PX else None

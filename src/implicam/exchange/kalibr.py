@@ -25,25 +25,25 @@ from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
 from implicam.exchange.checks import (
     as_table,
-    entry,
-    image_size,
+    check_text,
+    get_entry,
     lens_from_numbers,
-    numbers,
     pose_from_matrix,
+    read_image_size,
+    read_numbers,
     read_yaml,
-    shown,
-    text_entry,
+    shorten,
 )
-from implicam.exchange.fits import four_coefficients
+from implicam.exchange.fits import fit_four_coefficients
 from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.files import write_text
 from implicam.geometry import Pose
 from implicam.lenses import Floats, KannalaBrandt, Lens
 
-AGREE = 1e-5
+MAX_POSE_DIFFERENCE = 1e-5
 """How far T_cn_cnm1 and T_cam_world may be apart, as a part of the rig's size."""
 
-DISTORTIONS = {"radtan": 4, "equidistant": 4, "none": 0}
+DISTORTION_COEFFICIENTS = {"radtan": 4, "equidistant": 4, "none": 0}
 
 
 def write(rig: Rig, path: Path) -> list[str]:
@@ -67,7 +67,7 @@ def write(rig: Rig, path: Path) -> list[str]:
     ]
     text = []
     for i, camera in enumerate(rig.cameras):
-        lens, lost = _lens(camera)
+        lens, lost = _choose_lens(camera)
         notes += lost
         before = rig.cameras[i - 1].camera_from_world if i else None
         text.append(f"cam{i}:\n" + "".join(f"  {line}\n" for line in _camera_lines(camera, lens, before)))
@@ -75,10 +75,10 @@ def write(rig: Rig, path: Path) -> list[str]:
     return notes
 
 
-def _lens(camera: ExplicitCamera) -> tuple[Lens, list[str]]:
+def _choose_lens(camera: ExplicitCamera) -> tuple[Lens, list[str]]:
     if isinstance(camera.lens, KannalaBrandt):
         return camera.lens, []
-    lens, cost = four_coefficients(camera)
+    lens, cost = fit_four_coefficients(camera)
     if cost is None:
         return lens, []
     return lens, [f"Camera {camera.name!r}: Kalibr's radtan has no k3, so the lens was fitted again without: {cost}."]
@@ -88,30 +88,30 @@ def _camera_lines(camera: ExplicitCamera, lens: Lens, before: Pose | None) -> li
     model = "equidistant" if isinstance(lens, KannalaBrandt) else "radtan"
     pose, name = camera.camera_from_world, json.dumps(camera.name, ensure_ascii=False)
     topic = json.dumps(f"/{camera.name}/image_raw", ensure_ascii=False)
-    chain = _matrix("T_cn_cnm1", pose @ before.inverse()) if before else []
+    chain = _matrix_lines("T_cn_cnm1", pose @ before.inverse()) if before else []
     return [
         f"camera_name: {name}",
         "camera_model: pinhole",
-        f"intrinsics: {_row(astuple(lens)[:4])}",
+        f"intrinsics: {_format_row(astuple(lens)[:4])}",
         f"distortion_model: {model}",
-        f"distortion_coeffs: {_row(astuple(lens)[4:8])}",
+        f"distortion_coeffs: {_format_row(astuple(lens)[4:8])}",
         f"resolution: [{camera.size[0]}, {camera.size[1]}]",
         f"rostopic: {topic}",
         *chain,
-        *_matrix("T_cam_world", pose),
+        *_matrix_lines("T_cam_world", pose),
     ]
 
 
-def _matrix(name: str, pose: Pose) -> list[str]:
+def _matrix_lines(name: str, pose: Pose) -> list[str]:
     rows = np.vstack([np.column_stack([pose.rotation, pose.translation]), [0, 0, 0, 1]])
-    return [f"{name}:", *(f"- {_row(row)}" for row in rows.tolist())]
+    return [f"{name}:", *(f"- {_format_row(row)}" for row in rows.tolist())]
 
 
-def _row(values: Any) -> str:
-    return "[" + ", ".join(_number(float(x)) for x in values) + "]"
+def _format_row(values: Any) -> str:
+    return "[" + ", ".join(_format_number(float(x)) for x in values) + "]"
 
 
-def _number(x: float) -> str:
+def _format_number(x: float) -> str:
     """The shortest text that is the same number, with a dot: without, 1e-05 is text in YAML 1.1."""
     text = repr(x)
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
@@ -133,49 +133,49 @@ def read(path: Path) -> Rig:
     names = [f"cam{i}" for i in range(len(table))]
     if not names or set(names) != set(table):
         raise DatasetError(
-            f"{path}: the cameras must be cam0, cam1, ...; found {shown(list(table))}.",
+            f"{path}: the cameras must be cam0, cam1, ...; found {shorten(list(table))}.",
             fix="give the camchain.yaml that kalibr_calibrate_cameras wrote",
         )
     entries = [(as_table(table[name], f"{path}: {name}"), f"{path}: {name}") for name in names]
-    poses, notes = _poses(entries)
+    poses, notes = _read_poses(entries)
     with naming(str(path)):
-        cameras = [_camera(t, pose, place) for (t, place), pose in zip(entries, poses, strict=True)]
+        cameras = [_read_camera(t, pose, place) for (t, place), pose in zip(entries, poses, strict=True)]
         return Rig(tuple(cameras), "m", notes)
 
 
-def _camera(table: dict[str, Any], pose: Pose, place: str) -> ExplicitCamera:
+def _read_camera(table: dict[str, Any], pose: Pose, place: str) -> ExplicitCamera:
     key = place.rpartition(": ")[2]
-    name = text_entry(table.get("camera_name", key), f"{place}: camera_name")
-    width, height = image_size(entry(table, "resolution", place), f"{place}: resolution")
+    name = check_text(table.get("camera_name", key), f"{place}: camera_name")
+    width, height = read_image_size(get_entry(table, "resolution", place), f"{place}: resolution")
     return ExplicitCamera(name, width, height, _read_lens(table, place), pose)
 
 
 def _read_lens(table: dict[str, Any], place: str) -> Lens:
-    model, distortion = (entry(table, key, place) for key in ("camera_model", "distortion_model"))
-    if model != "pinhole" or distortion not in DISTORTIONS:
+    model, distortion = (get_entry(table, key, place) for key in ("camera_model", "distortion_model"))
+    if model != "pinhole" or distortion not in DISTORTION_COEFFICIENTS:
         raise DatasetError(
-            f"{place}: the lens model {shown(model)} with {shown(distortion)} is not supported.",
-            why=f"supported are pinhole with {', '.join(DISTORTIONS)}",
+            f"{place}: the lens model {shorten(model)} with {shorten(distortion)} is not supported.",
+            why=f"supported are pinhole with {', '.join(DISTORTION_COEFFICIENTS)}",
             fix="calibrate again with --models pinhole-radtan or pinhole-equi",
         )
-    linear = numbers(entry(table, "intrinsics", place), (4,), f"{place}: intrinsics")
-    given = entry(table, "distortion_coeffs", place) if DISTORTIONS[distortion] else []
-    coefficients = numbers(given, (DISTORTIONS[distortion],), f"{place}: distortion_coeffs")
+    linear = read_numbers(get_entry(table, "intrinsics", place), (4,), f"{place}: intrinsics")
+    given = get_entry(table, "distortion_coeffs", place) if DISTORTION_COEFFICIENTS[distortion] else []
+    coefficients = read_numbers(given, (DISTORTION_COEFFICIENTS[distortion],), f"{place}: distortion_coeffs")
     return lens_from_numbers(linear.tolist(), coefficients.tolist(), distortion == "equidistant", place)
 
 
-def _poses(entries: list[tuple[dict[str, Any], str]]) -> tuple[list[Pose], tuple[str, ...]]:
+def _read_poses(entries: list[tuple[dict[str, Any], str]]) -> tuple[list[Pose], tuple[str, ...]]:
     """Where the cameras are, `camera_from_world`; and the note that the world is the first camera's."""
     chain = [Pose(np.eye(3), np.zeros(3))]
     for table, place in entries[1:]:
-        step = pose_from_matrix(entry(table, "T_cn_cnm1", place), f"{place}: T_cn_cnm1")
+        step = pose_from_matrix(get_entry(table, "T_cn_cnm1", place), f"{place}: T_cn_cnm1")
         chain.append(step @ chain[-1])
     if not all("T_cam_world" in table for table, _ in entries):
         return chain, ("The world is the frame of the first camera: Kalibr knows no other.",)
     world = [pose_from_matrix(t["T_cam_world"], f"{place}: T_cam_world") for t, place in entries]
     size = max(float(np.linalg.norm(pose.centre - world[0].centre)) for pose in world) or 1.0
     for (a, b), (c, d), (_, place) in zip(pairwise(chain), pairwise(world), entries[1:], strict=True):
-        if _apart(b @ a.inverse(), d @ c.inverse(), size) > AGREE:
+        if _pose_difference(b @ a.inverse(), d @ c.inverse(), size) > MAX_POSE_DIFFERENCE:
             raise DatasetError(
                 f"{place}: T_cn_cnm1 and T_cam_world do not agree.",
                 why="one of them was changed after the file was written",
@@ -184,6 +184,6 @@ def _poses(entries: list[tuple[dict[str, Any], str]]) -> tuple[list[Pose], tuple
     return world, ()
 
 
-def _apart(a: Pose, b: Pose, size: float) -> float:
+def _pose_difference(a: Pose, b: Pose, size: float) -> float:
     turn: Floats = np.abs(a.rotation - b.rotation)
     return max(float(turn.max()), float(np.abs(a.translation - b.translation).max()) / size)

@@ -16,7 +16,7 @@ from implicam.errors import DatasetError
 from implicam.geometry import Pose
 from implicam.lenses import Bools, BrownConrady, Floats, Lens
 
-UNKNOWN = "unknown"
+UNKNOWN_UNIT = "unknown"
 """The length unit of a rig whose file does not say it."""
 
 

@@ -28,16 +28,16 @@ from implicam.exchange.checks import (
     MAX_CAMERAS,
     as_list,
     as_table,
-    entry,
+    check_text,
+    get_entry,
     lens_from_matrix,
-    numbers,
+    read_integer,
+    read_numbers,
     read_yaml,
     rotation_matrix,
-    shown,
-    text_entry,
-    whole,
+    shorten,
 )
-from implicam.exchange.model import UNKNOWN, ExplicitCamera, Rig
+from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.files import write_text
 from implicam.geometry import Pose, rotation_from_vector
 from implicam.lenses import Floats, KannalaBrandt
@@ -70,15 +70,15 @@ def _camera_text(camera: ExplicitCamera) -> str:
         f"image_width: {width}",
         f"image_height: {height}",
         f"fisheye_model: {int(isinstance(lens, KannalaBrandt))}",
-        *_matrix("camera_matrix", np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])),
-        *_matrix("distortion_coefficients", np.array(astuple(lens)[4:])[:, None]),
-        *_matrix("R", pose.rotation),
-        *_matrix("T", pose.translation[:, None]),
+        *_matrix_lines("camera_matrix", np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])),
+        *_matrix_lines("distortion_coefficients", np.array(astuple(lens)[4:])[:, None]),
+        *_matrix_lines("R", pose.rotation),
+        *_matrix_lines("T", pose.translation[:, None]),
     ]
     return "   -\n" + "".join(f"      {line}\n" for line in lines)
 
 
-def _matrix(name: str, values: Floats) -> list[str]:
+def _matrix_lines(name: str, values: Floats) -> list[str]:
     rows, columns = values.shape
     data = ", ".join(repr(float(x)) for x in values.ravel())
     return [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
@@ -95,52 +95,52 @@ def read(path: Path) -> Rig:
     """
     table = read_yaml(path)
     place = str(path)
-    unit = text_entry(table.get("length_unit", UNKNOWN), f"{place}: length_unit")
+    unit = check_text(table.get("length_unit", UNKNOWN_UNIT), f"{place}: length_unit")
     if "cameras" not in table:
         posed = {"R", "rvec"} & set(table)
         notes = () if posed else ("The file has no pose: the world is the camera's own frame.",)
-        return Rig((_camera({"name": path.stem, **table}, place),), unit, notes)
+        return Rig((_read_camera({"name": path.stem, **table}, place),), unit, notes)
     places = [f"{place}: cameras[{i}]" for i in range(MAX_CAMERAS)]
     listed = zip(as_list(table["cameras"], f"{place}: cameras"), places, strict=False)
-    cameras = tuple(_camera(as_table(camera, where), where) for camera, where in listed)
+    cameras = tuple(_read_camera(as_table(camera, where), where) for camera, where in listed)
     with naming(place):
         return Rig(cameras, unit)
 
 
-def _camera(table: dict[str, Any], place: str) -> ExplicitCamera:
-    name = text_entry(entry(table, "name", place), f"{place}: name")
-    place = f"{place} ({shown(name)})"
-    k = _array(entry(table, "camera_matrix", place), f"{place}: camera_matrix", (3, 3))
-    given = _array(entry(table, "distortion_coefficients", place), f"{place}: distortion_coefficients", (-1,))
-    fisheye = whole(table.get("fisheye_model", 0), f"{place}: fisheye_model") != 0
+def _read_camera(table: dict[str, Any], place: str) -> ExplicitCamera:
+    name = check_text(get_entry(table, "name", place), f"{place}: name")
+    place = f"{place} ({shorten(name)})"
+    k = _read_matrix(get_entry(table, "camera_matrix", place), f"{place}: camera_matrix", (3, 3))
+    given = _read_matrix(get_entry(table, "distortion_coefficients", place), f"{place}: distortion_coefficients", (-1,))
+    fisheye = read_integer(table.get("fisheye_model", 0), f"{place}: fisheye_model") != 0
     lens = lens_from_matrix(k, given.tolist(), fisheye=fisheye, place=place)
     sizes = [table[key] for key in ("image_width", "image_height") if key in table]
-    width, height = [whole(size, f"{place}: image size") for size in sizes] if len(sizes) == 2 else (None, None)
+    width, height = [read_integer(size, f"{place}: image size") for size in sizes] if len(sizes) == 2 else (None, None)
     with naming(place):
-        return ExplicitCamera(name, width, height, lens, _pose(table, place))
+        return ExplicitCamera(name, width, height, lens, _read_pose(table, place))
 
 
-def _pose(table: dict[str, Any], place: str) -> Pose:
+def _read_pose(table: dict[str, Any], place: str) -> Pose:
     if "R" in table or "T" in table:
-        r = _array(entry(table, "R", place), f"{place}: R", (3, 3))
-        return Pose(rotation_matrix(r, f"{place}: R"), _array(entry(table, "T", place), f"{place}: T", (3,)))
+        r = _read_matrix(get_entry(table, "R", place), f"{place}: R", (3, 3))
+        return Pose(rotation_matrix(r, f"{place}: R"), _read_matrix(get_entry(table, "T", place), f"{place}: T", (3,)))
     if "rvec" in table or "tvec" in table:
-        rotation = rotation_from_vector(_array(entry(table, "rvec", place), f"{place}: rvec", (3,)))
-        return Pose(rotation, _array(entry(table, "tvec", place), f"{place}: tvec", (3,)))
+        rotation = rotation_from_vector(_read_matrix(get_entry(table, "rvec", place), f"{place}: rvec", (3,)))
+        return Pose(rotation, _read_matrix(get_entry(table, "tvec", place), f"{place}: tvec", (3,)))
     return Pose(np.eye(3), np.zeros(3))
 
 
-def _array(value: object, place: str, shape: tuple[int, ...]) -> Floats:
+def _read_matrix(value: object, place: str, shape: tuple[int, ...]) -> Floats:
     """An OpenCV matrix as an array; a vector may be a row, a column, one-dimensional (OpenCV 5) or a plain list."""
     if isinstance(value, list):
-        return numbers(value, shape, place)
+        return read_numbers(value, shape, place)
     matrix = as_table(value, place)
     keys = ("rows", "cols")
-    given = entry(matrix, "sizes", place) if "sizes" in matrix else [entry(matrix, key, place) for key in keys]
-    sizes = tuple(int(size) for size in numbers(given, (-1,), f"{place} size"))
+    given = get_entry(matrix, "sizes", place) if "sizes" in matrix else [get_entry(matrix, key, place) for key in keys]
+    sizes = tuple(int(size) for size in read_numbers(given, (-1,), f"{place} size"))
     if len(shape) == 2 and sizes != shape:
         raise DatasetError(
-            f"{place} has the size {shown(sizes)}; it must be {' x '.join(map(str, shape))}.", fix="correct the value"
+            f"{place} has the size {shorten(sizes)}; it must be {' x '.join(map(str, shape))}.", fix="correct the value"
         )
     count = shape if len(shape) == 1 else (shape[0] * shape[1],)
-    return numbers(entry(matrix, "data", place), count, f"{place}.data").reshape(shape)
+    return read_numbers(get_entry(matrix, "data", place), count, f"{place}.data").reshape(shape)

@@ -10,7 +10,7 @@ from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.protocol import Calibration, RigCalibration
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations
 from implicam.errors import UsageError
-from implicam.exchange import UNKNOWN, ExplicitCamera, Rig
+from implicam.exchange import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.geometry import Floats, Pose
 from implicam.rig_model import (
     CameraModel,
@@ -95,7 +95,7 @@ def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
     """
     if len(rig.cameras) < 2:
         raise UsageError("there is one camera; a position takes two.", fix="give the file of the whole rig")
-    if rig.length_unit == UNKNOWN:
+    if rig.length_unit == UNKNOWN_UNIT:
         raise UsageError(
             "the file does not say what its lengths are in.", fix="state the unit of the cameras' places: --unit mm"
         )
