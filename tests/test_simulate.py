@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from scipy.stats import binom
 from implicam.dataset import Dataset
 from implicam.errors import UsageError
 from implicam.geometry import Pose
+from implicam.lenses import BrownConrady
 from implicam.simulate import (
     Optics,
     Rig,
@@ -80,6 +81,29 @@ def test_the_smooth_error_is_as_large_as_asked(spec: str) -> None:
         shift = camera.error.at(over_the_image(camera))
         np.testing.assert_allclose(np.sqrt(np.mean(shift**2, axis=0)), 0.7, rtol=0.05)
         np.testing.assert_allclose(shift.mean(axis=0), 0, atol=0.05)
+
+
+def test_a_tilted_sensor_is_as_far_behind_the_lens_as_the_middle_of_the_image_says() -> None:
+    """Whatever a lens of another package calls fx."""
+
+    @dataclass(frozen=True)
+    class Doubled(BrownConrady):
+        """fx and fy are twice the focal length, as that of a double sphere is (1 + xi) times it."""
+
+        def pixel_from_camera_point(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            uv, valid = super().pixel_from_camera_point(points)
+            return 0.5 * (uv + [self.cx, self.cy]), valid
+
+        def jacobian(self, points: np.ndarray) -> np.ndarray:
+            return 0.5 * super().jacobian(points)
+
+    camera = build_rig("dome4", seed=3, lens_error=0.0).cameras[0]
+    xyz = np.array([[150.0, 150, 600], [150, -150, 600]])
+    one, other = (
+        replace(camera, lens=lens, tilt=(0.2, 0.0)).pixel_from_world(xyz)[0]
+        for lens in (BrownConrady(1000, 1000, 640, 512), Doubled(2000, 2000, 640, 512))
+    )
+    np.testing.assert_allclose(one, other, atol=1e-9)
 
 
 def test_no_lens_model_explains_the_smooth_error() -> None:

@@ -96,4 +96,5 @@ class Equisolid:
 
     @classmethod
     def nearest(cls, lens: Lens, points: Floats) -> Equisolid:
-        return fit_lens(cls(lens.fx, lens.fy, lens.cx, lens.cy), points, lens.pixel_from_camera_point(points)[0])
+        starts = [cls(lens.fx, lens.fy, lens.cx, lens.cy, k1) for k1 in (0.0, -0.05, -0.1)]
+        return fit_lens(starts, points, lens.pixel_from_camera_point(points)[0])

@@ -8,6 +8,7 @@ recipes.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from typing import NamedTuple, TypeVar
 
@@ -78,6 +79,14 @@ class Registry(Mapping[str, Part]):
             )
         return self[name], variant
 
+    def importable(self) -> dict[str, Part]:
+        """Name -> part, without those of other packages that cannot be imported: for help, which is never refused."""
+        found = {}
+        for name in self:
+            with suppress(UsageError):
+                found[name] = self[name]
+        return found
+
     def __getitem__(self, name: str) -> Part:
         if name not in self._parts:
             for entry in entry_points(group=self.group, name=name):
@@ -88,7 +97,7 @@ class Registry(Mapping[str, Part]):
         """A part of another package; UsageError, which names the package, where it cannot be imported."""
         try:
             part: Part = entry.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             package = entry.dist.name if entry.dist is not None else entry.module
             raise UsageError(
                 f"the {self.kind} {entry.name!r} of the package {package} cannot be imported.",

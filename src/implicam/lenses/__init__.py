@@ -3,7 +3,7 @@
 `LENSES["kannala-brandt"]` is a family by its name; `Lens` is what each family offers.
 """
 
-from implicam.lenses.base import Bools, DistortionSds, Floats, Lens, fit_lens
+from implicam.lenses.base import Bools, DistortionSds, Floats, Lens, fit_lens, focal_lengths
 from implicam.lenses.brown_conrady import BrownConrady
 from implicam.lenses.kannala_brandt import PERSPECTIVE_K, KannalaBrandt
 from implicam.lenses.registry import LENSES
@@ -18,4 +18,5 @@ __all__ = [
     "KannalaBrandt",
     "Lens",
     "fit_lens",
+    "focal_lengths",
 ]

@@ -15,6 +15,7 @@ from implicam.lenses.base import (
     Lens,
     check_rays,
     fit_lens,
+    focal_lengths,
     pixel_from_plane,
     plane_from_pixel,
 )
@@ -115,7 +116,25 @@ class KannalaBrandt:
         """As of `Lens`; one of this family is itself."""
         if isinstance(lens, cls):
             return lens
-        return fit_lens(cls(lens.fx, lens.fy, lens.cx, lens.cy), points, lens.pixel_from_camera_point(points)[0])
+        uv = lens.pixel_from_camera_point(points)[0]
+        fx, fy = focal_lengths(lens)
+        starts = [cls(fx, fy, lens.cx, lens.cy), *(cls._linear(lens, points, uv, terms) for terms in (1, 4))]
+        return fit_lens(starts, points, uv)
+
+    @classmethod
+    def _linear(cls, lens: Lens, points: Floats, uv: Floats, terms: int) -> KannalaBrandt:
+        """By linear least squares, with another lens's axis and shape of pixels, and the first terms of k1 ... k4; it
+        may fold before it sees all the points."""
+        fx, fy = focal_lengths(lens)
+        r = np.hypot(points[:, 0], points[:, 1])
+        theta = np.arctan2(r, points[:, 2])
+        outward = points[:, :2] * divide(1.0, r, 0.0)[:, None]
+        flat, target = outward.ravel(), ((uv - [lens.cx, lens.cy]) / [1.0, fy / fx]).ravel()
+        # (u - cx) r / x = fx (theta + k1 theta³ + ...): linear in fx, fx k1, ...
+        powers = np.repeat(theta, 2)[:, None] ** (2 * np.arange(terms + 1) + 1)
+        a = np.linalg.lstsq(flat[:, None] * powers, target, rcond=None)[0]
+        k = (a[1:] / a[0]).tolist() if a[0] else []
+        return cls(float(a[0]), float(a[0] * fy / fx), lens.cx, lens.cy, *k)
 
     @property
     def _radial(self) -> tuple[float, ...]:

@@ -56,7 +56,7 @@ def invert_odd_polynomial(value: Floats, k: tuple[float, ...], upper: float) -> 
     return np.where(beyond, np.nan, t)
 
 
-def divide(a: Floats, b: Floats, at_zero: Floats | float) -> Floats:
+def divide(a: Floats | float, b: Floats, at_zero: Floats | float) -> Floats:
     """`a / b`, and its limit `at_zero` where b is zero."""
     zero = b == 0
     return np.where(zero, at_zero, a / np.where(zero, 1.0, b))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from implicam.dataset import Floats
 from implicam.geometry import Pose, rotation_from_vector
-from implicam.lenses import Lens
+from implicam.lenses import Lens, focal_lengths
 from implicam.simulate.window import Window
 
 WAVES = 64
@@ -195,8 +195,8 @@ class SimulatedCamera:
             return None
         turn = rotation_from_vector([*self.tilt, 0.0])
         ray_to_plane = np.vstack([turn.T[:2] * turn[2, 2] - np.outer(turn[2, :2], turn[:, 2]), turn[:, 2]])
-        lens = self.lens
-        intrinsics = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+        fx, fy = focal_lengths(self.lens)  # not its own fx and fy: a lens of another package may mean others by them
+        intrinsics = np.array([[fx, 0, self.lens.cx], [0, fy, self.lens.cy], [0, 0, 1]])
         return np.asarray(intrinsics @ ray_to_plane @ np.linalg.inv(intrinsics), dtype=np.float64)
 
 
