@@ -92,7 +92,7 @@ def test_a_tilted_sensor_is_as_far_behind_the_lens_as_the_middle_of_the_image_sa
 
         def pixel_from_camera_point(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             uv, valid = super().pixel_from_camera_point(points)
-            return 0.5 * (uv + [self.cx, self.cy]), valid
+            return 0.5 * (uv + np.array([self.cx, self.cy])), valid
 
         def jacobian(self, points: np.ndarray) -> np.ndarray:
             return 0.5 * super().jacobian(points)
