@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from implicam.active import Budget, Loop, SimulatedOracle, Step, Workspace, acquisition
+from implicam.active import Budget, Loop, SimulatedOracle, Step, Workspace, acquisition_from_name
 from implicam.calibrators import ForwardGP, InverseGP
 from implicam.simulate import Rig, Target, build_rig, cramer_rao_limit, random_positions, simulate, views
 from implicam.threads import blas_threads
@@ -157,8 +157,8 @@ class Judge:
 def grow(rig: Rig, method: Any, rule: str, judge: Judge, seed: int, start: int, most: int) -> Iterator[dict[str, Any]]:
     """A run of the loop. `own start` is the default rule from evenly spread points, and not random ones."""
     own = rule == "own start"
-    chosen = acquisition("integrated" if own else rule)
-    loop = Loop(method, Workspace.of_box(rig.volume), chosen, Budget(most), start=start, seed=seed)
+    chosen = acquisition_from_name("integrated" if own else rule)
+    loop = Loop(method, Workspace.from_box(rig.volume), chosen, Budget(most), start=start, seed=seed)
     oracle = SimulatedOracle(rig, seed)
     if not own:
         loop.reset(simulate(rig, random_positions(rig, start, np.random.default_rng([seed, 5])), seed=seed))
@@ -176,7 +176,7 @@ def grid(rig: Rig, method: Any, judge: Judge, seed: int, most: int) -> Iterator[
 
     for shape in GRIDS:
         if 8 <= np.prod(shape) <= most:
-            loop = Loop(method, Workspace.of_box(rig.volume), seed=seed)
+            loop = Loop(method, Workspace.from_box(rig.volume), seed=seed)
             loop.reset(simulate(rig, ball_grid(rig, shape), seed=seed))
             yield judge.row(loop, True)
 

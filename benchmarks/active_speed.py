@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from implicam.active import Loop, SimulatedOracle, Workspace, acquisition
+from implicam.active import Loop, SimulatedOracle, Workspace, acquisition_from_name
 from implicam.calibrators import ForwardGP, InverseGP
 from implicam.calibrators.inverse_gp import Scaling
 from implicam.simulate import build_rig, random_positions, simulate
@@ -35,7 +35,7 @@ def main() -> None:
             for method, rule in ((InverseGP(), "variance"), (InverseGP(), "integrated"), (ForwardGP(), "integrated")):
                 if noise and isinstance(method, InverseGP):
                     continue
-                loop = Loop(method, Workspace.of_box(rig.volume), acquisition(rule), data=data)
+                loop = Loop(method, Workspace.from_box(rig.volume), acquisition_from_name(rule), data=data)
                 choose, fit = _steps(loop, SimulatedOracle(rig, robot_noise=noise))
                 what = f"{method.method}, {rule}" + (", positions known to 0.1 mm" if noise else "")
                 step = choose + fit

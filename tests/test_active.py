@@ -29,7 +29,7 @@ from implicam.active import (
     Time,
     Within,
     Workspace,
-    acquisition,
+    acquisition_from_name,
     choose,
     design_model_of,
     path_length,
@@ -37,7 +37,7 @@ from implicam.active import (
     workspace_from,
 )
 from implicam.active.acquisitions import IntegratedVariance
-from implicam.active.design_model import K95, ForwardDesignModel, InverseDesignModel
+from implicam.active.design_model import ELLIPSOID_95_SCALE, ForwardDesignModel, InverseDesignModel
 from implicam.calibrators import ForwardGP, InverseGP
 from implicam.calibrators.inverse_maps import SmoothMap
 from implicam.dataset import Camera, Dataset, join
@@ -60,7 +60,7 @@ def known(rig: Rig) -> Dataset:
 
 @pytest.fixture(scope="module")
 def room(rig: Rig) -> Workspace:
-    return Workspace.of_box(rig.volume)
+    return Workspace.from_box(rig.volume)
 
 
 def renamed(data: Dataset, letter: str = "q") -> Dataset:
@@ -182,23 +182,23 @@ def test_a_forward_outlook_states_what_measuring_states(rig: Rig, known: Dataset
     cov = calibration.measure(replace(template, uv=uv, sd=np.full_like(uv, np.nan), extra={})).cov
     both = np.isfinite(cov[:, 0, 0])
     assert both.sum() > 30
-    assert (both == design.now.measured).all()
-    assert np.allclose(design.now.total[both], cov[both], rtol=2e-3)
+    assert (both == design.at_judged.measured).all()
+    assert np.allclose(design.at_judged.total[both], cov[both], rtol=2e-3)
 
 
 def test_the_floor_is_what_perfect_cameras_would_leave(known: Dataset, room: Workspace) -> None:
     design = forward(known, room)
     bare = replace(design, parts=tuple(p._replace(half=0 * p.half, rest=0 * p.rest) for p in design.parts))
-    ok = design.now.measured
-    assert np.allclose(bare.now.total[ok], design.now.floor[ok])
-    assert (design.now.excess[ok] > 1).all()
+    ok = design.at_judged.measured
+    assert np.allclose(bare.at_judged.total[ok], design.at_judged.floor[ok])
+    assert (design.at_judged.excess[ok] > 1).all()
 
 
 def test_an_inverse_outlook_states_what_measuring_states(rig: Rig, known: Dataset) -> None:
     new = simulate(rig, random_positions(rig, 30, np.random.default_rng(5)), seed=5)
     calibration = InverseGP().fit(known)
     design = design_model_of(calibration, Places.recorded(new).select(np.arange(0)), Places.recorded(new))
-    assert np.allclose(design.now.total, calibration.measure(new.observations).cov)
+    assert np.allclose(design.at_judged.total, calibration.measure(new.observations).cov)
 
 
 def test_one_more_point_of_an_inverse_outlook_is_a_gp_with_one_more_point(rig: Rig, known: Dataset) -> None:
@@ -210,7 +210,7 @@ def test_one_more_point_of_an_inverse_outlook_is_a_gp_with_one_more_point(rig: R
     grown = replace(calibration, data=join(known, renamed(new).select([4])))
     # what is left is the difference of two numbers as large as the signal's variance
     signal = max(gp.kernel.signal_variance for gp in calibration.processes) * calibration.positions.scale.max() ** 2
-    assert np.allclose(after.now.total, grown.measure(new.observations).cov, rtol=1e-8, atol=1e-13 * signal)
+    assert np.allclose(after.at_judged.total, grown.measure(new.observations).cov, rtol=1e-8, atol=1e-13 * signal)
 
 
 def test_one_more_point_of_a_smooth_outlook_is_kriging_with_one_more_point(rig: Rig, known: Dataset) -> None:
@@ -256,12 +256,12 @@ def test_one_more_point_of_a_forward_outlook_is_a_posterior_with_one_more_point(
 def test_the_gain_is_the_reduction_that_follows(kind: object, known: Dataset, room: Workspace) -> None:
     """Against computing the whole design after each candidate; exact for inverse-gp, to first order for forward-gp."""
     design = kind(known, room)  # type: ignore[operator]
-    weights = np.where(design.now.measured, RNG.random(len(design.judged)), np.nan)
-    trace = np.trace(design.now.total, axis1=1, axis2=2)
+    weights = np.where(design.at_judged.measured, RNG.random(len(design.judged)), np.nan)
+    trace = np.trace(design.at_judged.total, axis1=1, axis2=2)
     gain = design.gain(weights)
     brute = np.zeros(len(gain))
     for i in np.flatnonzero(design.useful):
-        then = np.trace(design.after(int(i)).now.total, axis1=1, axis2=2)
+        then = np.trace(design.after(int(i)).at_judged.total, axis1=1, axis2=2)
         brute[i] = np.nansum(weights * (trace - then))
     if kind is inverse:
         assert np.allclose(gain, brute, rtol=1e-6)
@@ -283,11 +283,11 @@ def test_information_is_the_log_of_the_determinants(kind: object, known: Dataset
 
 
 def test_u95_is_the_longest_axis_of_the_ellipsoid(known: Dataset, room: Workspace) -> None:
-    now = forward(known, room).now
+    now = forward(known, room).at_judged
     i = int(np.flatnonzero(now.measured)[0])
     points = RNG.multivariate_normal(np.zeros(3), now.total[i], size=40_000)
-    assert pytest.approx(7.8147, abs=1e-3) == K95**2
-    inside = np.einsum("ni,ij,nj->n", points, np.linalg.inv(now.total[i]), points) <= K95**2
+    assert pytest.approx(7.8147, abs=1e-3) == ELLIPSOID_95_SCALE**2
+    inside = np.einsum("ni,ij,nj->n", points, np.linalg.inv(now.total[i]), points) <= ELLIPSOID_95_SCALE**2
     assert inside.mean() == pytest.approx(0.95, abs=0.005)
     assert np.linalg.norm(points[inside], axis=1).max() <= now.u95[i]
     assert np.linalg.norm(points[inside], axis=1).max() > 0.97 * now.u95[i]
@@ -307,19 +307,19 @@ def test_what_no_camera_sees_is_not_proposed(rig: Rig, known: Dataset) -> None:
 @pytest.mark.parametrize("name", ACQUISITIONS)
 @pytest.mark.parametrize("kind", [forward, inverse])
 def test_every_acquisition(name: str, kind: object, known: Dataset, room: Workspace) -> None:
-    design, rule = kind(known, room), acquisition(name)  # type: ignore[operator]
-    before = [part.copy() for part in (design.candidates.xyz, design.now.total)]
+    design, rule = kind(known, room), acquisition_from_name(name)  # type: ignore[operator]
+    before = [part.copy() for part in (design.candidates.xyz, design.at_judged.total)]
     scores = rule.scores(design, np.random.default_rng(1))
     assert scores.shape == (len(design.candidates),)
-    assert np.isfinite(scores[design.there.measured]).all()
+    assert np.isfinite(scores[design.at_candidates.measured]).all()
     assert (scores[np.isfinite(scores)] >= 0).all()
     assert np.array_equal(scores, rule.scores(design, np.random.default_rng(1)), equal_nan=True)
-    for now, then in zip(before, (design.candidates.xyz, design.now.total), strict=True):
+    for now, then in zip(before, (design.candidates.xyz, design.at_judged.total), strict=True):
         assert np.array_equal(now, then, equal_nan=True)
     chosen = choose(design, rule, np.random.default_rng(1), count=5)
     assert len(set(chosen.index)) == 5
     assert design.useful[chosen.index].all()
-    assert hash(rule) == hash(acquisition(name))
+    assert hash(rule) == hash(acquisition_from_name(name))
 
 
 def test_a_batch_is_one_after_the_other(known: Dataset, room: Workspace) -> None:
@@ -331,7 +331,7 @@ def test_a_batch_is_one_after_the_other(known: Dataset, room: Workspace) -> None
         score = rule.scores(step, np.random.default_rng(0))
         assert score[i] == np.nanmax(score)
         step = step.after(i)
-    assert np.allclose(step.now.total, chosen.after.now.total, equal_nan=True)
+    assert np.allclose(step.at_judged.total, chosen.after.at_judged.total, equal_nan=True)
 
 
 def test_a_robot_does_not_zigzag(known: Dataset, room: Workspace) -> None:
@@ -351,7 +351,7 @@ def test_the_short_path_is_as_short_as_any(known: Dataset, room: Workspace) -> N
 
     design = forward(known, room, 60)
     here = room.centre
-    found = choose(design, acquisition("random"), np.random.default_rng(2), count=6, here=here)
+    found = choose(design, acquisition_from_name("random"), np.random.default_rng(2), count=6, here=here)
     xyz = design.candidates.xyz[found.index]
     best = min(path_length(xyz[list(order)], here) for order in permutations(range(6)))
     assert path_length(xyz, here) <= 1.1 * best
@@ -404,7 +404,7 @@ def test_a_stop_that_is_never_reached_is_refused(value: float) -> None:
 
 def test_unknown_names_are_told_with_the_nearest() -> None:
     with pytest.raises(UsageError, match="integrated"):
-        acquisition("intergated")
+        acquisition_from_name("intergated")
     with pytest.raises(UsageError, match="worst"):
         Below(1.0, "wrost")
 
@@ -465,7 +465,7 @@ def test_an_oracle_that_never_answers_ends_the_run(rig: Rig, room: Workspace) ->
 def test_in_view_is_what_every_camera_of_the_true_rig_sees(
     method: ForwardGP | InverseGP, rig: Rig, known: Dataset
 ) -> None:
-    found = suggest(method.fit(known), None, count=3, rule=acquisition("variance"))
+    found = suggest(method.fit(known), None, count=3, rule=acquisition_from_name("variance"))
     inside = found.workspace.judged(500)
     seen = [camera.pixel_from_world(inside)[1] for camera in rig.cameras]
     assert np.mean(np.all(seen, axis=0)) > 0.97
@@ -479,7 +479,7 @@ def test_in_view_is_what_every_camera_of_the_true_rig_sees(
 @pytest.mark.parametrize("rule", list(ACQUISITIONS))
 def test_a_list_of_places_is_used_up_and_then_the_loop_ends(rule: str, rig: Rig, room: Workspace) -> None:
     places = room.candidates(14, 3)
-    loop = Loop(ForwardGP(), Workspace.only(places), acquisition(rule)).run(SimulatedOracle(rig))
+    loop = Loop(ForwardGP(), Workspace.only(places), acquisition_from_name(rule)).run(SimulatedOracle(rig))
     assert sorted(map(tuple, loop.data.xyz)) == sorted(map(tuple, places))  # type: ignore[union-attr]
 
 
@@ -489,7 +489,7 @@ def test_each_place_of_a_list_is_asked_for_once_though_targets_stand_beside_it(
 ) -> None:
     """A person puts a target near a place, and types where it is: it was asked for again, and others never."""
     grid = room.candidates(12, 3)
-    loop, asked = Loop(ForwardGP(), Workspace.only(grid), acquisition(rule)), []
+    loop, asked = Loop(ForwardGP(), Workspace.only(grid), acquisition_from_name(rule)), []
     oracle, rng = SimulatedOracle(rig), np.random.default_rng(4)
     for _ in range(len(grid)):
         (target,) = loop.ask()
@@ -626,8 +626,8 @@ def test_the_papers_experiment_is_one_configuration_of_the_loop() -> None:
     mask = np.isin(np.arange(len(data)), np.random.default_rng(2).permutation(len(data))[:13])
     loop = Loop(
         InverseGP(preset="plain"),
-        Workspace.of_box(rig.volume),
-        acquisition("variance"),
+        Workspace.from_box(rig.volume),
+        acquisition_from_name("variance"),
         Budget(19),
         pool=data,
         growth=1.0,
@@ -670,7 +670,7 @@ def test_choosing_beats_chance_clearly(spec: str) -> None:
     chosen, chance = [], []
     for seed in range(3):
         rig = build_rig(spec, seed=seed)
-        room = Workspace.of_box(rig.volume)
+        room = Workspace.from_box(rig.volume)
         start = simulate(rig, random_positions(rig, 8, np.random.default_rng([seed, 5])), seed=seed)
         loop = Loop(ForwardGP(), room, rule=Budget(16), data=start, seed=seed).run(SimulatedOracle(rig, seed))
         chosen.append(loop.history[-1].excess)

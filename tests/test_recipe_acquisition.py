@@ -12,7 +12,7 @@ import pytest
 import test_active as contract
 from command_line import Cli, Ran, cli, made  # noqa: F401  fixtures
 from implicam import registry
-from implicam.active import ACQUISITIONS, Acquisition, Budget, Loop, SimulatedOracle, Workspace, acquisition
+from implicam.active import ACQUISITIONS, Acquisition, Budget, Loop, SimulatedOracle, Workspace, acquisition_from_name
 from implicam.active.design_model import DesignModel
 from implicam.calibrators import calibrator
 from implicam.dataset import Dataset, Floats
@@ -85,7 +85,12 @@ def test_acquire_works_with_it(cli: Cli, request: pytest.FixtureRequest) -> None
 @pytest.mark.parametrize("method", ["forward-gp", "inverse-gp"])
 def test_the_loop_works_with_it(method: str, rig: Rig) -> None:
     loop = Loop(
-        calibrator(method), Workspace.of_box(rig.volume), acquisition("highest"), Budget(10), candidates=60, judged=30
+        calibrator(method),
+        Workspace.from_box(rig.volume),
+        acquisition_from_name("highest"),
+        Budget(10),
+        candidates=60,
+        judged=30,
     )
     loop = loop.run(SimulatedOracle(rig))
     assert loop.points == 10
@@ -96,5 +101,5 @@ def test_the_loop_works_with_it(method: str, rig: Rig) -> None:
 )
 def test_another_name_is_refused_with_the_cure(name: str, says: str) -> None:
     with pytest.raises(UsageError, match=says) as error:
-        acquisition(name)
+        acquisition_from_name(name)
     assert "highest" in error.value.fix

@@ -389,7 +389,9 @@ def test_one_that_predicts_pixels_guides_a_session(cli: Cli, request: pytest.Fix
 def test_the_loop_takes_it_too(request: pytest.FixtureRequest) -> None:
     needs_one_way(request)
     rig = build_rig("bar6", seed=1, cameras="2R")
-    loop = Loop(calibrator("affine-cameras"), Workspace.of_box(rig.volume), rule=Budget(12), candidates=100, judged=50)
+    loop = Loop(
+        calibrator("affine-cameras"), Workspace.from_box(rig.volume), rule=Budget(12), candidates=100, judged=50
+    )
     loop = loop.run(SimulatedOracle(rig))
     assert loop.points == 12
     assert isinstance(loop.calibration, PredictsPixels)

@@ -157,7 +157,7 @@ def test_nothing_is_too_odd_to_be_drawn(phase: str) -> None:
 def stereo() -> Any:
     """A simulated rig, and a calibration of it."""
     rig = build_rig("stereo", seed=3)
-    xyz = Workspace.of_box(rig.volume).candidates(40, 1)
+    xyz = Workspace.from_box(rig.volume).candidates(40, 1)
     names = np.array([f"p{i:03d}" for i in range(40)])
     return rig, ForwardGP().fit(simulate(rig, Shown("ball", names, names, xyz), seed=4))
 
@@ -216,7 +216,7 @@ def test_edges_of_a_box_and_of_any_hull() -> None:
     assert sorted(np.linalg.norm(box[:, 1] - box[:, 0], axis=1)) == pytest.approx([3] * 4 + [4] * 4 + [5] * 4)
     for seed, rig in itertools.product(range(3), ("bar6", "dome8")):
         volume = build_rig(rig, seed=seed, frame="random", unit="m").volume
-        assert len(edges(Workspace.of_box(volume))) == 12
+        assert len(edges(Workspace.from_box(volume))) == 12
     assert len(edges(Workspace.hull(np.concatenate([np.eye(3), -np.eye(3)])))) == 12
     hull = Workspace.hull(np.random.default_rng(2).normal(size=(200, 3)))
     assert len(edges(hull)) == 3 * len(hull.vertices) - 6  # Euler, of triangles
@@ -226,7 +226,7 @@ def test_edges_of_a_box_and_of_any_hull() -> None:
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_everything_is_in_view(stereo: Any, aspect: float, calibrated: bool) -> None:
     rig, calibration = stereo
-    room = Workspace.of_box(rig.volume)
+    room = Workspace.from_box(rig.volume)
     seen = eyes(calibration) if calibrated else []
     placing = Placing.of(room, upwards(seen))
     position, at = vantage(seen, room.vertices, placing, aspect, 1.3)

@@ -93,7 +93,7 @@ class MaximumVariance(Acquisition):
         Returns:
             (m,) in the length unit; NaN where nothing can be measured.
         """
-        total = design.there.total
+        total = design.at_candidates.total
         return np.asarray(np.sqrt(np.diagonal(total, axis1=1, axis2=2)).mean(axis=1), dtype=np.float64)
 
 
@@ -113,7 +113,7 @@ class RelativeExcess(Acquisition):
         Returns:
             (m,) scores; NaN where nothing can be measured.
         """
-        return np.asarray(np.maximum(design.there.excess**2 - 1, 0), dtype=np.float64)
+        return np.asarray(np.maximum(design.at_candidates.excess**2 - 1, 0), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class IntegratedVariance(Acquisition):
         Returns:
             (m,) scores; zero where a point is of no use.
         """
-        now = design.now
+        now = design.at_judged
         floor = np.trace(now.floor, axis1=1, axis2=2) if self.relative else 1.0
         excess = np.trace(now.total, axis1=1, axis2=2) / floor
         worst = np.nanmax(excess, initial=0.0) or 1.0
@@ -179,10 +179,10 @@ ACQUISITIONS: Registry[Acquisition] = Registry(
 )
 """Name -> rule."""
 
-DEFAULT = IntegratedVariance.name
+DEFAULT_ACQUISITION = IntegratedVariance.name
 
 
-def acquisition(name: str) -> Acquisition:
+def acquisition_from_name(name: str) -> Acquisition:
     """The rule with this name.
 
     Args:

@@ -1,4 +1,4 @@
-"""What a calibration is worth at places, and what a known point there would add to it; nothing is measured yet.
+"""How exactly a calibration measures at places, and what a known point there would add; before anything is measured.
 
 A calibration is linear in what it does not know, near what it does: so the covariance after one more point depends on
 where the point is, not on what the cameras will see. Both kinds of methods answer the same questions:
@@ -27,8 +27,8 @@ from implicam.rig_model import Sensitivity
 
 Bools = NDArray[np.bool_]
 
-K95 = float(np.sqrt(chi2.ppf(0.95, 3)))
-"""The 95 % ellipsoid of a position is so many times as large as that of one standard deviation."""
+ELLIPSOID_95_SCALE = float(np.sqrt(chi2.ppf(0.95, 3)))
+"""The 95 % ellipsoid of a position, in units of the ellipsoid of one standard deviation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Places:
             xyz: (n, 3) positions in the world.
         """
         uv = rig.predict(xyz)
-        return cls(xyz, uv, on_image(rig.trained, uv))
+        return cls(xyz, uv, are_on_image(rig.trained, uv))
 
     @classmethod
     def recorded(cls, data: Dataset) -> Places:
@@ -77,11 +77,11 @@ class Places:
         return cls(data.xyz, data.observations.uv, data.observations.seen)
 
 
-UNTOLD_IMAGE_MARGIN = 0.25
-"""Where nobody told a picture's size, it is taken to reach beyond what was seen by this part of its extent."""
+UNKNOWN_SIZE_MARGIN_SHARE = 0.25
+"""Where the size of a picture is not known, it is taken to reach beyond what was seen by this part of its extent."""
 
 
-def on_image(observations: Observations, uv: Floats) -> Bools:
+def are_on_image(observations: Observations, uv: Floats) -> Bools:
     """Which pixels are in the picture; where its size is not known, which are near those that were seen.
 
     Args:
@@ -97,7 +97,7 @@ def on_image(observations: Observations, uv: Floats) -> Bools:
             low, high = np.array([-0.5, -0.5]), np.array([camera.width, camera.height]) - 0.5
         elif observations.seen[:, c].any():
             pixels = observations.uv[observations.seen[:, c], c]
-            margin = UNTOLD_IMAGE_MARGIN * np.ptp(pixels, axis=0)
+            margin = UNKNOWN_SIZE_MARGIN_SHARE * np.ptp(pixels, axis=0)
             low, high = pixels.min(axis=0) - margin, pixels.max(axis=0) + margin
         else:
             continue
@@ -142,7 +142,7 @@ class PredictedCovariance:
         """(n,) 95 % uncertainty in the length unit: the longest semi-axis of the 95 % ellipsoid of the position."""
         largest = np.full(len(self.total), np.nan)
         i = self.measured
-        largest[i] = K95 * np.sqrt(np.linalg.eigvalsh(self.total[i])[:, -1])
+        largest[i] = ELLIPSOID_95_SCALE * np.sqrt(np.linalg.eigvalsh(self.total[i])[:, -1])
         return largest
 
 
@@ -158,11 +158,11 @@ class DesignModel(Protocol):
         """Where the calibration has to be good."""
 
     @property
-    def now(self) -> PredictedCovariance:
+    def at_judged(self) -> PredictedCovariance:
         """The covariance of measuring at the judged places."""
 
     @property
-    def there(self) -> PredictedCovariance:
+    def at_candidates(self) -> PredictedCovariance:
         """The covariance of measuring at the candidates."""
 
     @property
@@ -245,13 +245,13 @@ class ForwardDesignModel:
         return tuple(_covariance(part) for part in self.parts)
 
     @property
-    def now(self) -> PredictedCovariance:
+    def at_judged(self) -> PredictedCovariance:
         """The covariance of measuring at the judged places."""
         m = len(self.candidates)
         return PredictedCovariance(self._predicted.total[m:], lambda: self._predicted.floor[m:])
 
     @property
-    def there(self) -> PredictedCovariance:
+    def at_candidates(self) -> PredictedCovariance:
         """The covariance of measuring at the candidates."""
         m = len(self.candidates)
         return PredictedCovariance(self._predicted.total[:m], lambda: self._predicted.floor[:m])
@@ -314,7 +314,7 @@ class ForwardDesignModel:
         return replace(self, parts=tuple(parts))
 
 
-def floor_of(rig: PredictsPixels, places: Places) -> Floats:
+def noise_floor_covariance(rig: PredictsPixels, places: Places) -> Floats:
     """The covariance of a position that pixel noise alone would leave.
 
     Args:
@@ -336,12 +336,12 @@ def floor_of(rig: PredictsPixels, places: Places) -> Floats:
 
 
 def _masked(part: Sensitivity, seen: Bools) -> Sensitivity:
-    """Zero slope and spread, unit noise, where a camera does not see a place; in place, for these are large."""
-    blind = ~seen.repeat(2, axis=1)
+    """Zero slope and spread, unit noise, where a camera does not see a place; changed in place: they are large."""
+    unseen = ~seen.repeat(2, axis=1)
     for values in (part.slope, part.half):
-        blind |= ~np.isfinite(values).all(axis=2)
+        unseen |= ~np.isfinite(values).all(axis=2)
     for values, instead in ((part.slope, 0.0), (part.half, 0.0), (part.rest, 0.0), (part.noise, 1.0)):
-        values[blind] = instead
+        values[unseen] = instead
     return part
 
 
@@ -388,18 +388,18 @@ class InverseDesignModel:
 
         def floor() -> Floats:
             if self.pilot is not None:
-                return floor_of(self.pilot, places)
+                return noise_floor_covariance(self.pilot, places)
             return np.broadcast_to(self.at.noise_covariance, total.shape)
 
         return PredictedCovariance(total, floor)
 
     @property
-    def now(self) -> PredictedCovariance:
+    def at_judged(self) -> PredictedCovariance:
         """The covariance of measuring at the judged places."""
         return self._predicted(slice(len(self.candidates), None), self.judged)
 
     @property
-    def there(self) -> PredictedCovariance:
+    def at_candidates(self) -> PredictedCovariance:
         """The covariance of measuring at the candidates."""
         return self._predicted(slice(len(self.candidates)), self.candidates)
 
@@ -439,7 +439,7 @@ class InverseDesignModel:
         return replace(self, at=self.at.with_known(i))
 
 
-def designs_experiments(calibration: Calibration | type) -> bool:
+def can_design_experiments(calibration: Calibration | type) -> bool:
     """Whether a calibration says what one more known point would add.
 
     Args:
@@ -448,13 +448,13 @@ def designs_experiments(calibration: Calibration | type) -> bool:
     return any(hasattr(calibration, name) for name in ("sensitivities", "position_processes"))
 
 
-def cannot_design(method: str) -> UsageError:
+def design_error(method: str) -> UsageError:
     """The error for a method that does not say what one more known point would add.
 
     Args:
         method: Its name.
     """
-    able = [name for name, (_, calibration) in CALIBRATORS.items() if designs_experiments(calibration)]
+    able = [name for name, (_, calibration) in CALIBRATORS.items() if can_design_experiments(calibration)]
     return UsageError(
         f"{method} cannot say where to measure next.",
         why="its error bars do not say what one more known point would change",
@@ -479,8 +479,8 @@ def design_model_of(
     Raises:
         UsageError: The method cannot say what one more known point would add, or nothing predicts pixels.
     """
-    if not designs_experiments(calibration):
-        raise cannot_design(calibration.method)
+    if not can_design_experiments(calibration):
+        raise design_error(calibration.method)
     pilot = calibration if isinstance(calibration, PredictsPixels) else pilot
 
     def places(where: Floats | Places) -> Places:

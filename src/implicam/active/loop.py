@@ -18,15 +18,15 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from implicam.active.acquisitions import DEFAULT, Acquisition, Choice, acquisition, choose
+from implicam.active.acquisitions import DEFAULT_ACQUISITION, Acquisition, Choice, acquisition_from_name, choose
 from implicam.active.design_model import (
     ForwardDesignModel,
     InverseDesignModel,
     Places,
     PredictedCovariance,
-    cannot_design,
+    can_design_experiments,
+    design_error,
     design_model_of,
-    designs_experiments,
 )
 from implicam.active.stopping import Never, Rule, Step
 from implicam.active.workspace import Workspace
@@ -37,19 +37,19 @@ from implicam.progress import Progress, silent
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.threads import blas_threads
 
-MAX_GROWTH = 1.25
-"""Between two fits from no guess the points grow by this factor at most; also of the forward model that predicts pixels
-for inverse-gp."""
+MAX_WARM_START_GROWTH = 1.25
+"""Between two fits from no guess the number of points grows by this factor at most; the same for the forward model that
+predicts pixels for inverse-gp."""
 
-FEW_POINTS = 16
-"""So few points say little of where the best fit is: each fit is one from no guess."""
+MAX_COLD_START_POINTS = 16
+"""Up to so many points each fit begins from no guess: they say little about where the optimum is."""
 
 REFUSED_RADIUS_RATIO, RELATIVE_PLACE_TOLERANCE = 0.05, 1e-6
 """Part of the workspace's size: so near to a place where no target could be measured none is asked for again; and, of a
 list of places, how far rounding may move one."""
 
-MAX_SKIPPED = 20
-"""So many targets in a row that nobody could measure are no accident."""
+MAX_SKIPPED_TARGETS = 20
+"""The loop ends after so many targets in a row that could not be measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Target:
     score: float = float("nan")
 
 
-def targets_of(places: Places, chosen: Choice, data: Dataset) -> list[Target]:
+def make_targets(places: Places, chosen: Choice, data: Dataset) -> list[Target]:
     """The chosen candidates as targets, with names that no point of the data has.
 
     Args:
@@ -81,11 +81,11 @@ def targets_of(places: Places, chosen: Choice, data: Dataset) -> list[Target]:
     uv = np.where(places.seen[..., None], places.uv, np.nan)
     return [
         Target(name, places.xyz[i], uv[i], score)
-        for name, i, score in zip(free_names(data), chosen.index, chosen.scores, strict=False)
+        for name, i, score in zip(new_point_names(data), chosen.index, chosen.scores, strict=False)
     ]
 
 
-def free_names(data: Dataset | None) -> Iterator[str]:
+def new_point_names(data: Dataset | None) -> Iterator[str]:
     """Names for new points, without end: p and a number, from the number of points on.
 
     Args:
@@ -149,14 +149,14 @@ class Loop:
 
     calibrator: Calibrator
     workspace: Workspace
-    acquisition: Acquisition = field(default_factory=lambda: acquisition(DEFAULT))
+    acquisition: Acquisition = field(default_factory=lambda: acquisition_from_name(DEFAULT_ACQUISITION))
     rule: Rule = field(default_factory=Never)
     start: int = MIN_POINTS_PER_CAMERA
     candidates: int = 1500
     judged: int = 400
     reach: float = np.inf
     seed: int = 0
-    growth: float = MAX_GROWTH
+    growth: float = MAX_WARM_START_GROWTH
     pool: Dataset | None = None
     data: Dataset | None = None
 
@@ -166,10 +166,10 @@ class Loop:
         self.problem: ImplicamError | None = None
         self.predicted: PredictedCovariance | None = None
         self.judged_at: Floats = self.workspace.judged(self.judged, self.seed)
-        self._began = time.monotonic()
+        self._started = time.monotonic()
         self._refused: list[tuple[Floats, str]] = []
         self._pilot: ForwardGPCalibration | None = None
-        self._asked = self._from_no_guess = 0
+        self._asked = self._cold_start_points = 0
         if self.data is not None:
             self.reset(self.data)
 
@@ -200,17 +200,17 @@ class Loop:
         """
         self._asked += 1
         if self.calibration is None:
-            return self._to_begin(number, here)
+            return self._starting_targets(number, here)
         rng = np.random.default_rng([self.seed, self._asked, 3])
         try:
-            with blas_threads(1):  # thousands of small matrices: two threads would wait for each other
+            with blas_threads(1):  # thousands of small matrices: threads would only wait for each other
                 design = self._design_model()
                 chosen = choose(design, self.acquisition, rng, count=number, here=here, reach=self.reach)
         except FitError as error:  # the forward model of inverse-gp: more points will help
             self.problem = error
-            return self._to_begin(number, here)
+            return self._starting_targets(number, here)
         assert self.data is not None
-        targets = targets_of(design.candidates, chosen, self.data)
+        targets = make_targets(design.candidates, chosen, self.data)
         if self.pool is None:
             return targets
         return [replace(target, name=self._name(target.xyz, k)) for k, target in enumerate(targets)]
@@ -257,14 +257,14 @@ class Loop:
         self.predicted = self.problem = None
         if data is not None and len(data) >= self.start:
             try:
-                self.calibration = self._fitted(before, data, progress)
+                self.calibration = self._fit(before, data, progress)
             except FitError as error:
                 self.problem = error  # more points will help
         if data is not None:
             self.history.append(self._step())
 
     def run(self, oracle: Oracle, progress: Progress = silent) -> Loop:
-        """Ask and tell until the rule says stop, no place is left, or `MAX_SKIPPED` targets in a row were not measured.
+        """Ask and tell until the rule says stop, no place is left, or too many targets in a row were not measured.
 
         Args:
             oracle: What measures at a target.
@@ -274,7 +274,7 @@ class Loop:
             The loop itself.
         """
         in_vain = 0
-        while not self.stop and in_vain < MAX_SKIPPED:
+        while not self.stop and in_vain < MAX_SKIPPED_TARGETS:
             try:
                 (target, *_) = self.ask(here=None if self.data is None else self.data.xyz[-1])
             except UsageError:
@@ -285,18 +285,18 @@ class Loop:
             progress("measuring", self.points, self.points + 1)
         return self
 
-    def _fitted(self, before: Calibration | None, data: Dataset, progress: Progress) -> Calibration:
-        """A fit with everything, from the last one's result; from no guess, too, when the points have grown by much."""
+    def _fit(self, before: Calibration | None, data: Dataset, progress: Progress) -> Calibration:
+        """A fit to all points, begun from the last result; from no guess too when there are many more points."""
         if self.growth <= 1:
             return self.calibrator.fit(data, progress)
-        anew = not FEW_POINTS < len(data) < self.growth * self._from_no_guess
+        anew = not MAX_COLD_START_POINTS < len(data) < self.growth * self._cold_start_points
         if anew:
-            self._from_no_guess = len(data)
+            self._cold_start_points = len(data)
         if isinstance(before, Updatable) and len(before.data) < len(data):
             return before.refit_from(data, progress, anew=anew)
         return self.calibrator.fit(data, progress)
 
-    def _to_begin(self, number: int, here: Floats | None) -> list[Target]:
+    def _starting_targets(self, number: int, here: Floats | None) -> list[Target]:
         """Places to begin with: the evenly spread ones that are farthest from what is known and what was refused."""
         used = [*(self.data.xyz if self.data is not None else ()), *(xyz for xyz, _ in self._refused)]
         pool = self.pool.xyz if self.pool is not None else self.workspace.design(self.start, self.seed)
@@ -325,18 +325,18 @@ class Loop:
     def _name(self, xyz: Floats, k: int) -> str:
         if self.pool is not None:
             return str(self.pool.points[int(np.argmin(np.linalg.norm(self.pool.xyz - xyz, axis=1)))])
-        return next(islice(free_names(self.data), k, None))
+        return next(islice(new_point_names(self.data), k, None))
 
     def _design_model(self) -> ForwardDesignModel | InverseDesignModel:
         assert self.calibration is not None
         candidates: Floats | Places
         if self.pool is not None:
-            candidates = Places.recorded(self.pool.select(self._unused()))
+            candidates = Places.recorded(self.pool.select(self._unused_rows()))
         else:
             candidates = self._free_candidates()
         return design_model_of(self.calibration, candidates, self._judged(), self._forward())
 
-    def _unused(self) -> list[int]:
+    def _unused_rows(self) -> list[int]:
         assert self.pool is not None
         used = {*(self.data.points.tolist() if self.data is not None else ())}
         refused = {tuple(xyz) for xyz, _ in self._refused}
@@ -353,7 +353,7 @@ class Loop:
         """Places where the next target may be: without the surroundings of what could not be measured, and of a list
         of places without those that are known."""
         same, places = self.acquisition.same_candidates, self.workspace.places
-        # Others each time, or what is between the candidates would never be measured.
+        # Other candidates each time, or places between them would never be measured.
         seed = self.seed if same else 1000 * self.seed + self._asked
         number = self.candidates + (self.points if same else 0)
         if places is not None:  # all of a list: one by one they are used up, whatever the rule
@@ -388,9 +388,9 @@ class Loop:
         """For a method that does not predict pixels, a forward model of the same points that does; else None."""
         if self.calibration is None or self.data is None or isinstance(self.calibration, PredictsPixels):
             return None
-        if not designs_experiments(self.calibration):
-            raise cannot_design(self.calibration.method)
-        if self._pilot is None or len(self.data) >= MAX_GROWTH * len(self._pilot.data):
+        if not can_design_experiments(self.calibration):
+            raise design_error(self.calibration.method)
+        if self._pilot is None or len(self.data) >= MAX_WARM_START_GROWTH * len(self._pilot.data):
             self._pilot = ForwardGP().fit(self.data)
             self._judged_by_pilot = Places.predicted(self._pilot, self.judged_at)
         return self._pilot
@@ -400,21 +400,22 @@ class Loop:
         return self.judged_at if self._forward() is None else self._judged_by_pilot
 
     def _step(self) -> Step:
-        """What is known now, and the predicted at the judged places."""
-        passed = time.monotonic() - self._began
+        """The uncertainty now; also sets `predicted`."""
+        passed = time.monotonic() - self._started
         if self.calibration is None:
             return Step(self.points, seconds=passed)
         try:
             with blas_threads(1):
-                predicted = design_model_of(self.calibration, self.judged_at[:0], self._judged(), self._forward()).now
+                design = design_model_of(self.calibration, self.judged_at[:0], self._judged(), self._forward())
+                predicted = design.at_judged
         except FitError as error:
             self.problem = error
             return Step(self.points, seconds=passed)
         self.predicted = predicted
-        return step_of(predicted, self.points, passed)
+        return summarise_step(predicted, self.points, passed)
 
 
-def step_of(predicted: PredictedCovariance, points: int, seconds: float = 0.0) -> Step:
+def summarise_step(predicted: PredictedCovariance, points: int, seconds: float = 0.0) -> Step:
     """The uncertainty over the places where something can be measured.
 
     Args:

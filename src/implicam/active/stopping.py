@@ -104,7 +104,7 @@ def _where(step: Step) -> str:
     return "" if step.measured > 0.995 else f" that enough cameras see ({percent(step.measured)} of the workspace)"
 
 
-OF = {"worst": "everywhere", "usual": "in 95 % of the workspace", "mean": "on average"}
+UNCERTAINTY_PLACES = {"worst": "everywhere", "usual": "in 95 % of the workspace", "mean": "on average"}
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,10 @@ class Below(Rule):
     of: str = "worst"
 
     def __post_init__(self) -> None:
-        if self.of not in OF:
+        if self.of not in UNCERTAINTY_PLACES:
             raise UsageError(
-                f"there is no uncertainty {self.of!r}{did_you_mean(self.of, OF)}.", fix=f"use {', '.join(OF)}"
+                f"there is no uncertainty {self.of!r}{did_you_mean(self.of, UNCERTAINTY_PLACES)}.",
+                fix=f"use {', '.join(UNCERTAINTY_PLACES)}",
             )
         if not 0 < self.value < math.inf:
             raise UsageError(f"a stop below {self.value} is never reached.", fix="give a length greater than zero")
@@ -141,7 +142,9 @@ class Below(Rule):
             The uncertainty in words; empty where it is larger than `value`.
         """
         now = getattr(history[-1], self.of) if history else math.nan
-        return f"{now:.2g} {unit}".strip() + f" {OF[self.of]}{_where(history[-1])}" if now <= self.value else ""
+        if not now <= self.value:
+            return ""
+        return f"{now:.2g} {unit}".strip() + f" {UNCERTAINTY_PLACES[self.of]}{_where(history[-1])}"
 
 
 @dataclass(frozen=True)

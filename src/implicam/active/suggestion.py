@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from implicam.active.acquisitions import DEFAULT, Acquisition, acquisition, choose
-from implicam.active.design_model import cannot_design, design_model_of, designs_experiments
-from implicam.active.loop import Target, step_of, targets_of
+from implicam.active.acquisitions import DEFAULT_ACQUISITION, Acquisition, acquisition_from_name, choose
+from implicam.active.design_model import can_design_experiments, design_error, design_model_of
+from implicam.active.loop import Target, make_targets, summarise_step
 from implicam.active.stopping import Step
 from implicam.active.workspace import Workspace
 from implicam.calibrators import Calibration, ForwardGP, PredictsPixels
@@ -62,23 +62,25 @@ def suggest(
     Raises:
         UsageError: The method cannot say what one more point would add, or the cameras do not see the workspace.
     """
-    if not designs_experiments(calibration):
-        raise cannot_design(calibration.method)
+    if not can_design_experiments(calibration):
+        raise design_error(calibration.method)
     rig: PredictsPixels = calibration if isinstance(calibration, PredictsPixels) else ForwardGP().fit(calibration.data)
     pilot = None if rig is calibration else rig
     if workspace is None:
         workspace = Workspace.in_view(rig, calibration.data.xyz)
     places = workspace.candidates(candidates, seed)
     design = design_model_of(calibration, places, workspace.judged(judged, seed), pilot)
-    if not design.now.measured.any():
+    if not design.at_judged.measured.any():
         raise UsageError(
             "nowhere in the workspace can a position be measured.",
             why="no place of it is seen by enough of the calibrated cameras",
             fix="give another workspace (--workspace), one that the cameras look at",
         )
     rng = np.random.default_rng([seed, 3])
-    chosen = choose(design, rule or acquisition(DEFAULT), rng, count=count, here=here, reach=reach)
+    chosen = choose(
+        design, rule or acquisition_from_name(DEFAULT_ACQUISITION), rng, count=count, here=here, reach=reach
+    )
     known = len(calibration.data)
-    then = step_of(chosen.after.now, known + len(chosen.index))
-    targets = targets_of(design.candidates, chosen, calibration.data)
-    return Suggestion(targets, step_of(design.now, known), then, workspace)
+    then = summarise_step(chosen.after.at_judged, known + len(chosen.index))
+    targets = make_targets(design.candidates, chosen, calibration.data)
+    return Suggestion(targets, summarise_step(design.at_judged, known), then, workspace)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.stats import qmc
 
-from implicam.active.design_model import on_image
+from implicam.active.design_model import are_on_image
 from implicam.calibrators import PredictsPixels
 from implicam.dataset import Floats
 from implicam.errors import HardwareError, UsageError
@@ -19,13 +19,13 @@ from implicam.hardware.csv_player import read_positions
 from implicam.simulate import Box
 
 SURFACE_STEP = 5
-"""One candidate of so many lies on the surface: the outermost places tell most of a lens."""
+"""One candidate of so many lies on the surface: the outermost places tell most about a lens."""
 
 MIN_INSIDE_SHARE = 0.05
 """Where less than this part of a box around it is inside, the box is turned."""
 
 START_DISTANCE_RATIO = 0.9
-"""The places to begin with are so much nearer to the centre than candidates: nobody knows yet what the cameras see."""
+"""The places to begin with are so much nearer to the centre than candidates: what the cameras see is not known yet."""
 
 VIEW_GROWTH, PLACES_IN_VIEW = 2.0, 8192
 """What the cameras see is looked for in the box of the known points made so many times as large, at so many places."""
@@ -73,7 +73,7 @@ class Workspace:
         return cls._of(corners, None, f"a box of {size}")
 
     @classmethod
-    def of_box(cls, box: Box) -> Workspace:
+    def from_box(cls, box: Box) -> Workspace:
         """The working volume of a simulated rig, in any orientation.
 
         Args:
@@ -128,7 +128,7 @@ class Workspace:
         around = cls.box(centre - VIEW_GROWTH * half, centre + VIEW_GROWTH * half)
         places = around.judged(PLACES_IN_VIEW)
         used = np.array([name in rig.camera_names for name in rig.trained.camera_names])
-        seen = places[on_image(rig.trained, rig.predict(places))[:, used].all(axis=1)]
+        seen = places[are_on_image(rig.trained, rig.predict(places))[:, used].all(axis=1)]
         if len(seen) < 4:
             raise UsageError(
                 "no volume near the known points is seen by every camera.",
@@ -190,7 +190,7 @@ class Workspace:
         if self.places is not None:
             return self.places[np.random.default_rng(seed).permutation(len(self.places))[:n]]
         corners = self._corners(n)
-        found = self._spread(n - len(corners), seed)
+        found = self._sample_inside(n - len(corners), seed)
         found[::SURFACE_STEP] = self._on_surface(found[::SURFACE_STEP])
         return self._pull_in(np.concatenate([found, corners]), 1 - RELATIVE_TOLERANCE)
 
@@ -205,7 +205,7 @@ class Workspace:
             (n, 3) places in the world.
         """
         corners = self._corners(n)
-        return np.concatenate([corners, self._spread(n - len(corners), [seed, 1])])
+        return np.concatenate([corners, self._sample_inside(n - len(corners), [seed, 1])])
 
     def design(self, n: int, seed: int) -> Floats:
         """Places to begin with, while nothing is known of the cameras: each as far from the others as can be.
@@ -233,15 +233,15 @@ class Workspace:
         return pool[chosen]
 
     def _pull_in(self, xyz: Floats, part: float) -> Floats:
-        """Towards the centre: to `part` of the distance. A billionth less and no rounding puts a point outside."""
+        """Points moved towards the centre, to `part` of the distance: a billionth less keeps rounding inside."""
         return np.asarray(self.centre + part * (xyz - self.centre), dtype=np.float64)
 
     def _corners(self, n: int) -> Floats:
-        """The corners, or as many of them, evenly, as are a quarter of n."""
+        """The corners; of many a regular selection, about a quarter of n."""
         return self.vertices[:: max(1, -(-len(self.vertices) * 4 // n))]
 
-    def _spread(self, n: int, seed: int | list[int]) -> Floats:
-        """So many points of a scrambled Sobol sequence in it."""
+    def _sample_inside(self, n: int, seed: int | list[int]) -> Floats:
+        """(n, 3) points of a scrambled Sobol sequence inside."""
         sequence = qmc.Sobol(3, rng=np.random.default_rng(seed))
         found, axes = np.zeros((0, 3)), np.eye(3)
         while len(found) < n:

@@ -54,9 +54,8 @@ def suggest_command(
     json: Json = False,
 ) -> None:
     """Where to put the next known points, and what each camera will see."""
-    from implicam.active import acquisition as rule_named
-    from implicam.active import suggest, workspace_from
-    from implicam.active.acquisitions import DEFAULT
+    from implicam.active import acquisition_from_name, suggest, workspace_from
+    from implicam.active.acquisitions import DEFAULT_ACQUISITION
 
     if output is not None:
         must_not_replace(output, calibration)
@@ -69,7 +68,7 @@ def suggest_command(
         fitted,
         room,
         count=count,
-        rule=rule_named(acquisition or DEFAULT),
+        rule=acquisition_from_name(acquisition or DEFAULT_ACQUISITION),
         here=place,
         reach=np.inf if reach is None else reach,
         seed=seed,

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition, workspace_from
-from implicam.active.acquisitions import DEFAULT
-from implicam.active.design_model import cannot_design, designs_experiments
+from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition_from_name, workspace_from
+from implicam.active.acquisitions import DEFAULT_ACQUISITION
+from implicam.active.design_model import can_design_experiments, design_error
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES_PER_UNIT
@@ -67,7 +67,7 @@ class Setup:
     bright: bool = False
     workspace: str = ""
     method: str = DEFAULT_METHOD
-    acquisition: str = DEFAULT
+    acquisition: str = DEFAULT_ACQUISITION
     below: float | None = None
     within: float = 1.2
     budget: int = 60
@@ -87,9 +87,9 @@ class Setup:
                 fix=f"use {', '.join(METRES_PER_UNIT)}",
             )
         method, _ = CALIBRATORS.find(self.method)
-        if not designs_experiments(method.calibration):
-            raise cannot_design(method.calibration.method)
-        acquisition(self.acquisition)
+        if not can_design_experiments(method.calibration):
+            raise design_error(method.calibration.method)
+        acquisition_from_name(self.acquisition)
         _ = self.rule
         for what in ("reach", "speed", "sd", "radius"):
             value = getattr(self, what)
@@ -192,7 +192,7 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
     loop = Loop(
         calibrator_from_name(setup.method),
         room,
-        acquisition(setup.acquisition),
+        acquisition_from_name(setup.acquisition),
         setup.rule,
         reach=np.inf if setup.reach is None else setup.reach,
         seed=setup.seed,
@@ -227,7 +227,7 @@ def _simulated(setup: Setup) -> Hardware:
         )
     speed = (setup.speed or SIMULATED_SPEED) / METRES_PER_UNIT[setup.unit]
     eyes, robot = simulated_rig(rig, seed=setup.seed, sd=setup.sd or 0.0, speed=speed)
-    room = workspace_from(setup.workspace, None) if setup.workspace else Workspace.of_box(rig.volume)
+    room = workspace_from(setup.workspace, None) if setup.workspace else Workspace.from_box(rig.volume)
     return list(eyes), robot, room
 
 
