@@ -1,9 +1,9 @@
 """Several outputs with one kernel and correlated values: the intrinsic coregionalisation model.
 
-The covariance of outputs i at x and j at x' is `B_ij k(x, x') + N_ij [x = x']` with covariances B of the signal and N of
-the noise (Goovaerts 1997; Alvarez, Rosasco & Lawrence 2012, section 4.2). A matrix T that turns N into unity and B into
-a diagonal, `T^T N T = I` and `T^T B T = diag(signal)`, makes the mixed outputs `Y T` independent processes with unit
-noise. So the mn x mn matrix falls into m of n x n, and the search is over T, the signals and the lengthscales.
+The covariance of outputs i at x and j at x' is `B_ij k(x, x') + N_ij [x = x']` with covariances B of the signal and N
+of the noise (Goovaerts 1997; Alvarez, Rosasco & Lawrence 2012, section 4.2). A matrix T that turns N into unity and B
+into a diagonal, `T^T N T = I` and `T^T B T = diag(signal)`, makes the mixed outputs `Y T` independent processes with
+unit noise. So the mn x mn matrix falls into m of n x n, and the search is over T, the signals and the lengthscales.
 """
 
 from __future__ import annotations
