@@ -39,6 +39,10 @@ def paper_command(
     runs: Annotated[
         int | None, typer.Option("--runs", min=2, metavar="N", help="So many runs of every method.")
     ] = None,
+    rigs: Annotated[
+        int | None,
+        typer.Option("--rigs", min=1, max=100, metavar="N", help="So many simulated rigs (5; with --quick 1)."),
+    ] = None,
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, metavar="N", help="Processes (default: one a core).")
     ] = None,
@@ -49,7 +53,7 @@ def paper_command(
     json: Json = False,
 ) -> None:
     """Reproduce the paper: its tables and figures beside ours. Interrupted, it goes on where it stopped."""
-    from implicam.experiments.plan import FULL, QUICK
+    from implicam.experiments.plan import FULL, QUICK, RIGS
     from implicam.experiments.reproduction import EXPERIMENTS, reproduce
     from implicam.experiments.source import Source
 
@@ -62,10 +66,15 @@ def paper_command(
     if runs is not None:
         plan = plan.with_runs(runs)
     chosen = EXPERIMENTS if experiment is Experiment.all else (experiment.value,)
-    source = Source.of(data, seed)
+    if data is not None and rigs is not None:
+        raise UsageError("measured data are of one rig.", fix="leave out --rigs, or --data")
+    count = rigs or (1 if quick or data is not None else RIGS)
+    sources = [Source.of(data, seed + i) for i in range(count)]
+    if count > 1 and not json:
+        show.say(f"{count} rigs; each takes about as long as the first. --rigs 1 computes that alone.")
     try:
         with log_to_file(output / LOG, command_line()), show.progress(json) as progress:
-            made = reproduce(chosen, output, source, plan, jobs=jobs, scheduler=scheduler, progress=progress)
+            made = reproduce(chosen, output, sources, plan, jobs=jobs, scheduler=scheduler, progress=progress)
     except KeyboardInterrupt:
         show.say(f"interrupted; what was done is kept in {output / 'cells'}: the same command goes on from there")
         raise typer.Exit(130) from None

@@ -26,15 +26,25 @@ class Case:
         value: The number; it supports the finding above `least`.
         low: The lower end of its 95 % interval.
         high: The upper end.
-        words: The number in words.
+        template: The case in words, with {} for the number.
         least: The threshold.
+        difference: Whether numbers of several rigs are averaged as they are; ratios by their logarithms.
     """
 
     value: float
     low: float
     high: float
-    words: str
+    template: str
     least: float = 1.0
+    difference: bool = False
+
+    @property
+    def words(self) -> str:
+        """The number in words."""
+        if not np.isfinite(self.value):
+            return self.template.format("unknown")
+        exact = self.high - self.low < 1e-9 * abs(self.value)
+        return self.template.format(number(self.value) if exact else interval(self.value, self.low, self.high))
 
     @property
     def verdict(self) -> str:
@@ -69,6 +79,18 @@ def column(rows: Iterable[Row], key: str) -> Floats:
     return np.array([float(row[key]) for row in rows], dtype=np.float64)
 
 
+def rows_by_rig(rows: Iterable[Row]) -> list[list[Row]]:
+    """The rows of each rig, in the order of the first of each.
+
+    Args:
+        rows: Rows of a table, with a column "rig" where there are several.
+    """
+    rigs: dict[str, list[Row]] = {}
+    for row in rows:
+        rigs.setdefault(str(row.get("rig", "")), []).append(row)
+    return list(rigs.values())
+
+
 def ratio(above: Floats, below: Floats, words: str, *, least: float = 1.0) -> Case:
     """The geometric mean of ratios over pairs, with its 95 % interval.
 
@@ -101,11 +123,35 @@ def unpaired(above: Floats, below: Floats, words: str, *, least: float = 1.0, al
 def _case(samples: Sequence[Floats], words: str, least: float, alone: float = 0.0) -> Case:
     """The exponential of the sum of the samples' means; without numbers a case that decides nothing."""
     if not all(len(sample) for sample in samples):
-        return Case(np.nan, np.nan, np.nan, words.format("unknown"), least)
+        return Case(np.nan, np.nan, np.nan, words, least)
     middle = sum(float(sample.mean()) for sample in samples)
     spread = float(np.hypot.reduce([half_width(sample, alone) for sample in samples]))
     value, low, high = np.exp(middle + np.array([0.0, -spread, spread]))
-    return Case(float(value), float(low), float(high), words.format(interval(value, low, high)), least)
+    return Case(float(value), float(low), float(high), words, least)
+
+
+def over_rigs(cases: Sequence[Case]) -> Case:
+    """One case of several rigs: the mean of their numbers, with its 95 % interval over the rigs, after Student.
+
+    Splits of the points of one rig share its lenses, its noise and its lattice; what holds for rigs is told by rigs.
+
+    Args:
+        cases: The same case of each rig; those without a number are left out.
+
+    Returns:
+        The case itself where only one has a number: its interval is that over its runs.
+    """
+    known = [case for case in cases if np.isfinite(case.value)]
+    if len(known) < 2:
+        return (known or list(cases))[0]
+    values = np.array([case.value for case in known])
+    if not known[0].difference:
+        values = np.log(values)
+    mean, spread = float(values.mean()), half_width(values)
+    ends = np.array([mean, mean - spread, mean + spread])
+    value, low, high = ends if known[0].difference else np.exp(ends)
+    first = known[0]
+    return Case(float(value), float(low), float(high), first.template, first.least, first.difference)
 
 
 def half_width(sample: Floats, alone: float = 0.0) -> float:
@@ -117,7 +163,7 @@ def half_width(sample: Floats, alone: float = 0.0) -> float:
     """
     n = len(sample)
     if n == 1:
-        return 1.96 * alone
+        return float(stats.norm.ppf(0.975)) * alone
     return float(stats.t.ppf(0.975, n - 1) * sample.std(ddof=1) / np.sqrt(n))
 
 
@@ -147,10 +193,9 @@ def share_of_drop(first: Floats, then: Floats, last: Floats, words: str) -> Case
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 100 * (first - then) / (first - last)
     if not len(share) or not (first > last).all():
-        return Case(np.nan, np.nan, np.nan, words.format("unknown"), 50)
+        return Case(np.nan, np.nan, np.nan, words, 50, difference=True)
     mean, spread = float(share.mean()), half_width(share)
-    low, high = mean - spread, mean + spread
-    return Case(mean, low, high, words.format(interval(mean, low, high)), 50)
+    return Case(mean, mean - spread, mean + spread, words, 50, difference=True)
 
 
 def stages(parts: Sequence[Mapping[int, Row]], key: str) -> tuple[Floats, Floats, Floats]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from implicam.experiments.evidence import Row, where
+from implicam.experiments.evidence import Row, rows_by_rig, where
 from implicam.experiments.plan import DRAWN_METHODS, FORWARD, GP, NETWORK, PAPER, slug
 from implicam.experiments.source import BALL, BOARD, CHECK
 from implicam.figures.interactive3d import draw_alignment_3d, html_page, panels_3d
@@ -27,7 +27,7 @@ def draw(rows: Mapping[str, Sequence[Row]], values: Values, folder: Path) -> Ite
 
     Args:
         rows: Of each experiment, lengths in mm.
-        values: Of all cells, by name, lengths in mm.
+        values: Of all cells of the first rig, by name, lengths in mm.
         folder: Where to write the figures.
 
     Yields:
@@ -36,7 +36,8 @@ def draw(rows: Mapping[str, Sequence[Row]], values: Values, folder: Path) -> Ite
     if rows.get("ball"):
         yield from _ball(rows["ball"], values, folder)
     if rows.get("active"):
-        _save(active_curves(where(rows["active"])), folder / "active")
+        each = [{**row, "repeat": f"{row.get('rig', '')}/{row['repeat']}"} for row in where(rows["active"])]
+        _save(active_curves(each), folder / "active")
         yield "active", "Uncertainty against points added by active learning (Figure 8)"
     if rows.get("board"):
         yield from _boards(rows["board"], values, folder)
@@ -93,9 +94,10 @@ def _in_3d(values: Values, folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _boards(rows: Sequence[Row], values: Values, folder: Path) -> Iterator[tuple[str, str]]:
+    first = rows_by_rig(rows)[0]
     for method in DRAWN_METHODS:
         panels = []
-        for row in where(rows, method=method, judged=BOARD):
+        for row in where(first, method=method, judged=BOARD):
             found = values[f"board/{row['set']}/{row['boards']}/{slug(method)}"]
             panels.append({**found, "set": row["set"], "boards": row["boards"]})
         if panels:

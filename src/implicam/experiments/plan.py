@@ -11,6 +11,9 @@ METHODS = (PAPER, GP, NETWORK, EXPLICIT, FORWARD)
 LEARNERS = (PAPER, GP, NETWORK, FORWARD)
 """Those that experiment 1 trains on positions; there, explicit learns from pictures of a board."""
 
+RIGS = 5
+"""Simulated rigs, unless told otherwise: what holds for one may be an accident of its lenses."""
+
 DRAWN_METHODS = (PAPER, NETWORK, FORWARD)
 """Whose boards are drawn."""
 

@@ -30,6 +30,7 @@ from implicam.simulate import (
     CAMERA_SETS,
     Box,
     Rig,
+    Target,
     ball_grid,
     build_rig,
     moving_board,
@@ -42,6 +43,8 @@ from implicam.simulate import (
 RIG = "bar6"
 BUDGETS = ((50, 10), (25, 6), (10, 4))
 """The paper's pictures of a checkerboard: of each camera, and of every pair of cameras."""
+ROBOT_NOISE_MM = 0.1
+"""The repeatability of the paper's robot, as the standard deviation of a known position per axis."""
 MAX_STRAY_SHOTS = 2
 """Pictures of a board that some cameras took together by chance: another one had its view hidden."""
 CHECK_POINTS = 300
@@ -61,11 +64,13 @@ class Source:
         seed: Of the simulated rig.
         folder: Of the measured data; empty for none.
         stamp: A digest of the content of its files.
+        robot_noise_mm: Standard deviation per axis of the simulated known positions: the paper's robot repeats to 0.1.
     """
 
     seed: int = 0
     folder: str = ""
     stamp: str = ""
+    robot_noise_mm: float = ROBOT_NOISE_MM
 
     @classmethod
     def of(cls, folder: Path | None, seed: int) -> Source:
@@ -191,7 +196,7 @@ def _groups(source: Source) -> dict[frozenset[str], list[Rows]]:
 @cache
 def _read(source: Source, part: str) -> Dataset:
     if not source.folder:
-        return _simulated(source.seed, part)
+        return _simulated(source, part)
     place = _place(Path(source.folder), part)
     if place is None:
         raise DatasetError(
@@ -201,20 +206,38 @@ def _read(source: Source, part: str) -> Dataset:
     return read_dataset(place)
 
 
-def _simulated(seed: int, part: str) -> Dataset:
-    rig = build_rig(RIG, seed=seed)
+def _simulated(source: Source, part: str) -> Dataset:
+    seed, rig = source.seed, build_rig(RIG, seed=source.seed)
+
+    def by_robot(target: Target) -> Dataset:
+        return _placed_by_robot(rig, target, source.robot_noise_mm * rig.units_per_mm, stream)
+
     stream = 10 * seed + PARTS.index(part)
     rng = np.random.default_rng([seed, 61, PARTS.index(part)])
     if part == BALL:
-        return simulate(rig, ball_grid(rig), seed=stream)
+        return by_robot(ball_grid(rig))
     if part == BOARD:
-        return simulate(rig, moving_board(rig), seed=stream)
+        return by_robot(moving_board(rig))
     if part == BOARDS:
         return simulate_boards(rig, each_and_every_pair(rig), seed=stream)
     if part == BOARD_CHECK:
         return simulate(_within_boards(rig), random_positions(_within_boards(rig), CHECK_POINTS, rng), seed=stream)
-    count = CHECK_POINTS if part == CHECK else len(ball_grid(rig).xyz)
-    return simulate(rig, random_positions(rig, count, rng), seed=stream)
+    if part == CHECK:
+        return simulate(rig, random_positions(rig, CHECK_POINTS, rng), seed=stream)
+    return by_robot(random_positions(rig, len(ball_grid(rig).xyz), rng))
+
+
+def _placed_by_robot(rig: Rig, target: Target, sd: float, seed: int) -> Dataset:
+    """What the cameras see of a target that a robot places: it says that it is where it was sent, and is nearly there.
+
+    So the known positions are those of the lattice, to the last bit, and the true ones are not: a method that learns
+    the planes of a lattice has as good a chance to as with a real robot.
+    """
+    shots, number = np.unique(target.shots, return_inverse=True)
+    off = sd * np.random.default_rng([seed, 62]).normal(size=(len(shots), 3))
+    data = simulate(rig, replace(target, xyz=target.xyz + off[number]), seed=seed)
+    stated = np.full_like(target.xyz, sd if sd > 0 else np.nan)
+    return replace(data, known=replace(data.positions, xyz=target.xyz, sd=stated))
 
 
 def each_and_every_pair(rig: Rig) -> list[tuple[str, ...]]:

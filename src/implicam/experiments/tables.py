@@ -9,7 +9,7 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.experiments import published
-from implicam.experiments.evidence import Row, column, unpaired, where
+from implicam.experiments.evidence import Row, column, over_rigs, rows_by_rig, unpaired, where
 from implicam.experiments.findings.active import EARLY_POINTS
 from implicam.experiments.findings.board import nearest_and_farthest
 from implicam.experiments.plan import FORWARD, GP, METHODS
@@ -60,12 +60,18 @@ def active_table(rows: Sequence[Row]) -> Table:
 def board_table(rows: Sequence[Row]) -> Table:
     """A line for each set, number of boards and method: mean and standard deviation over the test points, in mm.
 
+    Of several rigs the mean of each number.
+
     Args:
         rows: Of experiment 3.
     """
-    names = ("error", "error_sd", "sd", "sd_sd", "rmse", "mean_sd", "ellipsoid_95", "limit", "measured", "failure")
-    keys = ("set", "boards", "method", "judged", "known", *names)
-    return [{key: row[key] for key in keys if key in row} for row in rows]
+    names = ("error", "error_sd", "sd", "sd_sd", "rmse", "mean_sd", "ellipsoid_95", "limit", "measured")
+    table = []
+    for key, rigs in _grouped(rows, ("set", "boards", "method", "judged", "known")):
+        good = where(rigs)
+        line = {**key, "rigs": len(good), "failure": next((row["failure"] for row in rigs if row.get("failure")), "")}
+        table.append(line | {name: _mean(good, name) for name in names if any(name in row for row in good)})
+    return table
 
 
 def published_beside(rows: Sequence[Row]) -> Table:
@@ -80,8 +86,10 @@ def published_beside(rows: Sequence[Row]) -> Table:
         for key, spread in (("gp_rmse", row.gp_rmse), ("gp_sd", row.gp_sd), ("network_rmse", row.network_rmse)):
             line[f"paper_{key}"] = [spread.mean, spread.sd]
         for method in METHODS:
-            for own in where(rows, set=row.set, boards=row.boards, method=method, judged=BOARD):
-                line[method] = {"rmse": [own["error"], own["error_sd"]], "sd": [own["sd"], own["sd_sd"]]}
+            own = where(rows, set=row.set, boards=row.boards, method=method, judged=BOARD)
+            if own:
+                pairs = {"rmse": ("error", "error_sd"), "sd": ("sd", "sd_sd")}
+                line[method] = {key: [_mean(own, name) for name in names] for key, names in pairs.items()}
         if len(line) > 5:
             table.append(line)
     return table
@@ -94,8 +102,8 @@ def tenfold(rows: Sequence[Row]) -> Table:
         rows: Of experiment 1.
 
     Returns:
-        For each set and part to train on; `times` is the ratio of the geometric means of the runs' errors, with its 95
-        % interval.
+        For each set and part to train on; `times` is the ratio of the geometric means of the runs' errors, with its
+        95 % interval, over the rigs where there are several.
     """
     table = []
     for cameras in dict.fromkeys(str(row["set"]) for row in rows):
@@ -111,7 +119,12 @@ def tenfold(rows: Sequence[Row]) -> Table:
             own = numbers(where(ours, known=few), "rmse")
             line: dict[str, Any] = {"set": cameras, "trained": trained, "few": few, FORWARD: quartiles(own)}
             for key, size in (("most", known[-1]), ("best", best)):
-                case = unpaired(errors[size], own, "{}")
+                case = over_rigs(
+                    [
+                        unpaired(numbers(where(rig, known=size), "rmse"), numbers(where(mine, known=few), "rmse"), "{}")
+                        for rig, mine in zip(rows_by_rig(theirs), rows_by_rig(ours), strict=True)
+                    ]
+                )
                 times = [case.value, case.low, case.high]
                 line[key] = {"known": size, GP: quartiles(errors[size]), "times": times}
             table.append(line)
@@ -147,11 +160,12 @@ def nearness(rows: Sequence[Row]) -> Table:
         rows: Of experiment 3.
     """
     table = []
-    for row in where(rows, judged=BOARD):
-        line = {key: row[key] for key in ("set", "boards", "method")}
+    rigs = rows_by_rig(rows)
+    for line, _ in _grouped(where(rows, judged=BOARD), ("set", "boards", "method")):
         for key in ("sd", "error"):
-            near, far = nearest_and_farthest(rows, row["method"], row["set"], row["boards"], key)
-            line[key] = float(near.mean() / far.mean()) if len(far) else float("nan")
+            ends = [nearest_and_farthest(rig, line["method"], line["set"], line["boards"], key) for rig in rigs]
+            ratios = [np.log(near.mean() / far.mean()) for near, far in ends if len(far)]
+            line[key] = float(np.exp(np.mean(ratios))) if ratios else float("nan")
         table.append(line)
     return table
 
@@ -163,7 +177,12 @@ def by_board(rows: Sequence[Row]) -> Table:
         rows: Of experiment 3.
     """
     return [
-        {**{key: row[key] for key in ("set", "boards", "method")}, "board": number + 1, "error": error, "sd": sd}
+        {
+            **{key: row[key] for key in ("rig", "set", "boards", "method") if key in row},
+            "board": number + 1,
+            "error": error,
+            "sd": sd,
+        }
         for row in where(rows, judged=BOARD)
         for number, error, sd in zip(row["numbers"], row["error_by_board"], row["sd_by_board"], strict=True)
     ]
@@ -180,6 +199,12 @@ def quartiles(values: Floats) -> list[float]:
     """
     values = values[np.isfinite(values)]
     return [float(q) for q in np.quantile(values, [0.25, 0.5, 0.75])] if len(values) else [float("nan")] * 3
+
+
+def _mean(rows: Iterable[Row], key: str) -> float:
+    values = numbers(rows, key)
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else float("nan")
 
 
 def _range(values: Floats) -> list[float]:

@@ -1,9 +1,10 @@
 """Which of the paper's findings hold: each with a number and its 95 % interval.
 
 A finding is a ratio that should be above one (or a number above a threshold that is stated). Ratios are of geometric
-means, over paired runs (the same split, the same board) where there are pairs; their 95 % interval is that of a mean of
-logarithms, after Student. *Holds*: the interval lies on the finding's side, in every case that the finding speaks of;
-*does not hold*: in some case it lies on the other side; *not decided*: neither. The case that decides is shown.
+means, over paired runs (the same split, the same board) where there are pairs. Their 95 % interval is that of a mean of
+logarithms, after Student: over rigs, where there are several; over the runs, of a single one. *Holds*: the interval
+lies on the finding's side, in every case that the finding speaks of; *does not hold*: in some case it lies on the other
+side; *not decided*: neither. The case that decides is shown.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from implicam.experiments import published
-from implicam.experiments.evidence import FAILS, HOLDS, OPEN, Case, Rows, Test
+from implicam.experiments.evidence import FAILS, HOLDS, OPEN, Case, Rows, Test, over_rigs, rows_by_rig
 from implicam.experiments.findings import active, ball, board
 from implicam.experiments.plan import GP, PAPER
 from implicam.simulate import CAMERA_SETS
@@ -57,15 +58,18 @@ def verdicts(rows: Mapping[str, Rows]) -> list[Verdict]:
     Data of another rig have other sets of cameras: a finding is then judged for each of those.
 
     Args:
-        rows: "ball", "active" or "board" -> rows.
+        rows: "ball", "active" or "board" -> rows; those of several rigs have a column "rig".
     """
     found = []
     for experiment, tests in TESTS.items():
         mine = list(rows.get(experiment, ()))
+        rigs = rows_by_rig(mine)
         for key, finding in published.load(experiment).findings.items() if mine else ():
             for sets in _groups(finding.sets, mine, key in FINDINGS_ABOUT_SEVERAL_SETS):
                 for method in ("",) if key in FINDINGS_WITHOUT_GP else (PAPER, GP):
-                    cases = tests[key](mine, method, sets)
+                    of_rigs = [tests[key](rig, method, sets) for rig in rigs]
+                    whole = [cases for cases in of_rigs if len(cases) == max(map(len, of_rigs))]
+                    cases = [over_rigs(same) for same in zip(*whole, strict=True)]
                     if any(np.isfinite(case.value) for case in cases):
                         names, (verdict, number) = ", ".join(sets), _judge_cases(cases)
                         found.append(

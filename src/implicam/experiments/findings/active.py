@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from implicam.experiments.evidence import Case, Row, Rows, Test, column, share_of_drop, stages, where
-from implicam.formatting import percent
 
 EARLY_POINTS, WINDOW_STEPS = 20, 10
 """Points added that are almost none of 100; steps that are looked at there and at the end."""
@@ -56,12 +55,12 @@ def _one_value(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     ranges = {added: float(np.ptp(sd)) / drop for added, sd in mean.items()}
     early = float(np.median([ranges[added] for added in range(EARLY_POINTS, EARLY_POINTS + WINDOW_STEPS)]))
     late = float(np.median([ranges[added] for added in range(last - WINDOW_STEPS + 1, last + 1)]))
-    words = (
-        f"starts differ by {percent(ranges[0])} of the drop at first, {percent(early, 1)} after {EARLY_POINTS} points, "
-        f"{percent(late, 1)} at the end (one value: {100 * MAX_CONVERGED_RANGE:g} %)"
-    )
-    over = [1 / max(share, 1e-9) for share in (early, late)]
-    return [Case(value, value, value, words, 1 / MAX_CONVERGED_RANGE) for value in over]
+    over = {f"after {EARLY_POINTS} points": 1 / max(early, 1e-9), "at the end": 1 / max(late, 1e-9)}
+    return [
+        Case(value, value, value, f"the whole drop is {{}} times what starts differ by {when} (one value: 10 times)",
+             1 / MAX_CONVERGED_RANGE)
+        for when, value in over.items()
+    ]  # fmt: skip
 
 
 TESTS: dict[str, Test] = {"sd_drops_fast": _drops_fast, "any_start_converges": _one_value}
