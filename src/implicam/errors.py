@@ -9,6 +9,7 @@
     ├── MissingExtraError     an optional library is not installed
     ├── HardwareError         a camera, a trigger or a robot does not do what it was told
     └── UsageError            options that do not go together
+        └── PartError         what another package brings is not installed, cannot be imported, or is not what it says
 
 The command line prints the three lines and no traceback; `--debug` shows it.
 """
@@ -73,6 +74,10 @@ class HardwareError(ImplicamError):
 
 class UsageError(ImplicamError):
     """Options or arguments that do not go together."""
+
+
+class PartError(UsageError):
+    """A lens, a robot or another part that another package brings is missing or broken; names the package."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

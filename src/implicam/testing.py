@@ -19,11 +19,9 @@ from typing import Any
 import numpy as np
 
 from implicam.errors import FitError
-from implicam.lenses import LENSES, Bools, Floats, Lens, focal_lengths
+from implicam.lenses import FIRST_FIELDS, LENSES, Bools, Floats, Lens, focal_lengths
 
 __all__ = ["check_lens", "edge_of"]
-
-FIRST_FIELDS = ("fx", "fy", "cx", "cy")
 
 PART_OF_EDGE = 0.97
 """What a lens sees up to there must hold to the last digit; the rest is the last hair before it ends."""

@@ -11,7 +11,7 @@ import numpy as np
 from implicam.active.design_model import DesignModel
 from implicam.dataset import Floats
 from implicam.errors import UsageError
-from implicam.registry import Registry
+from implicam.registry import Registry, offers
 
 
 class Acquisition(Protocol):
@@ -176,6 +176,7 @@ ACQUISITIONS: Registry[Acquisition] = Registry(
         for rule in (Random(), Sobol(), MaximumVariance(), RelativeExcess(), IntegratedVariance(), DOptimal())
     },
     "implicam.acquisitions",
+    offers(Acquisition, "name", a_class=False),
 )
 """Name -> rule."""
 

@@ -5,6 +5,7 @@ CONTRIBUTING.md has the recipe for one more.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
 from implicam.calibrators.mlp import MLP, MLPCalibration
 from implicam.calibrators.protocol import Calibration, Calibrator
 from implicam.errors import CalibrationFileError, UsageError, did_you_mean, import_extra
-from implicam.registry import Registry
+from implicam.registry import Registry, missing_members
 
 
 class Method(NamedTuple):
@@ -24,6 +25,19 @@ class Method(NamedTuple):
 
     calibrator: type[Any]
     calibration: type[Any]
+
+
+def _what_is_wrong(name: str, part: Any) -> Iterator[str]:
+    if not isinstance(part, Method):
+        yield "it is no Method(calibrator, calibration) of implicam.calibrators"
+        return
+    for made, protocol in ((part.calibrator, Calibrator), (part.calibration, Calibration)):
+        missing = missing_members(made, protocol)
+        if missing:
+            yield f"{made.__name__} has no {', '.join(missing)}"
+    method = getattr(part.calibrator, "method", name)
+    if method != name:
+        yield f"its method is {method!r}, and it is added as {name!r}: the two must be the same"
 
 
 CALIBRATORS = Registry(
@@ -35,6 +49,7 @@ CALIBRATORS = Registry(
         Explicit.method: Method(Explicit, ExplicitCalibration),
     },
     "implicam.calibrators",
+    _what_is_wrong,
 )
 """Method name -> (calibrator, calibration)."""
 

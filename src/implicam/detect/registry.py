@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from implicam.dataset.folder import DESCRIPTION, read_description
 from implicam.detect.ball import Ball
@@ -16,10 +16,28 @@ from implicam.detect.charuco import Charuco
 from implicam.detect.dots import Dots
 from implicam.detect.model import Detector
 from implicam.errors import UsageError, did_you_mean
-from implicam.registry import Registry
+from implicam.registry import Registry, offers
+
+
+class DetectorClass(Detector, Protocol):
+    """What the registry asks of a detector's class."""
+
+    @classmethod
+    def from_options(cls, dataset: Path, described: dict[str, Any], **options: Any) -> Detector:
+        """The detector that the options of a command line mean; see `Detector`.
+
+        Args:
+            dataset: The folder.
+            described: The table `[target]` of dataset.toml.
+            **options: Named one by one; None where not given.
+        """
+
 
 TARGETS: Registry[type[Any]] = Registry(
-    "target", {"ball": Ball, "board": Board, "charuco": Charuco, "dots": Dots}, "implicam.detectors"
+    "target",
+    {"ball": Ball, "board": Board, "charuco": Charuco, "dots": Dots},
+    "implicam.detectors",
+    offers(DetectorClass),
 )
 """Target -> its detector."""
 

@@ -29,7 +29,7 @@ from implicam.hardware.protocol import (
 from implicam.hardware.simulated import PhotographingCamera, SimulatedRobot, simulated_rig
 from implicam.hardware.trigger import NetworkTrigger, TriggerSimulator
 from implicam.hardware.ur import URRobot
-from implicam.registry import Registry
+from implicam.registry import Registry, offers
 
 __all__ = [
     "CAMERAS",
@@ -59,12 +59,15 @@ __all__ = [
 ]
 
 CAMERAS: Registry[type[CameraDriver]] = Registry(
-    "camera", {"opencv": OpenCVCamera, "folder": FolderCamera, "genicam": GenICamCamera}, "implicam.cameras"
+    "camera",
+    {"opencv": OpenCVCamera, "folder": FolderCamera, "genicam": GenICamCamera},
+    "implicam.cameras",
+    offers(CameraDriver),
 )
 """Name -> driver; those that take a spec without their name are asked in this order."""
 
 ROBOTS: Registry[type[RobotDriver]] = Registry(
-    "robot", {"person": Person, "csv": CsvPlayer, "ur": URRobot}, "implicam.robots"
+    "robot", {"person": Person, "csv": CsvPlayer, "ur": URRobot}, "implicam.robots", offers(RobotDriver)
 )
 """Name -> driver."""
 

@@ -6,9 +6,10 @@
 from implicam.lenses.base import Bools, DistortionSds, Floats, Lens, fit_lens, focal_lengths
 from implicam.lenses.brown_conrady import BrownConrady
 from implicam.lenses.kannala_brandt import PERSPECTIVE_K, KannalaBrandt
-from implicam.lenses.registry import LENSES
+from implicam.lenses.registry import FIRST_FIELDS, LENSES
 
 __all__ = [
+    "FIRST_FIELDS",
     "LENSES",
     "PERSPECTIVE_K",
     "Bools",
