@@ -108,7 +108,8 @@ def library_of(name: str) -> tuple[str, str] | None:
     return calibrator(name).library
 
 
-NEEDED = {name: library for name in ("inverse-gp:paper", "mlp", "mlp:no-dropout") if (library := library_of(name))}
+_NEEDY = ("inverse-gp:paper", "explicit:paper", "explicit:paper-bundle", "mlp", "mlp:no-dropout")
+NEEDED = {name: library for name in _NEEDY if (library := library_of(name))}
 """`library_of` the methods and variants here that need one."""
 
 

@@ -22,7 +22,8 @@ from implicam.rig_model import CameraModel, CentralCamera
 MAX_SQUARED_MAHALANOBIS = 25.0
 """Squared distance, in its own covariance, of a known point from where it should be: one in 65,000 of good ones."""
 
-MATCHING = ("points", "icp")
+POINTS, ICP = "points", "icp"
+MATCHING = (POINTS, ICP)
 
 MAX_ROUNDS = 60
 
@@ -80,7 +81,7 @@ def align(
     cov = point + spread @ spread.swapaxes(1, 2)
     used = there
     for _ in range(8):
-        pose, pairs = _matched(measured, known.xyz, used, how)
+        pose, pairs = matched(measured, known.xyz, used, how)
         xyz, sd = known.xyz[pairs], known.sd[pairs]
         pose, Q, G, W, residual = _weighted(pose, measured, cov, xyz, sd, used, there)
         distance = np.einsum("ni,nij,nj->n", residual, W, residual)
@@ -98,9 +99,9 @@ def align(
     follows = (M[used] - G[used] @ K) @ root.T
     left = point[used] + follows @ follows.swapaxes(1, 2) + G[used] @ own @ G[used].swapaxes(1, 2)
     left = left + pose.rotation @ (sd[used][:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
-    errors, sds = _left_out(pose, Q, G[used], W[used], residual[used], left)
-    found = Alignment(pose, used, K, own, errors, sds, _scale(measured[used], xyz[used]))
-    _check(found, residual[there], xyz[there], measured[there], float(np.sqrt(np.sum(known.xyz.var(axis=0)))))
+    errors, sds = left_out(pose, Q, G[used], W[used], residual[used], left)
+    found = Alignment(pose, used, K, own, errors, sds, extent_ratio(measured[used], xyz[used]))
+    check_alignment(found, residual[there], xyz[there], measured[there], float(np.sqrt(np.sum(known.xyz.var(axis=0)))))
     return found
 
 
@@ -128,9 +129,9 @@ def _by_pixels(
     return x, point, point @ back
 
 
-def _matched(measured: Floats, xyz: Floats, used: Bools, how: str) -> tuple[Pose, NDArray[np.int64]]:
+def matched(measured: Floats, xyz: Floats, used: Bools, how: str) -> tuple[Pose, NDArray[np.int64]]:
     """rig_from_world in closed form, and the number of each measured point's known one: its own, or the closest."""
-    if how == "points":
+    if how == POINTS:
         return register(xyz[used], measured[used])[0], np.arange(len(xyz))
     pose = closest_points(xyz, measured[used], register(xyz[used], measured[used])[0])
     _, nearest = cKDTree(xyz).query(pose.inverse().apply(measured))
@@ -222,7 +223,7 @@ def _own_noise(B: Floats, point: Floats, pose: Pose, sd: Floats, shots: Names) -
     return np.asarray(total, dtype=np.float64)
 
 
-def _left_out(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats, cov: Floats) -> tuple[Floats, Floats]:
+def left_out(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats, cov: Floats) -> tuple[Floats, Floats]:
     """Errors and sds (m, 3) in the world of the used points, each as if the motion came from the others."""
     error = residual
     if len(residual) > 3:  # with three, two would be left: nothing to align with
@@ -232,13 +233,13 @@ def _left_out(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats, cov
     return error @ pose.rotation, np.sqrt(np.diagonal(world, axis1=1, axis2=2))
 
 
-def _scale(measured: Floats, xyz: Floats) -> float:
+def extent_ratio(measured: Floats, xyz: Floats) -> float:
     """World over rig, the ratio of the extents: 1 where the board's square is right."""
     a, b = measured - measured.mean(axis=0), xyz - xyz.mean(axis=0)
     return float(np.sqrt(np.sum(b**2) / np.sum(a**2)))
 
 
-def _check(found: Alignment, residual: Floats, xyz: Floats, measured: Floats, extent: float) -> None:
+def check_alignment(found: Alignment, residual: Floats, xyz: Floats, measured: Floats, extent: float) -> None:
     """FitError where boards and known points are not of one rig, or not of one unit."""
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
     if rms < MAX_RESIDUAL_EXTENTS * extent and abs(found.scale - 1) < MAX_RESIDUAL_EXTENTS:

@@ -16,12 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.explicit import saved
-from implicam.calibrators.explicit.align import MATCHING
-from implicam.calibrators.explicit.boards import boards_of, has_boards
+from implicam.calibrators.explicit.align import ICP, MATCHING
+from implicam.calibrators.explicit.boards import Boards, boards_of, has_boards
 from implicam.calibrators.explicit.camera_groups import CameraGroups, calibrate_groups
 from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_boards_alone, fit_to_points
 from implicam.calibrators.explicit.from_boards import fit_to_boards
 from implicam.calibrators.explicit.lenses import AUTO
+from implicam.calibrators.explicit.opencv_pipeline import FAMILIES, OpenCVRig, calibrate_with_opencv
+from implicam.calibrators.explicit.paper_preset import (
+    JOINT,
+    PAPER_BUNDLE,
+    PRESETS,
+    fit_like_the_paper,
+    measure_linearly,
+)
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -31,11 +39,12 @@ from implicam.calibrators.protocol import (
     per_axis,
     solvable,
 )
-from implicam.dataset import Dataset
+from implicam.dataset import Dataset, Observations
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
 from implicam.lenses import LENSES
+from implicam.measurement import Measurement
 from implicam.mistakes import mistakes_named
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig
@@ -49,11 +58,17 @@ class Explicit(CalibratorBase):
 
     boards: pictures of a board, the corners found in them; without, the known points are what it is fitted to. align:
     how a calibration from boards is brought into the world: `points`, by the names of the known points, or `icp`, by
-    the closest ones as in the paper. seed changes nothing: no part of this method is left to chance.
+    the closest ones as in the paper. preset: `joint`, all cameras, lenses and boards adjusted together; `paper`, the
+    paper's own pipeline with OpenCV, to compare with (paper_preset.py); `paper-bundle`, the same with a joint
+    adjustment at its end. seed changes nothing: no part of this method is left to chance.
     """
 
     lens: str = field(default=AUTO, metadata=option(f"auto, {', '.join(LENSES)}"))
     align: str = field(default=MATCHING[0], metadata=option("known points match boards by name (points), or icp"))
+    preset: str = field(
+        default=JOINT,
+        metadata=option('joint; "paper", its own pipeline with OpenCV, or "paper-bundle", adjusted at the end'),
+    )
     seed: int = 0
     boards: Dataset | None = field(
         default=None, metadata=option("learn the cameras from these pictures of a board", "DATASET", is_dataset=True)
@@ -62,17 +77,35 @@ class Explicit(CalibratorBase):
     method: ClassVar[str] = "explicit"
 
     def __post_init__(self) -> None:
-        for what, value, known in (("lens", self.lens, (AUTO, *LENSES)), ("align", self.align, MATCHING)):
+        for what, value, known in (
+            ("lens", self.lens, (AUTO, *LENSES)),
+            ("align", self.align, MATCHING),
+            ("preset", self.preset, PRESETS),
+        ):
             if value not in known:
                 raise UsageError(
                     f"explicit has no {what} {value!r}{did_you_mean(value, known)}.",
                     fix=f"choose one of {', '.join(known)}",
                 )
 
+        if self.preset != JOINT and self.lens not in (AUTO, *FAMILIES):
+            raise UsageError(
+                f"OpenCV has no lens {self.lens!r}.",
+                why=f"explicit:{self.preset} calibrates with OpenCV, as the paper",
+                fix=f"choose one of {', '.join((AUTO, *FAMILIES))}",
+            )
+
     @classmethod
     def variants(cls) -> dict[str, dict[str, Any]]:
-        """The lenses."""
-        return {lens: {"lens": lens} for lens in (AUTO, *LENSES)}
+        """The lenses; and the paper's pipeline, aligned as in the paper."""
+        return {lens: {"lens": lens} for lens in (AUTO, *LENSES)} | {
+            preset: {"preset": preset, "align": ICP} for preset in PRESETS if preset != JOINT
+        }
+
+    @property
+    def library(self) -> tuple[str, str] | None:
+        """The paper's pipeline is OpenCV."""
+        return None if self.preset == JOINT else ("cv2", "images")
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
         """Fit to the known points; or to the boards, and then to the known points.
@@ -81,6 +114,8 @@ class Explicit(CalibratorBase):
         the positions that the adjustment gives them.
         """
         with mistakes_named(data), solvable(), blas_threads(1):
+            if self.preset != JOINT:
+                return ExplicitCalibration(self, data, self._fitted_like_the_paper(data, progress))
             if self.boards is None and self.align != MATCHING[0]:
                 raise UsageError(
                     f"align {self.align!r} is for boards, and there are none.",
@@ -94,20 +129,42 @@ class Explicit(CalibratorBase):
                 fitted = fit_to_boards(data, self._groups(data, progress), self.boards, self.align, progress)
         return ExplicitCalibration(self, data, fitted)
 
+    def _fitted_like_the_paper(self, data: Dataset, progress: Progress) -> Fitted:
+        if self.boards is None or data.known is None:
+            raise UsageError(
+                f"explicit:{self.preset} takes pictures of a board and known positions; there are none"
+                f"{' of a board' if self.boards is None else ''}.",
+                why="the paper learns cameras from a checkerboard, and brings them into the world by known positions",
+                fix="give pictures of a board with --boards, and known positions in points.csv; or use explicit, which "
+                "takes either alone",
+            )
+        key = (data.length_unit, data.observations.camera_names)
+        if key not in self._by_opencv:
+            joint = self.preset == PAPER_BUNDLE
+            self._by_opencv[key] = calibrate_with_opencv(self._boards_for(data), self.lens, joint, progress)
+        return fit_like_the_paper(data, self._by_opencv[key], self.boards, self.align)
+
     def _groups(self, data: Dataset, progress: Progress) -> CameraGroups:
         """The cameras from the boards: adjusted once for all known points of the same cameras in the same unit."""
         key = (data.length_unit, data.observations.camera_names)
         if key not in self._adjusted:
-            assert self.boards is not None
-            scale = 1.0
-            if self.boards.length_unit != data.length_unit:
-                scale = self.boards.metres_per_unit / data.metres_per_unit
-            boards = boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)), scale)
-            self._adjusted[key] = calibrate_groups(boards, self.lens, progress)
+            self._adjusted[key] = calibrate_groups(self._boards_for(data), self.lens, progress)
         return self._adjusted[key]
+
+    def _boards_for(self, data: Dataset) -> Boards:
+        """The boards in the unit of the known points, as the cameras of both saw them."""
+        assert self.boards is not None
+        scale = 1.0
+        if self.boards.length_unit != data.length_unit:
+            scale = self.boards.metres_per_unit / data.metres_per_unit
+        return boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)), scale)
 
     @cached_property
     def _adjusted(self) -> dict[tuple[str, tuple[str, ...]], CameraGroups]:
+        return {}
+
+    @cached_property
+    def _by_opencv(self) -> dict[tuple[str, tuple[str, ...]], OpenCVRig]:
         return {}
 
 
@@ -128,6 +185,13 @@ class ExplicitCalibration(RigCalibration):
         return FittedRig(
             fitted.trained, self.data.length_unit, fitted.frame, fitted.cameras, fitted.posterior, misfit_adds=True
         )
+
+    def measure(self, observations: Observations) -> Measurement:
+        """Measure each point with the views it has, two or more: by maximum likelihood; with the paper's presets by
+        linear triangulation."""
+        if self.fitted.inflation is None:
+            return self.map.measure(observations)
+        return measure_linearly(self.fitted, self.map, observations)
 
     @property
     def unused(self) -> tuple[Unused, ...]:
@@ -172,6 +236,8 @@ class ExplicitCalibration(RigCalibration):
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The options; and per camera lens, pose and covariance, in the working frame."""
         options = {"lens": self.calibrator.lens, "align": self.calibrator.align, "seed": self.calibrator.seed}
+        if self.calibrator.preset != JOINT:
+            options["preset"] = self.calibrator.preset
         table, arrays = saved.state(self.fitted, self.calibrator.boards)
         return {**options, **table}, arrays
 
@@ -179,7 +245,10 @@ class ExplicitCalibration(RigCalibration):
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ExplicitCalibration:
         """Restore a calibration; nothing is computed again."""
         fitted, boards = saved.restored(data, table, arrays)
-        calibrator = Explicit(str(table["lens"]), str(table["align"]), int(table["seed"]), boards)
+        preset = str(table.get("preset", JOINT))
+        if (preset == JOINT) != (fitted.inflation is None):
+            raise ValueError(f"a calibration of the preset {preset} cannot measure like this one")
+        calibrator = Explicit(str(table["lens"]), str(table["align"]), preset, int(table["seed"]), boards)
         return cls(calibrator, data, fitted)
 
 

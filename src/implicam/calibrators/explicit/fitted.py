@@ -40,7 +40,11 @@ METHOD = "explicit"
 class Fitted:
     """Cameras in the working frame. trained: the observations that cameras, sizes and stated noise are known from;
     cameras: numbers of those calibrated; choices: their lens models; errors, sds (m, 3): of known points, each left
-    out in turn. alone: from boards alone, so that nothing is known and errors are those of corners as adjusted."""
+    out in turn. alone: from boards alone, so that nothing is known and errors are those of corners as adjusted.
+
+    Of the paper's presets: reference, the place in `cameras` of the one in whose frame points are triangulated;
+    inflation, what standard deviations are multiplied by (None, of every other preset: measured by maximum likelihood);
+    reprojection: rms distance of all corners from where they are predicted, pixels."""
 
     trained: Observations
     frame: Frame
@@ -53,6 +57,9 @@ class Fitted:
     unused: tuple[Unused, ...]
     notes: tuple[str, ...]
     alone: bool = False
+    reference: int = 0
+    inflation: float | None = None
+    reprojection: float = float("nan")
 
 
 def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:

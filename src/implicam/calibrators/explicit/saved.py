@@ -41,6 +41,7 @@ def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[
         ],
         "notes": list(fitted.notes),
         "alone": fitted.alone,
+        **_of_the_paper(fitted),
         "rejected": [[view.point, view.camera, float(view.residual)] for view in fitted.rejected],
         "unused": [[one.point, one.reason] for one in fitted.unused],
     }
@@ -59,6 +60,29 @@ def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[
     if boards is not None:
         arrays |= {BOARDS + name: array for name, array in arrays_from_dataset(boards).items()}
     return table, arrays
+
+
+def _of_the_paper(fitted: Fitted) -> dict[str, Any]:
+    """What the paper's presets measure with; nothing for the others."""
+    if fitted.inflation is None:
+        return {}
+    return {
+        "reference": fitted.reference,
+        "inflation": fitted.inflation,
+        "reprojection_px": fitted.reprojection,
+    }
+
+
+def _paper_from(table: Mapping[str, Any], cameras: int) -> tuple[int, float | None, float]:
+    """The inverse of `_of_the_paper`."""
+    if "inflation" not in table:
+        return 0, None, float("nan")
+    reference, inflation, reprojection = int(table["reference"]), float(table["inflation"]), table["reprojection_px"]
+    if not 0 <= reference < cameras:
+        raise ValueError(f"there is no camera number {reference} to triangulate with")
+    if not 1 <= inflation < np.inf:
+        raise ValueError("inflation must be one or more, and finite")
+    return reference, inflation, float(reprojection)
 
 
 def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[Fitted, Dataset | None]:
@@ -104,6 +128,7 @@ def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[F
         tuple(Unused(str(point), str(reason)) for point, reason in table["unused"]),
         tuple(map(str, table["notes"])),
         bool(table["alone"]),
+        *_paper_from(table, len(cameras)),
     )
     return fitted, boards
 
