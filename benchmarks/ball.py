@@ -80,7 +80,7 @@ def judged(studio, found):
             one = found[View(camera.name, shot)]
             if not len(one):
                 continue
-            error = one.uv[0] - true_middle(camera, studio.thing(s))
+            error = one.uv[0] - true_middle(camera, studio.shown_object(s))
             if not visible[s, c] or np.linalg.norm(error) > FALSE:
                 false += 1
                 continue

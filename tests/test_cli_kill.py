@@ -19,7 +19,7 @@ import pytest
 from command_line import UNWATCHED, files, made, read_measured, real  # noqa: F401  a fixture
 from implicam.calibrators import load_calibration
 from implicam.dataset import read_dataset, write_dataset
-from implicam.files import left_behind
+from implicam.files import find_left_behind
 from implicam.simulate import build_rig, random_positions, simulate
 
 # kill -9: the old or the new, nothing between
@@ -126,7 +126,7 @@ def check_kill(folder: Path, victim: Victim, old: Any, new: Any, sources: dict[s
     """After a kill: the old or the new, whole; or, between the two renames of a folder, the old beside its place."""
     now, outcome = state(folder, victim.target), "old"
     if now is None:
-        beside = left_behind(folder / victim.target)
+        beside = find_left_behind(folder / victim.target)
         assert beside is not None, f"{victim.target} is lost"
         assert files(beside) == old
         outcome = "beside"

@@ -19,7 +19,7 @@ from dataset_files import FORMS, assert_same, numbered
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, join, read_dataset, write_dataset
 from implicam.dataset.marks import MISSING_VIEW_PIXELS
 from implicam.errors import DatasetError, ImplicamError
-from implicam.files import left_behind, replacing_folder
+from implicam.files import find_left_behind, replacing_folder
 from implicam.simulate import simulated
 
 # --- any legal dataset ---------------------------------------------------------------------------------------------
@@ -440,7 +440,7 @@ def test_a_kill_between_the_renames_loses_nothing(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("shutil.rmtree", lambda *_, **__: None)
     write_dataset(numbered(4), tmp_path / "rig", overwrite=True)
     monkeypatch.undo()
-    old = left_behind(tmp_path / "rig")
+    old = find_left_behind(tmp_path / "rig")
     assert old is not None
     assert len(read_dataset(old)) == 3
     with pytest.raises(DatasetError) as caught:

@@ -189,7 +189,7 @@ def errors_of(made, detector):
             if not made.true_pixels[1][s, c]:
                 assert len(found) == 0
             elif len(found):
-                errors.append(found.uv[0] - true_outline(camera, made.thing(s)).centre)
+                errors.append(found.uv[0] - true_outline(camera, made.shown_object(s)).centre)
                 sd.append(found.sd[0])
                 assert found.points == (shot,)
     return np.array(errors), np.array(sd), visible
@@ -431,7 +431,7 @@ def true_shift(rig, xyz, radius):
     made = Studio(
         rig, replace(random_positions(rig, len(xyz), np.random.default_rng(0)), xyz=xyz), ball_radius_mm=radius
     )
-    pairs = [[true_outline(camera, made.thing(s)).centre for camera in rig.cameras] for s in range(len(xyz))]
+    pairs = [[true_outline(camera, made.shown_object(s)).centre for camera in rig.cameras] for s in range(len(xyz))]
     return np.array(pairs) - made.true_pixels[0]
 
 

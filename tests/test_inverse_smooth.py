@@ -13,7 +13,7 @@ from implicam.calibrators.inverse_maps import SmoothMap, is_principal
 from implicam.calibrators.pixel_cloud import MAX_DISTANCE_RATIO, PixelCloud
 from implicam.dataset import Dataset, read_dataset
 from implicam.evaluation import evaluate
-from implicam.gp import Kernel, Kriging, LengthscalePrior, Smoothness, most_probable
+from implicam.gp import Kernel, Kriging, LengthscalePrior, Smoothness, maximise_posterior
 from implicam.gp.kriging import RestrictedPosterior
 from implicam.simulate import build_rig, random_positions, simulate
 
@@ -111,7 +111,7 @@ def test_what_lengthscales_do_to_a_prediction_is_its_derivative(shape: str) -> N
 
 
 def test_the_most_probable_is_where_the_gradient_vanishes() -> None:
-    found = most_probable(X, Y, with_one(X), "squared-exponential", PRIOR)
+    found = maximise_posterior(X, Y, with_one(X), "squared-exponential", PRIOR)
     theta = np.append(PRIOR.whitened(found.lengthscale), np.log(found.noise_ratio))
     value, gradient = RestrictedPosterior(X, Y, with_one(X), "squared-exponential", PRIOR)(theta)
     assert value == pytest.approx(found.value, rel=1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from implicam.gp import GaussianProcess, Kernel
-from implicam.gp.low_rank import MAX_DRAWN, LowRank, pivoted_cholesky
+from implicam.gp.low_rank import MAX_CANDIDATE_POINTS, LowRank, pivoted_cholesky
 
 NOISE_SD, SIGNAL = 0.1, 1.7
 LENGTHSCALE = np.array([0.6, 0.6, 1.5])
@@ -164,7 +164,7 @@ def test_slope_is_the_derivative() -> None:
 
 def test_more_points_than_are_looked_at() -> None:
     """The inducing points come from a draw; what they leave at the points not drawn is as little."""
-    X = points(3 * MAX_DRAWN, 19)
+    X = points(3 * MAX_CANDIDATE_POINTS, 19)
     field = LowRank.of(kernel(), X, 1e-5)
     phi = field.features(X)
     assert (1 - np.sum(phi**2, axis=1)).max() < 1e-3
@@ -174,7 +174,10 @@ def test_more_points_than_are_looked_at() -> None:
     y, at = values(X, 20), points(50, 21)
     mean, sd = predicted(field, X, y, at)
     exact = GaussianProcess.condition(
-        Kernel("squared-exponential", SIGNAL**2, LENGTHSCALE), NOISE_SD**2, X[:MAX_DRAWN], y[:MAX_DRAWN]
+        Kernel("squared-exponential", SIGNAL**2, LENGTHSCALE),
+        NOISE_SD**2,
+        X[:MAX_CANDIDATE_POINTS],
+        y[:MAX_CANDIDATE_POINTS],
     )
     exact_mean, variance = exact.predict(at)
     assert np.abs((mean - exact_mean) / np.sqrt(variance)).max() < 4  # a third of the data says the same, less well

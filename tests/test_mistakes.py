@@ -10,7 +10,7 @@ import pytest
 import implicam as ic
 from implicam.dataset import Dataset, Floats
 from implicam.errors import FitError
-from implicam.mistakes import mistakes_in
+from implicam.mistakes import find_mistakes
 from implicam.row_order import shift_rows
 from implicam.simulate import ball_grid, build_rig, random_positions, simulate
 from implicam.verdict import _of_data
@@ -40,7 +40,7 @@ def with_column(data: Dataset, camera: int, uv: Floats) -> Dataset:
 @pytest.mark.parametrize("points", [12, 40, 150])
 def test_right_points_have_none(spec: str, points: int) -> None:
     for seed in range(5):
-        assert mistakes_in(known(spec, points, seed, missing=0.2, outliers=0.03, robot_noise=0.2)) == []
+        assert find_mistakes(known(spec, points, seed, missing=0.2, outliers=0.03, robot_noise=0.2)) == []
 
 
 def test_a_place_that_is_gone_back_to_is_no_other_unit() -> None:
@@ -49,7 +49,7 @@ def test_a_place_that_is_gone_back_to_is_no_other_unit() -> None:
     xyz, uv = data.xyz - data.xyz[0], data.observations.uv.copy()
     xyz[:8] = np.random.default_rng(0).normal(scale=0.03, size=(8, 3))
     uv[:8] = uv[0] + np.random.default_rng(1).normal(scale=0.2, size=uv[:8].shape)
-    assert not any("unit" in one.reason for one in mistakes_in(at(with_pixels(data, uv), xyz)))
+    assert not any("unit" in one.reason for one in find_mistakes(at(with_pixels(data, uv), xyz)))
 
 
 def with_pixels(data: Dataset, uv: Floats) -> Dataset:
@@ -62,7 +62,7 @@ def test_points_in_another_unit_are_named(factor: float, many: int) -> None:
     data = known()
     xyz = data.xyz.copy()
     xyz[:many] /= factor
-    (found,) = mistakes_in(at(data, xyz))
+    (found,) = find_mistakes(at(data, xyz))
     assert found.grave
     assert f"{many} of 30 known positions" in found.reason
     assert f"times {factor:g}" in found.reason
@@ -71,7 +71,7 @@ def test_points_in_another_unit_are_named(factor: float, many: int) -> None:
 @pytest.mark.parametrize("data", [known(), known("stereo", 13), lattice()])
 @pytest.mark.parametrize(("rows", "said"), [(1, "1 row early"), (-1, "1 row late"), (-2, "2 rows late")])
 def test_positions_in_another_order_are_named(data: Dataset, rows: int, said: str) -> None:
-    (found,) = mistakes_in(at(data, np.roll(data.xyz, rows, axis=0)))
+    (found,) = find_mistakes(at(data, np.roll(data.xyz, rows, axis=0)))
     assert found.grave
     assert "in another order than the views" in found.reason
     assert said in found.reason
@@ -79,13 +79,13 @@ def test_positions_in_another_order_are_named(data: Dataset, rows: int, said: st
 
 def test_rows_from_the_last_to_the_first_are_named() -> None:
     data = known()
-    (found,) = mistakes_in(at(data, data.xyz[::-1].copy()))
+    (found,) = find_mistakes(at(data, data.xyz[::-1].copy()))
     assert "from the last row to the first" in found.reason
 
 
 def test_one_camera_late_is_named() -> None:
     data = known()
-    (found,) = mistakes_in(with_column(data, 1, np.roll(data.observations.uv[:, 1], 1, axis=0)))
+    (found,) = find_mistakes(with_column(data, 1, np.roll(data.observations.uv[:, 1], 1, axis=0)))
     assert not found.grave
     assert found.reason.startswith("cam2: its pixels are 1 row late: put right they fit to")
 

@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from implicam.errors import UsageError
 from implicam.geometry import Pose, look_at, rotation_from_vector
 from implicam.lenses import BrownConrady, KannalaBrandt
-from implicam.row_order import order_of
+from implicam.row_order import find_row_order
 from implicam.simulate import (
     Optics,
     Rig,
@@ -36,7 +36,7 @@ from implicam.simulate import (
     write_rig,
 )
 from implicam.simulate.camera import random_error
-from implicam.simulate.photographs import PAD, lines_of_sight
+from implicam.simulate.photographs import PADDING_PX, lines_of_sight
 
 NO_ERROR = random_error(np.random.default_rng(0), 1280, 1024, 0.0)
 ALL_ODD = Unusual(tilt=8.0, mirror="cam1", aspect=1.3, window=12.0)
@@ -333,7 +333,7 @@ def test_lines_of_sight_are_those_of_the_camera() -> None:
     directions = lines_of_sight(view)
     rng = np.random.default_rng(0)
     u, v = rng.integers(0, view.width, 500), rng.integers(0, view.height, 500)
-    along = directions[v + PAD, u + PAD].astype(float)
+    along = directions[v + PADDING_PX, u + PADDING_PX].astype(float)
     world = view.camera_from_world.centre + rng.uniform(200, 800, (500, 1)) * along
     pixels, seen = view.pixel_from_world(world)
     assert seen.mean() > 0.9
@@ -417,4 +417,4 @@ def test_a_lattice_is_not_read_from_its_end(odd_rigs: ModuleType, kind: str, see
     or doubted as being in another order."""
     known = odd_rigs.draw(kind, seed).known
     for c in range(len(known.cameras)):
-        assert order_of(known.xyz, known.observations.uv[:, c]) is None
+        assert find_row_order(known.xyz, known.observations.uv[:, c]) is None

@@ -10,7 +10,7 @@ pytest.importorskip("cv2")
 from implicam.errors import UsageError
 from implicam.images import find_pictures, opencv, read_picture
 from implicam.simulate import Optics, Studio, build_rig, moving_board, random_positions, record, views
-from implicam.simulate.photographs import PAD, Cover, lines_of_sight
+from implicam.simulate.photographs import PADDING_PX, Occluder, lines_of_sight
 
 cv2 = opencv()
 STILL = Optics(noise=0, blur=0.7, vignetting=0, uneven=0, clutter=False, bits=16)
@@ -25,10 +25,10 @@ def balls(seed=1, n=2, optics=STILL, spec="bar6", cameras="cam1", **more):
 def test_lines_of_sight_are_those_of_the_camera(spec, camera):
     view = build_rig(spec, seed=2).cameras[camera]
     directions = lines_of_sight(view)
-    assert directions.shape == (view.height + 2 * PAD, view.width + 2 * PAD, 3)
+    assert directions.shape == (view.height + 2 * PADDING_PX, view.width + 2 * PADDING_PX, 3)
     rng = np.random.default_rng(0)
     u, v = rng.integers(0, view.width, 3000), rng.integers(0, view.height, 3000)
-    along = directions[v + PAD, u + PAD].astype(float)
+    along = directions[v + PADDING_PX, u + PADDING_PX].astype(float)
     assert np.linalg.norm(along, axis=1) == pytest.approx(np.ones(3000), abs=1e-5)
     world = view.camera_from_world.centre + rng.uniform(200, 800, (3000, 1)) * along
     pixels, seen = view.pixel_from_world(world)
@@ -130,7 +130,7 @@ def test_corners_of_a_covered_board_are_hidden_where_the_bar_is():
     for s, shot in enumerate(board.shots):
         rows = np.flatnonzero(board.target.shots == shot)
         grey, clean = board.picture(0, s), bare.picture(0, s)
-        cover = board._place_cover(0, s)
+        cover = board._place_occluder(0, s)
         for row in rows:
             u, v = np.rint(uv[row, 0]).astype(int)
             clear = cover.distance(uv[row, 0])
@@ -143,7 +143,7 @@ def test_corners_of_a_covered_board_are_hidden_where_the_bar_is():
 
 
 def test_a_cover_is_a_bar_with_round_ends():
-    bar = Cover(np.array([0.0, 0]), np.array([10.0, 0]), 2.0)
+    bar = Occluder(np.array([0.0, 0]), np.array([10.0, 0]), 2.0)
     at = np.array([[5, 0], [5, 3], [-4, 0], [13, 4], [0, -2]])
     assert bar.distance(at) == pytest.approx([-2, 1, 2, 3, 0])
 

@@ -46,12 +46,12 @@ def test_files_get_the_rights_of_any_new_file(tmp_path: Path, umask_027: None, m
 def test_a_limit_of_cores_is_of_the_work_inside_alone() -> None:
     free = threads.cores()
     elsewhere: list[int] = []
-    with threads.at_most(1):
+    with threads.limit_cores(1):
         other = threading.Thread(target=lambda: elsewhere.append(threads.cores()))
         other.start()
         other.join()
         assert threads.cores() == 1
-        with threads.at_most(free + 1):
+        with threads.limit_cores(free + 1):
             assert threads.cores() == free
         assert threads.cores() == 1
     assert (elsewhere, threads.cores()) == ([free], free)
@@ -60,7 +60,7 @@ def test_a_limit_of_cores_is_of_the_work_inside_alone() -> None:
 def test_work_side_by_side_keeps_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """The threads of `side_by_side` are others than the one that set it."""
     monkeypatch.setattr(threads.os, "sched_getaffinity", lambda _: range(4), raising=False)
-    with threads.at_most(2):
+    with threads.limit_cores(2):
         assert threads.side_by_side(lambda _: threads.cores(), range(4)) == [2, 2, 2, 2]
     assert threads.side_by_side(lambda _: threads.cores(), range(4)) == [4, 4, 4, 4]
 

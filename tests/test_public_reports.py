@@ -15,7 +15,7 @@ import pytest
 import implicam as ic
 from implicam.dataset import Floats
 from implicam.geometry import look_at
-from implicam.row_order import order_of, what_is_wrong
+from implicam.row_order import describe_row_mistake, find_row_order
 
 SIZE = np.array([1920, 1080])
 NOISE = 0.3
@@ -191,8 +191,8 @@ def test_nothing_is_said_of_rows_that_are_right(where: Floats, wild: float) -> N
         somewhere = rng.random(uv.shape[:2]) < wild
         uv[somewhere] = rng.uniform(0, 1000, size=(int(somewhere.sum()), 2))
         for c in range(4):
-            assert order_of(where, uv[:, c]) is None
-            assert what_is_wrong(where, uv[:, c]) == ""
+            assert find_row_order(where, uv[:, c]) is None
+            assert describe_row_mistake(where, uv[:, c]) == ""
 
 
 def test_pictures_of_two_sizes() -> None:
@@ -246,8 +246,8 @@ def test_a_camera_of_half_the_frame_rate() -> None:
     xyz = trajectory(80)
     uv = views(ring(), xyz)
     uv[1::2, 2] = uv[0::2, 2]
-    assert what_is_wrong(xyz, uv[:, 2]).startswith("40 of its 80 pixels are those of the row before")
-    assert what_is_wrong(xyz, uv[:, 1]) == ""
+    assert describe_row_mistake(xyz, uv[:, 2]).startswith("40 of its 80 pixels are those of the row before")
+    assert describe_row_mistake(xyz, uv[:, 1]) == ""
 
 
 def test_positions_from_a_tape_measure() -> None:

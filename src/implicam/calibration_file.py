@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.tables import parse_toml
 from implicam.errors import CalibrationFileError, ImplicamError
-from implicam.files import inflated_bytes, npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
+from implicam.files import max_inflated_bytes, npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
 
 FORMAT_VERSION = 2
 MAX_BYTES = 1 << 31
@@ -168,7 +168,7 @@ def read(path: str | Path) -> Contents:
     if table.get("arrays_sha256") != hashlib.sha256(members[ARRAYS]).hexdigest():
         raise refusal(path, "its arrays are not those it was written with (their SHA-256 differs)")
     # a zip within a zip inflates twice: the bound is that of the outer one
-    most = inflated_bytes(path.stat().st_size)
+    most = max_inflated_bytes(path.stat().st_size)
     arrays = read_npz(members[ARRAYS], lambda reason: refusal(path, reason), most=most)
     for older in range(table["format_version"], FORMAT_VERSION):
         _UPGRADES[older](table, arrays)

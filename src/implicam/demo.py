@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from implicam.calibrators import Calibration, ForwardGP, ForwardGPCalibration, InverseGP
-from implicam.compare import Trial, trial_of
+from implicam.compare import Trial, trial_from_evaluation
 from implicam.dataset import Dataset, folder_files, write_dataset
 from implicam.detect import Ball, DetectionRun, detect_folder
 from implicam.errors import UsageError, import_extra
@@ -190,4 +190,4 @@ def _one(
     seconds = time.perf_counter() - start
     # against the check points only: the known ones that were not drawn are fewer, and differ from row to row
     evaluation = evaluate(calibration, held_out, regions=size == KNOWN)
-    return calibration, evaluation, trial_of(evaluation, method.method, size, method.seed, seconds)
+    return calibration, evaluation, trial_from_evaluation(evaluation, method.method, size, method.seed, seconds)

@@ -1,4 +1,4 @@
-"""Write files whole or not at all; read zip and NumPy files that somebody may have tampered with.
+"""Write files whole or not at all; read zip and NumPy files that may have been tampered with.
 
 Every file is written under a temporary name and then renamed, so that after a crash either the old or the new file is
 there, complete. The sizes that a zip or NumPy file declares are checked *before* memory is allocated; pickle is never
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from implicam.errors import ImplicamError
 
 # A calibration or dataset is stored uncompressed by us, so a member is never larger than its file. Others may
-# deflate: text shrinks perhaps tenfold, while the bombs we refuse shrink a thousandfold. Bzip2 and LZMA may ask for
+# deflate: text shrinks perhaps tenfold, zip bombs a thousandfold. Bzip2 and LZMA may ask for
 # gigabytes before the first byte, and NumPy files are not written with them: they are refused.
 MAX_INFLATION_RATIO = 100
 MIN_INFLATED_BYTES = 1 << 24
@@ -63,11 +63,11 @@ def replacing(path: Path) -> Iterator[Path]:
         ImplicamError: There is a folder of this name, or the system refuses to write.
     """
     path = Path(path)
-    must_be_no_folder(path)
+    refuse_folder(path)
     parent = _existing_folder(path.parent)
-    with failing_to_write(str(path)):
+    with convert_write_errors(str(path)):
         temporary = _partial_path(path, parent)
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # less what the umask takes
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))  # the umask applies
         try:
             yield temporary
             _flush(temporary)
@@ -76,7 +76,7 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def must_be_no_folder(path: Path) -> None:
+def refuse_folder(path: Path) -> None:
     """Check that a file can have a name.
 
     Args:
@@ -96,7 +96,7 @@ def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """As `replacing`, for a folder; an existing one is swapped when all is ready.
 
     Where the system cannot swap two folders in one step, a kill in the instant between two renames leaves the old
-    folder beside its place; `left_behind` finds it, and nothing is lost.
+    folder beside its place; `find_left_behind` finds it, and nothing is lost.
 
     Args:
         path: The folder to write.
@@ -119,7 +119,7 @@ def replacing_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             fix="choose another name, remove it, or add --overwrite",
         )
     parent = _existing_folder(path.parent)
-    with failing_to_write(str(path)):
+    with convert_write_errors(str(path)):
         temporary = _partial_path(path, parent)
         temporary.mkdir()
         try:
@@ -171,7 +171,7 @@ def _partial_path(path: Path, parent: Path) -> Path:
     return parent / f"{_partial_prefix(path)}{secrets.token_hex(4)}"
 
 
-def left_behind(path: Path) -> Path | None:
+def find_left_behind(path: Path) -> Path | None:
     """The old folder that a kill in the middle of `replacing_folder` left behind.
 
     Args:
@@ -192,7 +192,7 @@ def left_behind(path: Path) -> Path | None:
 
 
 @contextmanager
-def failing_to_write(what: str, check: str = "the name, the permissions and the free space") -> Iterator[None]:
+def convert_write_errors(what: str, check: str = "the name, the permissions and the free space") -> Iterator[None]:
     """Turn an error of the system into an ImplicamError that says what to check.
 
     Args:
@@ -303,13 +303,13 @@ def read_zip(source: bytes | Path, refuse: Refuse, *, most: int | None = None) -
         with zipfile.ZipFile(source if isinstance(source, Path) else io.BytesIO(source)) as archive:
             size = source.stat().st_size if isinstance(source, Path) else len(source)
             entries = archive.infolist()
-            _check_directory(entries, size, inflated_bytes(size) if most is None else most, refuse)
+            _check_directory(entries, size, max_inflated_bytes(size) if most is None else most, refuse)
             return {entry.filename: _member(archive, entry) for entry in entries}
     except _ZIP_ERRORS as error:
         raise refuse(f"not a readable zip: {str(error)[:200] or type(error).__name__}") from error
 
 
-def inflated_bytes(size: int) -> int:
+def max_inflated_bytes(size: int) -> int:
     """How many bytes a zip can plausibly hold.
 
     Args:
@@ -332,7 +332,7 @@ def _check_directory(entries: list[zipfile.ZipInfo], size: int, most: int, refus
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    # read() without a number inflates everything first and cuts to the declared size afterwards: a bomb goes off
+    # read() without a number inflates everything before it cuts to the declared size: a zip bomb would fill the memory
     with archive.open(entry) as file:
         content = file.read(entry.file_size)
     if len(content) != entry.file_size:

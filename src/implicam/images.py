@@ -102,7 +102,7 @@ def _read_bytes(path: Path) -> bytes:
         raise ImageError(f"{path} cannot be read.", why=str(error), fix="check the file and its permissions") from error
     if not data:
         raise ImageError(f"{path} is empty.", fix="copy it again from where it was recorded")
-    # Some decoders fill what is missing with grey, and say nothing that a program could hear.
+    # Some decoders fill what is missing with grey and report no error.
     if (data.startswith(_PNG) and b"IEND" not in data) or (data.startswith(_JPEG) and not _ends_jpeg(data)):
         raise ImageError(
             f"{path} is cut off.",

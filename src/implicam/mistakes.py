@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from implicam.dataset import Dataset, Floats
 from implicam.dataset.copies import without_copies
 from implicam.errors import FitError
-from implicam.row_order import MIN_VIEWS, describe_order, order_of
+from implicam.row_order import MIN_VIEWS, describe_order, find_row_order
 
 UNITS = {
     1000.0: "metres and millimetres, say",
@@ -48,7 +48,7 @@ class Finding(NamedTuple):
     cameras: tuple[str, ...] = ()
 
 
-def mistakes_in(data: Dataset) -> list[Finding]:
+def find_mistakes(data: Dataset) -> list[Finding]:
     """What is plainly wrong with known points.
 
     Args:
@@ -64,7 +64,7 @@ def mistakes_in(data: Dataset) -> list[Finding]:
 
 
 @contextmanager
-def mistakes_named(data: Dataset) -> Iterator[None]:
+def explain_fit_error(data: Dataset) -> Iterator[None]:
     """Add to the error of a failing fit which mistake in the data causes it.
 
     A mistake of the whole rig replaces the reason of the error; those of single cameras are added to it.
@@ -78,7 +78,7 @@ def mistakes_named(data: Dataset) -> Iterator[None]:
     try:
         yield
     except FitError as error:
-        found = mistakes_in(data)
+        found = find_mistakes(data)
         grave = [one.reason for one in found if one.grave]
         if grave:
             raise FitError(error.what, why=" ".join(grave), fix="correct them first") from error
@@ -140,7 +140,7 @@ def _spread(uv: Floats) -> float:
 def _other_rows(data: Dataset) -> Iterator[Finding]:
     """Each camera alone: do its views fit the positions of other rows, and not those of their own?"""
     names, uv = data.observations.camera_names, data.observations.uv
-    orders = {name: order for c, name in enumerate(names) if (order := order_of(data.xyz, uv[:, c])) is not None}
+    orders = {name: order for c, name in enumerate(names) if (order := find_row_order(data.xyz, uv[:, c])) is not None}
     judged = sum(np.isfinite(uv[..., 0]).sum(axis=0) >= MIN_VIEWS)
     for rows, count in Counter(order.rows for order in orders.values()).items():
         if count > 0.5 * judged:
@@ -155,10 +155,10 @@ def _other_rows(data: Dataset) -> Iterator[Finding]:
             )
             return
     for name, order in orders.items():
-        yield of_rows(name, describe_order(order))
+        yield row_finding(name, describe_order(order))
 
 
-def of_rows(camera: str, why: str) -> Finding:
+def row_finding(camera: str, why: str) -> Finding:
     """What is wrong with the rows of one camera, as a finding.
 
     Args:

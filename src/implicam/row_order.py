@@ -104,7 +104,7 @@ def describe_moved_camera(row: int) -> str:
     )
 
 
-def order_of(points: Floats, uv: Floats) -> Order | None:
+def find_row_order(points: Floats, uv: Floats) -> Order | None:
     """The order that a camera's pixels are in.
 
     Args:
@@ -147,12 +147,12 @@ def describe_order(order: Order) -> str:
     """The order of one camera in words.
 
     Args:
-        order: As of `order_of`.
+        order: As of `find_row_order`.
     """
     return f"its pixels are {order.how}: put right {order.fit}"
 
 
-def change_of(points: Floats, uv: Floats) -> str:
+def describe_change(points: Floats, uv: Floats) -> str:
     """What is wrong with a camera from some row on, or in some rows.
 
     Args:
@@ -165,8 +165,8 @@ def change_of(points: Floats, uv: Floats) -> str:
     return _repeated(points, uv) or _in_two_parts(points, uv)
 
 
-def what_is_wrong(points: Floats, uv: Floats) -> str:
-    """What is wrong with the rows of a camera that misses its known points: their order, or `change_of`.
+def describe_row_mistake(points: Floats, uv: Floats) -> str:
+    """What is wrong with the rows of a camera that misses its known points: their order, or `describe_change`.
 
     Args:
         points: (n, 3) known points, in the order in which they were seen.
@@ -175,8 +175,8 @@ def what_is_wrong(points: Floats, uv: Floats) -> str:
     Returns:
         It in words; empty where the rows show nothing.
     """
-    order = order_of(points, uv)
-    return change_of(points, uv) if order is None else describe_order(order)
+    order = find_row_order(points, uv)
+    return describe_change(points, uv) if order is None else describe_order(order)
 
 
 def _repeated(points: Floats, uv: Floats) -> str:

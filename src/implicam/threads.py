@@ -24,13 +24,13 @@ _MOST_CORES: ContextVar[int] = ContextVar("_MOST_CORES", default=sys.maxsize)
 
 
 def cores() -> int:
-    """Cores that the work at hand may use: those of this process, or fewer inside `at_most`."""
+    """Cores that the work at hand may use: those of this process, or fewer inside `limit_cores`."""
     own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(own, _MOST_CORES.get())
 
 
 @contextmanager
-def at_most(count: int) -> Iterator[None]:
+def limit_cores(count: int) -> Iterator[None]:
     """Limit the cores of the work inside; work in other threads keeps its own number.
 
     Args:

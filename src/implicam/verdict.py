@@ -1,11 +1,11 @@
 """Is a calibration to be used? A verdict in words, with the reasons and their cures.
 
-The formula for leaving one point out knows the fit that it belongs to, and shares its mistakes: it once believed
-0.0007 mm where the errors were 13 mm. So the method is fitted again from nothing without a part of the known points,
-a few times, and measures those. Beside that stands what can be seen from the data: wrong views, noise, copies, marks.
+The leave-one-out formula uses the fit that it belongs to, and shares its mistakes: it once gave 0.0007 mm where the
+errors were 13 mm. So the method is fitted again from no guess without a part of the known points, a few times, and
+measures those. The data are checked as well: wrong views, noise, copies, marks.
 
-"usable": nothing speaks against it. "doubtful": measure, but look at the reasons first. "not usable": a number from it
-would be worse than none.
+"usable": nothing speaks against it. "doubtful": measure, but look at the reasons first. "not usable": its numbers are
+worse than none.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from implicam.dataset.marks import without_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluation import known_position_covariance
 from implicam.formatting import percent
-from implicam.mistakes import Finding, mistakes_in, of_rows
+from implicam.mistakes import Finding, find_mistakes, row_finding
 from implicam.progress import Progress, silent
 from implicam.rig_model.training_data import stated_noise
-from implicam.row_order import change_of, describe_moved_camera
+from implicam.row_order import describe_change, describe_moved_camera
 
 USABLE, DOUBTFUL, NOT_USABLE = "usable", "doubtful", "not usable"
 
@@ -36,11 +36,11 @@ MIN_QUADRIC_RMS = 0.05
 """Rms of the best quadratic equation at known points, in coordinates of unit variance: with 14 or more points all over
 less was never seen in 2000 draws, two planes good to a hundredth of their distance have 0.03."""
 
-FEW_POINTS = 12
+MIN_RECOMMENDED_POINTS = 12
 """Fewer known points fix a rig, but leave too little to check it by."""
 
-ENOUGH_POINTS = 17
-"""From so many on, a fit that fails without a fifth of them is bad luck and no sign, unless most of them do."""
+MIN_ROBUST_POINTS = 17
+"""From so many on, a fit that fails without a fifth of them says nothing, unless most such fits fail."""
 
 FLAT_RATIO = 0.01
 """Thickness over width of known points that are nearly on a plane, or a line: beyond it nothing is known."""
@@ -61,20 +61,20 @@ MIN_MOVE_SHARE, MIN_VIEWS_IN_PART = 0.5, 4
 """Share of a camera's residuals that a move explains at least: a lens that is not quite understood leaves some that
 depend on the place, and so on the order of a lattice. Views before and after a move."""
 
-MAX_NEES, HOPELESS_NEES = 7.0, 60.0
+MAX_NEES, UNUSABLE_NEES = 7.0, 60.0
 """Mean NEES of held-out points, 3 is right, above which error bars are doubtful, and above which they are nothing."""
 
 USUAL_OUTSIDE_SHARE = 0.15
 """Share of the held-out points outside of their 95 % ellipsoids that is usual: 5 %, and wrong views."""
 
 TRIMMED_SHARE = 0.05
-"""Share of the held-out points, the worst and at least one, that have no say: a wrong view may hide among two."""
+"""Share of the held-out points, the worst and at least one, that do not count: of two views one may be wrong."""
 
 MAX_POINTS_FOR_FIVE_FOLDS = 25
 """Up to so many, a fit without a third of the points would be another calibration: a fifth is left out."""
 
 MIN_JUDGED_POINTS = 6
-"""Held-out points of which something can be said."""
+"""Held-out points that are enough to judge by."""
 
 MAX_RELATIVE_RMS = 0.3
 """rms error of held-out points, in the rms distance of the known points from their middle, that is no measurement."""
@@ -178,14 +178,14 @@ def _held_out(calibration: Calibration, progress: Progress) -> tuple[HeldOut | N
             continue
         found.append(_measured(again, data.select(fold == i)))
     progress("checking", plan.fits, plan.fits)
-    if not found or len(failures) > plan.fits / 2 or (failures and n < ENOUGH_POINTS):
+    if not found or len(failures) > plan.fits / 2 or (failures and n < MIN_ROBUST_POINTS):
         return None, _not_repeatable(n, failures[0]) if failures else []
     how = f"{len(found)} fits from nothing without {'a fifth' if plan.folds == 5 else 'a third'} of the known points"
     return _summary(found, how + (f", at most {plan.max_points} points each" if n > plan.max_points else "")), []
 
 
 def _not_repeatable(n: int, error: ImplicamError) -> list[Finding]:
-    if n < FEW_POINTS:  # said of their number already
+    if n < MIN_RECOMMENDED_POINTS:  # said of their number already
         return []
     return [
         Finding(False, f"Without a few of the known points there is no calibration ({error.what}): add known points.")
@@ -259,7 +259,7 @@ def _of_held_out(found: HeldOut | None, calibration: Calibration, cure: str) -> 
         yield Finding(True, f"{within}: this is no measurement. {_LOOK}")
     elif found.rms > MAX_RELATIVE_RMS * extent:
         yield Finding(False, f"{within}: this is hardly a measurement, as the error bars say. {_LOOK}")
-    elif found.nees > HOPELESS_NEES and found.inside < 0.5:
+    elif found.nees > UNUSABLE_NEES and found.inside < 0.5:
         yield Finding(True, f"{said}, where the error bars say {found.stated:.2g}: they mean nothing. {_LOOK}")
     elif found.nees > MAX_NEES or _beyond(round((1 - found.inside) * found.points), found.points, USUAL_OUTSIDE_SHARE):
         yield Finding(
@@ -302,13 +302,13 @@ def _of_kept_back(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _of_data(data: Dataset) -> Iterator[Finding]:
-    yield from mistakes_in(data)
+    yield from find_mistakes(data)
     copies = copies_of(data)
     seen = ~copies.points & data.observations.seen.any(axis=1)
     n, places = int(seen.sum()), len(np.unique(data.places[seen]))
-    if 0 < places < FEW_POINTS:
+    if 0 < places < MIN_RECOMMENDED_POINTS:
         what = f"{n} known points are" if places == n else f"{n} known points at {places} different positions are"
-        yield Finding(False, f"{what} few: show the cameras {FEW_POINTS} or more, better 17, all over.")
+        yield Finding(False, f"{what} few: show the cameras {MIN_RECOMMENDED_POINTS} or more, better 17, all over.")
     for note in copy_notes(data):
         yield Finding(False, note)
     for note in without_marks(data).notes[len(data.notes) :]:
@@ -337,7 +337,7 @@ def _of_surface(calibration: Calibration) -> Iterator[Finding]:
     data = calibration.data
     xyz = data.xyz[data.observations.seen.any(axis=1)]
     n = len(xyz)
-    if n < FEW_POINTS:
+    if n < MIN_RECOMMENDED_POINTS:
         return
     left, extents, _ = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
     if extents[-1] <= FLAT_RATIO * extents[0]:
@@ -363,8 +363,8 @@ def _of_cameras(calibration: Calibration, explained: set[str]) -> Iterator[Findi
         own = [finding for finding in missed if name in finding.cameras]
         if name in explained or not (own or any(name in finding.cameras for finding in rejected)):
             continue
-        why = change_of(data.xyz, data.observations.uv[:, c]) if data.known is not None else ""
-        yield from [of_rows(name, why)] if why else own
+        why = describe_change(data.xyz, data.observations.uv[:, c]) if data.known is not None else ""
+        yield from [row_finding(name, why)] if why else own
 
 
 def _of_rejected(calibration: Calibration) -> Iterator[Finding]:
@@ -403,7 +403,7 @@ def _of_residuals(calibration: Calibration) -> Iterator[Finding]:
         first = _moved_at(uv[rows, c] - predicted[rows, c])
         if first is not None:
             moved.add(name)
-            yield of_rows(name, describe_moved_camera(int(rows[first])))
+            yield row_finding(name, describe_moved_camera(int(rows[first])))
     medians, stated = _missed_by(calibration)
     declared = _declared(data)
     for c, (name, median, sd) in enumerate(zip(data.observations.camera_names, medians, stated, strict=True)):
@@ -473,7 +473,7 @@ def _moved_at(residual: Floats) -> int | None:
     """The row from which residuals (n, 2) are about another mean than before, in the order in which they were taken:
     where two means explain more than half of them, and chance (F, for any of the rows) would not. None where not."""
     n = len(residual)
-    if n < FEW_POINTS:
+    if n < MIN_RECOMMENDED_POINTS:
         return None
     centred = residual - residual.mean(axis=0)
     total = float(np.sum(centred**2))

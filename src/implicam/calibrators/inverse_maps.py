@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.gp import GaussianProcess, Kriging, LengthscalePrior, Smoothness, most_probable
+from implicam.gp import GaussianProcess, Kriging, LengthscalePrior, Smoothness, maximise_posterior
 from implicam.threads import blas_threads, cores, side_by_side
 
 DEGREES_OF_FREEDOM = 3
@@ -236,7 +236,7 @@ def learn_smooth(
     def one(number: int) -> tuple[Smoothness, Floats]:
         basis, prior = bases[number]
         known = start[0] if start is not None and start[1] == (number == 0) else None
-        return most_probable(X @ basis, Y, H, shape, prior, start=known, anew=anew, seed=seed), basis
+        return maximise_posterior(X @ basis, Y, H, shape, prior, start=known, anew=anew, seed=seed), basis
 
     wanted = range(len(bases))
     if start is not None and not anew:

@@ -14,7 +14,7 @@ from implicam.calibration_file import package_version
 from implicam.calibrators import DEFAULT_METHOD
 from implicam.dataset import Dataset, read_dataset
 from implicam.errors import UsageError, import_extra
-from implicam.files import must_be_no_folder
+from implicam.files import refuse_folder
 
 app = typer.Typer(
     name="implicam",
@@ -112,7 +112,7 @@ def must_be_folder(path: Path) -> None:
 
 def must_be_calibration(output: Path) -> None:
     """An error where the name does not end as that of a calibration, or is that of a folder."""
-    must_be_no_folder(output)
+    refuse_folder(output)
     if output.suffix.lower() != CALIBRATION_SUFFIX:
         raise UsageError(
             f"{output} is no name for a calibration.", fix=f"end it in {CALIBRATION_SUFFIX}: -o {output.stem}.implicam"

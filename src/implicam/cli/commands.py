@@ -50,7 +50,7 @@ from implicam.cli.options import OptionsOfParts, calibrator_from_options, option
 from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
-from implicam.files import must_be_no_folder, toml_text
+from implicam.files import refuse_folder, toml_text
 from implicam.formatting import decimal_number, percent
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
@@ -159,7 +159,7 @@ def measure_command(
     json: Json = False,
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
-    must_be_no_folder(output)
+    refuse_folder(output)
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
@@ -233,7 +233,7 @@ def _evaluate(
     _check_evaluate(dataset, cv, leave_out, given)
     if report is not None:
         need_plotly()
-        must_be_no_folder(report)
+        refuse_folder(report)
         must_not_replace(report, file, dataset)
     with show.progress(json) as progress:
         if dataset is not None:
@@ -324,7 +324,7 @@ def report_command(
 ) -> None:
     """Write a one-page HTML report with an interactive 3D view."""
     need_plotly()
-    must_be_no_folder(output)
+    refuse_folder(output)
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     with show.progress(json) as progress:

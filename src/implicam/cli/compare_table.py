@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from rich.table import Table
 
 from implicam.cli.show import text_table
-from implicam.compare import RANDOM, SHOT, Row, Trial, plane_of
+from implicam.compare import RANDOM, SHOT, Row, Trial, plane_axis
 from implicam.formatting import decimal_number
 
 
@@ -42,7 +42,7 @@ class _CompareColumns:
     def needed(cls, rows: Sequence[Row]) -> _CompareColumns:
         means = [row.mean for row in rows]
         common = [(mean["rmse_common"], mean["rmse"]) for mean in means if math.isfinite(mean["rmse_common"])]
-        planes = any(plane_of(row.split) for row in rows)
+        planes = any(plane_axis(row.split) for row in rows)
         return cls(
             planes,
             not planes or len({row.known for row in rows}) > 1,
@@ -71,7 +71,7 @@ def _by_method(rows: Sequence[Row], columns: _CompareColumns) -> list[list[str]]
         cells.append([method, *[""] * (len(columns.headings("")) - 1)])
         at_random = next((row.mean["rmse"] for row in group if row.split == RANDOM), math.nan)
         for row in group:
-            name = f"  {plane_of(row.split)} planes" if plane_of(row.split) else "  random"
+            name = f"  {plane_axis(row.split)} planes" if plane_axis(row.split) else "  random"
             cells.append([name, *_compare_cells(row, columns, row.mean["rmse"] / at_random)])
     return cells
 
@@ -95,7 +95,7 @@ def _compare_cells(row: Row, columns: _CompareColumns, lattice_bias: float = mat
         *([decimal_number(100 * mean["measured"])] if columns.partial else []),
         _plus_minus(mean["rmse"], error["rmse"]),
         *([decimal_number(mean["rmse_common"])] if columns.uneven else []),
-        *([decimal_number(lattice_bias, 2) if plane_of(row.split) else ""] if columns.planes else []),
+        *([decimal_number(lattice_bias, 2) if plane_axis(row.split) else ""] if columns.planes else []),
         *([decimal_number(mean["rmse_over_limit"])] if columns.limited else []),
         _plus_minus(100 * mean["ellipsoid_95"], 100 * error["ellipsoid_95"]),
         decimal_number(mean["nees"]),

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from implicam.calibrators import Calibrator
-from implicam.compare.splits import RANDOM, SHOT, Split, plane_of, plane_splits, random_splits, shot_splits
+from implicam.compare.splits import RANDOM, SHOT, Split, plane_axis, plane_splits, random_splits, shot_splits
 from implicam.compare.summary import NUMBERS, Row, as_json, mean_and_error, summarise
-from implicam.compare.trials import Trial, compare_on, fit_each, judge, trial_of
+from implicam.compare.trials import Trial, compare_on, fit_each, judge, trial_from_evaluation
 from implicam.dataset import Dataset
 from implicam.progress import Progress, silent
 
@@ -62,10 +62,10 @@ __all__ = [
     "fit_each",
     "judge",
     "mean_and_error",
-    "plane_of",
+    "plane_axis",
     "plane_splits",
     "random_splits",
     "shot_splits",
     "summarise",
-    "trial_of",
+    "trial_from_evaluation",
 ]

@@ -52,7 +52,7 @@ class Split:
         return self.kind, 0 if self.all_others else len(self.train)
 
 
-def plane_of(kind: str) -> str:
+def plane_axis(kind: str) -> str:
     """The coordinate that the held-out points of a kind of split share.
 
     Args:
@@ -118,7 +118,7 @@ def shot_splits(data: Dataset, sizes: Sequence[int] | None = None, *, most: int 
             f"each of the {len(data)} points of {data.name!r} is a shot of its own, so leaving a shot out leaves out "
             "one point.",
             why="only points of one exposure (a board, a plate) share errors that a random split would hide",
-            fix="leave out --leave-out: random splits are as honest here",
+            fix="leave out --leave-out: random splits are as good here",
         )
     held_out = [(name, data.shots == name) for name in _at_most(most, names)]
     return _leave_out(SHOT, data, held_out, sizes)
@@ -236,6 +236,6 @@ def _no_lattice(data: Dataset) -> DatasetError:
         f"by {MIN_POINTS_PER_PLANE} points or more within {MAX_PLANE_THICKNESS:g} of the extent. Planes are looked for "
         "across x, y and z of the "
         "world only, not across a lattice that stands at an angle",
-        fix="leave out --lattice: away from a lattice a random split flatters nobody; or --leave-out shot, where each "
+        fix="leave out --lattice: away from a lattice a random split has no such bias; or --leave-out shot, where each "
         "plane is a shot",
     )

@@ -235,11 +235,11 @@ def _judge(name: str, split: Split, fit: Calibration | ImplicamError, seconds: f
         evaluation = evaluate(fit, split.held_out, regions=False)
     except (FitError, NumericalError) as error:
         return _Judged(replace(blank, failure=error.what), {})
-    trial = replace(trial_of(evaluation, name, len(split.train), split.seed, seconds), **known)
+    trial = replace(trial_from_evaluation(evaluation, name, len(split.train), split.seed, seconds), **known)
     return _Judged(trial, _squared(evaluation))
 
 
-def trial_of(evaluation: Evaluation, name: str, known: int, seed: int, seconds: float) -> Trial:
+def trial_from_evaluation(evaluation: Evaluation, name: str, known: int, seed: int, seconds: float) -> Trial:
     """The numbers of an evaluation that a comparison shows.
 
     Args:
@@ -286,12 +286,12 @@ def _squared(evaluation: Evaluation) -> dict[str, float]:
 
 def _with_common(judged: Mapping[str, list[_Judged]]) -> list[Trial]:
     """The trials of a cell by split, each with the error at the points that all methods measured."""
-    have_a_say = [k for k, trials in enumerate(judged.values()) if any(one.squared for one in trials)]
+    counting = [k for k, trials in enumerate(judged.values()) if any(one.squared for one in trials)]
     trials: list[Trial] = []
     for row in zip(*judged.values(), strict=True):
-        measured = [row[k].squared.keys() for k in have_a_say]
+        measured = [row[k].squared.keys() for k in counting]
         common = set.intersection(*map(set, measured)) if measured else set()
-        trials += [_at(one, common) if k in have_a_say else one.trial for k, one in enumerate(row)]
+        trials += [_at(one, common) if k in counting else one.trial for k, one in enumerate(row)]
     return trials
 
 

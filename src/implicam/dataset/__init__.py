@@ -31,7 +31,7 @@ from implicam.dataset.wide import (
     write_wide_csv,
 )
 from implicam.errors import DatasetError
-from implicam.files import left_behind
+from implicam.files import find_left_behind
 
 __all__ = [
     "TRUTH_COLUMNS",
@@ -94,7 +94,7 @@ def _read(path: Path, unit: str | None) -> Dataset:
         return read_parquet(path)
     if suffix == ".npz":
         return read_npz_dataset(path)
-    old = left_behind(path)
+    old = find_left_behind(path)
     if old:
         raise DatasetError(
             f"{path} does not exist.", why="a program was killed while replacing it", fix=f"rename {old} to {path.name}"

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, Protocol
 
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.experiments.stored import encode
-from implicam.threads import at_most
+from implicam.threads import limit_cores
 
 CONNECT_SECONDS = 10
 POLL_SECONDS = 5  # waiting for results, ask so often whether any can come
@@ -107,7 +107,7 @@ def _one_thread() -> Iterator[None]:
     if torch:
         torch.set_num_threads(1)
     try:
-        with threadpool_limits(limits=1), at_most(1):
+        with threadpool_limits(limits=1), limit_cores(1):
             yield
     finally:
         if torch:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from implicam.compare import RANDOM, mean_and_error, plane_of
+from implicam.compare import RANDOM, mean_and_error, plane_axis
 from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.figures.printed import PURPOSE, new_figure, place_legend, plain_log, style_axes, values
@@ -143,8 +143,8 @@ def _points(row: Row) -> int:
 
 
 def _called(kind: str) -> str:
-    if plane_of(kind):
-        return f"planes across {plane_of(kind)} left out"
+    if plane_axis(kind):
+        return f"planes across {plane_axis(kind)} left out"
     return "random splits" if kind == RANDOM else "shots left out"
 
 

@@ -2,7 +2,7 @@
 
 from implicam.gp.fit import Fit, maximise, maximise_each
 from implicam.gp.kernels import SHAPES, Floats, Kernel
-from implicam.gp.kriging import Kriging, LengthscalePrior, Smoothness, most_probable
+from implicam.gp.kriging import Kriging, LengthscalePrior, Smoothness, maximise_posterior
 from implicam.gp.regression import GaussianProcess
 
 __all__ = [
@@ -16,5 +16,5 @@ __all__ = [
     "Smoothness",
     "maximise",
     "maximise_each",
-    "most_probable",
+    "maximise_posterior",
 ]

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from implicam.errors import NumericalError
-from implicam.gp.fit import LONGEST, Fit
+from implicam.gp.fit import MAX_LENGTHSCALE_SDS, Fit
 from implicam.gp.kernels import SHAPES, Floats, Kernel, squared_distances
 from implicam.gp.linalg import cholesky, solve
 from implicam.threads import side_by_side
@@ -135,7 +135,9 @@ def _search(likelihood: CoregionalisedLikelihood, shape: str, start: Fit, shorte
     X, Y = likelihood.X, likelihood.Y
     (n, d), m = X.shape, Y.shape[1]
     low = np.concatenate([np.full(d, np.log(shortest)), np.full(m, np.log(MIN_SIGNAL)), np.full(m * m, -np.inf)])
-    high = np.concatenate([np.full(d, np.log(LONGEST)), np.full(m, np.log(MAX_SIGNAL)), np.full(m * m, np.inf)])
+    high = np.concatenate(
+        [np.full(d, np.log(MAX_LENGTHSCALE_SDS)), np.full(m, np.log(MAX_SIGNAL)), np.full(m * m, np.inf)]
+    )
     lengths = np.clip(np.log(start.kernel.lengthscale), low[:d], high[:d])
     ratio = start.noise_variance / start.kernel.signal_variance
     A = Kernel(shape, 1.0, np.exp(lengths))(X, X)

@@ -26,7 +26,7 @@ from implicam.gp.kernels import SHAPES, Floats, Kernel, squared_distances
 from implicam.gp.linalg import cholesky, factor_in_place, invert_in_place, solve
 from implicam.threads import side_by_side
 
-LONGEST, SHORTEST = 1e6, 0.05  # default lengthscale bounds, in standard deviations of an input
+MAX_LENGTHSCALE_SDS, MIN_LENGTHSCALE_SDS = 1e6, 0.05  # default lengthscale bounds, in standard deviations of an input
 MAX_START_LENGTHSCALE_SDS = 30.0  # beyond this a lengthscale has next to no gradient: a search must not start there
 MAX_NOISE_RATIO = 10.0  # largest noise-to-signal ratio
 SEARCH_SUBSET_POINTS = 80
@@ -156,7 +156,7 @@ def maximise(
     y: Floats,
     shape: str = "squared-exponential",
     *,
-    shortest: float = SHORTEST,
+    shortest: float = MIN_LENGTHSCALE_SDS,
     start: Fit | None = None,
     seed: int = 0,
 ) -> Fit:
@@ -184,7 +184,7 @@ def maximise_each(
     Y: Floats,
     shape: str = "squared-exponential",
     *,
-    shortest: float = SHORTEST,
+    shortest: float = MIN_LENGTHSCALE_SDS,
     seed: int = 0,
     done: Callable[[int, int], None] = lambda done, of: None,
     starts: Sequence[Fit] = (),
@@ -275,7 +275,7 @@ class _Search:
         # Below this ratio rounding, about n times 1e-16, would make the Cholesky fail.
         quietest = max(1e-12, 20 * n * np.finfo(float).eps)
         self.low = np.append(np.full(d, np.log(shortest)), np.log(quietest))
-        self.high = np.append(np.full(d, np.log(LONGEST)), np.log(MAX_NOISE_RATIO))
+        self.high = np.append(np.full(d, np.log(MAX_LENGTHSCALE_SDS)), np.log(MAX_NOISE_RATIO))
         self.evaluations: dict[int, int] = {}
         self.converged = True
 
@@ -291,7 +291,7 @@ class _Search:
 
         The lower bound holds at the end only, because the way there may lead through shorter ones.
         """
-        bound, self.low = self.low, np.minimum(self.low, np.log(SHORTEST))
+        bound, self.low = self.low, np.minimum(self.low, np.log(MIN_LENGTHSCALE_SDS))
         self.low[-1] = bound[-1]
         theta, value = self._descend(self.all_data, self._isotropic(1.0, 1e-4), whiten=False)
         self.low = bound

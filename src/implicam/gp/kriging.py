@@ -158,7 +158,7 @@ class Smoothness:
     value: float = np.nan
 
 
-def most_probable(
+def maximise_posterior(
     X: Floats,
     Y: Floats,
     H: Floats,

@@ -50,7 +50,7 @@ def _reason(K: Floats, info: int) -> NumericalError:
     )
 
 
-def routine(name: str, arguments: int) -> Any:
+def load_routine(name: str, arguments: int) -> Any:
     """A LAPACK routine, by the pointer that SciPy publishes for C callers.
 
     Args:
@@ -65,7 +65,7 @@ def routine(name: str, arguments: int) -> Any:
     return prototype(get_pointer(capsule, get_name(capsule)))
 
 
-_DPOTRF, _DPOTRI, _DTRTRS = routine("dpotrf", 5), routine("dpotri", 5), routine("dtrtrs", 10)
+_DPOTRF, _DPOTRI, _DTRTRS = load_routine("dpotrf", 5), load_routine("dpotri", 5), load_routine("dtrtrs", 10)
 
 
 def address(A: Floats) -> int:

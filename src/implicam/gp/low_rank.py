@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.gp.kernels import Floats, Kernel
-from implicam.gp.linalg import address, cholesky, routine, solve_lower
+from implicam.gp.linalg import address, cholesky, load_routine, solve_lower
 
-MAX_DRAWN = 1000
+MAX_CANDIDATE_POINTS = 1000
 """Points of many among which the inducing points are looked for; drawn at random but always the same."""
 
-_DPSTRF = routine("dpstrf", 9)
+_DPSTRF = load_routine("dpstrf", 9)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,14 @@ class LowRank:
 
         Args:
             kernel: Of unit variance.
-            X: (n, d) points; of more than `MAX_DRAWN`, as many are drawn at random but always the same.
+            X: (n, d) points; of more than `MAX_CANDIDATE_POINTS`, as many are drawn at random but always the same.
             tolerance: The variance that may be left.
         """
-        drawn = X if len(X) <= MAX_DRAWN else X[np.random.default_rng(0).choice(len(X), MAX_DRAWN, replace=False)]
+        drawn = (
+            X
+            if len(X) <= MAX_CANDIDATE_POINTS
+            else X[np.random.default_rng(0).choice(len(X), MAX_CANDIDATE_POINTS, replace=False)]
+        )
         pivots, _ = pivoted_cholesky(kernel(drawn, drawn), tolerance)
         return cls(kernel, drawn[pivots])
 

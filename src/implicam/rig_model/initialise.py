@@ -20,7 +20,7 @@ from implicam.rig_model.field import empty_field
 from implicam.rig_model.general_camera import AnyCamera
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import MIN_POINTS_PER_CAMERA, TrainingData, pixel_extent
-from implicam.row_order import what_is_wrong
+from implicam.row_order import describe_row_mistake
 from implicam.threads import side_by_side
 
 ENOUGH_VIEWS = 12
@@ -216,7 +216,7 @@ def _explain_rows(training: TrainingData, c: int) -> str:
     seen = training.camera_views[c]
     uv = np.full((len(training.points), 2), np.nan)
     uv[seen.rows] = seen.uv
-    why = what_is_wrong(training.points, uv)
+    why = describe_row_mistake(training.points, uv)
     return f" {why[0].upper()}{why[1:]}." if why else ""
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from implicam.dataset import Camera, Dataset, folder_files
 from implicam.dataset.folder import DESCRIPTION, IMAGES, POINTS, VIEWS, description_text
 from implicam.errors import DatasetError, ImageError, ImplicamError, UsageError
-from implicam.files import failing_to_write, replacing
+from implicam.files import convert_write_errors, replacing
 from implicam.images import Grey, write_picture
 from implicam.session.database import DATABASE
 
@@ -40,7 +40,7 @@ def writing_into(folder: Path) -> AbstractContextManager[None]:
     Args:
         folder: Named in the error.
     """
-    return failing_to_write(f"into {folder}", "the permissions and the free space")
+    return convert_write_errors(f"into {folder}", "the permissions and the free space")
 
 
 def stale_tables(folder: Path, data: Dataset | None, empty: Dataset) -> dict[str, str]:

@@ -18,8 +18,8 @@ from implicam.geometry import Pose, rotation_from_vector
 from implicam.lenses import Lens, focal_lengths
 from implicam.simulate.window import Window
 
-WAVES = 64
-RANGE = 0.6
+WAVE_COUNT = 64
+LENGTH_SCALE_HALF_DIAGONALS = 0.6
 """Length scale of the smooth error, in half image diagonals."""
 
 
@@ -80,9 +80,9 @@ def random_error(rng: np.random.Generator, width: int, height: int, rms: float) 
         height: Of the image, pixels.
         rms: Its root mean square over the image, in pixels, in u and in v.
     """
-    frequencies = rng.normal(size=(WAVES, 2)) / (RANGE * 0.5 * np.hypot(width, height))
-    phases = rng.uniform(0, 2 * np.pi, WAVES)
-    amplitudes = rng.normal(size=(WAVES, 2))
+    frequencies = rng.normal(size=(WAVE_COUNT, 2)) / (LENGTH_SCALE_HALF_DIAGONALS * 0.5 * np.hypot(width, height))
+    phases = rng.uniform(0, 2 * np.pi, WAVE_COUNT)
+    amplitudes = rng.normal(size=(WAVE_COUNT, 2))
     pixels = _pixel_grid(width, height)
     waves = np.cos(pixels @ frequencies.T + phases) @ amplitudes
     affine = np.linalg.lstsq(_affine_basis(pixels), waves)[0]
@@ -155,7 +155,7 @@ class SimulatedCamera:
             along = _projected_slope(self._tilting, uv) @ along
             uv, _ = _projected(self._tilting, uv)
         if self.mirrored:
-            along = along * MIRROR
+            along = along * MIRROR_SIGNS
         if self.window is not None:
             along = along @ self.window.jacobian(self.camera_from_world.apply(xyz))
         bend = np.eye(2) + self.error.jacobian(uv)
@@ -176,14 +176,14 @@ class SimulatedCamera:
         if self._tilting is not None:
             uv, _ = _projected(np.asarray(np.linalg.inv(self._tilting), dtype=np.float64), uv)
         rays, valid = self.lens.ray_from_pixel(uv)
-        return rays * MIRROR if self.mirrored else rays, valid
+        return rays * MIRROR_SIGNS if self.mirrored else rays, valid
 
     def _before_lens(self, xyz: Floats) -> Floats:
         """Where world points (n, 3) seem to be to the lens, in the camera frame."""
         points = self.camera_from_world.apply(xyz)
         if self.window is not None:
             points, _ = self.window.apparent(points)
-        return points * MIRROR if self.mirrored else points
+        return points * MIRROR_SIGNS if self.mirrored else points
 
     @cached_property
     def _tilting(self) -> Floats | None:
@@ -200,8 +200,8 @@ class SimulatedCamera:
         return np.asarray(intrinsics @ ray_to_plane @ np.linalg.inv(intrinsics), dtype=np.float64)
 
 
-MIRROR = np.array([-1.0, 1.0, 1.0])
-"""What a mirror does to the camera frame."""
+MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])
+"""Signs of x, y, z in the camera frame after a mirror."""
 
 
 def _projected(homography: Floats, uv: Floats) -> tuple[Floats, NDArray[np.bool_]]:

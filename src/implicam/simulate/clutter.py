@@ -6,7 +6,7 @@ import numpy as np
 
 from implicam.images import Grey, opencv
 
-THINGS, LOOK_ALIKES = 24, 14
+CLUTTER_COUNT, LOOK_ALIKE_COUNT = 24, 14
 
 
 def background(width: int, height: int, rng: np.random.Generator, *, clutter: bool = True) -> Grey:
@@ -29,14 +29,14 @@ def background(width: int, height: int, rng: np.random.Generator, *, clutter: bo
     cv2 = opencv()
     coarse = rng.normal(scale=0.05, size=(height // 40 + 2, width // 40 + 2)).astype(np.float32)
     wall = wall + cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-    for _ in range(THINGS):
-        _draw_thing(wall, rng)
-    for _ in range(LOOK_ALIKES):
+    for _ in range(CLUTTER_COUNT):
+        _draw_clutter(wall, rng)
+    for _ in range(LOOK_ALIKE_COUNT):
         _draw_look_alike(wall, rng)
     return np.asarray(np.clip(wall, 0.03, 0.95), np.float32)
 
 
-def _draw_thing(wall: Grey, rng: np.random.Generator) -> None:
+def _draw_clutter(wall: Grey, rng: np.random.Generator) -> None:
     """A cable, a box, a bracket."""
     cv2 = opencv()
     height, width = wall.shape

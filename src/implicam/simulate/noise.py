@@ -18,7 +18,7 @@ from implicam.simulate.targets import Target, held_boards
 
 Bools = NDArray[np.bool_]
 
-GRAZING = np.cos(np.radians(80.0))
+MIN_FACING_COSINE = np.cos(np.radians(80.0))
 """A board seen more obliquely than 80° is not detected."""
 
 
@@ -218,7 +218,7 @@ def _is_facing(camera: SimulatedCamera, target: Target) -> Bools:
         return np.ones(len(target.xyz), dtype=np.bool_)
     to_camera = camera.camera_from_world.centre - target.xyz
     cos = np.sum(to_camera * target.facing, axis=1) / np.linalg.norm(to_camera, axis=1)
-    return np.asarray(cos > GRAZING, dtype=np.bool_)
+    return np.asarray(cos > MIN_FACING_COSINE, dtype=np.bool_)
 
 
 def _known_positions(target: Target, robot_noise: float, rng: np.random.Generator, limit: Floats) -> KnownPositions:

@@ -23,11 +23,11 @@ from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.clutter import background
 from implicam.simulate.noise import Bools, simulate, views
 from implicam.simulate.rigs import Rig
-from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, Thing
+from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, ShownObject
 from implicam.simulate.targets import Target
 from implicam.threads import side_by_side
 
-RAYS = 2
+RAYS_PER_PIXEL_SIDE = 2
 """Rays per pixel in each direction."""
 
 BALL_RADIUS_MM = 8.0
@@ -63,7 +63,7 @@ class Optics:
                 raise UsageError(f"{what} = {value} is out of range.", fix=f"for example {what} = {0.3:g}")
 
 
-class Cover(NamedTuple):
+class Occluder(NamedTuple):
     """A bar in front of the target, with round ends.
 
     Attributes:
@@ -141,7 +141,7 @@ class Studio:
         visible = visible.copy()
         for c in range(len(self.rig.cameras)):
             for s, shot in enumerate(self.shots):
-                cover = self._place_cover(c, s)
+                cover = self._place_occluder(c, s)
                 if cover is not None:
                     rows = self.target.shots == shot
                     visible[rows, c] &= cover.distance(uv[rows, c]) > 0
@@ -219,11 +219,11 @@ class Studio:
         if self.target.board is None:
             return {"kind": "ball", "radius": self.ball_radius_mm * self.rig.units_per_mm}
         rows, columns = self.target.board
-        thing = self.thing(0)
+        thing = self.shown_object(0)
         assert isinstance(thing, Checkerboard)
         return {"kind": "board", "rows": rows, "columns": columns, "square": float(np.linalg.norm(thing.right))}
 
-    def thing(self, shot: int) -> Thing:
+    def shown_object(self, shot: int) -> ShownObject:
         """The object that the cameras see in a shot.
 
         Args:
@@ -273,11 +273,11 @@ class Studio:
             columns.append(towards @ self._towards_cameras > 0.17 * np.linalg.norm(towards, axis=1))
         return np.stack(columns, axis=1)
 
-    def _place_cover(self, camera: int, shot: int) -> Cover | None:
+    def _place_occluder(self, camera: int, shot: int) -> Occluder | None:
         rng = np.random.default_rng([self.seed, 8, camera, shot])
         if rng.random() >= self.covered:
             return None
-        thing = self.thing(shot)
+        thing = self.shown_object(shot)
         uv, _ = self.rig.cameras[camera].pixel_from_world(thing.reach())
         middle = np.nanmean(uv, axis=0)
         size = float(np.nanmax(np.linalg.norm(uv - middle, axis=1)))
@@ -285,34 +285,38 @@ class Studio:
         along = size * np.array([np.cos(angle), np.sin(angle)])
         if isinstance(thing, Ball):
             (middle,), _ = self.rig.cameras[camera].pixel_from_world(thing.centre[None])
-            return Cover(middle - along, middle + along, 0.35 * size)
+            return Occluder(middle - along, middle + along, 0.35 * size)
         middle = middle + rng.normal(scale=0.25 * size, size=2)
-        return Cover(middle - along, middle + along, float(rng.uniform(0.1, 0.35)) * size)
+        return Occluder(middle - along, middle + along, float(rng.uniform(0.1, 0.35)) * size)
 
     def _compose(self, camera: int, shot: int) -> Grey:
-        look, thing = self._looks[camera], self.thing(shot)
+        look, thing = self._looks[camera], self.shown_object(shot)
         picture = look.blurred.copy()
-        cover = self._place_cover(camera, shot)
+        cover = self._place_occluder(camera, shot)
         box = self._find_patch(camera, thing, cover)
         if box is None:
             return _cut_padding(picture)
         top, bottom, left, right = box
         window = slice(top, bottom), slice(left, right)
         cv2 = opencv()
-        fine = ((right - left) * RAYS, (bottom - top) * RAYS)
+        fine = ((right - left) * RAYS_PER_PIXEL_SIDE, (bottom - top) * RAYS_PER_PIXEL_SIDE)
         ground = cv2.resize(look.sharp[window], fine, interpolation=cv2.INTER_LINEAR)
         directions = cv2.resize(look.directions[window], fine, interpolation=cv2.INTER_LINEAR)
         patch = thing.paint(Rays(look.camera.camera_from_world.centre, directions), ground)
         if cover is not None:
-            patch = _paint_cover(patch, cover, (left, top))
+            patch = _paint_occluder(patch, cover, (left, top))
         if self.optics.blur > 0:
-            patch = cv2.GaussianBlur(patch, (0, 0), self.optics.blur * RAYS)
+            patch = cv2.GaussianBlur(patch, (0, 0), self.optics.blur * RAYS_PER_PIXEL_SIDE)
         small = cv2.resize(patch, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
-        inner = slice(_MARGIN, -_MARGIN)  # what the blur took from beyond the patch's edge is not wanted
-        picture[top + _MARGIN : bottom - _MARGIN, left + _MARGIN : right - _MARGIN] = small[inner, inner]
+        inner = slice(
+            _PATCH_MARGIN_PX, -_PATCH_MARGIN_PX
+        )  # what the blur took from beyond the patch's edge is not wanted
+        picture[
+            top + _PATCH_MARGIN_PX : bottom - _PATCH_MARGIN_PX, left + _PATCH_MARGIN_PX : right - _PATCH_MARGIN_PX
+        ] = small[inner, inner]
         return _cut_padding(picture)
 
-    def _find_patch(self, camera: int, thing: Thing, cover: Cover | None) -> tuple[int, int, int, int] | None:
+    def _find_patch(self, camera: int, thing: ShownObject, cover: Occluder | None) -> tuple[int, int, int, int] | None:
         """The patch of the padded picture that shows the target: top, bottom, left, right."""
         view = self.rig.cameras[camera]
         uv, _ = view.pixel_from_world(_densify(thing.reach()))
@@ -322,10 +326,13 @@ class Studio:
         uv = uv[np.isfinite(uv).all(axis=1)]
         if len(uv) == 0:
             return None
-        rim = 2 * _MARGIN
-        low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - rim, -PAD) + PAD
-        high = np.minimum(np.ceil(uv.max(axis=0)).astype(int) + rim, [view.width + PAD, view.height + PAD]) + PAD
-        if (high - low < 3 * _MARGIN).any():
+        rim = 2 * _PATCH_MARGIN_PX
+        low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - rim, -PADDING_PX) + PADDING_PX
+        high = (
+            np.minimum(np.ceil(uv.max(axis=0)).astype(int) + rim, [view.width + PADDING_PX, view.height + PADDING_PX])
+            + PADDING_PX
+        )
+        if (high - low < 3 * _PATCH_MARGIN_PX).any():
             return None
         return int(low[1]), int(high[1]), int(low[0]), int(high[0])
 
@@ -408,20 +415,22 @@ def record(
     return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, visible=visible, extra=described), studio)
 
 
-PAD = 16
+PADDING_PX = 16
 """Pixels around the picture that are rendered too, so that a target may be cut by its edge."""
 
-_MARGIN = 4
+_PATCH_MARGIN_PX = 4
 
 
 class _Look:
-    """What of a camera's pictures never changes: lines of sight, background (sharp and blurred), vignetting."""
+    """What is the same in all pictures of a camera: lines of sight, background (sharp and blurred), vignetting."""
 
     def __init__(self, camera: SimulatedCamera, optics: Optics, rng: np.random.Generator) -> None:
         cv2 = opencv()
         self.camera = camera
         self.directions = lines_of_sight(camera)
-        self.sharp = np.pad(background(camera.width, camera.height, rng, clutter=optics.clutter), PAD, mode="edge")
+        self.sharp = np.pad(
+            background(camera.width, camera.height, rng, clutter=optics.clutter), PADDING_PX, mode="edge"
+        )
         self.blurred = cv2.GaussianBlur(self.sharp, (0, 0), optics.blur) if optics.blur > 0 else self.sharp
         v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
         middle = np.array([camera.width - 1, camera.height - 1]) / 2
@@ -439,10 +448,10 @@ def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
         camera: The camera; without a window.
 
     Returns:
-        (height + 2 PAD, width + 2 PAD, 3) unit vectors in the world.
+        (height + 2 PADDING_PX, width + 2 PADDING_PX, 3) unit vectors in the world.
     """
     size = np.array([camera.width, camera.height])
-    us, vs = (np.linspace(-PAD, n - 1 + PAD, (n + 2 * PAD) // 8 + 2) for n in size)
+    us, vs = (np.linspace(-PADDING_PX, n - 1 + PADDING_PX, (n + 2 * PADDING_PX) // 8 + 2) for n in size)
     grid = np.stack(np.meshgrid(us, vs), axis=2).reshape(-1, 2)
     straight = grid.copy()
     for _ in range(6):  # the smooth error changes by less than a per cent from pixel to pixel
@@ -453,17 +462,17 @@ def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
         straight[~seen] = middle + 0.98 * (straight[~seen] - middle)
         rays[~seen], seen[~seen] = camera.ray_from_pixel(straight[~seen])
     directions = (rays @ camera.camera_from_world.rotation).reshape(len(vs), len(us), 3)
-    u, v = np.arange(-PAD, size[0] + PAD), np.arange(-PAD, size[1] + PAD)
+    u, v = np.arange(-PADDING_PX, size[0] + PADDING_PX), np.arange(-PADDING_PX, size[1] + PADDING_PX)
     planes = [RectBivariateSpline(vs, us, directions[:, :, k])(v, u) for k in range(3)]
     return np.stack(planes, axis=2).astype(np.float32)
 
 
-def _paint_cover(patch: Grey, cover: Cover, corner: tuple[int, int]) -> Grey:
+def _paint_occluder(patch: Grey, cover: Occluder, corner: tuple[int, int]) -> Grey:
     rows, columns = patch.shape
-    u = (np.arange(columns) + 0.5) / RAYS - 0.5 + corner[0] - PAD
-    v = (np.arange(rows) + 0.5) / RAYS - 0.5 + corner[1] - PAD
+    u = (np.arange(columns) + 0.5) / RAYS_PER_PIXEL_SIDE - 0.5 + corner[0] - PADDING_PX
+    v = (np.arange(rows) + 0.5) / RAYS_PER_PIXEL_SIDE - 0.5 + corner[1] - PADDING_PX
     outside = cover.distance(np.stack(np.meshgrid(u, v), axis=2))
-    part = np.clip(0.5 - outside * RAYS, 0, 1)
+    part = np.clip(0.5 - outside * RAYS_PER_PIXEL_SIDE, 0, 1)
     return np.asarray(patch + part * (0.3 - patch), np.float32)
 
 
@@ -475,4 +484,4 @@ def _densify(points: Floats) -> Floats:
 
 
 def _cut_padding(padded: Grey) -> Grey:
-    return padded[PAD:-PAD, PAD:-PAD]
+    return padded[PADDING_PX:-PADDING_PX, PADDING_PX:-PADDING_PX]

@@ -202,7 +202,7 @@ class Checkerboard:
         return np.array([self.corner + i * self.right + j * self.down for i, j in ends])
 
 
-Thing = Ball | Checkerboard
+ShownObject = Ball | Checkerboard
 
 
 def _across(normal: Floats) -> tuple[Floats, Floats]:

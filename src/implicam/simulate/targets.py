@@ -137,8 +137,8 @@ def held_boards(
     return Target("boards", points, shots, np.concatenate(positions), np.concatenate(facing), corners, takes)
 
 
-TRIES = 1500
-"""Places and tilts that are tried for a board; of neighbours on a bar one in a hundred will do."""
+POSE_TRIAL_COUNT = 1500
+"""Places and tilts that are tried for a board; for neighbours on a bar one in a hundred is good."""
 
 
 def _hold_board(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> tuple[Floats, Floats]:
@@ -160,10 +160,10 @@ def _hold_board(flat: Floats, cameras: Sequence[SimulatedCamera], rng: np.random
 
 
 def _propose_places(diagonal: float, cameras: Sequence[SimulatedCamera], rng: np.random.Generator) -> Floats:
-    """(n, 3) places for a board's middle, of `TRIES` those that all cameras see."""
-    chosen = rng.integers(len(cameras), size=TRIES)
-    part, span = rng.uniform(0.05, 0.95, size=(TRIES, 2)), rng.uniform(0.25, 0.8, size=TRIES)
-    places = np.full((TRIES, 3), np.nan)
+    """(n, 3) places for a board's middle, of `POSE_TRIAL_COUNT` those that all cameras see."""
+    chosen = rng.integers(len(cameras), size=POSE_TRIAL_COUNT)
+    part, span = rng.uniform(0.05, 0.95, size=(POSE_TRIAL_COUNT, 2)), rng.uniform(0.25, 0.8, size=POSE_TRIAL_COUNT)
+    places = np.full((POSE_TRIAL_COUNT, 3), np.nan)
     for c, camera in enumerate(cameras):
         mine = chosen == c
         rays, _ = camera.ray_from_pixel(part[mine] * [camera.width - 1, camera.height - 1])

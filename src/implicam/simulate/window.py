@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from implicam.dataset import Floats
 
-GLASS, WATER = 1.49, 1.333
+GLASS_INDEX, WATER_INDEX = 1.49, 1.333
 """Refractive indices of acrylic glass, of which tanks are made, and of water; air has 1."""
 
-NEWTON_STEPS = 40
-"""Newton's method comes from one side and doubles its digits; grazing rays need about 15 steps."""
+NEWTON_STEP_COUNT = 40
+"""Newton's method converges from one side, quadratically; grazing rays need about 15 steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,8 @@ class Window:
     normal: Floats
     distance: float
     thickness: float
-    glass: float = GLASS
-    water: float = WATER
+    glass: float = GLASS_INDEX
+    water: float = WATER_INDEX
 
     def scaled(self, scale: float) -> Window:
         """The same window in another unit of length.
@@ -96,7 +96,7 @@ class Window:
         """
         water = depth - self.distance - self.thickness
         slope = radius / (self.distance + self.thickness / self.glass + water / self.water)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(NEWTON_STEP_COUNT):
             comes = (
                 self.distance * slope
                 + self.thickness * _tangent(slope, self.glass)

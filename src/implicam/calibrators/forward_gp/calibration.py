@@ -33,7 +33,7 @@ from implicam.dataset import Dataset, without_copies
 from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
-from implicam.mistakes import mistakes_named
+from implicam.mistakes import explain_fit_error
 from implicam.progress import Progress, silent
 from implicam.rig_model.diagnostics import Diagnosis
 from implicam.rig_model.fit_result import FitResult
@@ -83,7 +83,7 @@ class ForwardGP(CalibratorBase):
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
         """Fit to all known points that any camera saw."""
-        with mistakes_named(data):
+        with explain_fit_error(data):
             return self._fit(data, progress)
 
     def _fit(
