@@ -109,10 +109,10 @@ class Registry(Mapping[str, Part]):
         return found
 
     def package_of(self, name: str) -> str:
-        """The name of the package that brings a part; "implicam" for those here.
+        """The package that brings a part.
 
-        Raises:
-            KeyError: there is no part of this name.
+        Args:
+            name: The name of the part.
         """
         part = self[name]
         entry, brought = self._brought.get(name, (None, None))
