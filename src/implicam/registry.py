@@ -109,10 +109,13 @@ class Registry(Mapping[str, Part]):
         return found
 
     def package_of(self, name: str) -> str:
-        """The package that brings a part.
+        """The package that brings a part; "implicam" for those here.
 
         Args:
             name: The name of the part.
+
+        Raises:
+            KeyError: There is no part of this name.
         """
         part = self[name]
         entry, brought = self._brought.get(name, (None, None))

@@ -45,7 +45,7 @@ from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
 from implicam.lenses import LENSES
 from implicam.measurement import Measurement
-from implicam.mistakes import mistakes_named
+from implicam.mistakes import explain_fit_error
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig
 from implicam.threads import blas_threads
@@ -113,7 +113,7 @@ class Explicit(CalibratorBase):
         A dataset of boards at places nobody knows is calibrated in the frame of its first camera; its boards then have
         the positions that the adjustment gives them.
         """
-        with mistakes_named(data), solvable(), blas_threads(1):
+        with explain_fit_error(data), solvable(), blas_threads(1):
             if self.preset != JOINT:
                 return ExplicitCalibration(self, data, self._fitted_like_the_paper(data, progress))
             if self.boards is None and self.align != MATCHING[0]:
