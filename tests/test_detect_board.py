@@ -10,7 +10,7 @@ pytest.importorskip("cv2")
 from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
 from implicam.detect.corners import fit_corners
-from implicam.detect.grid import grow
+from implicam.detect.grid import grow_grid
 from implicam.detect.model import Detected, View
 from implicam.detect.numbering import find_numberings
 from implicam.detect.seeds import from_libcbdetect
@@ -190,7 +190,7 @@ def test_every_reading_of_a_part_keeps_the_colours():
     picture = photograph(checkered(8, 11), h, fine=4)
     truth = corners_of(8, 11, h).reshape(8, 11, 2)
     for rows, columns in ((slice(0, 4), slice(0, 5)), (slice(3, 7), slice(2, 9)), (slice(2, 8), slice(5, 8))):
-        part = grow(picture, truth[rows, columns], 0)  # it must not grow
+        part = grow_grid(picture, truth[rows, columns], 0)  # it must not grow
         ways = find_numberings(part, ("unknown",) * 4, 8, 11)
         shape = (part.rows, part.columns)
         readings = [(*(int(x[0, 0]) for x in way.of(shape)), way.turns) for way in ways]
@@ -310,7 +310,7 @@ def test_the_papers_detector_cannot_take_this_process_down():
     assert from_libcbdetect(np.zeros((200, 300), np.float32), 1.0) == []
     h = rotated(0.2, 24)
     (seed,) = from_libcbdetect(photograph(checkered(5, 8), h, fine=4), 1.0)
-    assert grow(photograph(checkered(5, 8), h, fine=4), seed, 11).count == 40
+    assert grow_grid(photograph(checkered(5, 8), h, fine=4), seed, 11).count == 40
 
 
 # ChArUco

@@ -22,8 +22,8 @@ from implicam.dataset import read_dataset
 from implicam.detect.folder import detect_folder
 from implicam.detect.journal import Entry, Journal, Key
 from implicam.detect.model import Detected, DetectorBase, View, nothing
-from implicam.detect.overlay import STATES, Result, overlay, thumbnail
-from implicam.detect.sheets import COLUMNS, ROWS
+from implicam.detect.overlay import STATES, Result, draw_overlay, draw_thumbnail
+from implicam.detect.sheets import PAGE_COLUMNS, PAGE_ROWS
 from implicam.errors import DatasetError, ImageError, MissingExtraError, UsageError
 from implicam.images import eight_bit, read_picture
 
@@ -689,7 +689,7 @@ def test_a_damaged_record_of_drawings_hurts_nobody(tmp_path, content):
 
 
 def test_long_cameras_take_several_sheets_of_names_of_their_own(tmp_path):
-    for shot in range(COLUMNS * ROWS + 1):
+    for shot in range(PAGE_COLUMNS * PAGE_ROWS + 1):
         put(tmp_path / "images" / "cam" / f"{shot}.png", photograph((20, 20), (40, 40)))
     put(tmp_path / "images" / "cam-2" / "0.png", photograph((20, 20), (40, 40)))
     run = detect_folder(tmp_path, Spot(), unit="mm")
@@ -721,15 +721,16 @@ def test_marks_are_where_the_points_are(shape):
     ):
         result = Result(View("cam", "shot"), Path("x"), found, 2)
         grey = np.full(shape, 128, np.uint8)
-        canvas = overlay(grey, result)
+        canvas = draw_overlay(grey, result)
         assert canvas.dtype == np.uint8
         assert max(canvas.shape) < 2600
-        assert thumbnail(grey, result).shape == thumbnail(None, result).shape
+        assert draw_thumbnail(grey, result).shape == draw_thumbnail(None, result).shape
     if 90 <= shape[0] <= 800 and shape[1] <= 1280:
         uv = np.concatenate([uv, [[0.8 * shape[1], 0.1 * shape[0]]]])  # far apart: nothing is shown enlarged
         plain = Result(View("cam", "shot"), Path("x"), Detected(("", ""), uv, np.ones((2, 2))))
         scale = {90: 13, 480: 2, 800: 1}[shape[0]]
-        canvas = overlay(np.full(shape, 128, np.uint8), plain).astype(float)[: shape[0] * scale, : shape[1] * scale]
+        canvas = draw_overlay(np.full(shape, 128, np.uint8), plain).astype(float)
+        canvas = canvas[: shape[0] * scale, : shape[1] * scale]
         at = (uv[0] + 0.5) * scale - 0.5
         window = canvas[round(at[1]) - 20 : round(at[1]) + 21, round(at[0]) - 20 : round(at[0]) + 21]
         weight = np.abs(window - 128).sum(axis=2)
@@ -752,7 +753,7 @@ def test_rows_of_a_board_are_joined_and_no_row_to_the_next():
     chains = _join_rows(found.points, found.uv)
     assert [len(chain) for chain in chains] == [11] * 8
     whole = replace(found, uv=found.uv + 0.25)  # drawn twice as large, its lines lie on rows of pixels
-    canvas = overlay(np.full((480, 640), 128, np.uint8), Result(View("c", "s"), Path("x"), whole))
+    canvas = draw_overlay(np.full((480, 640), 128, np.uint8), Result(View("c", "s"), Path("x"), whole))
     assert near(canvas, 161, 101, SKY)  # between numbers 1 and 2
     assert not near(canvas, 121, 141, SKY)  # between numbers 1 and 12
     holes = np.ones(88, bool)
@@ -773,11 +774,11 @@ def test_states_are_told_apart():
     assert (state(whole, 89).summary, state(nothing("")).summary) == ("88 of 89 points", "nothing found")
     grey = eight_bit(np.random.default_rng(0).random((480, 640), dtype=np.float32))
     for result in (state(whole), state(whole, 89), state(nothing("dark"))):
-        tile = thumbnail(grey, result)
+        tile = draw_thumbnail(grey, result)
         assert near(tile, 1, 100, STATES[result.state])
 
 
 def test_text_that_no_font_has_is_no_problem():
     found = nothing("Grüße 漢字 \x00 \ud800 ∞ " * 3)
-    canvas = overlay(np.full((90, 120), 128, np.uint8), Result(View("Kamera Süd", "漢字"), Path("x"), found))
+    canvas = draw_overlay(np.full((90, 120), 128, np.uint8), Result(View("Kamera Süd", "漢字"), Path("x"), found))
     assert canvas.shape[1] >= 560

@@ -31,7 +31,7 @@ from implicam.calibrators import (
 from implicam.calibrators.inverse_gp import lattice_note, missing_view_reasons, pixels_of, seen_by_all
 from implicam.calibrators.protocol import finite_column, option, per_axis
 from implicam.dataset import Dataset, Floats, Observations
-from implicam.dataset.requirements import require_points, same_cameras
+from implicam.dataset.requirements import match_cameras, require_points
 from implicam.experiments import active, ball, board
 from implicam.experiments.source import Source
 from implicam.measurement import Measurement
@@ -89,7 +89,7 @@ class AffineCalibration(CalibrationBase):
 
     def measure(self, observations: Observations) -> Measurement:
         """With every camera."""
-        observations = same_cameras(self.data.observations, observations)
+        observations = match_cameras(self.data.observations, observations)
         n, seen = len(observations), observations.seen
         uv = observations.uv.reshape(n, len(self.offset))
         xyz = np.column_stack([np.ones(n), (uv - self.offset) / self.scale]) @ self.slopes
@@ -209,7 +209,7 @@ class AffineCamerasCalibration(CalibrationBase):
 
     def measure(self, observations: Observations) -> Measurement:
         """Least squares over the views there are."""
-        observations = same_cameras(self.trained, observations)
+        observations = match_cameras(self.trained, observations)
         n, seen = len(observations), observations.seen
         information, right = np.zeros((n, 3, 3)), np.zeros((n, 3))
         for c, (map_, _, noise) in enumerate(self._cameras()):

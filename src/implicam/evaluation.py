@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from implicam.calibrators import Calibration
 from implicam.coverage import Coverage, assess, tercile_labels
 from implicam.dataset import Dataset, Floats, Names, Observations, copies_of
-from implicam.dataset.model import fingerprints
+from implicam.dataset.model import fingerprint_rows
 from implicam.errors import DatasetError
 from implicam.geometry import depth_of_points
 from implicam.measurement import Measurement
@@ -274,6 +274,6 @@ def _same_views(fitted: Observations, given: Observations) -> NDArray[np.bool_]:
 
 def _fingerprints(observations: Observations) -> list[bytes]:
     """Per point its pixels as bytes; a point without any is known by its name."""
-    marks = fingerprints(observations.uv.reshape(len(observations), 2 * len(observations.cameras)))
+    marks = fingerprint_rows(observations.uv.reshape(len(observations), 2 * len(observations.cameras)))
     seen = observations.seen.sum(axis=1) > 0
     return [mark if s else str(name).encode() for mark, s, name in zip(marks, seen, observations.points, strict=True)]

@@ -21,7 +21,7 @@ from scipy.special import bdtrc, chdtri, fdtrc
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.calibrators.protocol import CheckPlan
 from implicam.dataset import Dataset, Floats, copies_of, copy_notes
-from implicam.dataset.marks import without_marks
+from implicam.dataset.marks import remove_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluation import known_position_covariance
 from implicam.formatting import percent
@@ -311,7 +311,7 @@ def _of_data(data: Dataset) -> Iterator[Finding]:
         yield Finding(False, f"{what} few: show the cameras {MIN_RECOMMENDED_POINTS} or more, better 17, all over.")
     for note in copy_notes(data):
         yield Finding(False, note)
-    for note in without_marks(data).notes[len(data.notes) :]:
+    for note in remove_marks(data).notes[len(data.notes) :]:
         yield Finding(False, note.replace("missing, and taken as such", "missing, but here it was taken for a pixel"))
     if n < 3:
         return

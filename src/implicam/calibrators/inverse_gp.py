@@ -36,8 +36,8 @@ from implicam.calibrators.protocol import (
     why_not_all_seen,
 )
 from implicam.dataset import Dataset, Floats, Names, Observations, copy_notes, without_copies
-from implicam.dataset.requirements import MAX_RELATIVE_THICKNESS, require_points, require_two_values, same_cameras
-from implicam.dataset.unused import Unused, copied_points
+from implicam.dataset.requirements import MAX_RELATIVE_THICKNESS, match_cameras, require_points, require_two_values
+from implicam.dataset.unused import Unused, list_copied_points
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
 from implicam.gp.linalg import solve_lower
@@ -159,7 +159,7 @@ class InverseGP(CalibratorBase):
 
 def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
     """The points with every view, each once, and why the others are not used; FitError where they are too few."""
-    copied = copied_points(data)
+    copied = list_copied_points(data)
     data = without_copies(data, cameras_too=True)
     seen = data.observations.seen
     complete = seen.all(axis=1)
@@ -274,7 +274,7 @@ class InverseGPCalibration(CalibrationBase):
     def measure(self, observations: Observations) -> Measurement:
         """Measure the points that every camera saw, and whose pixels are like those learned from (`smooth`); the
         others keep their row, with a reason."""
-        observations = same_cameras(self.used.observations, observations)
+        observations = match_cameras(self.used.observations, observations)
         seen = observations.seen
         reason = missing_view_reasons(seen, observations.camera_names, self.method).astype(object)
         complete = np.flatnonzero(seen.all(axis=1))

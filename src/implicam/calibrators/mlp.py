@@ -32,7 +32,7 @@ from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import Examples, train
 from implicam.calibrators.protocol import Arrays, CalibrationBase, CalibratorBase, FitSummary, finite_column, per_axis
 from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_copies
-from implicam.dataset.requirements import same_cameras
+from implicam.dataset.requirements import match_cameras
 from implicam.dataset.unused import Unused
 from implicam.errors import FitError, UsageError
 from implicam.formatting import percent
@@ -154,7 +154,7 @@ class MLPCalibration(CalibrationBase):
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure the points that every camera saw; the others keep their row, with a reason."""
-        observations = same_cameras(self.used.observations, observations)
+        observations = match_cameras(self.used.observations, observations)
         seen = observations.seen
         complete = seen.all(axis=1)
         n = len(observations)

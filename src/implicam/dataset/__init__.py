@@ -7,7 +7,7 @@ from pathlib import Path
 
 from implicam.dataset.copies import copies_of, copy_notes, without_copies
 from implicam.dataset.folder import folder_files, read_folder, write_folder
-from implicam.dataset.marks import without_marks
+from implicam.dataset.marks import remove_marks
 from implicam.dataset.model import (
     TRUTH_COLUMNS,
     Camera,
@@ -81,7 +81,7 @@ def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
             why="its own description states the length unit",
             fix="leave out --unit, or correct the description",
         )
-    return without_marks(data)
+    return remove_marks(data)
 
 
 def _read(path: Path, unit: str | None) -> Dataset:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset.model import Dataset, Floats, Observations, first_same
+from implicam.dataset.model import Dataset, Floats, Observations, find_first_equal
 
 Integers = NDArray[np.int64]
 
@@ -51,31 +51,32 @@ def copies_of(data: Dataset) -> Copies:
         data: n points, C cameras.
     """
     n, cameras = len(data), len(data.cameras)
-    camera_of = _camera_of(data.observations)
+    camera_of = _find_camera_copies(data.observations)
     if data.known is None:
         return Copies(np.arange(n), camera_of)
     own = np.flatnonzero(camera_of == np.arange(cameras))
     observations = data.observations
     views = observations.seen[:, own].sum(axis=1)
-    point_of = first_same(np.concatenate([observations.uv[:, own].reshape(n, 2 * len(own)), data.known.xyz], axis=1))
+    pixels = observations.uv[:, own].reshape(n, 2 * len(own))
+    point_of = find_first_equal(np.concatenate([pixels, data.known.xyz], axis=1))
     certain = (views >= 2) & (point_of != np.arange(n))
     copied = (views >= 1) if certain.any() else certain
     return Copies(np.where(copied, point_of, np.arange(n)), camera_of)
 
 
-def _camera_of(observations: Observations) -> Integers:
+def _find_camera_copies(observations: Observations) -> Integers:
     uv, seen = observations.uv, observations.seen
     found = np.arange(seen.shape[1])
     order = np.argsort(-seen.sum(axis=0), kind="stable")  # the one that saw the most stays
     for later, c in enumerate(order):
         for original in order[:later]:
-            if found[original] == original and _same(uv[:, c], uv[:, original], seen[:, c] & seen[:, original]):
+            if found[original] == original and _are_same(uv[:, c], uv[:, original], seen[:, c] & seen[:, original]):
                 found[c] = original
                 break
     return found
 
 
-def _same(a: Floats, b: Floats, both: NDArray[np.bool_]) -> bool:
+def _are_same(a: Floats, b: Floats, both: NDArray[np.bool_]) -> bool:
     if both.sum() < MIN_COMMON_VIEWS or (a[both] != b[both]).any():
         return False
     return len(np.unique(a[both], axis=0)) >= MIN_COMMON_VIEWS - 2

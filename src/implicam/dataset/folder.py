@@ -306,7 +306,7 @@ def _with_camera_tables(table: dict[str, Any], cameras: list[dict[str, Any]]) ->
 
 def _points_text(points: Names, known: KnownPositions) -> str:
     sd = {c: column for c, column in zip(SD_POINT, known.sd.T, strict=True) if not np.isnan(column).all()}
-    columns = [points.tolist(), known.shots.tolist(), *map(cells, known.xyz.T), *map(cells, sd.values())]
+    columns = [points.tolist(), known.shots.tolist(), *map(format_cells, known.xyz.T), *map(format_cells, sd.values())]
     columns += [column.tolist() for column in known.extra.values()]
     return csv_text([*POINT_COLUMNS, *sd, *known.extra], zip(*columns, strict=True))
 
@@ -316,13 +316,13 @@ def _observations_text(observations: Observations) -> str:
     i, k = np.nonzero(seen)
     stated = () if np.isnan(observations.sd).all() else SD_VIEW
     columns = [observations.points[i].tolist(), np.array(observations.camera_names)[k].tolist()]
-    columns += [cells(column) for column in observations.uv[seen].T]
-    columns += [cells(column) for column in observations.sd[seen].T] if stated else []
+    columns += [format_cells(column) for column in observations.uv[seen].T]
+    columns += [format_cells(column) for column in observations.sd[seen].T] if stated else []
     columns += [column[seen].tolist() for column in observations.extra.values()]
     return csv_text([*VIEW_COLUMNS, *stated, *observations.extra], zip(*columns, strict=True))
 
 
-def cells(values: Floats) -> list[str]:
+def format_cells(values: Floats) -> list[str]:
     """Numbers as the shortest texts that read back to the same bits; an empty text for NaN.
 
     Args:

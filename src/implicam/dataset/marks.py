@@ -24,7 +24,7 @@ MIN_REPEATED_SHARE = 0.02
 """The least share of all views that a repeated pixel must have: whole-number pixels coincide now and then."""
 
 
-def without_marks(data: Dataset) -> Dataset:
+def remove_marks(data: Dataset) -> Dataset:
     """Read marks, such as (-1, -1), as missing views.
 
     Args:
@@ -35,8 +35,9 @@ def without_marks(data: Dataset) -> Dataset:
     """
     observations = data.observations
     places = None if data.known is None else data.known.xyz
-    found = {pixel: _at(observations.uv, pixel) for pixel in (*MISSING_VIEW_PIXELS, *_repeated(observations, places))}
-    notes = [_note(observations, pixel, marked) for pixel, marked in found.items() if marked.any()]
+    pixels = (*MISSING_VIEW_PIXELS, *_find_repeated(observations, places))
+    found = {pixel: _find_pixel(observations.uv, pixel) for pixel in pixels}
+    notes = [_describe_mark(observations, pixel, marked) for pixel, marked in found.items() if marked.any()]
     if not notes:
         return data
     marked = np.any(list(found.values()), axis=0)
@@ -46,11 +47,11 @@ def without_marks(data: Dataset) -> Dataset:
     return replace(data, observations=cleaned, notes=(*data.notes, *notes))
 
 
-def _at(uv: Floats, pixel: tuple[float, float]) -> NDArray[np.bool_]:
+def _find_pixel(uv: Floats, pixel: tuple[float, float]) -> NDArray[np.bool_]:
     return np.asarray((uv == np.array(pixel)).all(axis=2), dtype=np.bool_)
 
 
-def _repeated(observations: Observations, places: Floats | None) -> list[tuple[float, float]]:
+def _find_repeated(observations: Observations, places: Floats | None) -> list[tuple[float, float]]:
     """Pixels that stand for many places: known to be different ones, or seen to be by the other cameras."""
     counts = Counter(map(tuple, observations.uv[observations.seen].tolist()))
     least = max(MIN_PLACES_AT_ONE_PIXEL, MIN_REPEATED_SHARE * sum(counts.values()))
@@ -59,7 +60,7 @@ def _repeated(observations: Observations, places: Floats | None) -> list[tuple[f
 
 
 def _stands_for_many(observations: Observations, places: Floats | None, pixel: tuple[float, float]) -> bool:
-    repeated = _at(observations.uv, pixel)
+    repeated = _find_pixel(observations.uv, pixel)
     rows = repeated.any(axis=1)
     if places is not None:
         return len(np.unique(places[rows], axis=0)) >= MIN_PLACES_AT_ONE_PIXEL
@@ -70,7 +71,7 @@ def _stands_for_many(observations: Observations, places: Floats | None, pixel: t
     return odd and len(np.unique(others.reshape(len(others), -1), axis=0)) >= MIN_PLACES_AT_ONE_PIXEL
 
 
-def _note(observations: Observations, pixel: tuple[float, float], marked: NDArray[np.bool_]) -> str:
+def _describe_mark(observations: Observations, pixel: tuple[float, float], marked: NDArray[np.bool_]) -> str:
     names = np.array(observations.camera_names)[marked.any(axis=0)]
     where = ", ".join(map(str, names[:4])) + (f" and {len(names) - 4} more cameras" if len(names) > 4 else "")
     return (

@@ -71,7 +71,7 @@ class Camera:
                     f"camera {self.name!r} has {what} = {size!r}; it must be a whole number of pixels.",
                     fix=f"give the {what} of its images, for example {what} = 1280",
                 )
-        _freeze(self, extra=_described(self.extra, _CAMERA_KEYS, f"camera {self.name!r}"))
+        _freeze(self, extra=_check_entries(self.extra, _CAMERA_KEYS, f"camera {self.name!r}"))
 
     def as_table(self) -> dict[str, Any]:
         """Name and image size, as far as it is known, as plain values."""
@@ -112,7 +112,7 @@ class Observations:
         sd = _array(self.sd, (n, c, 2), "sd")
         check_views(uv, sd, self.cameras, lambda i, k: f"point {str(points[i])!r}")
         sd[np.isnan(uv)] = np.nan
-        extra = _columns(self.extra, (n, c), (*VIEW_COLUMNS, *SD_VIEW))
+        extra = _check_columns(self.extra, (n, c), (*VIEW_COLUMNS, *SD_VIEW))
         _freeze(self, points=points, cameras=tuple(self.cameras), uv=uv, sd=sd, extra=extra)
 
     def __len__(self) -> int:
@@ -189,7 +189,7 @@ class KnownPositions:
             raise DatasetError("a known position must be finite.")
         sd = _array(self.sd, (n, 3), "sd")
         check_position_sd(sd, lambda i: f"known position {i + 1}")
-        extra = _columns(self.extra, (n,), (*POINT_COLUMNS, *SD_POINT))
+        extra = _check_columns(self.extra, (n,), (*POINT_COLUMNS, *SD_POINT))
         _freeze(self, shots=shots, xyz=xyz, sd=sd, extra=extra)
 
     def select(self, index: ArrayLike) -> KnownPositions:
@@ -203,7 +203,7 @@ class KnownPositions:
         return KnownPositions(self.shots[i], self.xyz[i], self.sd[i], extra)
 
 
-def fingerprints(values: Floats) -> list[bytes]:
+def fingerprint_rows(values: Floats) -> list[bytes]:
     """The numbers of each row as bytes, with one NaN and one zero, so that equal rows have equal bytes.
 
     Args:
@@ -212,7 +212,7 @@ def fingerprints(values: Floats) -> list[bytes]:
     return [row.tobytes() for row in np.where(np.isnan(values), np.nan, values + 0.0)]
 
 
-def first_same(values: Floats) -> NDArray[np.int64]:
+def find_first_equal(values: Floats) -> NDArray[np.int64]:
     """The first row that is the same to the last bit.
 
     Args:
@@ -222,7 +222,7 @@ def first_same(values: Floats) -> NDArray[np.int64]:
         (n,) number of the first row that is the same; its own where none is before.
     """
     first: dict[bytes, int] = {}
-    return np.array([first.setdefault(mark, i) for i, mark in enumerate(fingerprints(values))], dtype=np.int64)
+    return np.array([first.setdefault(mark, i) for i, mark in enumerate(fingerprint_rows(values))], dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,7 +256,7 @@ class Dataset:
     def __post_init__(self) -> None:
         check_name(self.name, "dataset name")
         check_name(self.length_unit, "length unit")
-        _freeze(self, extra=_described(self.extra, _DATASET_KEYS, f"dataset {self.name!r}"))
+        _freeze(self, extra=_check_entries(self.extra, _DATASET_KEYS, f"dataset {self.name!r}"))
         if self.known is not None and len(self.known.shots) != len(self.observations):
             raise DatasetError(
                 f"{len(self.observations)} observed points, but {len(self.known.shots)} known positions.",
@@ -304,7 +304,7 @@ class Dataset:
 
         A place that was measured again tells something of the pixel noise, and nothing of the rig.
         """
-        return np.arange(len(self)) if self.known is None else first_same(self.known.xyz)
+        return np.arange(len(self)) if self.known is None else find_first_equal(self.known.xyz)
 
     @property
     def truth(self) -> Truth | None:
@@ -446,7 +446,7 @@ def join(first: Dataset, second: Dataset) -> Dataset:
         a.cameras,
         np.concatenate([a.uv, b.uv]),
         np.concatenate([a.sd, b.sd]),
-        _joined_columns(a.extra, b.extra, a.uv.shape[:2], b.uv.shape[:2]),
+        _join_columns(a.extra, b.extra, a.uv.shape[:2], b.uv.shape[:2]),
     )
     known = None
     if first.known and second.known:
@@ -455,7 +455,7 @@ def join(first: Dataset, second: Dataset) -> Dataset:
             np.concatenate([p.shots, q.shots]),
             np.concatenate([p.xyz, q.xyz]),
             np.concatenate([p.sd, q.sd]),
-            _joined_columns(p.extra, q.extra, (len(first),), (len(second),)),
+            _join_columns(p.extra, q.extra, (len(first),), (len(second),)),
         )
     return replace(first, observations=observations, known=known)
 
@@ -494,7 +494,7 @@ def covariance_from_columns(sd: Floats, off_diagonal: Floats) -> Floats:
     return cov
 
 
-def _joined_columns(
+def _join_columns(
     a: Mapping[str, Names], b: Mapping[str, Names], shape_a: tuple[int, ...], shape_b: tuple[int, ...]
 ) -> dict[str, Names]:
     keys = [*a, *(key for key in b if key not in a)]
@@ -633,7 +633,7 @@ def check_position_sd(sd: Floats, place: Callable[[int], str]) -> None:
         )
 
 
-def _columns(extra: Mapping[str, ArrayLike], shape: tuple[int, ...], taken: Sequence[str]) -> dict[str, Names]:
+def _check_columns(extra: Mapping[str, ArrayLike], shape: tuple[int, ...], taken: Sequence[str]) -> dict[str, Names]:
     """The extra columns, checked: names of their own, text that every form can hold."""
     columns = {}
     for name, value in extra.items():
@@ -665,13 +665,13 @@ def _refuse_misspelt(key: str, extra: Mapping[str, Any], whose: str) -> None:
         )
 
 
-def _described(extra: Mapping[str, Any], taken: Sequence[str], whose: str) -> dict[str, Any]:
+def _check_entries(extra: Mapping[str, Any], taken: Sequence[str], whose: str) -> dict[str, Any]:
     """Further entries of dataset.toml, as plain values that TOML can hold."""
     for key in taken:
         if key in extra:
             raise DatasetError(f"{whose}: an extra entry cannot be named {key!r}.", fix="rename it")
     try:
-        entries: dict[str, Any] = plain(extra)
+        entries: dict[str, Any] = to_plain(extra)
     except ValueError as error:
         raise DatasetError(
             f"{whose} has an extra entry that dataset.toml cannot hold.",
@@ -681,7 +681,7 @@ def _described(extra: Mapping[str, Any], taken: Sequence[str], whose: str) -> di
     return entries
 
 
-def plain(value: Any, depth: int = 0) -> Any:
+def to_plain(value: Any, depth: int = 0) -> Any:
     """A copy made of the types that TOML knows.
 
     Args:
@@ -698,9 +698,9 @@ def plain(value: Any, depth: int = 0) -> Any:
     if isinstance(value, Mapping):
         if not all(isinstance(key, str) for key in value):
             raise ValueError("the keys of a table are text")
-        return {_encodable(key): plain(item, depth + 1) for key, item in value.items()}
+        return {_encodable(key): to_plain(item, depth + 1) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item, depth + 1) for item in value]
+        return [to_plain(item, depth + 1) for item in value]
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise ValueError("a whole number has more than 64 bits")
     if isinstance(value, str):

@@ -12,7 +12,7 @@ MAX_RELATIVE_THICKNESS = 1e-3
 """Thickness over width of what is called a plane, or a line."""
 
 
-def same_cameras(trained: Observations, observations: Observations) -> Observations:
+def match_cameras(trained: Observations, observations: Observations) -> Observations:
     """The observations with the cameras of a calibration, in its order.
 
     Args:

@@ -25,7 +25,7 @@ from implicam.dataset.model import (
     check_name,
     check_position_sd,
     check_unique,
-    plain,
+    to_plain,
 )
 from implicam.errors import DatasetError
 
@@ -103,7 +103,7 @@ def read_columns(
         lines.append(line)
         for column, text in zip(header, row, strict=True):
             if column in numbers:
-                value: str | float = number(text, f"{in_file}{line}", column, **numbers[column]._asdict())
+                value: str | float = read_number(text, f"{in_file}{line}", column, **numbers[column]._asdict())
             else:
                 value = text.strip() if column in names else text
             columns[column].append(value)
@@ -128,13 +128,13 @@ def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[
     """
     example = example or ",".join(required)
     require_file(path, f"put a comma-separated table with the columns {example} there")
-    rows = _rows(path)
+    rows = _read_rows(path)
     _, header = next(rows, (1, []))
     if not header:
         raise DatasetError(f"{path} is empty.", fix=f"its first line must be {example}, then one row per entry")
     header = [name.strip() for name in header]
     _check_header(path, header, required)
-    return header, _checked_width(path, len(header), rows)
+    return header, _check_width(path, len(header), rows)
 
 
 def require_file(path: Path, fix: str) -> None:
@@ -150,7 +150,7 @@ def require_file(path: Path, fix: str) -> None:
     if path.is_dir():
         raise DatasetError(f"{path} is a folder, not a file.", fix=fix)
     if not path.is_file():
-        raise DatasetError(f"{path} does not exist.", why=f"{path.parent} holds: {_listing(path.parent)}", fix=fix)
+        raise DatasetError(f"{path} does not exist.", why=f"{path.parent} holds: {_list_folder(path.parent)}", fix=fix)
 
 
 @contextmanager
@@ -171,8 +171,8 @@ def naming(place: Path | str) -> Iterator[None]:
         raise DatasetError(f"{place}: {error.what}", why=error.why, fix=error.fix) from None
 
 
-def _rows(path: Path) -> Iterator[Row]:
-    reader = csv.reader(_lines(path), strict=True)
+def _read_rows(path: Path) -> Iterator[Row]:
+    reader = csv.reader(_read_lines(path), strict=True)
     first = 1  # the line on which the row begins; a quoted cell may go on over several
     try:
         for row in reader:
@@ -187,7 +187,7 @@ def _rows(path: Path) -> Iterator[Row]:
         ) from error
 
 
-def _lines(path: Path) -> Iterator[str]:
+def _read_lines(path: Path) -> Iterator[str]:
     """Lines as text, read one at a time, so that a gigabyte of something else costs one line of memory."""
     with path.open("rb") as file:
         for number in range(1, 1 << 62):
@@ -205,10 +205,10 @@ def _lines(path: Path) -> Iterator[str]:
                     else f"the line is longer than {MAX_LINE_BYTES} bytes",
                     fix="export the data as comma-separated text (CSV, UTF-8)",
                 )
-            yield _decoded(path, number, line)
+            yield _decode(path, number, line)
 
 
-def _decoded(path: Path, number: int, line: bytes) -> str:
+def _decode(path: Path, number: int, line: bytes) -> str:
     try:
         return line.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -242,7 +242,7 @@ def _check_header(path: Path, header: list[str], required: Sequence[str]) -> Non
         if name not in header:
             raise DatasetError(
                 f"{path}, line 1: the column {name!r} is missing; found {','.join(header)[:120]!r}.",
-                why=_misspelt(name, header),
+                why=_hint_misspelling(name, header),
                 fix=f"the first line must name at least the columns {','.join(required)}",
             )
     for name, times in Counter(header).items():
@@ -262,7 +262,7 @@ def _check_header(path: Path, header: list[str], required: Sequence[str]) -> Non
             check_name(name, "column name")
 
 
-def _checked_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]:
+def _check_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]:
     for line, row in rows:
         if len(row) != width:
             raise DatasetError(
@@ -279,7 +279,7 @@ def _checked_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]
         yield line, row
 
 
-def name_in(text: str, what: str, place: str) -> str:
+def read_name(text: str, what: str, place: str) -> str:
     """Read a name, without the spaces around it.
 
     Args:
@@ -299,7 +299,7 @@ NO_VALUE_WORDS = ("", "-", "--", "n/a", "na", "#n/a", "none", "null", "missing")
 """What people and spreadsheets write where there is no value; refused, with the cure that belongs to it."""
 
 
-def number(text: str, place: str, column: str, *, cure_nan: str, missing: Sequence[str] = ()) -> float:
+def read_number(text: str, place: str, column: str, *, cure_nan: str, missing: Sequence[str] = ()) -> float:
     """Read a finite number.
 
     Args:
@@ -384,7 +384,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         if content.count(".") > MAX_TOML_LINE_DOTS:
             raise ValueError(f"more than {MAX_TOML_LINE_DOTS} dots in one line (at line {line}); break it into several")
     try:
-        table: dict[str, Any] = plain(tomllib.loads(text))
+        table: dict[str, Any] = to_plain(tomllib.loads(text))
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     return table
@@ -405,36 +405,36 @@ def description_from_toml(table: dict[str, Any], path: Path) -> tuple[str, str, 
     """
     extra = dict(table)
     extra.pop(WIDE_TABLE, None)
-    name = _text_entry(extra, "name", path, example="my-rig")
-    unit = _text_entry(extra, "length_unit", path, example="mm")
+    name = _pop_text(extra, "name", path, example="my-rig")
+    unit = _pop_text(extra, "length_unit", path, example="mm")
     cameras = extra.pop("cameras", None)
     if not isinstance(cameras, list) or not cameras or not all(isinstance(c, dict) for c in cameras):
         raise DatasetError(
             f"{path}: there is no [[cameras]] table.",
-            why=_misspelt("cameras", extra),
+            why=_hint_misspelling("cameras", extra),
             fix='add, for each camera, [[cameras]] with name = "cam1", width = 1280, height = 800',
         )
-    made = tuple(_camera(dict(c), path) for c in cameras)
+    made = tuple(_read_camera(dict(c), path) for c in cameras)
     with naming(path):
         check_unique([camera.name for camera in made], "camera")
     return name, unit, made, extra
 
 
-def _camera(table: dict[str, Any], path: Path) -> Camera:
-    name = _text_entry(table, "name", path, example="cam1")
+def _read_camera(table: dict[str, Any], path: Path) -> Camera:
+    name = _pop_text(table, "name", path, example="cam1")
     with naming(path):
         return Camera(name, table.pop("width", None), table.pop("height", None), table)
 
 
-def _misspelt(word: str, found: Iterable[str]) -> str:
+def _hint_misspelling(word: str, found: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, list(found), n=1)
     return f"{close[0]!r} may be a misspelling of it" if close else ""
 
 
-def _text_entry(table: dict[str, Any], key: str, path: Path, *, example: str) -> str:
+def _pop_text(table: dict[str, Any], key: str, path: Path, *, example: str) -> str:
     if key not in table:
         raise DatasetError(
-            f"{path}: {key!r} is missing.", why=_misspelt(key, table), fix=f'write the line {key} = "{example}"'
+            f"{path}: {key!r} is missing.", why=_hint_misspelling(key, table), fix=f'write the line {key} = "{example}"'
         )
     value = table.pop(key)
     if not isinstance(value, str) or value.strip() == "":
@@ -442,7 +442,7 @@ def _text_entry(table: dict[str, Any], key: str, path: Path, *, example: str) ->
     return value.strip()
 
 
-def _listing(folder: Path) -> str:
+def _list_folder(folder: Path) -> str:
     if not folder.is_dir():
         return f"nothing ({folder} is not a folder)"
     names = sorted(entry.name for entry in folder.iterdir())

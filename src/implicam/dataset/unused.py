@@ -27,7 +27,7 @@ class Rejected:
     residual: float
 
 
-def copied_points(data: Dataset) -> tuple[Unused, ...]:
+def list_copied_points(data: Dataset) -> tuple[Unused, ...]:
     """The known points that are copies of others: each is used once.
 
     Args:

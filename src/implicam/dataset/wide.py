@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset.folder import cells, csv_text, description_text
+from implicam.dataset.folder import csv_text, description_text, format_cells
 from implicam.dataset.model import (
     SD_POINT,
     SD_VIEW,
@@ -44,7 +44,7 @@ from implicam.dataset.tables import (
 from implicam.errors import DatasetError, ImplicamError, did_you_mean, import_extra
 from implicam.files import npz_bytes, read_npz, replacing, toml_text, write_text
 
-_EXAMPLE = "x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ..."
+_EXAMPLE_HEADER = "x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ..."
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ class _Layout:
         return ["x", "y", "z", *SD_POINT, *views]
 
 
-def _sidecar(path: Path) -> Path:
+def _description_path(path: Path) -> Path:
     return path.with_name(path.name + ".toml")  # not rig.toml, which may be anything
 
 
-def _layout(header: list[str], description: dict[str, Any] | None, path: Path, unit: str | None) -> _Layout:
+def _read_layout(header: list[str], description: dict[str, Any] | None, path: Path, unit: str | None) -> _Layout:
     if not _cameras_named(header) and any(map(_is_number, header)):
         raise DatasetError(
             f"{path}, line 1: the first line holds numbers, and no names of columns.",
@@ -79,7 +79,7 @@ def _layout(header: list[str], description: dict[str, Any] | None, path: Path, u
         if unit is None:
             raise DatasetError(
                 f"{path}: the length unit of x, y, z is not stated.",
-                why=f"a wide CSV carries it in {_sidecar(path).name} beside it, which is not there",
+                why=f"a wide CSV carries it in {_description_path(path).name} beside it, which is not there",
                 fix='add --unit mm, or unit="mm" in read_dataset(...)',
             )
         _refuse_unpaired(header, path)
@@ -123,9 +123,11 @@ def _is_number(text: str) -> bool:
 
 
 def _refuse_unpaired(header: list[str], path: Path) -> None:
-    """A column u_ without its v_, or the reverse: a camera must not vanish for a slip of the pen."""
+    """A column u_ without its v_, or the reverse: a typing error must not remove a camera."""
     columns = set(header)
-    partner = {column: ("v_" if column[0] == "u" else "u_") + column[2:] for column in header if column[:2] in _PAIR}
+    partner = {
+        column: ("v_" if column[0] == "u" else "u_") + column[2:] for column in header if column[:2] in _PREFIXES
+    }
     lonely = [column for column, other in partner.items() if other not in columns]
     for column in lonely[:1]:
         likely = [other for other in lonely if other[0] != column[0]] or [c for c in header if c not in partner]
@@ -137,7 +139,7 @@ def _refuse_unpaired(header: list[str], path: Path) -> None:
         )
 
 
-_PAIR = ("u_", "v_")
+_PREFIXES = ("u_", "v_")
 
 
 def _cameras_named(header: Iterable[str]) -> list[str]:
@@ -187,9 +189,9 @@ def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
     Raises:
         DatasetError: The unit is not stated, or there is a mistake; names file, line, value and cure.
     """
-    header, rows = read_table(path, (), _EXAMPLE)
-    sidecar = _sidecar(path)
-    layout = _layout(header, read_toml(sidecar) if sidecar.exists() else None, path, unit)
+    header, rows = read_table(path, (), _EXAMPLE_HEADER)
+    sidecar = _description_path(path)
+    layout = _read_layout(header, read_toml(sidecar) if sidecar.exists() else None, path, unit)
     numbers = dict.fromkeys(layout.numbers(), NumberColumn("leave the cell empty where there is no value", ("", "nan")))
     table = read_columns(path, header, rows, ("point", "shot"), numbers)
     if not table.n:
@@ -198,7 +200,7 @@ def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
         return _assemble(table, layout)
 
 
-def _columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
+def _make_columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
     """The columns of the table (numbers or text), and the sidecar's text."""
     if not len(data):
         raise DatasetError(f"dataset {data.name!r} has no points.", fix="a table needs one; write it as .npz")
@@ -254,9 +256,9 @@ def write_wide_csv(data: Dataset, path: Path) -> None:
         DatasetError: A table cannot hold the dataset: it has no points, or a column that could be mistaken for another.
         ImplicamError: The files cannot be written.
     """
-    columns, description = _columns(data)
-    text = [v.tolist() if v.dtype.kind == "U" else cells(v) for v in columns.values()]
-    sidecar = _sidecar(path)
+    columns, description = _make_columns(data)
+    text = [v.tolist() if v.dtype.kind == "U" else format_cells(v) for v in columns.values()]
+    sidecar = _description_path(path)
     unchanged = sidecar.is_file() and sidecar.read_bytes() == description.encode()
     if not unchanged:
         sidecar.unlink(missing_ok=True)
@@ -297,21 +299,21 @@ def read_parquet(path: Path) -> Dataset:
     for column, times in Counter(table.column_names).items():
         if times > 1:
             raise DatasetError(f"{path}: the column {column[:60]!r} is there {times} times.", fix="leave one out")
-    layout = _layout(table.column_names, description, path, None)
+    layout = _read_layout(table.column_names, description, path, None)
     numeric = set(layout.numbers())
-    numbers = {c: _numbers(v, c, path) for c, v in columns.items() if c in numeric}
-    texts = {c: _texts(v, c, path) for c, v in columns.items() if c not in numeric}
+    numbers = {c: _read_numbers(v, c, path) for c, v in columns.items() if c in numeric}
+    texts = {c: _read_texts(v, c, path) for c, v in columns.items() if c not in numeric}
     with naming(path):
         return _assemble(Columns(texts, numbers, table.num_rows, lambda i: f"{path}, row {i + 1}"), layout)
 
 
-def _numbers(values: list[Any], column: str, path: Path) -> Floats:
+def _read_numbers(values: list[Any], column: str, path: Path) -> Floats:
     """A column of Parquet as numbers, NaN where there is none."""
     _check_types(values, (int, float), "a number", column, path)
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def _texts(values: list[Any], column: str, path: Path) -> list[str]:
+def _read_texts(values: list[Any], column: str, path: Path) -> list[str]:
     """A column of Parquet as text, empty where there is none."""
     _check_types(values, str, "text", column, path)
     return [value or "" for value in values]
@@ -340,7 +342,7 @@ def write_parquet(data: Dataset, path: Path) -> None:
     """
     pyarrow = import_extra("pyarrow", "parquet", "writing Parquet")
     parquet = import_extra("pyarrow.parquet", "parquet", "writing Parquet")
-    columns, description = _columns(data)
+    columns, description = _make_columns(data)
     table = pyarrow.table({c: pyarrow.array(v.tolist()) for c, v in columns.items()})
     with replacing(path) as temporary:
         parquet.write_table(table.replace_schema_metadata({"implicam": description}), temporary)
@@ -418,11 +420,11 @@ def read_npz_dataset(path: Path) -> Dataset:
     with path.open("rb") as file:
         if file.read(2) != b"PK":
             raise DatasetError(f"{path} is not an NPZ file.", fix="write it with implicam")
-    arrays = read_npz(path, lambda reason: _refused(path, reason))
+    arrays = read_npz(path, lambda reason: _damaged_error(path, reason))
     return dataset_from_arrays(arrays, path)
 
 
-def _refused(path: Path, reason: str) -> ImplicamError:
+def _damaged_error(path: Path, reason: str) -> ImplicamError:
     return DatasetError(f"{path} is damaged: {reason}.", fix="write it again with implicam")
 
 

@@ -46,7 +46,7 @@ MIN_RIVAL_QUALITY_RATIO = 0.6
 MIN_AXIS_RATIO = 0.65
 """A sphere far off the axis of a wide lens is an ellipse; its shorter axis is at least this part of the longer."""
 
-MIN_EDGE_SEEN = 0.7
+MIN_EDGE_SHARE = 0.7
 """Part of the edge that must be seen."""
 
 MIN_STEP_NOISES, MAX_RESIDUAL_STEPS = 8.0, 0.12
@@ -64,7 +64,7 @@ MIN_RIVAL_SCORE_RATIO = 0.75
 
 SAME_PLACE_PX, SAME_SIZE_RADII, MIN_STILL_SHOTS = 2.0, 0.03, 3
 """Pixels within which a thing is at the same place, and the part of its radius within which it has the same size (a
-ball that comes nearer along a line of sight grows); and in so many shots at least it must be there to be furniture."""
+ball that comes nearer along a line of sight grows); and it must be there in so many shots at least to be left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +244,8 @@ class Ball(DetectorBase):
         views = {camera: [view for view in found if view.camera == camera] for camera in cameras}
         moving: dict[View, Detected] = {}
         for own in views.values():
-            furniture = _find_furniture([_all_candidates(found[view]) for view in own])
-            moving |= {view: _drop_furniture(found[view], furniture) for view in own}
+            still = _find_still_objects([_all_candidates(found[view]) for view in own])
+            moving |= {view: _drop_still_objects(found[view], still) for view in own}
         steps = {camera: [moving[v].notes["step"] for v in own if len(moving[v])] for camera, own in views.items()}
         every = [step for own in steps.values() for step in own]
         usual = {
@@ -328,7 +328,7 @@ def _fit_ball(picture: Grey, rough: Rough) -> Edge | None:
     found = edge.outer - edge.inner
     good = (
         short >= MIN_AXIS_RATIO * long
-        and edge.support >= MIN_EDGE_SEEN
+        and edge.support >= MIN_EDGE_SHARE
         and found > MIN_STEP_NOISES * edge.residual
         and edge.residual < MAX_RESIDUAL_STEPS * found
         and edge.inner < MAX_BALL_BRIGHTNESS * edge.outer
@@ -369,7 +369,7 @@ def _all_candidates(found: Detected) -> list[Detected]:
     return [*([replace(found, others=())] if len(found) else []), *found.others]
 
 
-def _find_furniture(shots: list[list[Detected]]) -> Floats:
+def _find_still_objects(shots: list[list[Detected]]) -> Floats:
     """(k, 3) places and radii where something is found in many shots of a camera, while the ball is elsewhere."""
     uvr = np.array([[*ball.uv[0], ball.notes["radius_px"]] for balls in shots for ball in balls]).reshape(-1, 3)
     shot = np.array([s for s, balls in enumerate(shots) for _ in balls], dtype=np.int64)
@@ -378,7 +378,7 @@ def _find_furniture(shots: list[list[Detected]]) -> Floats:
     while len(uvr):
         near = _match_place(uvr, uvr[0])
         times = len(set(shot[near].tolist()))
-        # A ball that never moves in any shot is a person's test of repeatability, not furniture.
+        # A ball that moves in no shot is a test of repeatability, and is kept.
         ball_elsewhere = times < 0.8 * looked_at or _is_mostly_elsewhere(shot, near)
         if times >= max(MIN_STILL_SHOTS, 0.1 * looked_at) and ball_elsewhere:
             places.append(np.median(uvr[near], axis=0))
@@ -397,9 +397,9 @@ def _is_mostly_elsewhere(shot: NDArray[np.int64], near: NDArray[np.bool_]) -> bo
     return len(set(shot[~near].tolist())) > 0.5 * len(set(shot.tolist()))
 
 
-def _drop_furniture(found: Detected, furniture: Floats) -> Detected:
+def _drop_still_objects(found: Detected, still: Floats) -> Detected:
     balls = _all_candidates(found)
-    moving = [b for b in balls if not _match_place(furniture, np.array([*b.uv[0], b.notes["radius_px"]])).any()]
+    moving = [b for b in balls if not _match_place(still, np.array([*b.uv[0], b.notes["radius_px"]])).any()]
     if len(moving) == len(balls):
         return found
     if not moving:

@@ -42,8 +42,8 @@ MAX_CLICK_PX = 3.0
 MIN_RESPONSE_NOISES = 5.0
 """A spot answers the Laplacian so many times its noise at least."""
 
-MAX_REACH = (2.5, 2.0)
-"""Scales, and pixels more, from the middle of a spot to where it ends at the latest."""
+MAX_RADIUS_SCALES, MAX_RADIUS_EXTRA_PX = 2.5, 2.0
+"""Their sum is how far from its middle a spot ends at the latest."""
 
 SMOOTHING_PX = 1.2
 """Pixels of the smoothing before a spot is told from its surroundings: noise of single pixels must not do that."""
@@ -278,7 +278,7 @@ def _weigh_pixels(bright: Floats, far: Floats, sigma: float, noise: float) -> tu
     top = int(np.argmax(np.where(summit, smooth, -np.inf)))
     rough = noise / (2 * np.sqrt(np.pi) * SMOOTHING_PX)  # the noise that is left; the largest of several is 2 sd above
     peak = float(smooth.flat[top]) - 2 * rough
-    end = far > MAX_REACH[0] * sigma + MAX_REACH[1]
+    end = far > MAX_RADIUS_SCALES * sigma + MAX_RADIUS_EXTRA_PX
     for raised in BACKGROUND_STEPS:
         height = (1 - raised) * peak
         if height <= MIN_BRIGHTNESS_NOISES * rough:

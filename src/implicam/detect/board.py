@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.detect.grid import Grid, grow, join
+from implicam.detect.grid import Grid, grow_grid, join_grids
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.numbering import END, MORE, Numbering, find_numberings, find_sides
 from implicam.detect.seeds import find_saddles, from_libcbdetect, from_opencv, from_saddles, resize, to_original_pixels
@@ -121,7 +121,7 @@ class Board(DetectorBase):
         grids: list[Grid] = []
         limit, grown = max(self.rows, self.columns) + 3, 0
         for seed in self._find_seeds(picture, grids):
-            grid = grow(picture, seed[:limit, :limit], limit)
+            grid = grow_grid(picture, seed[:limit, :limit], limit)
             if grid is not None:
                 _add_grid(grids, grid)
                 grown += 1
@@ -135,7 +135,7 @@ class Board(DetectorBase):
             return grids
         first, rest = grids[0], []
         for grid in grids[1:]:
-            both = join(picture, first, grid, (self.rows, self.columns), limit)
+            both = join_grids(picture, first, grid, (self.rows, self.columns), limit)
             if both is None or both.count <= first.count:
                 rest.append(grid)
             else:

@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from implicam.dataset import Floats, KnownPositions
 from implicam.dataset.folder import POINTS, read_points
-from implicam.dataset.tables import name_in, number, read_table
+from implicam.dataset.tables import read_name, read_number, read_table
 from implicam.detect.blobs import find_scale, find_spots, measure_spots
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.errors import DatasetError, UsageError, did_you_mean
@@ -39,7 +39,7 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.intp]
 Labels = Mapping[View, Mapping[str, tuple[float, float]]]
 
-LABELS = "labels.csv"
+LABELS_FILE = "labels.csv"
 
 MIN_LABELS = 6
 """Labels that a camera needs."""
@@ -47,20 +47,20 @@ MIN_LABELS = 6
 MAX_CLICK_PX = 3.5
 """Pixels from a label to the spot that is meant."""
 
-MIN_SDS_TO_NEXT = 2.0
+MIN_SEPARATION_SDS = 2.0
 """Standard deviations of a prediction that must stay within the way to the next dot."""
 
-MAX_OFF_TO_NEXT = 0.4
-"""Of the distance to the next dot: farther from its prediction a spot may be that dot."""
+MAX_OFFSET_SPACINGS = 0.4
+"""Of the distance to the next dot: a spot farther from its prediction may be that dot."""
 
 MAX_ASTRAY_RATIO = 6.0
 """A dot so many times farther from what the others predict than they are from theirs is none."""
 
-TOLERATED_OFF = 1.0
-"""Pixels, and times the scale of the dots, from what the others predict that are no reason to drop a dot: targets are
+TOLERATED_OFFSET_PX, TOLERATED_OFFSET_SCALES = 1.0, 1.0
+"""The larger of the two is an offset from what the others predict for which no dot is dropped: targets are
 drilled by hand, and a glint at its rim draws a dot's centroid there. Its uncertainty says so."""
 
-MAX_SCATTER_TO_NEXT = 0.05
+MAX_SCATTER_SPACINGS = 0.05
 """Median distance of dots from what the others predict, as a part of the way to the next dot, that is no fit."""
 
 MAX_ROUNDS = 25
@@ -132,7 +132,7 @@ class Dots(DetectorBase):
             UsageError: There are no labels.
             DatasetError: A file has a mistake; names file, line and cure.
         """
-        labels = labels or dataset / LABELS
+        labels = labels or dataset / LABELS_FILE
         if not labels.exists():
             raise UsageError(
                 f"{labels} does not exist.",
@@ -198,13 +198,13 @@ def _read_labels(path: Path, points: Sequence[str]) -> dict[View, dict[str, tupl
     labels: dict[View, dict[str, tuple[float, float]]] = {}
     for line, row in rows:
         place = f"{path}, line {line}"
-        name, camera = (name_in(row[at[c]], c, place) for c in ("point", "camera"))
+        name, camera = (read_name(row[at[c]], c, place) for c in ("point", "camera"))
         if name not in index:
             raise DatasetError(
                 f"{place}: point {name!r} is not in the layout{did_you_mean(name, points)}.",
                 fix="correct the name, or add the point to the layout",
             )
-        u, v = (number(row[at[c]], place, c, cure_nan="a label needs its pixel: remove the row") for c in "uv")
+        u, v = (read_number(row[at[c]], place, c, cure_nan="a label needs its pixel: remove the row") for c in "uv")
         marks = labels.setdefault(View(camera, row[at["shot"]].strip() if "shot" in at else ""), {})
         if name in marks:
             raise DatasetError(f"{place}: point {name!r} of camera {camera!r} is labelled twice.", fix="remove one row")
@@ -356,7 +356,7 @@ class _Search:
         self.rough, self.answer = find_spots(picture, sigma)
         self.tree = cKDTree(self.rough.reshape(-1, 2)) if len(self.rough) else None
         self.measured: dict[int, tuple[Floats, Floats, float]] = {}
-        self.tolerated = max(TOLERATED_OFF, TOLERATED_OFF * sigma)
+        self.tolerated = max(TOLERATED_OFFSET_PX, TOLERATED_OFFSET_SCALES * sigma)
         self.to = np.full(len(xyz), -1)
         self.labelled: list[int] = []
         self.meant: dict[int, int] = {}
@@ -441,7 +441,7 @@ class _Search:
         predicted.uv[rows], predicted.sd[rows] = by_others
         self.uv, self.sd = middle + scale * predicted.uv, scale * predicted.sd
         self.apart = cKDTree(self.uv).query(self.uv, k=2)[0][:, 1]
-        self.sure = MIN_SDS_TO_NEXT * self.sd < MAX_OFF_TO_NEXT * self.apart
+        self.sure = MIN_SEPARATION_SDS * self.sd < MAX_OFFSET_SPACINGS * self.apart
 
     def _distances(self) -> Floats:
         """(n,) pixels from what the others say of a dot to where it is; NaN where it is not matched."""
@@ -459,9 +459,9 @@ class _Search:
         usual = float(np.median(distance[matched]))
         with np.errstate(invalid="ignore"):
             far = distance > np.maximum(
-                np.maximum(MAX_ASTRAY_RATIO * usual, self.tolerated), 2 * MIN_SDS_TO_NEXT * self.sd
+                np.maximum(MAX_ASTRAY_RATIO * usual, self.tolerated), 2 * MIN_SEPARATION_SDS * self.sd
             )
-            far |= self.sure & (distance > MAX_OFF_TO_NEXT * self.apart)
+            far |= self.sure & (distance > MAX_OFFSET_SPACINGS * self.apart)
         far &= distance >= 0.5 * np.nanmax(distance[far], initial=0.0)  # the worst first: they push others off
         self.off |= set(np.flatnonzero(far).tolist())
         self.to[far] = -1
@@ -471,7 +471,7 @@ class _Search:
         pairs: list[tuple[float, int, int]] = []
         taken = set(self.to[self.to >= 0].tolist())
         for row in np.flatnonzero((self.to < 0) & self.sure & self._is_inside()):
-            within = min(MAX_OFF_TO_NEXT * self.apart[row], 2 * MIN_SDS_TO_NEXT * self.sd[row] + self.tolerated)
+            within = min(MAX_OFFSET_SPACINGS * self.apart[row], 2 * MIN_SEPARATION_SDS * self.sd[row] + self.tolerated)
             free = [k for k in self._find_near(self.uv[row], within) if k not in taken]
             pairs += [(float(np.linalg.norm(self.measured[k][0] - self.uv[row])), int(row), k) for k in free]
         for _, at, k in sorted(pairs):
@@ -484,7 +484,7 @@ class _Search:
         distance = self._distances()
         usual = float(np.nanmedian(distance))
         with np.errstate(invalid="ignore"):
-            far = distance > np.maximum(MAX_ASTRAY_RATIO * usual, 2 * MIN_SDS_TO_NEXT * self.sd)
+            far = distance > np.maximum(MAX_ASTRAY_RATIO * usual, 2 * MIN_SEPARATION_SDS * self.sd)
         return np.where(far, distance, 0.0)
 
     def _is_inside(self) -> Bools:
@@ -499,7 +499,7 @@ class _Search:
         scatter = float(np.nanmedian(self._distances() / self.apart))
         against = [self.names[row] for row, spot in self.meant.items() if self.to[row] != spot]
         outvoted = share >= 0.95 and bool(self.sure[inside].all()) and 3 * len(against) <= len(self.meant)
-        if share >= 0.6 and scatter <= MAX_SCATTER_TO_NEXT and (not against or outvoted):
+        if share >= 0.6 and scatter <= MAX_SCATTER_SPACINGS and (not against or outvoted):
             return ""
         which = f", least of all {list_some(against)}" if against and len(against) < len(self.meant) else ""
         return (

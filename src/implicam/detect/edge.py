@@ -44,7 +44,7 @@ UNMODELLED_SD_BLURS = 0.01
 """Standard deviation, in blurs, of what light that is not of this form does to the centre: rendered balls with shading
 and a soft shadow, without any noise, are off by 0.005 to 0.01 of the blur."""
 
-OUTWARD_PX = 2.0
+BAND_MARGIN_PX = 2.0
 """Pixels beyond the blur that tell the light."""
 
 
@@ -228,7 +228,7 @@ def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
     ellipse, kept = start, np.ones(SECTORS, dtype=np.bool_)
     band = fit = None
     for _ in range(3):
-        band = _cut_band(picture, ellipse, 3 * blur + OUTWARD_PX)
+        band = _cut_band(picture, ellipse, 3 * blur + BAND_MARGIN_PX)
         if band is None:
             return None
         fit = _gauss_newton(band, ellipse, blur, kept[_sector_of(band.uv, ellipse)])

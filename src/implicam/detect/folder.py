@@ -27,18 +27,18 @@ from implicam.dataset import Camera, Dataset, KnownPositions, Observations, fold
 from implicam.dataset.folder import DESCRIPTION, IMAGES, VIEWS, csv_text, read_description, read_known
 from implicam.dataset.model import check_name
 from implicam.dataset.tables import parse_toml
-from implicam.detect.journal import Entry, Looked, detect_all
+from implicam.detect.journal import Entry, JournalResults, detect_all
 from implicam.detect.model import Detector, View, nothing
 from implicam.detect.overlay import Result
-from implicam.detect.sheets import draw
+from implicam.detect.sheets import draw_sheets
 from implicam.errors import DatasetError, ImageError, UsageError, did_you_mean
 from implicam.files import replacing, toml_text, write_text
 from implicam.formatting import list_some
 from implicam.images import PATTERN, find_pictures, in_order, one_thread_each
 from implicam.progress import Progress, silent
 
-DETECTIONS, JOURNAL, SUMMARY, WRITTEN = "detections", "journal.jsonl", "summary.csv", "written.toml"
-KEPT = "observations.before-detect"
+DETECTIONS, JOURNAL_FILE, SUMMARY_FILE, WRITTEN_FILE = "detections", "journal.jsonl", "summary.csv", "written.toml"
+BACKUP_NAME = "observations.before-detect"
 
 MAX_NAMES, MAX_NOTES = 5, 20
 """So many names in a sentence, then "and N more"; so many notes about pictures."""
@@ -113,21 +113,22 @@ def detect_folder(
     """
     rig = _Rig.of(Path(dataset), unit, Path(dataset) / pictures, pattern)
     with one_thread_each():
-        looked = detect_all(rig.pictures, detector, rig.path / DETECTIONS / JOURNAL, restart=restart, progress=progress)
+        journal = rig.path / DETECTIONS / JOURNAL_FILE
+        looked = detect_all(rig.pictures, detector, journal, restart=restart, progress=progress)
         rig = rig.with_sizes(looked.sizes)
         results, notes = _settle(rig, detector, looked)
         data, more = _gather(rig, results)
         folder = rig.path / DETECTIONS
-        write_text(folder / SUMMARY, _summary_csv(rig, results))
+        write_text(folder / SUMMARY_FILE, _summary_csv(rig, results))
         if data is not None:
             data, said = (correct or detector.correct)(data)
             more += [*said, *_write(rig, data)]
-        sheets, undrawn = draw(folder, results, progress, redraw=restart) if overlays else ((), ())
+        sheets, undrawn = draw_sheets(folder, results, progress, redraw=restart) if overlays else ((), ())
     if data is None:
         raise _nothing_found_error(rig, results, sheets)
     return DetectionRun(
         rig.path / VIEWS,
-        folder / SUMMARY,
+        folder / SUMMARY_FILE,
         data,
         tuple(results),
         tuple(_count_by_camera(results)),
@@ -242,7 +243,7 @@ def _note_missing(cameras: Iterable[str], usable: Iterable[View]) -> list[str]:
     return notes
 
 
-def _settle(rig: _Rig, detector: Detector, looked: Looked) -> tuple[list[Result], list[str]]:
+def _settle(rig: _Rig, detector: Detector, looked: JournalResults) -> tuple[list[Result], list[str]]:
     """The results in the order of the pictures, after the detector's second look; and a note per unusable picture."""
     problems = dict(looked.problems)
     cameras = {camera.name: camera for camera in rig.cameras}
@@ -270,7 +271,8 @@ def _note_problems(rig: _Rig, problems: Mapping[View, str]) -> list[str]:
     notes = [f"{list_some(names)}: {problem}." for problem, names in files.items()]
     if len(notes) <= MAX_NOTES:
         return notes
-    return [*notes[:MAX_NOTES], f"{len(notes) - MAX_NOTES} more such problems are named in {DETECTIONS}/{SUMMARY}."]
+    more = len(notes) - MAX_NOTES
+    return [*notes[:MAX_NOTES], f"{more} more such problems are named in {DETECTIONS}/{SUMMARY_FILE}."]
 
 
 def _explain_wrong_size(camera: Camera, entry: Entry) -> str:
@@ -331,7 +333,7 @@ def _write(rig: _Rig, data: Dataset) -> list[str]:
     files = folder_files(data)
     if not (rig.path / DESCRIPTION).exists():
         write_text(rig.path / DESCRIPTION, files[DESCRIPTION])
-    target, record = rig.path / VIEWS, rig.path / DETECTIONS / WRITTEN
+    target, record = rig.path / VIEWS, rig.path / DETECTIONS / WRITTEN_FILE
     new, old = _sha256(files[VIEWS].encode()), _sha256(target.read_bytes()) if target.exists() else ""
     notes = []
     ours = [old] if old in (*_read_own_sums(record), new) else []
@@ -355,7 +357,7 @@ def _read_own_sums(record: Path) -> list[str]:
 
 def _keep_copy(target: Path) -> Path:
     """A copy under the first name that is free."""
-    free = (target.with_name(f"{KEPT}{f'-{n}' if n > 1 else ''}.csv") for n in range(1, 1 << 31))
+    free = (target.with_name(f"{BACKUP_NAME}{f'-{n}' if n > 1 else ''}.csv") for n in range(1, 1 << 31))
     kept = next(path for path in free if not path.exists())
     with replacing(kept) as temporary:
         shutil.copyfile(target, temporary)

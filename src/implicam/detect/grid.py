@@ -138,7 +138,7 @@ class Places(NamedTuple):
     down: Floats
 
 
-def grow(picture: Grey, seed: Floats, limit: int) -> Grid | None:
+def grow_grid(picture: Grey, seed: Floats, limit: int) -> Grid | None:
     """All of a checkerboard that can be seen, from a few of its corners.
 
     Args:
@@ -153,7 +153,7 @@ def grow(picture: Grey, seed: Floats, limit: int) -> Grid | None:
     return None if grid is None else _grow_from(picture, grid, limit)
 
 
-def join(picture: Grey, a: Grid, b: Grid, size: tuple[int, int], limit: int) -> Grid | None:
+def join_grids(picture: Grey, a: Grid, b: Grid, size: tuple[int, int], limit: int) -> Grid | None:
     """Join two grids that are parts of one board, behind something that hides what is between.
 
     The plane of each must put the corners of the other on whole numbers of squares, and the colours must agree.

@@ -1,4 +1,4 @@
-"""A look at every picture, what was found kept as it comes: a run that is killed goes on where it stopped.
+"""Detection in every picture; each result is written at once, so that a run that was killed goes on where it stopped.
 
 One JSON line per picture, the later line wins. Each ends in a checksum, so that half a line, or a damaged one, is not
 there at all: the picture is looked at again.
@@ -183,7 +183,7 @@ def _parse_line(line: bytes) -> tuple[Key, Entry] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Looked:
+class JournalResults:
     """What the detector found by itself, picture by picture, and the reasons why others could not be looked at."""
 
     entries: Mapping[View, Entry]
@@ -202,7 +202,7 @@ class Looked:
 
 def detect_all(
     pictures: Mapping[View, Path], detector: Detector, path: Path, *, restart: bool, progress: Progress
-) -> Looked:
+) -> JournalResults:
     """Detect in each picture that the journal does not know yet, on all cores.
 
     A picture that cannot be used, and a detector that fails on one, are problems, and looked at again the next time.
@@ -230,7 +230,7 @@ def detect_all(
             try:
                 entries[view] = _look(file, view, detector, journal, options)
             except ImageError as error:
-                problems[view] = sentence(error).replace(str(file), "the file")
+                problems[view] = join_lines(error).replace(str(file), "the file")
             seconds.append(time.perf_counter() - start)
             progress("looking at pictures", resumed + len(seconds), total)
 
@@ -244,7 +244,7 @@ def detect_all(
         resumed = len(entries)
         progress("looking at pictures", resumed, total)
         side_by_side(work, new)
-    return Looked(entries, problems, resumed, float(np.mean(seconds)) if seconds else float("nan"))
+    return JournalResults(entries, problems, resumed, float(np.mean(seconds)) if seconds else float("nan"))
 
 
 def _find_entry(journal: Journal, view: View, path: Path, options: str) -> Entry | None:
@@ -279,7 +279,7 @@ def _look(path: Path, view: View, detector: Detector, journal: Journal, options:
     except MissingExtraError:
         raise
     except ImplicamError as error:
-        raise ImageError(f"the detector failed: {sentence(error)}") from error
+        raise ImageError(f"the detector failed: {join_lines(error)}") from error
     except Exception as error:
         raise ImageError(f"the detector failed: {type(error).__name__}: {error}") from error
 
@@ -303,7 +303,7 @@ def _find_fault(entry: Entry) -> str:
     return ""
 
 
-def sentence(error: ImplicamError) -> str:
+def join_lines(error: ImplicamError) -> str:
     """An error's three lines in one sentence.
 
     Args:

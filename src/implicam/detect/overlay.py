@@ -14,7 +14,7 @@ from implicam.dataset import Floats
 from implicam.detect.model import Detected, View
 from implicam.drawing import Canvas, Pixels
 
-INK = (40, 50, 60)
+INK_COLOUR = (40, 50, 60)
 STATES = {"found": drawing.GREEN, "partly found": drawing.ORANGE, "nothing found": drawing.VERMILLION}
 
 MAX_SIDE_PX, MIN_SIDE_PX = 1600, 800
@@ -58,7 +58,7 @@ class Result:
         return f"{len(self.found)}{of} {points}" if len(self.found) else self.state
 
 
-def overlay(grey: Pixels | None, result: Result) -> Pixels:
+def draw_overlay(grey: Pixels | None, result: Result) -> Pixels:
     """Draw the whole picture with what was found, and a caption.
 
     Args:
@@ -77,11 +77,11 @@ def overlay(grey: Pixels | None, result: Result) -> Pixels:
         scale = float(min(16, MAX_SIDE_PX // longest))
     whole = _Window(0, 0, width, height, scale)
     canvas = whole.draw(grey, result.found)
-    _draw_loupe(canvas, grey, result.found, whole)
+    _draw_magnified(canvas, grey, result.found, whole)
     return _add_caption(canvas, result).pixels
 
 
-def thumbnail(grey: Pixels | None, result: Result) -> Pixels:
+def draw_thumbnail(grey: Pixels | None, result: Result) -> Pixels:
     """Draw a tile of a sheet: the neighbourhood of what was found, the whole picture small, and a caption below.
 
     Args:
@@ -104,11 +104,11 @@ def thumbnail(grey: Pixels | None, result: Result) -> Pixels:
     tile.paste(_centre(inner, width, height), 4, 4)
     tile.border(4, STATES[result.state])
     right, top = tile.width - 10, tile.height - TEXT_PX
-    tile.write(result.summary, (right, top + 17), 14, INK, "rs")
+    tile.write(result.summary, (right, top + 17), 14, INK_COLOUR, "rs")
     name = drawing.cut_text(result.view.shot, right - 20 - drawing.text_width(result.summary, 14), 15)
-    tile.write(name, (10, top + 17), 15, INK)
+    tile.write(name, (10, top + 17), 15, INK_COLOUR)
     for i, line in enumerate(drawing.wrap_text(result.found.reason, tile.width - 20, 11.5, 2)):
-        tile.write(line, (10, top + 35 + 16 * i), 11.5, INK)
+        tile.write(line, (10, top + 35 + 16 * i), 11.5, INK_COLOUR)
     return tile.pixels
 
 
@@ -246,7 +246,7 @@ def _write_names(canvas: Canvas, points: Sequence[str], uv: Floats) -> None:
         canvas.write(name, (u + size, v - 0.7 * size), size, drawing.WHITE, rim=1)
 
 
-def _draw_loupe(canvas: Canvas, grey: Pixels, found: Detected, whole: _Window) -> None:
+def _draw_magnified(canvas: Canvas, grey: Pixels, found: Detected, whole: _Window) -> None:
     """Where what was found is small in the picture: enlarged in the corner that is farthest from it."""
     near = _find_neighbourhood(found, grey.shape)
     if near is None or near.width > 0.3 * grey.shape[1] or near.height > 0.3 * grey.shape[0]:

@@ -1,8 +1,8 @@
-"""Where a checkerboard may be: grids of rough corners, from which `grid.grow` finds the board, or nothing.
+"""Where a checkerboard may be: grids of rough corners, from which `grid.grow_grid` finds the board, or nothing.
 
 Three detectors: OpenCV's sector-based one (Duda & Frese 2018), the paper's, libCBDetect (after Geiger et al. 2012), and
 the saddle points of the picture with their eight neighbours, which needs no more than a ninth of a board to begin.
-A seed may be wrong: nothing is believed that the picture does not bear out afterwards.
+A seed may be wrong: every corner is checked in the picture afterwards.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Names, Observations
-from implicam.dataset.requirements import same_cameras
+from implicam.dataset.requirements import match_cameras
 from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.rig_model.alarm import Table, alarm_of
@@ -81,7 +81,7 @@ class FittedRig:
         """Measure each point with the views it has, two or more."""
         known = [name for name in self.trained.camera_names if name in observations.camera_names]
         trained = self.trained.with_cameras(known) if known else self.trained
-        observations = same_cameras(trained, observations)
+        observations = match_cameras(trained, observations)
         uv, noise = self.views(observations)
         found = locate(self.posterior, uv, noise, self.labels, self.degrees, self.settings)
         seen = np.asarray(np.isfinite(uv).all(axis=2))

@@ -13,8 +13,8 @@ from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.pixels import told
 from implicam.dataset import Dataset, KnownPositions, Observations, without_copies
-from implicam.dataset.requirements import same_cameras
-from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
+from implicam.dataset.requirements import match_cameras
+from implicam.dataset.unused import Rejected, Unused, list_copied_points, point_copy_notes, uncalibrated_with_copies
 from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.progress import Progress
@@ -77,7 +77,7 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
         tuple(choices[c] for c in fitted.cameras),
         *diagnosis.leave_one_out,
         diagnosis.rejected,
-        (*diagnosis.unused, *copied_points(data)),
+        (*diagnosis.unused, *list_copied_points(data)),
         (
             *point_copy_notes(data),
             *diagnosis.notes(),
@@ -138,7 +138,7 @@ def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
             fix="give boards that the same cameras saw, with the same names in dataset.toml",
         )
     trained = boards.observations.with_cameras(names)
-    same_cameras(trained, data.observations.with_cameras(names))
+    match_cameras(trained, data.observations.with_cameras(names))
     return trained
 
 

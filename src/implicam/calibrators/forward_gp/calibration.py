@@ -30,7 +30,7 @@ from implicam.calibrators.protocol import (
     solvable,
 )
 from implicam.dataset import Dataset, without_copies
-from implicam.dataset.unused import Rejected, Unused, copied_points, point_copy_notes, uncalibrated_with_copies
+from implicam.dataset.unused import Rejected, Unused, list_copied_points, point_copy_notes, uncalibrated_with_copies
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
 from implicam.mistakes import explain_fit_error
@@ -161,7 +161,7 @@ class ForwardGPCalibration(RigCalibration):
     @property
     def unused(self) -> tuple[Unused, ...]:
         """The known points of which no view is used."""
-        return (*self.diagnosis.unused, *copied_points(self.data))
+        return (*self.diagnosis.unused, *list_copied_points(self.data))
 
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> ForwardGPCalibration:
         """As `refit`, starting from what is known: for a few points more, in half of the time.
