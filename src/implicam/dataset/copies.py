@@ -4,7 +4,7 @@ This happens when files are joined twice, or a camera is exported under two name
 must not count as evidence: a fit would estimate a noise that is too small, and a held-out fold would hold known points.
 
 Points are copies where the known position is the same and so are all pixels, in two cameras or more. With whole-number
-pixels a point that was measured twice at rest may look like that: it is no news either. One camera alone proves
+pixels a point that was measured twice at rest may look like that: it adds nothing either. One camera alone proves
 nothing, unless the table has copies that do. Cameras are copies where all views that both have are the same.
 """
 

@@ -287,7 +287,7 @@ def description_text(data: Dataset) -> str:
     table = {"name": data.name, "length_unit": data.length_unit, **data.extra}
     try:
         text = _with_camera_tables(table, cameras)
-        parse_toml(text)  # what is written must be readable again: sizes, time zones
+        parse_toml(text)  # it must be readable again: too long, or a time zone
     except ValueError as error:
         raise DatasetError(
             f"the description of dataset {data.name!r} cannot be written.",

@@ -42,7 +42,7 @@ def remove_marks(data: Dataset) -> Dataset:
         return data
     marked = np.any(list(found.values()), axis=0)
     uv = np.where(marked[..., None], np.nan, observations.uv)
-    extra = {key: np.where(marked, "", text) for key, text in observations.extra.items()}  # of a view that is none
+    extra = {key: np.where(marked, "", text) for key, text in observations.extra.items()}  # of removed views
     cleaned = replace(observations, uv=uv, extra=extra)
     return replace(data, observations=cleaned, notes=(*data.notes, *notes))
 
@@ -64,7 +64,7 @@ def _stands_for_many(observations: Observations, places: Floats | None, pixel: t
     rows = repeated.any(axis=1)
     if places is not None:
         return len(np.unique(places[rows], axis=0)) >= MIN_PLACES_AT_ONE_PIXEL
-    # positions unknown: a point at rest has one pixel in every camera, so only an impossible-looking pixel is a mark
+    # positions unknown: a point at rest has one pixel in every camera, so only a negative pixel or u = v is a mark
     u, v = pixel
     others = np.where(repeated[..., None], np.nan, observations.uv)[rows]
     odd = u < 0 or v < 0 or u == v

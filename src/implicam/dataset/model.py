@@ -27,7 +27,7 @@ SD_POINT, SD_VIEW = ("sd_x", "sd_y", "sd_z"), ("sd_u", "sd_v")
 WIDE_TABLE = "wide_table"  # what the description of a wide table says of its columns
 _CAMERA_KEYS, _DATASET_KEYS = ("name", "width", "height"), ("name", "length_unit", "cameras", WIDE_TABLE)
 
-# A text column is as wide as its longest text in every row, so one runaway cell would cost gigabytes.
+# A text column is as wide as its longest text in every row, so one long cell would cost gigabytes.
 MAX_NAME_CHARACTERS, MAX_CELL_CHARACTERS = 200, 1000
 MAX_IMAGE_SIZE_PX = 1_000_000
 MAX_TOML_DEPTH = 50
@@ -518,7 +518,7 @@ def _text(value: ArrayLike, shape: tuple[int, ...] | None = None) -> Names:
 
 def _index(index: ArrayLike) -> NDArray[Any]:
     i = np.asarray(index)
-    return i if i.size else i.astype(i.dtype if i.dtype.kind == "b" else np.intp)  # [] is no list of floats
+    return i if i.size else i.astype(i.dtype if i.dtype.kind == "b" else np.intp)  # [] becomes floats
 
 
 def check_name(name: object, what: str, place: str = "") -> None:
@@ -711,7 +711,7 @@ def to_plain(value: Any, depth: int = 0) -> Any:
 
 
 def _encodable(text: str) -> str:
-    text.encode()  # UnicodeEncodeError, a ValueError, for half a character
+    text.encode()  # UnicodeEncodeError, a ValueError, for half of a surrogate pair
     return text
 
 

@@ -195,7 +195,7 @@ def _read_lines(path: Path) -> Iterator[str]:
             if not line:
                 return
             if number == 1:
-                line = line.removeprefix(b"\xef\xbb\xbf")  # the mark that Excel puts before UTF-8
+                line = line.removeprefix(b"\xef\xbb\xbf")  # the byte order mark that Excel writes
                 _refuse_other_text(path, line)
             if len(line) > MAX_LINE_BYTES or b"\0" in line:
                 raise DatasetError(

@@ -3,8 +3,8 @@
 As in the paper, template matching finds the plate and what is before it, and the blob inside is the ball. Here the
 template is a dark disc on a light ground in many sizes, or a crop of a picture that a person pointed at; then the edge
 of each blob is fitted (detect/edge.py), and a blob is a ball if its edge is a whole, nearly round step from dark to
-light. A second look at all pictures of a camera drops what is at the same place in shot after shot: the ball moves, the
-laboratory does not.
+light. A second look at all pictures of a camera drops what is at the same place in shot after shot: only the ball
+moves.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ TEMPLATE_RADII_PX = (2.5, 3.5)
 """Radii of the drawn template, in pixels of a picture that is halved again and again."""
 
 MIN_CORRELATION = 0.45
-"""Correlation with the template from which on a place is looked at."""
+"""Least correlation with the template of a place where an edge is sought."""
 
 MAX_PLACES, MAX_EDGES_FITTED = 10, 4
-"""Places that are looked at in one picture, and edges that are fitted."""
+"""Places where an edge is sought in one picture, and edges that are fitted."""
 
 MIN_RIVAL_QUALITY_RATIO = 0.6
 """An edge whose rough quality is less than this part of the best one's is no rival of a ball that was found."""

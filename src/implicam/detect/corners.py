@@ -126,7 +126,7 @@ class _Windows:
         error, parameters, linear, jacobian = self._evaluate(parameters, weight)
         damping = np.full(n, 1e-3)
         for turn in range(MAX_ROUNDS):
-            if turn == 2:  # the window follows the corner, but not for ever: what moves does not converge
+            if turn == 2:  # the window follows the corner once only: else the fit does not converge
                 weight = self._choose_window(parameters)
                 error, parameters, linear, jacobian = self._evaluate(parameters, weight)
             trial = self._limit(parameters - self._solve_step(linear[1], jacobian, weight, damping))

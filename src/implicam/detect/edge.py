@@ -349,7 +349,7 @@ def _gauss_newton(band: _Band, start: Ellipse, blur: float, use: Bools) -> _Fit 
     for iteration in range(15):
         model, J, step = _evaluate_model(uv, fit)
         residual = grey - model
-        if iteration >= 2:  # a first fit knows what is odd
+        if iteration >= 2:  # outliers are known after a first fit
             fit = fit._replace(noise=_estimate_noise(residual, step))
             weight = np.maximum(1 - residual**2 / (25 * _noise_variance(fit.noise, step)), 0) ** 2
         JW = J * (weight / _noise_variance(fit.noise, step))[:, None]

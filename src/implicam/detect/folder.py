@@ -59,12 +59,12 @@ class Count(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DetectionRun:
-    """What came of `detect_folder`.
+    """The result of `detect_folder`.
 
     data: the observations as written. cameras: a count each. reasons: why nothing, or not everything, was found, with
     the number of pictures, the commonest first; those that differ in numbers only count as one. notes: sentences for
-    the person. resumed: pictures that an earlier run had looked at. seconds_per_picture: how long one core took to read
-    a picture and to look at it, NaN where none was new. sheets: the pictures to check by eye.
+    the person. resumed: pictures that an earlier run had searched. seconds_per_picture: how long one core took to read
+    a picture and to search it, NaN where none was new. sheets: the pictures to check by eye.
     """
 
     observations: Path
@@ -340,7 +340,7 @@ def _write(rig: _Rig, data: Dataset) -> list[str]:
     if old and not ours:
         kept = _keep_copy(target)
         notes.append(f"the {VIEWS} that was there is kept as {kept.name}: detect had not written it.")
-    # Both sums first: killed between the two, the next run still knows which file is its own.
+    # Both sums first: after a kill between the two, the next run still recognises its own file.
     write_text(record, toml_text({"observations_sha256": [*ours, new]}))
     write_text(target, files[VIEWS])
     return notes

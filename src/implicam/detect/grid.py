@@ -28,7 +28,7 @@ MAX_TURN_RAD = 0.35
 """Radians that an edge may be turned from where the neighbours put it: more, and the fit has found other edges."""
 
 QUADRANT_SQUARES = 0.3
-"""How far into a square its colour is looked at, in squares from the corner in both directions."""
+"""Where the colour of a square is read, in squares from the corner in both directions."""
 
 MIN_GREY_HEIGHTS = 0.35
 """How far a square's grey must be on its side of the middle, as a part of the height, to have that colour."""

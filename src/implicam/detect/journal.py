@@ -1,7 +1,7 @@
 """Detection in every picture; each result is written at once, so that a run that was killed goes on where it stopped.
 
 One JSON line per picture, the later line wins. Each ends in a checksum, so that half a line, or a damaged one, is not
-there at all: the picture is looked at again.
+there at all: the picture is searched again.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class Journal:
                 path.unlink(missing_ok=True)
             self.entries = _read(path)
             self._file = path.open("ab", buffering=0)
-            if not _ends_with_newline(path):  # a kill may have left half a line: what comes next must not join it
+            if not _ends_with_newline(path):  # a kill may have left half a line: the next must begin on its own
                 self._file.write(b"\n")
         except OSError as error:
             raise self._write_error(error) from error
@@ -184,7 +184,7 @@ def _parse_line(line: bytes) -> tuple[Key, Entry] | None:
 
 @dataclass(frozen=True, eq=False)
 class JournalResults:
-    """What the detector found by itself, picture by picture, and the reasons why others could not be looked at."""
+    """What the detector found in each picture, and the reasons why others could not be searched."""
 
     entries: Mapping[View, Entry]
     problems: Mapping[View, str]
@@ -205,7 +205,7 @@ def detect_all(
 ) -> JournalResults:
     """Detect in each picture that the journal does not know yet, on all cores.
 
-    A picture that cannot be used, and a detector that fails on one, are problems, and looked at again the next time.
+    A picture that cannot be used, and a detector that fails on one, are problems, and are tried again the next time.
 
     Args:
         pictures: View -> file.
@@ -251,7 +251,7 @@ def _find_entry(journal: Journal, view: View, path: Path, options: str) -> Entry
     try:
         entry = journal.entries.get(Key.of(view, path, options))
     except OSError:
-        return None  # reading it will say why
+        return None  # `_look` will say why
     return None if entry is None or _find_fault(entry) else entry
 
 

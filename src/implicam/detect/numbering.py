@@ -23,7 +23,7 @@ TOP, RIGHT, BOTTOM, LEFT = range(4)
 END, MORE, UNKNOWN = "end", "more", "unknown"
 
 WITHIN_SQUARES, BEYOND_SQUARES = 0.7, 1.3
-"""Squares outwards from a grid's outermost line where the last square, and what follows it, are looked at."""
+"""Squares outwards from a grid's outermost line where the last square, and what follows it, are read."""
 
 MIN_GREY_HEIGHTS = 0.4
 """How far a grey must be on one side of the middle, as a part of the height, to be called black or white."""

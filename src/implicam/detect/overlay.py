@@ -35,7 +35,7 @@ _CORNER = re.compile(r".*-c(\d{3,})")
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What came of a picture. expected: how many known points belong to its shot, None where that is not known."""
+    """The result of a picture. expected: how many known points belong to its shot, None where that is not known."""
 
     view: View
     path: Path
@@ -63,7 +63,7 @@ def draw_overlay(grey: Pixels | None, result: Result) -> Pixels:
 
     Args:
         grey: (height, width) as `eight_bit` gives it; None where the picture cannot be read.
-        result: What came of the picture.
+        result: The result of the picture.
 
     Returns:
         (rows, columns, 3) red, green, blue, from 0 to 255.
@@ -86,7 +86,7 @@ def draw_thumbnail(grey: Pixels | None, result: Result) -> Pixels:
 
     Args:
         grey: (height, width) as `eight_bit` gives it; None where the picture cannot be read.
-        result: What came of the picture.
+        result: The result of the picture.
 
     Returns:
         (rows, columns, 3) red, green, blue, from 0 to 255; all tiles have the same size.

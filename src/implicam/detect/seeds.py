@@ -26,7 +26,7 @@ MIN_ROWS = 4
 """Rows and columns of the smallest board that OpenCV is asked for; with three it sees boards in anything."""
 
 MAX_SADDLES = 800
-"""Saddle points that are looked at, the strongest first."""
+"""Saddle points that are used, the strongest first."""
 
 FAINT_RANK, MIN_STRENGTH_RATIO = 25, 0.2
 """A saddle point is weak if it has less than this part of the strength of the one with this rank."""
@@ -57,7 +57,7 @@ def from_opencv(picture: Grey, scale: float) -> list[Floats]:
         return []
     try:
         found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (MIN_ROWS, MIN_ROWS), cv2.CALIB_CB_LARGER)
-    except cv2.error:  # its own sub-pixel step fails near the picture's rim
+    except cv2.error:  # its sub-pixel step fails near the picture's rim
         return []
     if not found or meta is None or corners.size != 2 * meta.size:
         return []

@@ -62,11 +62,11 @@ def draw_sheets(
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Draw overlays and sheets: folder/overlays/<camera>/<shot>.jpg and folder/<camera>.jpg, -2.jpg, ...
 
-    What is there and shows the same is left alone. What shows pictures that are gone is removed.
+    Files that already show the same are kept. Files of pictures that no longer exist are removed.
 
     Args:
         folder: Where to.
-        results: What came of each picture.
+        results: The result of each picture.
         progress: Told how many pictures are drawn.
         redraw: Whether to draw all again.
 
@@ -118,7 +118,7 @@ class _Page:
                 if new:
                     write_picture(folder / name, draw_overlay(grey, result)[..., ::-1])
                 tile = draw_thumbnail(grey, result) if whole else tile
-            except Exception as error:  # what was found is worth more than its drawing
+            except Exception as error:  # a failed drawing must not lose what was found
                 digests.pop(name)
                 notes.append(f"{folder / name} is not drawn: {error}")
             step()

@@ -125,7 +125,7 @@ class Robot(Protocol):
     """Whatever puts the target somewhere and knows where it is; positions (3,) in the dataset's unit and world frame.
 
     sd: standard uncertainty of `position` along x, y, z in that unit, (nan, nan, nan) where unknown. moves: False for
-    a person, whom `move` only asks. alone: whether it gets there without anybody's help, so that a session may go on
+    a person, whom `move` only asks. alone: whether it gets there without a person's help, so that a session may go on
     by itself.
     """
 
@@ -139,7 +139,7 @@ class Robot(Protocol):
 
     @property
     def alone(self) -> bool:
-        """Whether it gets there without anybody's help."""
+        """Whether it gets there without a person's help."""
 
     def open(self) -> None:
         """Connect. Opening twice is harmless. HardwareError with the cure."""

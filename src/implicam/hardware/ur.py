@@ -181,7 +181,7 @@ class URRobot:
             if self._worker is not None and not self._dry:
                 self._worker.call("control", "stopScript")
         except (RuntimeError, TimeoutError):
-            return  # it is gone already
+            return  # it is disconnected already
         finally:
             self._disconnect()
 

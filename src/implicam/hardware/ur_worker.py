@@ -103,7 +103,7 @@ class Worker:
 def _serve() -> None:
     """The other process: answer until the session closes the pipe."""
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the library prints where the answers go
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the library prints to stdout, where the answers go
     things: dict[str, Any] = {}
     with suppress(BrokenPipeError):  # the session died before it read the answer
         for line in sys.stdin:
@@ -116,7 +116,7 @@ def _serve() -> None:
         with suppress(Exception):
             things["control"].stopL(DECELERATION_M_S2)
             things["control"].stopScript()
-    os._exit(0)  # without the library's destructors
+    os._exit(0)  # skips the library's destructors, which may hang
 
 
 def _answer_call(things: dict[str, Any], thing: str, method: str, args: list[Any]) -> dict[str, Any]:

@@ -223,7 +223,7 @@ class SessionController:
         end = time.monotonic() + STOP_REPEAT_SECONDS
         try:
             self.equipment.robot.stop()
-            while self.state.phase == "moving" and time.monotonic() < end:  # a move may have been about to begin
+            while self.state.phase == "moving" and time.monotonic() < end:  # a move may begin just now
                 time.sleep(0.05)
                 self.equipment.robot.stop()
         finally:
@@ -369,7 +369,7 @@ class SessionController:
         measured = calibration.measure(self._make_observations("live", self.state.looks))
         return np.asarray(measured.xyz[0], dtype=np.float64)
 
-    # inside
+    # private
 
     def _list_devices(self) -> Iterator[FrameSource | Robot | Trigger]:
         yield from self.equipment.cameras
@@ -390,7 +390,7 @@ class SessionController:
         try:
             yield
         except ImplicamError as error:
-            if isinstance(error, UsageError):  # nothing happened: what was shown is shown again
+            if isinstance(error, UsageError):  # nothing was done: show the phase before
                 self._show(phase=before.phase, message=before.message)
                 raise
             self._report_trouble(error)

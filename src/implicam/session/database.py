@@ -128,7 +128,7 @@ class Database:
             DatasetError: There is none, or it is damaged, another program's, or a newer version's.
             ImplicamError: The file cannot be written.
         """
-        if not os.path.isfile(path):  # Path.is_file raises where the folder may not be looked into
+        if not os.path.isfile(path):  # Path.is_file raises where the folder may not be read
             raise DatasetError(
                 f"{path.parent} is no session.",
                 why=f"it has no {path.name}, or may not be looked into",

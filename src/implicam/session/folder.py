@@ -102,7 +102,7 @@ def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> No
         right |= {VIEWS: "", POINTS: ""}
     for name, text in right.items():
         old = _read_or_none(folder / name)
-        if old and not text.encode().startswith(old):  # else only the last points are missing: a kill
+        if old and not text.encode().startswith(old):  # else only the last points are missing, after a kill
             shutil.copyfile(folder / name, _find_free_path(folder / UNDONE / name))
 
 

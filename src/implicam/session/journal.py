@@ -186,7 +186,7 @@ class Session:
                         insert_shot(self._database, shot, noted)
                     self._data = data
             except BaseException:
-                with suppress(ImplicamError):  # the next opening does it
+                with suppress(ImplicamError):  # `open` does it the next time
                     self._set_pictures_aside()
                 raise
 
@@ -280,7 +280,7 @@ class Session:
         if len(names) != 1:
             raise DatasetError(f"{len(names)} shots at once: {', '.join(names[:5])}.", fix="accept one after the other")
         files.check_file_name(names[0], "shot")
-        if self._list_begun_shots():  # of an `accept` that failed, and could not clean up either
+        if self._list_begun_shots():  # left by an `accept` that failed
             self._set_pictures_aside()
         states = self._database.rows("SELECT state FROM shots WHERE name = ?", names[0])
         if states:
