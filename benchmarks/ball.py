@@ -30,7 +30,7 @@ from implicam.dataset import Observations
 from implicam.detect.ball import Ball
 from implicam.detect.edge import Ellipse, fit_ellipse
 from implicam.detect.model import View
-from implicam.detect.silhouette import centred
+from implicam.detect.silhouette import correct_outlines
 from implicam.files import write_text
 from implicam.images import one_thread_each, read_picture, write_picture
 from implicam.simulate import Optics, Studio, build_rig, random_positions, record
@@ -186,12 +186,12 @@ def end_to_end(noise, blur, rigs, count):
     ratios, nees, covered, millimetres, measured = [], [], [], [], 0
     for seed in range(rigs):
         rig, optics = build_rig("bar6", seed=seed), Optics(noise=noise, blur=blur)
-        known, _ = centred(
+        known, _ = correct_outlines(
             photographed(rig, random_positions(rig, KNOWN, np.random.default_rng([seed, 3])), seed, optics), 8.0
         )
         others = photographed(rig, random_positions(rig, count, np.random.default_rng([seed, 4])), seed + 100, optics)
         calibration = ForwardGP().fit(known)
-        moved, _ = centred(replace(others, known=None), 8.0, calibration)
+        moved, _ = correct_outlines(replace(others, known=None), 8.0, calibration)
         m = calibration.measure(moved.observations)
         bound = limit(rig, others.xyz, moved.observations.sd)
         good = np.isfinite(m.xyz).all(axis=1) & np.isfinite(bound).all(axis=(1, 2))

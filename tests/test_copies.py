@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import implicam as ic
-from implicam.dataset import Dataset, KnownPositions, Observations, copies_of, copy_notes, without_copies
+from implicam.dataset import Dataset, KnownPositions, Observations, describe_copies, find_copies, remove_copies
 from implicam.errors import DatasetError
 from implicam.simulate import ball_grid, build_rig, random_positions, simulate
 
@@ -40,9 +40,9 @@ def with_pixels(data: Dataset, uv: np.ndarray) -> Dataset:
 
 def test_rows_joined_twice_are_one_and_said() -> None:
     data = ic.read_dataset(CASES / "rows-copied" / "known.csv")
-    assert copies_of(data).points.sum() == 48
-    assert len(without_copies(data)) == 12
-    (note,) = copy_notes(data)
+    assert find_copies(data).points.sum() == 48
+    assert len(remove_copies(data)) == 12
+    (note,) = describe_copies(data)
     assert note.startswith("48 of 60 known points are copies of others")
 
 
@@ -83,7 +83,7 @@ def test_copies_are_not_counted_when_held_out() -> None:
 def test_cameras_copied_are_one_and_named() -> None:
     data = ic.read_dataset(CASES / "cameras-copied" / "known.csv")
     names = np.array(data.observations.camera_names)
-    assert list(names[~copies_of(data).cameras]) == ["k0", "k3", "k6", "k9"]
+    assert list(names[~find_copies(data).cameras]) == ["k0", "k3", "k6", "k9"]
     calibration = ic.ForwardGP().fit(data)
     assert calibration.camera_names == ("k0", "k3", "k6", "k9")
     assert any("k1" in note and "those of k0" in note for note in calibration.notes())
@@ -108,7 +108,7 @@ def test_the_copy_with_more_views_stays() -> None:
     uv[3:5, 0] = np.nan
     cameras = (*o.cameras, replace(o.cameras[0], name="again"))
     three = Observations(o.points, cameras, uv, np.full(uv.shape, np.nan))
-    copies = copies_of(replace(data, observations=three))
+    copies = find_copies(replace(data, observations=three))
     assert copies.cameras.tolist() == [True, False, False]
     assert copies.camera_of[0] == 2
 
@@ -118,7 +118,7 @@ def test_ordinary_rigs_without_noise_have_no_copies(spec: str) -> None:
     built = build_rig(spec, seed=2, noise=0.0, lens_error=0.0)
     for target in (ball_grid(built), random_positions(built, 60, np.random.default_rng(0))):
         data = simulate(built, target, seed=1, missing=0.3)
-        assert without_copies(data) is data
+        assert remove_copies(data) is data
 
 
 def test_whole_number_pixels_of_one_camera_are_no_copies() -> None:
@@ -127,17 +127,17 @@ def test_whole_number_pixels_of_one_camera_are_no_copies() -> None:
     uv = np.round(data.observations.uv)
     uv[30:, 1:] = np.nan
     uv[:30, 0] = np.where(np.arange(30)[:, None] < 15, uv[:30, 0], np.nan)
-    assert not copies_of(with_pixels(data, uv)).points.any()
+    assert not find_copies(with_pixels(data, uv)).points.any()
 
 
 def test_points_seen_by_nobody_are_no_copies() -> None:
     data = twice(rig(10))
-    assert not copies_of(with_pixels(data, np.full(data.observations.uv.shape, np.nan))).points.any()
+    assert not find_copies(with_pixels(data, np.full(data.observations.uv.shape, np.nan))).points.any()
 
 
 def test_nothing_is_a_copy_where_positions_are_not_known() -> None:
     data = twice(rig(10))
-    assert not copies_of(replace(data, known=None)).points.any()
+    assert not find_copies(replace(data, known=None)).points.any()
 
 
 # --- marks ---------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from implicam.calibrators import ForwardGP
 from implicam.detect.ball import Ball, Template
 from implicam.detect.edge import Ellipse, find_rough_edge, fit_edge, fit_ellipse
 from implicam.detect.model import Detected, View
-from implicam.detect.silhouette import centred, outline_shift
+from implicam.detect.silhouette import correct_outlines, predict_outline_shift
 from implicam.errors import ImageError, UsageError
 from implicam.images import read_picture, write_picture
 from implicam.simulate import Optics, Studio, build_rig, random_positions, simulate
@@ -443,7 +443,7 @@ def test_the_outline_is_off_by_what_is_predicted(lens_error, most):
     calibration = ForwardGP().fit(data)
     xyz = random_positions(rig, 12, np.random.default_rng(9)).xyz
     true = true_shift(rig, xyz, 8.0)
-    off = np.abs(outline_shift(calibration, xyz, 8.0, data.observations.camera_names) - true)
+    off = np.abs(predict_outline_shift(calibration, xyz, 8.0, data.observations.camera_names) - true)
     assert np.abs(true).max() > 0.2  # there is something to predict
     assert np.quantile(off, 0.95) < 0.005
     assert off.max() < most
@@ -451,10 +451,10 @@ def test_the_outline_is_off_by_what_is_predicted(lens_error, most):
 
 def test_where_nothing_can_be_predicted_there_is_no_number(calibrated):
     _, data, calibration = calibrated
-    shift = outline_shift(calibration, data.xyz[:3], 8.0, ("cam2", "unheard-of"))
+    shift = predict_outline_shift(calibration, data.xyz[:3], 8.0, ("cam2", "unheard-of"))
     assert np.isfinite(shift[:, 0]).all()
     assert np.isnan(shift[:, 1]).all()
-    nowhere = outline_shift(calibration, np.full((1, 3), np.nan), 8.0, data.observations.camera_names)
+    nowhere = predict_outline_shift(calibration, np.full((1, 3), np.nan), 8.0, data.observations.camera_names)
     assert np.isnan(nowhere).all()
 
 
@@ -463,7 +463,7 @@ def test_observations_are_moved_to_the_middle(calibrated):
     shift = true_shift(rig, data.xyz, 8.0)
     outlines = replace(data, observations=replace(data.observations, uv=data.observations.uv + shift))
     for given, target in ((None, outlines), (calibration, outlines), (calibration, replace(outlines, known=None))):
-        moved, notes = centred(target, 8.0, given)
+        moved, notes = correct_outlines(target, 8.0, given)
         seen = data.observations.seen
         assert np.abs(moved.observations.uv - data.observations.uv)[seen].max() < 0.02  # of up to 0.2 px
         assert any("corrected" in note for note in notes)
@@ -476,7 +476,7 @@ def test_observations_are_moved_to_the_middle(calibrated):
 def test_without_positions_and_calibration_the_pixels_stay(calibrated):
     data = calibrated[1]
     for bare, why in ((replace(data, known=None), "no calibration yet"), (few(data, 5), "too few")):
-        same, notes = centred(bare, 8.0)
+        same, notes = correct_outlines(bare, 8.0)
         assert np.array_equal(same.observations.uv, bare.observations.uv, equal_nan=True)
         assert "outline_u" not in same.observations.extra
         assert len(notes) == 1
@@ -491,4 +491,4 @@ def few(data, n):
 @pytest.mark.parametrize("radius", [0.0, -1.0, np.nan, np.inf])
 def test_a_ball_has_a_radius(calibrated, radius):
     with pytest.raises(UsageError, match="no radius"):
-        centred(calibrated[1], radius)
+        correct_outlines(calibrated[1], radius)

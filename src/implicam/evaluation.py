@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from implicam.calibrators import Calibration
 from implicam.coverage import Coverage, assess, tercile_labels
-from implicam.dataset import Dataset, Floats, Names, Observations, copies_of
+from implicam.dataset import Dataset, Floats, Names, Observations, find_copies
 from implicam.dataset.model import fingerprint_rows
 from implicam.errors import DatasetError
 from implicam.geometry import depth_of_points
@@ -107,9 +107,9 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
         )
     held_out = data.select(~used)
     how = f"{len(held_out)} points not used in the fit"
-    if copies_of(held_out).points.any():
-        how += f", of which {int(copies_of(held_out).points.sum())} are copies of others and not counted"
-        held_out = held_out.select(~copies_of(held_out).points)
+    if find_copies(held_out).points.any():
+        how += f", of which {int(find_copies(held_out).points.sum())} are copies of others and not counted"
+        held_out = held_out.select(~find_copies(held_out).points)
     if used.any():
         how += f"; {used.sum()} of this dataset were, and are left out"
     measurement = calibration.measure(held_out.observations)
@@ -155,7 +155,7 @@ def leave_out_shots(fit: Fits, data: Dataset, *, progress: Progress = silent) ->
 
 def _each_once(data: Dataset, how: str) -> tuple[Dataset, str]:
     """Without copied points: a copy in another fold is a point that the fit knows, and no second piece of evidence."""
-    copied = copies_of(data).points
+    copied = find_copies(data).points
     if not copied.any():
         return data, how
     return data.select(~copied), f"{how}; {copied.sum()} points are copies of others and not counted"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Dataset, Floats
-from implicam.dataset.copies import without_copies
+from implicam.dataset.copies import remove_copies
 from implicam.errors import FitError
 from implicam.row_order import MIN_VIEWS, describe_order, find_row_order
 
@@ -59,7 +59,7 @@ def find_mistakes(data: Dataset) -> list[Finding]:
     """
     if data.known is None:
         return []
-    data = without_copies(data)
+    data = remove_copies(data)
     return list(_two_units(data)) or list(_other_rows(data))
 
 

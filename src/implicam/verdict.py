@@ -20,7 +20,7 @@ from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.calibrators.protocol import CheckPlan
-from implicam.dataset import Dataset, Floats, copies_of, copy_notes
+from implicam.dataset import Dataset, Floats, find_copies, describe_copies
 from implicam.dataset.marks import remove_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluation import known_position_covariance
@@ -204,7 +204,7 @@ def _clean(calibration: Calibration) -> Dataset:
     views = (~np.isnan(uv[..., 0])).sum(axis=1)
     unused = np.isin(data.points, [one.point for one in calibration.unused])
     clean = replace(data, observations=replace(data.observations, uv=uv))
-    return clean.select((views >= 2) & ~unused & ~copies_of(data).points)
+    return clean.select((views >= 2) & ~unused & ~find_copies(data).points)
 
 
 def _at_most(data: Dataset, most: int) -> Dataset:
@@ -303,13 +303,13 @@ def _of_kept_back(calibration: Calibration) -> Iterator[Finding]:
 
 def _of_data(data: Dataset) -> Iterator[Finding]:
     yield from find_mistakes(data)
-    copies = copies_of(data)
+    copies = find_copies(data)
     seen = ~copies.points & data.observations.seen.any(axis=1)
     n, places = int(seen.sum()), len(np.unique(data.places[seen]))
     if 0 < places < MIN_RECOMMENDED_POINTS:
         what = f"{n} known points are" if places == n else f"{n} known points at {places} different positions are"
         yield Finding(False, f"{what} few: show the cameras {MIN_RECOMMENDED_POINTS} or more, better 17, all over.")
-    for note in copy_notes(data):
+    for note in describe_copies(data):
         yield Finding(False, note)
     for note in remove_marks(data).notes[len(data.notes) :]:
         yield Finding(False, note.replace("missing, and taken as such", "missing, but here it was taken for a pixel"))
@@ -445,7 +445,7 @@ def _of_stated_sds(calibration: Calibration) -> Iterator[Finding]:
 def _seen_and_predicted(calibration: Calibration) -> tuple[Floats, Floats]:
     """(n, cameras, 2) each: pixels of the known points, and where the calibration has them; n = 0 if it cannot say."""
     data = calibration.data
-    uv = np.where(copies_of(data).cameras[:, None], np.nan, data.observations.uv)
+    uv = np.where(find_copies(data).cameras[:, None], np.nan, data.observations.uv)
     if not isinstance(calibration, PredictsPixels) or data.known is None:
         return uv[:0], uv[:0]
     predicted = calibration.predict(data.xyz)

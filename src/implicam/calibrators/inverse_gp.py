@@ -35,7 +35,7 @@ from implicam.calibrators.protocol import (
     per_axis,
     why_not_all_seen,
 )
-from implicam.dataset import Dataset, Floats, Names, Observations, copy_notes, without_copies
+from implicam.dataset import Dataset, Floats, Names, Observations, describe_copies, remove_copies
 from implicam.dataset.requirements import MAX_RELATIVE_THICKNESS, match_cameras, require_points, require_two_values
 from implicam.dataset.unused import Unused, list_copied_points
 from implicam.errors import UsageError, did_you_mean
@@ -160,7 +160,7 @@ class InverseGP(CalibratorBase):
 def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
     """The points with every view, each once, and why the others are not used; FitError where they are too few."""
     copied = list_copied_points(data)
-    data = without_copies(data, cameras_too=True)
+    data = remove_copies(data, cameras_too=True)
     seen = data.observations.seen
     complete = seen.all(axis=1)
     names = data.observations.camera_names
@@ -224,7 +224,7 @@ class InverseGPCalibration(CalibrationBase):
     @cached_property
     def used(self) -> Dataset:
         """The data without the points and cameras that are there twice."""
-        return without_copies(self.data, cameras_too=True)
+        return remove_copies(self.data, cameras_too=True)
 
     @property
     def check_plan(self) -> CheckPlan:
@@ -342,7 +342,7 @@ class InverseGPCalibration(CalibrationBase):
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         flat = flat_note(self.data) or self._thin_note()
-        return [*copy_notes(self.data), *flat, *lattice_note(self.data, self.method), *self._suspects()]
+        return [*describe_copies(self.data), *flat, *lattice_note(self.data, self.method), *self._suspects()]
 
     @cached_property
     def _thickness(self) -> tuple[float, float]:
@@ -429,7 +429,7 @@ class InverseGPCalibration(CalibrationBase):
             str(table["kernel"]), str(table["preset"]), int(table["seed"]), float(table["shortest_lengthscale"])
         )
         _, unused = seen_by_all(data, cls.method)
-        used = without_copies(data, cameras_too=True)
+        used = remove_copies(data, cameras_too=True)
         d = 2 * len(used.cameras)
         pixels, positions = scalings(arrays, used)
         if calibrator.preset == "smooth":

@@ -31,7 +31,7 @@ from implicam.calibrators.inverse_gp import (
 from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
 from implicam.calibrators.mlp_training import Examples, train
 from implicam.calibrators.protocol import Arrays, CalibrationBase, CalibratorBase, FitSummary, finite_column, per_axis
-from implicam.dataset import Dataset, Floats, Observations, copy_notes, without_copies
+from implicam.dataset import Dataset, Floats, Observations, describe_copies, remove_copies
 from implicam.dataset.requirements import match_cameras
 from implicam.dataset.unused import Unused
 from implicam.errors import FitError, UsageError
@@ -150,7 +150,7 @@ class MLPCalibration(CalibrationBase):
     @cached_property
     def used(self) -> Dataset:
         """The data without the points and cameras that are there twice."""
-        return without_copies(self.data, cameras_too=True)
+        return remove_copies(self.data, cameras_too=True)
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure the points that every camera saw; the others keep their row, with a reason."""
@@ -210,7 +210,7 @@ class MLPCalibration(CalibrationBase):
         """What the user should know before trusting this calibration: always what its error bars are worth."""
         return [
             self._worth_of_error_bars(),
-            *copy_notes(self.data),
+            *describe_copies(self.data),
             *flat_note(self.data),
             *lattice_note(self.data, self.method),
         ]
@@ -258,7 +258,7 @@ class MLPCalibration(CalibrationBase):
         held_out = arrays["held_out"]
         if held_out.dtype != np.bool_ or held_out.shape != (len(usable),) or held_out.all() or not held_out.any():
             raise ValueError(f"held_out must be {len(usable)} booleans, some true and some false")
-        used = without_copies(data, cameras_too=True)
+        used = remove_copies(data, cameras_too=True)
         pixels, positions = scalings(arrays, used)
         shapes = list(enumerate(layer_shapes(2 * len(used.cameras))))
         network = Network(

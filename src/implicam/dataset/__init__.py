@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from implicam.dataset.copies import copies_of, copy_notes, without_copies
+from implicam.dataset.copies import describe_copies, find_copies, remove_copies
 from implicam.dataset.folder import folder_files, read_folder, write_folder
 from implicam.dataset.marks import remove_marks
 from implicam.dataset.model import (
@@ -43,14 +43,14 @@ __all__ = [
     "Observations",
     "Truth",
     "arrays_from_dataset",
-    "copies_of",
-    "copy_notes",
     "covariance_from_columns",
     "dataset_from_arrays",
+    "describe_copies",
+    "find_copies",
     "folder_files",
     "join",
     "read_dataset",
-    "without_copies",
+    "remove_copies",
     "write_dataset",
 ]
 

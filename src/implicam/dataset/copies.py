@@ -44,7 +44,7 @@ class Copies:
         return np.asarray(self.camera_of != np.arange(len(self.camera_of)), dtype=np.bool_)
 
 
-def copies_of(data: Dataset) -> Copies:
+def find_copies(data: Dataset) -> Copies:
     """Which points and cameras are copies of others; points only where their positions are known.
 
     Args:
@@ -82,14 +82,14 @@ def _are_same(a: Floats, b: Floats, both: NDArray[np.bool_]) -> bool:
     return len(np.unique(a[both], axis=0)) >= MIN_COMMON_VIEWS - 2
 
 
-def without_copies(data: Dataset, *, cameras_too: bool = False) -> Dataset:
+def remove_copies(data: Dataset, *, cameras_too: bool = False) -> Dataset:
     """The dataset with each point and camera once; the same dataset where nothing is a copy.
 
     Args:
         data: The dataset.
         cameras_too: Whether a copied camera is left out; else it stays, without views.
     """
-    copies = copies_of(data)
+    copies = find_copies(data)
     if copies.points.any():
         data = data.select(~copies.points)
     if not copies.cameras.any():
@@ -102,7 +102,7 @@ def without_copies(data: Dataset, *, cameras_too: bool = False) -> Dataset:
     return replace(data, observations=replace(observations, uv=blank))
 
 
-def copy_notes(data: Dataset) -> list[str]:
+def describe_copies(data: Dataset) -> list[str]:
     """What occurs more than once, in sentences for the user.
 
     Args:
@@ -111,9 +111,9 @@ def copy_notes(data: Dataset) -> list[str]:
     Returns:
         One note for each copied camera, then one for all copied points; none where nothing is a copy.
     """
-    copies, notes = copies_of(data), list[str]()
+    copies, notes = find_copies(data), list[str]()
     names = data.observations.camera_names
-    notes += [f"{names[c]} is not used: {why_no_camera(data, int(c), copies)}." for c in np.flatnonzero(copies.cameras)]
+    notes += [f"{names[c]} is not used: {explain_copy(data, int(c), copies)}." for c in np.flatnonzero(copies.cameras)]
     extra = np.flatnonzero(copies.points)
     if len(extra):
         some = ", ".join(f"{data.points[i]} of {data.points[copies.point_of[i]]}" for i in extra[:MAX_COPIES_NAMED])
@@ -125,7 +125,7 @@ def copy_notes(data: Dataset) -> list[str]:
     return notes
 
 
-def why_no_camera(data: Dataset, c: int, copies: Copies) -> str:
+def explain_copy(data: Dataset, c: int, copies: Copies) -> str:
     """Why a copied camera is not used, in words.
 
     Args:

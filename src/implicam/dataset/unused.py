@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from implicam.dataset import Dataset, copies_of, copy_notes
-from implicam.dataset.copies import why_no_camera
+from implicam.dataset import Dataset, describe_copies, find_copies
+from implicam.dataset.copies import explain_copy
 
 
 @dataclass(frozen=True)
@@ -33,14 +33,14 @@ def list_copied_points(data: Dataset) -> tuple[Unused, ...]:
     Args:
         data: The dataset that is fitted.
     """
-    copies = copies_of(data)
+    copies = find_copies(data)
     return tuple(
         Unused(str(data.points[i]), "a copy of another: the same pixels at the same position to the last bit")
         for i in np.flatnonzero(copies.points)
     )
 
 
-def uncalibrated_with_copies(data: Dataset, uncalibrated: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
+def explain_copied_cameras(data: Dataset, uncalibrated: tuple[tuple[int, str], ...]) -> tuple[tuple[int, str], ...]:
     """Say of uncalibrated cameras that are copies whose copies they are.
 
     Args:
@@ -50,14 +50,14 @@ def uncalibrated_with_copies(data: Dataset, uncalibrated: tuple[tuple[int, str],
     Returns:
         The same cameras; of copies the reason is that they are copies.
     """
-    copies = copies_of(data)
-    return tuple((c, why_no_camera(data, c, copies) if copies.cameras[c] else why) for c, why in uncalibrated)
+    copies = find_copies(data)
+    return tuple((c, explain_copy(data, c, copies) if copies.cameras[c] else why) for c, why in uncalibrated)
 
 
-def point_copy_notes(data: Dataset) -> list[str]:
+def describe_point_copies(data: Dataset) -> list[str]:
     """What occurs more than once among points; a method that names its uncalibrated cameras names copied ones too.
 
     Args:
         data: The dataset that is fitted.
     """
-    return copy_notes(data)[int(copies_of(data).cameras.sum()) :]
+    return describe_copies(data)[int(find_copies(data).cameras.sum()) :]

@@ -11,7 +11,7 @@ from implicam.detect.dots import Dots
 from implicam.detect.folder import Correct, DetectionRun, detect_folder
 from implicam.detect.model import Detected, Detector, DetectorBase, View
 from implicam.detect.registry import TARGETS, detector_from_options, options_of
-from implicam.detect.silhouette import centred, outline_shift
+from implicam.detect.silhouette import correct_outlines, predict_outline_shift
 from implicam.registry import Option
 
 __all__ = [
@@ -28,9 +28,9 @@ __all__ = [
     "Option",
     "Template",
     "View",
-    "centred",
+    "correct_outlines",
     "detect_folder",
     "detector_from_options",
     "options_of",
-    "outline_shift",
+    "predict_outline_shift",
 ]

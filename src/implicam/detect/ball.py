@@ -23,7 +23,7 @@ from implicam.calibrators import PredictsPixels, load_calibration
 from implicam.dataset import Dataset, Floats
 from implicam.detect.edge import Edge, Rough, find_rough_edge, fit_edge
 from implicam.detect.model import Detected, DetectorBase, View, nothing
-from implicam.detect.silhouette import centred
+from implicam.detect.silhouette import correct_outlines
 from implicam.errors import ImageError, UsageError
 from implicam.images import Grey, opencv, read_picture
 from implicam.registry import Option
@@ -265,7 +265,7 @@ class Ball(DetectorBase):
             The dataset, and notes for the user.
         """
         if self.radius is not None:
-            return centred(data, self.radius, self.calibration)
+            return correct_outlines(data, self.radius, self.calibration)
         return data, [
             "the pixels are those of the ball's outline, whose middle is not quite that of the ball: "
             f"give its radius with --radius, in {data.length_unit}, and it is corrected"

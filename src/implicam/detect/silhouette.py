@@ -26,7 +26,9 @@ MIN_POINTS = 10
 """Known points from which a calibration is good enough: the difference follows from where cameras are, roughly."""
 
 
-def centred(data: Dataset, radius: float, calibration: PredictsPixels | None = None) -> tuple[Dataset, list[str]]:
+def correct_outlines(
+    data: Dataset, radius: float, calibration: PredictsPixels | None = None
+) -> tuple[Dataset, list[str]]:
     """The observations moved from the middle of each outline to the ball's middle.
 
     Args:
@@ -50,7 +52,7 @@ def centred(data: Dataset, radius: float, calibration: PredictsPixels | None = N
             calibration, xyz = _fit_own(data), data.xyz
         except FitError as error:
             return data, [f"the pixels are those of the ball's outline, not of its middle: {error.what}"]
-    shift = outline_shift(calibration, xyz, radius, data.observations.camera_names)
+    shift = predict_outline_shift(calibration, xyz, radius, data.observations.camera_names)
     usable = np.asarray(np.isfinite(shift).all(axis=2))
     seen = data.observations.seen
     moved = data.observations.uv - np.where(usable[..., None], shift, 0)
@@ -77,7 +79,7 @@ def _fit_own(data: Dataset) -> PredictsPixels:
     return ForwardGP().fit(data)
 
 
-def outline_shift(calibration: PredictsPixels, xyz: Floats, radius: float, cameras: tuple[str, ...]) -> Floats:
+def predict_outline_shift(calibration: PredictsPixels, xyz: Floats, radius: float, cameras: tuple[str, ...]) -> Floats:
     """How far the middle of a ball's outline is from the picture of the ball's middle.
 
     Args:

@@ -26,7 +26,7 @@ import numpy as np
 from implicam.active import Loop, PredictedCovariance, Step, Target
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
-from implicam.detect import Detected, Detector, View, centred
+from implicam.detect import Detected, Detector, View, correct_outlines
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.formatting import json_safe
 from implicam.hardware import Frame, FrameSource, MovedByHand, Robot, Trigger, take_frames
@@ -436,7 +436,7 @@ class SessionController:
         """The pixels of the ball's middle, for those of its outline; by the last calibration, where there is one."""
         assert self.equipment.radius is not None
         last = self.loop.calibration
-        return centred(data, self.equipment.radius, last if isinstance(last, PredictsPixels) else None)[0]
+        return correct_outlines(data, self.equipment.radius, last if isinstance(last, PredictsPixels) else None)[0]
 
     def _aim(self, before: str = "") -> None:
         """Propose the next target; where there is none left, say so."""

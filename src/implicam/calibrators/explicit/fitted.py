@@ -12,9 +12,9 @@ from implicam.calibrators.explicit.camera_groups import CameraGroup, calibrate_l
 from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.pixels import told
-from implicam.dataset import Dataset, KnownPositions, Observations, without_copies
+from implicam.dataset import Dataset, KnownPositions, Observations, remove_copies
 from implicam.dataset.requirements import match_cameras
-from implicam.dataset.unused import Rejected, Unused, list_copied_points, point_copy_notes, uncalibrated_with_copies
+from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
 from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.progress import Progress
@@ -64,10 +64,10 @@ class Fitted:
 
 def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
     """Every camera from the known points; FitError where fewer than two can be calibrated."""
-    used = without_copies(data)
+    used = remove_copies(data)
     frame = Frame.of(used, METHOD)
     fitted, choices = fit_points(TrainingData.of("central", used, frame, shots_off=False), family, progress)
-    fitted = replace(fitted, uncalibrated=uncalibrated_with_copies(data, fitted.uncalibrated))
+    fitted = replace(fitted, uncalibrated=explain_copied_cameras(data, fitted.uncalibrated))
     diagnosis = Diagnosis(used, frame, fitted)
     return Fitted(
         data.observations,
@@ -79,7 +79,7 @@ def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
         diagnosis.rejected,
         (*diagnosis.unused, *list_copied_points(data)),
         (
-            *point_copy_notes(data),
+            *describe_point_copies(data),
             *diagnosis.notes(),
             *_pixel_notes(used, fitted, choices),
             *diagnosis.noise_notes(),

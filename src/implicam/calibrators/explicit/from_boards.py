@@ -26,8 +26,8 @@ from implicam.calibrators.explicit.fitted import (
 )
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.place import place
-from implicam.dataset import Dataset, Names, Observations, without_copies
-from implicam.dataset.unused import Rejected, Unused, list_copied_points, point_copy_notes
+from implicam.dataset import Dataset, Names, Observations, remove_copies
+from implicam.dataset.unused import Rejected, Unused, describe_point_copies, list_copied_points
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
@@ -51,8 +51,8 @@ class Part(NamedTuple):
 
 def fit_to_boards(data: Dataset, groups: CameraGroups, boards: Dataset, how: str, progress: Progress) -> Fitted:
     """FitError where fewer than two cameras get a place in the world."""
-    copied, copies_told = list_copied_points(data), point_copy_notes(data)
-    data = without_copies(data)
+    copied, copies_told = list_copied_points(data), describe_point_copies(data)
+    data = remove_copies(data)
     trained = by_cameras_of(data, boards)
     frame = _frame(data.positions.xyz)
     names = trained.camera_names

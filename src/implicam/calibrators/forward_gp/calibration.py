@@ -29,8 +29,8 @@ from implicam.calibrators.protocol import (
     per_axis,
     solvable,
 )
-from implicam.dataset import Dataset, without_copies
-from implicam.dataset.unused import Rejected, Unused, list_copied_points, point_copy_notes, uncalibrated_with_copies
+from implicam.dataset import Dataset, remove_copies
+from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
 from implicam.mistakes import explain_fit_error
@@ -90,13 +90,13 @@ class ForwardGP(CalibratorBase):
         self, data: Dataset, progress: Progress, before: ForwardGPCalibration | None = None
     ) -> ForwardGPCalibration:
         """From no guess, or from a fit to most of the points, in its working frame."""
-        used = without_copies(data)
+        used = remove_copies(data)
         with solvable(), blas_threads(1):  # many small matrices, one after the other: two threads would wait
             frame = Frame.of(used, self.method) if before is None else before.frame
             training = Training.of(self.lens, used, frame, self.settings)
             fitted = fit_rig(training, progress, None if before is None else before.fitted)
             fitted = separate_position_errors(training, fitted, used.shots)
-        uncalibrated = uncalibrated_with_copies(data, fitted.uncalibrated)
+        uncalibrated = explain_copied_cameras(data, fitted.uncalibrated)
         return ForwardGPCalibration(self, data, frame, replace(fitted, uncalibrated=uncalibrated))
 
 
@@ -114,7 +114,7 @@ class ForwardGPCalibration(RigCalibration):
     @cached_property
     def used(self) -> Dataset:
         """The data without what is there twice; of it are the numbers of points in the fit and its diagnosis."""
-        return without_copies(self.data)
+        return remove_copies(self.data)
 
     @property
     def posterior(self) -> Posterior:
@@ -175,7 +175,7 @@ class ForwardGPCalibration(RigCalibration):
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         return [
-            *point_copy_notes(self.data),
+            *describe_point_copies(self.data),
             *(kind_notes(self.fitted, self.camera_names) if self.calibrator.lens == AUTO else ()),
             *self.diagnosis.notes(),
             *self._label_notes(),
@@ -257,6 +257,6 @@ class ForwardGPCalibration(RigCalibration):
         settings = ForwardGPSettings.from_table(table.get("settings", {}))  # files had none before there were settings
         calibrator = ForwardGP(str(table["lens"]), int(table["seed"]), settings)
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
-        used = without_copies(data)
+        used = remove_copies(data)
         fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, settings)
         return cls(calibrator, data, working, fitted)
