@@ -18,9 +18,9 @@ from scipy.special import chdtrc
 from implicam.calibrators.explicit.align import Alignment, check_alignment, extent_ratio, left_out, matched
 from implicam.calibrators.explicit.fitted import WORLD_FRAME, Fitted, by_cameras_of, posterior_of
 from implicam.calibrators.explicit.opencv_pipeline import OpenCVRig
-from implicam.dataset import Dataset, Observations, without_copies
-from implicam.dataset.requirements import same_cameras
-from implicam.dataset.unused import Unused, copied_points, point_copy_notes
+from implicam.dataset import Dataset, Observations, remove_copies
+from implicam.dataset.requirements import match_cameras
+from implicam.dataset.unused import Unused, describe_point_copies, list_copied_points
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose
 from implicam.measurement import Measurement
@@ -43,8 +43,8 @@ def fit_like_the_paper(data: Dataset, rig: OpenCVRig, boards: Dataset, how: str)
     Raises:
         FitError: the known points do not fix where the rig is, or contradict the boards.
     """
-    copied, told = copied_points(data), point_copy_notes(data)
-    data = without_copies(data)
+    copied, told = list_copied_points(data), describe_point_copies(data)
+    data = remove_copies(data)
     trained = by_cameras_of(data, boards)
     in_rig = FittedRig(trained, data.length_unit, WORLD_FRAME, rig.cameras, _posterior(rig, rig.bundle.cameras))
     uv, _ = in_rig.views(data.observations)
@@ -203,7 +203,7 @@ def measure_linearly(fitted: Fitted, rig: FittedRig, observations: Observations)
         The positions in the world, their covariances those of the pixels' noise times `inflation` squared.
     """
     known = [name for name in rig.trained.camera_names if name in observations.camera_names]
-    observations = same_cameras(rig.trained.with_cameras(known) if known else rig.trained, observations)
+    observations = match_cameras(rig.trained.with_cameras(known) if known else rig.trained, observations)
     uv, _ = rig.views(observations)
     assert fitted.inflation is not None
     xyz, cov, p, used = triangulated(fitted.posterior.models, fitted.reference, uv)
