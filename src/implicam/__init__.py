@@ -46,6 +46,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.errors import ImplicamError as ImplicamError
     from implicam.errors import MissingExtraError as MissingExtraError
     from implicam.errors import NumericalError as NumericalError
+    from implicam.errors import PartError as PartError
     from implicam.errors import UsageError as UsageError
     from implicam.evaluation import Evaluation as Evaluation
     from implicam.evaluation import cross_validate as cross_validate
@@ -69,7 +70,7 @@ _NAMES = {
     ),
     "implicam.errors": (
         "CalibrationFileError", "DatasetError", "FitError", "HardwareError", "ImageError", "ImplicamError",
-        "MissingExtraError", "NumericalError", "UsageError",
+        "MissingExtraError", "NumericalError", "PartError", "UsageError",
     ),
     "implicam.evaluation": ("Evaluation", "cross_validate", "evaluate", "leave_out_shots"),
     "implicam.measurement": ("Measurement",),
