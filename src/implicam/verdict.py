@@ -20,7 +20,7 @@ from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.calibrators.protocol import CheckPlan
-from implicam.dataset import Dataset, Floats, find_copies, describe_copies
+from implicam.dataset import Dataset, Floats, describe_copies, find_copies
 from implicam.dataset.marks import remove_marks
 from implicam.errors import ImplicamError, UsageError
 from implicam.evaluation import known_position_covariance
