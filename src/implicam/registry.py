@@ -114,9 +114,6 @@ class Registry(Mapping[str, Part]):
         Args:
             name: The name of the part.
 
-        Args:
-            name: Of the part.
-
         Raises:
             KeyError: There is no part of this name.
         """
