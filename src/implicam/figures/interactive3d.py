@@ -15,6 +15,7 @@ from implicam.figures.panels3d import (
     PanelPoints,
     Scales,
     bounding_box,
+    exaggerated_residuals,
     known_of,
     line_segments,
     points_in_view,
@@ -22,7 +23,7 @@ from implicam.figures.panels3d import (
     select_points,
     title_of,
 )
-from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, WHITE, figure_3d, plain, points_3d
+from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILLION, WHITE, figure_3d, plain, points_3d
 from implicam.formatting import number
 from implicam.templates import Markup, render
 
@@ -90,6 +91,8 @@ def draw_alignment_3d(
         for xyz, name, symbol, colour in parts
         if xyz is not None
     ]
+    lines, words = exaggerated_residuals(true_xyz, aligned_xyz)
+    traces.append(_points(lines, plain(words), mode="lines", line={"color": VERMILLION, "width": 3}))
     return _figure(traces, bounding_box(xyz for xyz, *_ in parts if xyz is not None), [])
 
 
@@ -157,13 +160,20 @@ def _points(xyz: Floats, name: str, **look: Any) -> Any:
 
 
 def _measured(found: PanelPoints, scales: Scales) -> Any:
+    colour, low, top, ticks = found.error, 0.0, scales.error_top, dict[str, Any]()
+    if scales.error_low > 0:  # Plotly has no logarithmic colours
+        colour = np.log10(np.maximum(colour, scales.error_low))
+        low, top = float(np.log10(scales.error_low)), float(np.log10(top))
+        lengths = [m * 10.0**e for e in range(-6, 7) for m in (1, 2, 5)]
+        lengths = [length for length in lengths if scales.error_low <= length <= scales.error_top]
+        ticks = {"tickvals": np.log10(lengths).tolist(), "ticktext": [f"{length:g}" for length in lengths]}
     bar = {
-        "title": {"text": "distance from<br>the truth (mm)", "side": "top"}, "thickness": 14, "len": 0.7,
+        **ticks, "title": {"text": "distance from<br>the truth (mm)", "side": "top"}, "thickness": 14, "len": 0.7,
         "outlinewidth": 0, "ticks": "outside", "x": 0.95,
     }  # fmt: skip
     marker = {
-        "size": scales.diameters(found.sd, len(found.xyz)), "color": found.error, "cmin": 0.0,
-        "cmax": scales.error_top, "colorscale": COLOUR_MAP.capitalize(), "colorbar": bar,
+        "size": scales.diameters(found.sd, len(found.xyz)), "color": colour, "cmin": low,
+        "cmax": top, "colorscale": COLOUR_MAP.capitalize(), "colorbar": bar,
         "line": {"width": 1, "color": BLACK}, "opacity": 1.0,
     }  # fmt: skip
     certain = "" if found.sd is None else ", larger: less certain"

@@ -21,8 +21,8 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.errors import import_extra
-from implicam.figures.printed import PURPOSE, new_figure
-from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY
+from implicam.figures.printed import PURPOSE, new_figure, plain_log
+from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILLION
 from implicam.formatting import number
 
 Panel = Mapping[str, Any]
@@ -33,14 +33,16 @@ class Scales:
     """What colour and size mean; values beyond an end are drawn as that end.
 
     Attributes:
-        error_top: Colour runs from error 0 to this, mm.
+        error_top: Colour runs up to this error, mm.
         sd: Size runs over this range of the standard deviation, mm.
         sizes: The diameters at the ends, in pixels of a panel 400 wide.
+        error_low: Colour runs from this error on, in equal steps of its logarithm; 0 for equal steps of the error.
     """
 
     error_top: float
     sd: tuple[float, float]
     sizes: tuple[float, float] = (7.0, 30.0)
+    error_low: float = 0.0
 
     def diameters(self, sd: Floats | None, n: int) -> Floats:
         """The diameters of points.
@@ -62,6 +64,10 @@ BOARD_SCALES = Scales(error_top=100.0, sd=(10.0, 100.0))
 TEST_POINT_STEP = 10
 """The paper draws one test point in so many."""
 _PANEL_PX = 400
+VISIBLE_RESIDUAL_SHARE = 0.1
+"""Of the cloud's diagonal: residuals are made about as long, or up to ten times shorter."""
+LOG_COLOURS_FROM = 10.0
+"""Ratio of the panels' median errors from which colours are steps of a factor."""
 COLOUR_MAP = "cividis_r"
 """Light is right, dark is wrong: truths and lines, in black, stay visible on points that are nearly right."""
 
@@ -103,6 +109,9 @@ def select_points(panel: Panel, every: int = 1) -> PanelPoints:
 def scales_of(panels: Iterable[Panel]) -> Scales:
     """One scale for all panels: colour up to the 98th percentile of the errors, so that one blunder does not set it.
 
+    Where the panels' errors differ by more than a factor of `LOG_COLOURS_FROM`, the steps of the colour are factors, or
+    the better ones would all look alike.
+
     Args:
         panels: As in the head of this module.
     """
@@ -111,7 +120,10 @@ def scales_of(panels: Iterable[Panel]) -> Scales:
     sd = np.concatenate([np.zeros(0), *(d.sd[np.isfinite(d.sd)] for d in found if d.sd is not None)])
     low, high = np.quantile(sd, [0.02, 0.98]) if len(sd) else (0.0, 0.0)
     top = float(np.quantile(errors, 0.98)) if len(errors) else 0.0
-    return Scales(top or 1.0, (float(low), float(high)), sizes=(9.0, 24.0))
+    medians = [float(np.median(d.error)) for d in found if len(d.error) and np.median(d.error) > 0]
+    factors = len(medians) > 1 and max(medians) > LOG_COLOURS_FROM * min(medians)
+    bottom = float(np.quantile(errors, 0.02)) if factors else 0.0
+    return Scales(top or 1.0, (float(low), float(high)), sizes=(9.0, 24.0), error_low=bottom)
 
 
 def title_of(panel: Panel, found: PanelPoints | None) -> str:
@@ -207,9 +219,31 @@ def draw_alignment(
         _plot(
             axes, camera_xyz, **look, marker="^", mfc="none", color=ORANGE, label=f"explicit, in the frame of {camera}"
         )
+    lines, words = exaggerated_residuals(true_xyz, aligned_xyz)
+    _plot(axes, lines, color=VERMILLION, lw=1.0, label=words)
     _style_axes(axes, bounding_box(xyz for xyz in (true_xyz, aligned_xyz, camera_xyz) if xyz is not None), size=8)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return figure
+
+
+def exaggerated_residuals(true_xyz: Floats, aligned_xyz: Floats) -> tuple[Floats, str]:
+    """What is left after alignment, made so many times as long that it can be seen.
+
+    Args:
+        true_xyz: (n, 3) the robot's positions, mm.
+        aligned_xyz: (n, 3) the points moved onto them, mm.
+
+    Returns:
+        Lines from the positions, with gaps, (k, 3); and what they are, with the rms residual in words.
+    """
+    true, aligned = (np.asarray(xyz, dtype=np.float64).reshape(-1, 3) for xyz in (true_xyz, aligned_xyz))
+    good = np.isfinite(true).all(axis=1) & np.isfinite(aligned).all(axis=1)
+    off = (aligned - true)[good]
+    rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else 0.0
+    size = float(np.linalg.norm(np.ptp(true[good], axis=0))) if len(off) else 0.0
+    wanted = VISIBLE_RESIDUAL_SHARE * size / rms if rms > 0 else 1.0
+    factor = max(1, int(10 ** np.floor(np.log10(max(wanted, 1.0)))))
+    return line_segments(true[good], true[good] + factor * off), f"residuals, {number(rms)} mm rms, × {factor:,}"
 
 
 def _projection() -> str:
@@ -241,7 +275,10 @@ def _fill(
             shown = _draw(place, known_of(panel), points, scales, points_per_pixel)
             _style_axes(place, corners, size=6 if width < 3 else 8)
     if shown is not None:
-        bar = figure.colorbar(shown, ax=list(axes), shrink=0.5, aspect=25, pad=0.02, extend="max")
+        ends = "both" if scales.error_low > 0 else "max"
+        bar = figure.colorbar(shown, ax=list(axes), shrink=0.5, aspect=25, pad=0.02, extend=ends)
+        if scales.error_low > 0:
+            plain_log(bar.ax.yaxis, name="y")
         bar.set_label("distance from the truth (mm)")
         bar.outline.set_visible(False)
     _legend(figure, panels, scales, points_per_pixel)
@@ -298,12 +335,19 @@ def _draw(axes: Any, known: Floats, found: PanelPoints, scales: Scales, points_p
     _plot(axes, known, ls="", marker="+", ms=9 * points_per_pixel, mew=0.5, color=SKY, zorder=1)
     diameter = points_per_pixel * scales.diameters(found.sd, len(found.xyz))
     shown = axes.scatter(
-        *found.xyz.T, s=diameter**2, c=found.error, cmap=COLOUR_MAP, vmin=0, vmax=scales.error_top,
+        *found.xyz.T, s=diameter**2, c=found.error, cmap=COLOUR_MAP, norm=_norm(scales),
         linewidths=0.3, edgecolors=BLACK, depthshade=False, zorder=2,
     )  # fmt: skip
     _plot(axes, line_segments(found.xyz, found.true), color=BLACK, lw=0.7, zorder=3)
     _plot(axes, found.true, ls="", marker=".", ms=4.5 * points_per_pixel, mew=0, color=BLACK, zorder=4)
     return shown
+
+
+def _norm(scales: Scales) -> Any:
+    colours = import_extra("matplotlib.colors", "report", PURPOSE)
+    if scales.error_low > 0:
+        return colours.LogNorm(scales.error_low, scales.error_top, clip=True)
+    return colours.Normalize(0, scales.error_top)
 
 
 def _plot(axes: Any, xyz: Floats, **look: Any) -> None:

@@ -79,7 +79,11 @@ def plain_log(axis: Any, *, name: str) -> None:
     axis.axes.set(**{f"{name}scale": "log"})
     axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(ticker.NullFormatter())
-    low, high = axis.get_data_interval()
+    # Panels that share an axis share its ticks, and so all their data count.
+    shared = getattr(axis.axes, f"get_shared_{name}_axes")().get_siblings(axis.axes)
+    ends = np.array([getattr(axes, f"{name}axis").get_data_interval() for axes in shared])
+    ends = ends[np.isfinite(ends).all(axis=1) & (ends[:, 0] > 0)]
+    low, high = (float(ends[:, 0].min()), float(ends[:, 1].max())) if len(ends) else (1.0, 1.0)
     decades = np.log10(high / low) if 0 < low < high < np.inf else 1.0
     if decades < 0.7:  # one or two of 1, 2, 5 at most
         axis.set_major_locator(ticker.MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
