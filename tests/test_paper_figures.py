@@ -14,6 +14,7 @@ from implicam.errors import MissingExtraError, UsageError
 from implicam.experiments import published
 from implicam.figures import interactive3d, panels3d, paper
 from implicam.figures.panels3d import BOARD_SCALES, Scales
+from implicam.formatting import number
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
@@ -451,19 +452,55 @@ def test_few_points_in_3d(n: int, tmp_path: Path) -> None:
     assert interactive3d.panels_3d([]).to_json()
 
 
-def test_aligned_shows_three_clouds(tmp_path: Path) -> None:
+def test_aligned_shows_three_clouds_and_the_residuals(tmp_path: Path) -> None:
     true, moved, before = (np.random.default_rng(i).uniform(0, 100, (9, 3)) for i in range(3))
+    moved = true + 0.01 * (moved - 50)
     moved[2] = np.nan
     figure = panels3d.draw_alignment(true, moved, before, camera="cam7")
-    for line, xyz in zip(three_d(figure.axes[0]), (true, moved, before), strict=True):
+    *clouds, residuals = three_d(figure.axes[0])
+    for line, xyz in zip(clouds, (true, moved, before), strict=True):
         np.testing.assert_allclose(np.transpose(line.get_data_3d()), xyz)
+    rms = np.sqrt(np.nanmean(np.sum((moved - true) ** 2, axis=1)))
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert texts == ["robot's positions", "explicit, aligned", "explicit, in the frame of cam7"]
-    assert len({line.get_marker() for line in three_d(figure.axes[0])}) == 3
+    assert texts[:3] == ["robot's positions", "explicit, aligned", "explicit, in the frame of cam7"]
+    assert texts[3] == f"residuals, {number(rms)} mm rms, × 10"
+    ends = np.transpose(residuals.get_data_3d()).reshape(8, 3, 3)
+    good = np.delete(np.arange(9), 2)
+    np.testing.assert_allclose(ends[:, 1] - ends[:, 0], 10 * (moved - true)[good])
+    assert len({line.get_marker() for line in clouds}) == 3
     figure.savefig(tmp_path / "aligned.pdf")
-    assert len(three_d(panels3d.draw_alignment(true, moved).axes[0])) == 2
-    shown = interactive3d.draw_alignment_3d(true, moved, before).data
+    assert len(three_d(panels3d.draw_alignment(true, moved).axes[0])) == 3
+    *shown, _ = interactive3d.draw_alignment_3d(true, moved, before).data
     np.testing.assert_allclose(np.array([[t.x, t.y, t.z] for t in shown]), np.swapaxes([true, moved, before], 1, 2))
+
+
+def test_panels_that_differ_tenfold_have_colours_by_factors(tmp_path: Path) -> None:
+    rough = panel(40, seed=1)
+    fine = {**rough, "xyz": rough["true_xyz"] + 0.01 * (rough["xyz"] - rough["true_xyz"])}
+    assert panels3d.scales_of([rough, rough]).error_low == 0
+    scales = panels3d.scales_of([rough, fine])
+    assert 0 < scales.error_low < 0.05 * scales.error_top
+    figure = panels3d.clouds([rough, fine])
+    figure.savefig(tmp_path / "clouds.png")
+    assert len([tick for tick in figure.axes[-1].get_yticks() if scales.error_low <= tick <= scales.error_top]) >= 2
+    measured = interactive3d.panels_3d([rough, fine]).data[3]
+    assert measured.marker.cmin == pytest.approx(np.log10(scales.error_low))
+    assert "1" in measured.marker.colorbar.ticktext
+
+
+def test_panels_that_share_an_axis_have_numbers_all_along_it() -> None:
+    """One panel within a decade does not take the numbers of the others."""
+    rows = [
+        {"set": "2R", "method": method, "known": known, "mean_sd": sd, "run": 0}
+        for method, size in (("forward-gp", 0.1), ("mlp", 15.0))
+        for known, sd in ((17, 1.3 * size), (157, size))
+    ]
+    figure = paper.sd_curves(rows)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    low, high = axes.get_ylim()
+    shown = [label.get_text() for tick, label in zip(axes.get_yticks(), axes.get_yticklabels(), strict=False) if low <= tick <= high]
+    assert {"1", "10"} <= set(shown)
 
 
 def test_interactive_panels_show_one_at_a_time_and_the_same_points() -> None:
