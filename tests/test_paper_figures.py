@@ -499,7 +499,8 @@ def test_panels_that_share_an_axis_have_numbers_all_along_it() -> None:
     figure.canvas.draw()
     axes = figure.axes[0]
     low, high = axes.get_ylim()
-    shown = [label.get_text() for tick, label in zip(axes.get_yticks(), axes.get_yticklabels(), strict=False) if low <= tick <= high]
+    ticks = zip(axes.get_yticks(), axes.get_yticklabels(), strict=False)
+    shown = [label.get_text() for tick, label in ticks if low <= tick <= high]
     assert {"1", "10"} <= set(shown)
 
 
