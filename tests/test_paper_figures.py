@@ -63,11 +63,11 @@ def test_the_table_adds_up() -> None:
 def test_every_number_is_in_the_paper() -> None:
     text = source()
     for name in published.EXPERIMENTS:
-        for number in published.load(name).numbers.values():
-            values = number.value if isinstance(number.value, tuple) else (number.value,)
+        for stated in published.load(name).numbers.values():
+            values = stated.value if isinstance(stated.value, tuple) else (stated.value,)
             for value in values:
                 written = "zero" if value == 0 else f"{value:g}"
-                assert re.search(rf"(?<![\d.]){re.escape(written)}(?![\d]|\.\d)", text), (name, number)
+                assert re.search(rf"(?<![\d.]){re.escape(written)}(?![\d]|\.\d)", text), (name, stated)
 
 
 def test_places_are_where_latex_puts_them() -> None:
