@@ -40,6 +40,7 @@ MAKES = {
     "export": {"cameras.toml"},
     "import": {"cameras.implicam"},
     "suggest": set(),
+    "design": {"design.html"},
     "acquire": {"my-session"},
     "paper": {"implicam-paper"},
     "info": set(),

@@ -137,7 +137,7 @@ def test_metres_and_other_ways_to_say_the_same(tmp_path: Path) -> None:
     ("old", "new", "said"),
     [
         ("name", "nmae", "'nmae' is not known (did you mean 'name'?)"),
-        ('name = "two"', "name = 3", "name = 3 must be text"),
+        ('name = "two"', "name = 3", "name = 3 must be a short text"),
         ('name = "two"', 'length_unit = "inch"', "length_unit = 'inch' is not known"),
         ('name = "two"', "spread = -1", "spread = -1 must be a number"),
         ('name = "two"', "spread = true", "spread = True must be a number"),
@@ -169,6 +169,7 @@ def test_metres_and_other_ways_to_say_the_same(tmp_path: Path) -> None:
         ("position = [-400, 0, -500]", "position = [1e99, 0, 0]", "position = [1e+99, 0, 0] must be three numbers"),
         ("noise = 0.1", "noise = -0.1", "camera 2: noise = -0.1 must be a number"),
         ("noise = 0.1", 'name = "left"', "two cameras are called 'left'"),
+        ("noise = 0.1", 'name = "../x"', "cannot name a folder"),
         ("noise = 0.1", "colour = 3", "'colour' is not known"),
         ("[[cameras]]", "[[camera]]", "'camera' is not known (did you mean 'cameras'?)"),
         ("[[cameras]]", "[[cameras", "not valid TOML"),

@@ -41,6 +41,7 @@ EXAMPLES = {
     "import": "implicam import cameras.toml -o cameras.implicam",
     "suggest": "implicam suggest my-rig.implicam -n 5",
     "acquire": "implicam acquire my-session --cameras 2R --budget 12 --unattended",
+    "design": "implicam design bar6 grid9 --points 36 -o design.html",
     "paper": "implicam paper board --quick",
     "info": "implicam info my-rig.implicam",
 }

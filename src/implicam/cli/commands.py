@@ -18,9 +18,10 @@ import typer
 import implicam.cli.acquire
 import implicam.cli.cameras
 import implicam.cli.compare
+import implicam.cli.design
 import implicam.cli.detect
 import implicam.cli.paper
-import implicam.cli.simulate  # noqa: F401  the six register their commands
+import implicam.cli.simulate  # noqa: F401  the seven register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards

@@ -365,3 +365,21 @@ def _square(half: Floats) -> Floats:
 def _solve_stack(A: Floats, b: Floats) -> Floats:
     """A^-1 b of stacks, NaN where A is singular or not finite."""
     return np.asarray(np.einsum("nij,nj->ni", invert_stack(A), b), dtype=np.float64)
+
+
+def predict_covariance(posterior: Posterior, points: Floats, noise: Floats, seen: Bools) -> Floats:
+    """The covariance that `locate` would state of points at known places, eq. (20).
+
+    Args:
+        posterior: What is known of the C cameras.
+        points: (n, 3) in the working frame, where all cameras in use have an answer.
+        noise: (n, C) of each view, in pixels.
+        seen: (n, C) the views in use.
+
+    Returns:
+        (n, 3, 3) in the working frame; NaN with fewer than two views.
+    """
+    weights = _Weights(posterior, points, noise, seen)
+    information, _, _ = weights.normal(points, np.zeros((*seen.shape, 2)), seen)
+    information[seen.sum(axis=1) < 2] = np.nan
+    return invert_stack(information)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from implicam.dataset import Dataset
-from implicam.simulate.camera import SimulatedCamera, SmoothError
+from implicam.simulate.camera import SimulatedCamera, SmoothError, error_process
 from implicam.simulate.noise import (
     as_boards,
     cramer_rao_limit,
@@ -47,6 +47,7 @@ __all__ = [
     "build_rig",
     "cramer_rao_limit",
     "each_and_pairs",
+    "error_process",
     "held_boards",
     "moving_board",
     "named_placement",

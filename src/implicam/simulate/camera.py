@@ -90,6 +90,27 @@ def random_error(rng: np.random.Generator, width: int, height: int, rms: float) 
     return SmoothError(frequencies, phases, amplitudes * rms / size, affine * rms / size, rms)
 
 
+def error_process(width: int, height: int, rms: float) -> tuple[float, float]:
+    """The Gaussian process that smooth errors are drawn from, before their affine part is taken away.
+
+    Args:
+        width: Of the image, in pixels.
+        height: Of the image, in pixels.
+        rms: Root mean square in pixels of what is left on average.
+
+    Returns:
+        Its standard deviation in pixels, and its lengthscale in half the longer side of the image.
+    """
+    lengthscale = RANGE * 0.5 * float(np.hypot(width, height))
+    pixels = _pixel_grid(width, height)[::2]
+    scaled = pixels / lengthscale
+    squares = np.sum(scaled**2, axis=1)
+    K = np.exp(-0.5 * (squares[:, None] + squares - 2 * scaled @ scaled.T))
+    basis = np.linalg.qr(_affine_basis(pixels))[0]
+    left = (np.trace(K) - np.trace(basis.T @ K @ basis)) / len(pixels)
+    return rms / float(np.sqrt(left)), lengthscale / (max(width, height) / 2)
+
+
 @dataclass(frozen=True, eq=False)
 class SimulatedCamera:
     """A camera whose model is known exactly.

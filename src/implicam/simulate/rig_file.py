@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from implicam.dataset import Floats
+from implicam.dataset import Camera, Floats
 from implicam.dataset.tables import read_toml
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.geometry import Pose, look_at, rotation_from_vector
@@ -21,7 +21,7 @@ from implicam.simulate.placements import MOST_CAMERAS, PERSPECTIVE_FROM_PX, Moun
 
 SUFFIX = ".toml"
 MM_PER_UNIT = {"mm": 1.0, "m": 1e3}
-MAX_RIG_FILE_BYTES = 1 << 20
+MAX_RIG_FILE_BYTES, MAX_RIG_NAME_CHARACTERS = 1 << 20, 100
 MAX_LENGTH_MM, MIN_LENGTH_MM = 1e7, 1e-3
 """A rig is smaller than ten kilometres, and a workspace thicker than a micrometre."""
 MAX_IMAGE_SIDE_PX, MIN_IMAGE_SIDE_PX = 100_000, 16
@@ -60,8 +60,8 @@ def read_placement(path: Path) -> Placement:
     if unit not in MM_PER_UNIT:
         raise UsageError(f"{path}: length_unit = {_shown(unit)} is not known.", fix='write "mm" or "m"')
     name = table.get("name", path.stem)
-    if not isinstance(name, str) or not name.strip() or not name.isprintable():
-        raise UsageError(f"{path}: name = {_shown(name)} must be text.", fix='write name = "my-rig"')
+    if not isinstance(name, str) or not 0 < len(name.strip()) <= MAX_RIG_NAME_CHARACTERS or not name.isprintable():
+        raise UsageError(f"{path}: name = {_shown(name)} must be a short text.", fix='write name = "my-rig"')
     cameras, shared = table.get("cameras"), table.get("every_camera", {})
     if not isinstance(shared, Mapping):
         raise UsageError(f"{path}: every_camera = {_shown(shared)} is no table.", fix="write [every_camera]")
@@ -163,6 +163,10 @@ class _Camera(_Reader):
         if not isinstance(name, str) or not name.strip() or not name.isprintable() or "," in name:
             raise self.error("name", "must be text without commas", f'write name = "{usual_name}"')
         width, height = self._size()
+        try:
+            Camera(name.strip(), width, height)  # data that the rig records must be able to name it
+        except DatasetError as error:
+            raise UsageError(f"{self.where}: {error.what}", why=error.why, fix=error.fix) from error
         return Mount(
             name.strip(), width, height, self._lens(width, height), self._pose(), self.number("noise", 0, MAX_NOISE_PX)
         )
