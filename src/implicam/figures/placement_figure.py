@@ -19,6 +19,8 @@ COLOURS = "Cividis"
 """Of the uncertainty: dark is certain."""
 AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))
 """Of each slice: across, up, and the axis that it is square to."""
+EYE_DISTANCE = 2.4
+"""From where the scene is seen, in its own size, so that all of it fits into half a page."""
 SCENE_WIDTH = 0.86
 """Of the 3D view, as a part of the figure; the rest is the colour bar's."""
 SLICE_GAP = 0.09
@@ -104,21 +106,23 @@ def placement_scene(
     if not measured.all():
         blind = {"symbol": "x", "size": 3, "color": GREY}
         traces.append(points_3d(places[~measured], "seen by fewer than two cameras", marker=blind, hoverinfo="skip"))
+    extent = np.ptp(np.concatenate([pyramids[np.isfinite(pyramids[:, 0])], corners]), axis=0)
+    length = float(extent.max() / np.cbrt(np.prod(extent)))
     return figure_3d(
         traces,
         scale.unit,
-        _view(np.asarray(up, dtype=np.float64)),
+        _view(np.asarray(up, dtype=np.float64), length),
         legend={"x": 0, "y": 1},
         scene={"domain": {"x": [0, SCENE_WIDTH]}},
     )
 
 
-def _view(up: Floats) -> dict[str, Any]:
-    """From the side and above, as Plotly says it."""
+def _view(up: Floats, length: float) -> dict[str, Any]:
+    """From the side and above, as Plotly says it; length: of the scene, over the geometric mean of its sides."""
     beside = np.eye(3)[np.argmin(np.abs(up))]
     beside = beside - (beside @ up) * up
     beside /= np.linalg.norm(beside)
-    eye = 1.6 * beside + 1.35 * np.cross(up, beside) + 0.9 * up
+    eye = EYE_DISTANCE * length * (0.7 * beside + 0.6 * np.cross(up, beside) + 0.4 * up)
 
     def words(vector: Floats) -> dict[str, float]:
         return dict(zip("xyz", map(float, np.round(vector, 4)), strict=True))
