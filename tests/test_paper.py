@@ -19,12 +19,23 @@ from implicam.calibrators.explicit.boards import boards_of
 from implicam.cli import main
 from implicam.dataset import Dataset, write_dataset
 from implicam.errors import DatasetError, FitError, MissingExtraError
-from implicam.experiments import active, ball, board, findings, published, tables
+from implicam.experiments import active, ball, board, evidence, findings, published, tables
 from implicam.experiments.account import markdown
 from implicam.experiments.cells import run
 from implicam.experiments.evidence import FAILS, HOLDS, OPEN, Case, interval, ratio, share_of_drop, unpaired
 from implicam.experiments.markdown import number, quartiles, table
-from implicam.experiments.plan import EXPLICIT, FORWARD, FULL, GP, METHODS, NETWORK, PAPER, QUICK, Plan
+from implicam.experiments.plan import (
+    EXPLICIT_BUNDLE,
+    FORWARD,
+    FULL,
+    GP,
+    LINES,
+    METHODS,
+    NETWORK,
+    PAPER,
+    QUICK,
+    Plan,
+)
 from implicam.experiments.reproduction import EXPERIMENTS, reproduce
 from implicam.experiments.source import BALL, BOARD, BOARDS, BUDGETS, CHECK, PARTS, RANDOM, Source
 from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate
@@ -162,8 +173,9 @@ def test_the_full_plan_is_the_papers() -> None:
     assert runs[GP] == runs[NETWORK] == published.load("ball").numbers["runs"].value == 1350
     sizes = sorted({cell.options["known"] for cell in cells if cell.options.get("trained") == BALL})
     assert sizes == [17, 35, 52, 70, 87, 105, 122, 140, 157]
-    lines = [cell.name for cell in cells if cell.name.startswith("ball/explicit/")]
-    assert len(lines) == 3 * (1 + 10 + 10)
+    for name in ("explicit", "explicit-paper", "explicit-paper-bundle"):
+        lines = [cell.name for cell in cells if cell.name.startswith(f"ball/{name}/")]
+        assert len(lines) == 3 * (1 + 10 + 10)
     growing = [cell for cell in active.cells(Source(0), FULL) if cell.options["method"] == GP]
     assert len(growing) == 3 * 5
     assert {(c.options["start"], c.options["additions"], c.options["lot"]) for c in growing} == {(35, 100, 1)}
@@ -297,8 +309,11 @@ def rows_of_the_ball(factors: dict[str, float], *, spread: float = 0.05, sets: t
                     for run, x in enumerate(own)
                 ]
         for budget, size in zip(BUDGETS, (0.04, 0.05, 0.08), strict=True):
-            where = {"set": cameras, "method": EXPLICIT, "judged": BALL, "budget": "{}+{}".format(*budget)}
-            rows += [{**where, "run": k, "rmse": size * (1 + 0.01 * k), "failure": ""} for k in range(3)]
+            where = {"set": cameras, "judged": BALL, "budget": "{}+{}".format(*budget), "failure": ""}
+            for method in LINES:
+                for k, reprojection in enumerate((0.33, 0.31, 0.35)):  # the first is the median one
+                    row = {"method": method, "run": k, "rmse": size * (1 + 0.01 * k), "reprojection": reprojection}
+                    rows.append({**where, **row})
     return rows
 
 
@@ -449,10 +464,30 @@ def test_explicit_is_a_line_that_the_most_points_must_cross() -> None:
     found = judged(rows, "gp_beats_explicit", GP)  # 0.29, 0.096, 0.032 against 0.04
     assert found.verdict == HOLDS
     assert "its own with 157 points" in found.number
-    assert judged(rows, "few_boards_hurt_explicit", "").verdict == HOLDS  # 0.08 over 0.04: twice
+    assert judged(rows, "few_boards_hurt_explicit", GP).verdict == HOLDS  # 0.08 over 0.04: twice
+    assert "2.00" in judged(rows, "few_boards_hurt_explicit", GP).number
     assert judged(rows, "learners_beat_poor_explicit", GP).verdict == HOLDS
     assert judged(rows_of_the_ball({GP: 2.0}), "explicit_wins_2R", GP).verdict == HOLDS
     assert judged(rows_of_the_ball({GP: 0.5}), "explicit_wins_2R", GP).verdict == FAILS
+
+
+def test_the_papers_software_is_judged_by_the_papers_pipeline_in_both_variants() -> None:
+    rows = rows_of_the_ball({PAPER: 0.5, GP: 0.5, NETWORK: 0.6}, sets=("2R2W",))
+    for row in rows:
+        if row["method"] == EXPLICIT_BUNDLE and row["budget"] == "10+4":
+            row["rmse"] /= 2  # few boards do not hurt this one
+    assert judged(rows, "few_boards_hurt_explicit", GP).verdict == HOLDS
+    found = judged(rows, "few_boards_hurt_explicit", PAPER)
+    assert found.verdict == FAILS
+    assert "explicit:paper-bundle" in found.number
+    assert "in 1 of 2 cases" in found.number
+
+
+def test_of_the_subsets_the_one_with_the_median_reprojection_error_counts() -> None:
+    rows = [{"rmse": 9.0, "reprojection": 0.3}, {"rmse": 1.0, "reprojection": 0.4}, {"rmse": 2.0, "reprojection": 0.2}]
+    assert evidence.median_row(rows, "reprojection") == rows[:1]
+    assert evidence.median_row(rows[:2], "reprojection") == rows[:1]  # the lower one of two
+    assert evidence.median_row([], "reprojection") == []
 
 
 def test_every_finding_of_the_paper_is_judged() -> None:

@@ -231,6 +231,22 @@ def test_explicit_lines_are_the_medians_in_the_papers_colours() -> None:
     assert len(legend.get_texts()) == 5
 
 
+def test_the_papers_pipeline_is_a_line_at_the_subset_with_the_median_reprojection_error() -> None:
+    rows = ball_rows(2)
+    for method, factor in (("explicit", 1.0), ("explicit:paper", 2.0), ("explicit:paper-bundle", 3.0)):
+        for budget in ("50+10", "10+4"):
+            for error, reprojection in ((1.0, 0.3), (5.0, 0.2), (7.0, 0.4)):
+                row = {"set": "2R", "method": method, "budget": budget, "mean_sd": 1.0, "reprojection": reprojection}
+                rows.append({**row, "rmse": factor * error})
+    lines = lines_of(paper.rmse_curves(rows).axes[0])
+    heights = {label: line.get_ydata()[0] for label, line in lines.items() if label.startswith("explicit")}
+    assert heights == {
+        "explicit:paper, 50 + 10 pictures": 2.0, "explicit:paper, 10 + 4 pictures": 2.0,
+        "explicit:paper-bundle, 50 + 10 pictures": 3.0, "explicit:paper-bundle, 10 + 4 pictures": 3.0,
+        "explicit, 50 + 10 pictures": 1.0,
+    }  # fmt: skip
+
+
 def test_labels_beside_far_lines_stand_at_their_lines() -> None:
     figure = paper.rmse_curves(ball_rows(2) + explicit_rows({"50+10": (2.0,), "10+4": (20.0,)}))
     axes = figure.axes[0]

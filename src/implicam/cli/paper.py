@@ -108,7 +108,7 @@ def _findings(verdicts: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
     for experiment in dict.fromkeys(verdict["experiment"] for verdict in verdicts):
         for method in (PAPER, GP):
-            mine = [v["verdict"] for v in verdicts if v["experiment"] == experiment and v["method"] in (method, "")]
+            mine = [v["verdict"] for v in verdicts if v["experiment"] == experiment and v["method"] == method]
             rows.append([experiment, method, *(str(mine.count(verdict)) for verdict in (HOLDS, FAILS, OPEN))])
     title = "The paper's findings, each for each set of cameras it speaks of"
     return show.text_table(title, ["", "Gaussian process", "hold", "do not", "not decided"], rows, left=2)

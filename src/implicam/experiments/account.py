@@ -14,7 +14,7 @@ from typing import Any
 from implicam.experiments import plan, published
 from implicam.experiments.evidence import FAILS, HOLDS
 from implicam.experiments.markdown import number, quartiles, span, spread, table
-from implicam.experiments.plan import DRAWN_METHODS, EXPLICIT, GP, METHODS, PAPER, slug
+from implicam.experiments.plan import DRAWN_METHODS, EXPLICIT, EXPLICIT_PAPER, GP, LINES, METHODS, PAPER, slug
 from implicam.experiments.source import BALL, BOARD_CHECK, BUDGETS, CHECK, RANDOM
 from implicam.formatting import percent
 from implicam.templates import render
@@ -48,7 +48,7 @@ def markdown(summary: Summary, *, figures: str = "figures") -> str:
         "off_the_lattice": _tabulate_ball(off_the_lattice, _error),
         "random": _tabulate_ball(_select(ball, trained=RANDOM, judged=CHECK), _error),
         "coverage": _tabulate_ball(off_the_lattice or lattice, _coverage),
-        "explicit": _tabulate_explicit(_select(ball, method=EXPLICIT)),
+        "explicit": _tabulate_explicit([row for row in ball if row["method"] in LINES]),
         "lattice_bias": _pivot(
             _select(bias, known=most_points), lambda row: number(row["random"] / row["lattice"]), "set"
         ),
@@ -76,7 +76,10 @@ def markdown(summary: Summary, *, figures: str = "figures") -> str:
         quartiles=quartiles,
         span=span,
         spread=spread,
-        **{name: getattr(plan, name) for name in ("PAPER", "GP", "NETWORK", "EXPLICIT", "FORWARD")},
+        **{
+            name: getattr(plan, name)
+            for name in ("PAPER", "GP", "NETWORK", "EXPLICIT", "FORWARD", "EXPLICIT_PAPER", "EXPLICIT_BUNDLE")
+        },
     )
     return re.sub(r"\n{3,}", "\n\n", text).rstrip() + "\n"
 
@@ -98,11 +101,10 @@ def _tabulate_findings(verdicts: Rows) -> str:
     for (_, _, sets), verdict_of in groups.items():
         statement = next(iter(verdict_of.values()))["statement"]
         cells = [_verdict(verdict_of.get(method)) for method in (PAPER, GP)]
-        if "" in verdict_of:
-            cells = [_verdict(verdict_of[""]), "the same"]
         repeated = any(line[0] == statement for line in lines)
         lines.append(["" if repeated else statement, sets, *cells])
-    return table(["finding", "cameras", f"`{PAPER}`", f"`{GP}`"], lines, left=4)
+    heads = [f"the paper's software (`{PAPER}`, `{EXPLICIT_PAPER}`)", f"ours (`{GP}`, `{EXPLICIT}`)"]
+    return table(["finding", "cameras", *heads], lines, left=4)
 
 
 def _verdict(verdict: Mapping[str, Any] | None) -> str:
@@ -110,7 +112,7 @@ def _verdict(verdict: Mapping[str, Any] | None) -> str:
 
 
 def _count_verdicts(verdicts: Rows, method: str) -> str:
-    found = [verdict["verdict"] for verdict in verdicts if verdict["method"] in (method, "")]
+    found = [verdict["verdict"] for verdict in verdicts if verdict["method"] == method]
     return f"{found.count(HOLDS)} of {len(found)} hold, {found.count(FAILS)} do not"
 
 
@@ -158,13 +160,25 @@ def _coverage(row: Mapping[str, Any]) -> str:
 
 
 def _tabulate_explicit(rows: Rows) -> str:
-    """A line for each set of cameras and where it was judged, a column for each budget of pictures."""
+    """A line for each set of cameras, pipeline and where it was judged, a column for each budget of pictures."""
     budgets = ["{}+{}".format(*budget) for budget in BUDGETS]
     body = list[list[str]]()
     for cameras in sorted({row["set"] for row in rows}):
         for judged, words in ((BALL, "lattice"), (CHECK, "random")):
-            found = {row.get("budget"): _error(row) for row in _select(rows, set=cameras, judged=judged)}
-            if found:
-                body.append([cameras, words, *(found.get(budget, "") for budget in budgets)])
-    heads = ["cameras", "judged at", *(budget.replace("+", " + ") for budget in budgets)]
-    return table(heads, body, left=2) if body else ""
+            for method in LINES:
+                mine = _select(rows, set=cameras, method=method, judged=judged)
+                found = {row["budget"]: _of_subsets(row) for row in mine}
+                if found:
+                    body.append([cameras, f"`{method}`", words, *(found.get(budget, "") for budget in budgets)])
+    heads = ["cameras", "pipeline", "judged at", *(budget.replace("+", " + ") for budget in budgets)]
+    return table(heads, body, left=3) if body else ""
+
+
+def _of_subsets(row: Mapping[str, Any]) -> str:
+    """The error of the calibration that the paper would take; of all subsets the middle half, and what is missing."""
+    if "by_reprojection" not in row:  # a summary of before
+        return _error(row)
+    low, _, high = row["rmse"]
+    chosen = number(row["by_reprojection"][1])
+    between = f" [{number(low, 2)}, {number(high, 2)}]" if low != high else ""
+    return chosen + between + (f" ({row['failed']} failed)" if row.get("failed") else "")

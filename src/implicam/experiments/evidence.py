@@ -79,6 +79,17 @@ def column(rows: Iterable[Row], key: str) -> Floats:
     return np.array([float(row[key]) for row in rows], dtype=np.float64)
 
 
+def median_row(rows: Iterable[Row], key: str) -> list[Row]:
+    """The row with the median of a column, the lower one of two; none where there is no row.
+
+    Args:
+        rows: Rows of a table, of runs that did not fail.
+        key: The column.
+    """
+    ordered = sorted(rows, key=lambda row: float(row[key]))
+    return ordered[(len(ordered) - 1) // 2 :][:1]
+
+
 def rows_by_rig(rows: Iterable[Row]) -> list[list[Row]]:
     """The rows of each rig, in the order of the first of each.
 
@@ -105,7 +116,9 @@ def ratio(above: Floats, below: Floats, words: str, *, least: float = 1.0) -> Ca
     return _case([logs[np.isfinite(logs)]], words, least)
 
 
-def unpaired(above: Floats, below: Floats, words: str, *, least: float = 1.0, alone: float = 0.0) -> Case:
+def unpaired(
+    above: Floats, below: Floats, words: str, *, least: float = 1.0, alone: tuple[float, float] = (0.0, 0.0)
+) -> Case:
     """The ratio of the geometric means of two independent samples, with its 95 % interval.
 
     Args:
@@ -113,19 +126,19 @@ def unpaired(above: Floats, below: Floats, words: str, *, least: float = 1.0, al
         below: (m,).
         words: The case in words, with {} for the number.
         least: The threshold.
-        alone: Standard deviation of the logarithm of a sample of one.
+        alone: Standard deviation of the logarithm, of each of the two, where it is a sample of one.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = [np.log(sample) for sample in (above, 1 / below)]
     return _case([sample[np.isfinite(sample)] for sample in logs], words, least, alone)
 
 
-def _case(samples: Sequence[Floats], words: str, least: float, alone: float = 0.0) -> Case:
+def _case(samples: Sequence[Floats], words: str, least: float, alone: Sequence[float] = (0.0, 0.0)) -> Case:
     """The exponential of the sum of the samples' means; without numbers a case that decides nothing."""
     if not all(len(sample) for sample in samples):
         return Case(np.nan, np.nan, np.nan, words, least)
     middle = sum(float(sample.mean()) for sample in samples)
-    spread = float(np.hypot.reduce([half_width(sample, alone) for sample in samples]))
+    spread = float(np.hypot.reduce([half_width(*pair) for pair in zip(samples, alone, strict=False)]))
     value, low, high = np.exp(middle + np.array([0.0, -spread, spread]))
     return Case(float(value), float(low), float(high), words, least)
 

@@ -11,6 +11,11 @@ METHODS = (PAPER, GP, NETWORK, EXPLICIT, FORWARD)
 LEARNERS = (PAPER, GP, NETWORK, FORWARD)
 """Those that experiment 1 trains on positions; there, explicit learns from pictures of a board."""
 
+EXPLICIT_PAPER, EXPLICIT_BUNDLE = "explicit:paper", "explicit:paper-bundle"
+LINES = (EXPLICIT_PAPER, EXPLICIT_BUNDLE, EXPLICIT)
+"""Those that learn from pictures of a board in experiment 1: the paper's pipeline with OpenCV without and with a joint
+adjustment, since it does not say which it ran; ours."""
+
 RIGS = 5
 """Simulated rigs, unless told otherwise: what holds for one may be an accident of its lenses."""
 
@@ -47,7 +52,7 @@ class Plan:
         runs: Random splits of each share, by method.
         random_shares: As `shares`, with training positions off the lattice.
         random_runs: As `runs`, for `random_shares`.
-        subsets: Of the pictures, for the smaller budgets of `explicit`.
+        subsets: Of the pictures, for the smaller budgets of `LINES`.
         start_share: Per cent of the positions that active learning begins with.
         additions: Points that active learning adds.
         repeats: Runs of active learning, by method.

@@ -25,7 +25,9 @@ from implicam.figures.style import BLUE, GREEN, GREY, ORANGE, VERMILLION
 
 Row = Mapping[str, Any]
 
-EXPLICIT = "explicit"
+EXPLICIT, EXPLICIT_PAPER, EXPLICIT_BUNDLE = "explicit", "explicit:paper", "explicit:paper-bundle"
+LINES = (EXPLICIT_PAPER, EXPLICIT_BUNDLE, EXPLICIT)
+"""Methods that are horizontal lines: from pictures of a board, the paper's pipeline in two variants, and ours."""
 # The paper's colours, from the palette; the dashes tell them apart in grey.
 _BUDGET_LOOKS: dict[str, dict[str, Any]] = {
     "50+10": {"color": GREEN, "ls": (0, (7, 2))},
@@ -50,8 +52,10 @@ def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     """Error against training points, log scale: a panel for each set, a line for each method (the paper's Figure 5).
 
     Args:
-        rows: Keys set, method, known, rmse. Rows of "explicit" have `budget` ("50+10": pictures of each camera and of
-            each pair) in place of known, and become a horizontal line at their median.
+        rows: Keys set, method, known, rmse. Rows of `LINES` have `budget` ("50+10": pictures of each camera and of
+            each pair) in place of known, and become a horizontal line: at the error of the subset with the median
+            `reprojection` error, as in the paper, the median over the rigs (`rig`). Where the paper's pipeline is
+            there, of ours only the largest budget is drawn.
         total: Number of points to split; the axis then shows the share trained on as well.
 
     Returns:
@@ -61,8 +65,8 @@ def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
         MissingExtraError: Matplotlib is not installed.
     """
     table = list(rows)
-    learners = [row for row in table if row["method"] != EXPLICIT]
-    explicit = [row for row in table if row["method"] == EXPLICIT]
+    learners = [row for row in table if row["method"] not in LINES]
+    explicit = [row for row in table if row["method"] in LINES]
     sets = _words(table, "set")
     figure = new_figure(7.5, 1.2 + 2.6 * max(len(sets), 1))
     panels = figure.subplots(max(len(sets), 1), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
@@ -98,7 +102,7 @@ def sd_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     Raises:
         MissingExtraError: Matplotlib is not installed.
     """
-    table = [row for row in rows if row["method"] != EXPLICIT and len(values([row], "mean_sd"))]
+    table = [row for row in rows if row["method"] not in LINES and len(values([row], "mean_sd"))]
     methods = list(choose_looks(_words(table, "method")))
     figure = new_figure(1.2 + 3.7 * max(len(methods), 1), 4.0)
     panels = figure.subplots(1, max(len(methods), 1), sharey=True, squeeze=False)[0]
@@ -236,23 +240,45 @@ def _quantiles(runs: Floats) -> Floats:
 
 
 def _explicit_lines(axes: Any, rows: Sequence[Row]) -> None:
-    for budget, error in _medians_of_budgets(rows).items():
+    for (method, budget), error in _heights(rows).items():
         axes.axhline(
             error,
-            lw=1.6,
             zorder=1.9,
-            label=f"explicit, {_spaced(budget)} pictures",
-            **_BUDGET_LOOKS.get(budget, _OTHER_BUDGET_LOOK),
+            label=f"{method}, {_spaced(budget)} pictures",
+            **{**_BUDGET_LOOKS.get(budget, _OTHER_BUDGET_LOOK), **_LINE_LOOKS[method]},
         )
 
 
 _OTHER_BUDGET_LOOK: dict[str, Any] = {"color": GREY, "ls": (0, (1, 3))}
 
 
-def _medians_of_budgets(rows: Sequence[Row]) -> dict[str, float]:
+_LINE_LOOKS: dict[str, dict[str, Any]] = {
+    EXPLICIT_PAPER: {"lw": 1.6},
+    EXPLICIT_BUNDLE: {"lw": 0.8},
+    EXPLICIT: {"lw": 1.6},
+}
+
+
+def _heights(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
+    """Errors of the lines, by method and budget."""
     budgets = [*_BUDGET_LOOKS, *sorted({str(row["budget"]) for row in rows} - set(_BUDGET_LOOKS))]
-    found = {budget: values(_where(rows, budget=budget), "rmse") for budget in budgets}
-    return {budget: float(np.median(errors)) for budget, errors in found.items() if len(errors)}
+    paper = any(row["method"] == EXPLICIT_PAPER for row in rows)
+    found = {}
+    for method in LINES:
+        for budget in budgets[:1] if paper and method == EXPLICIT else budgets:
+            errors = _of_median_subsets(_where(rows, method=method, budget=budget))
+            if errors:
+                found[method, budget] = float(np.median(errors))
+    return found
+
+
+def _of_median_subsets(rows: Sequence[Row]) -> list[float]:
+    """For each rig the error of the subset with the median reprojection error, the lower one of two."""
+    rigs: dict[str, list[tuple[float, float]]] = {}
+    for row in rows:
+        if len(values([row], "rmse")):
+            rigs.setdefault(str(row.get("rig", "")), []).append((row.get("reprojection", row["rmse"]), row["rmse"]))
+    return [sorted(pairs)[(len(pairs) - 1) // 2][1] for pairs in rigs.values()]
 
 
 def _spaced(budget: str) -> str:
@@ -260,8 +286,14 @@ def _spaced(budget: str) -> str:
 
 
 def _label_lines(axes: Any, rows: Sequence[Row]) -> None:
-    """Name the explicit lines at the panel's right edge, kept apart where the lines nearly coincide."""
-    medians = sorted(_medians_of_budgets(rows).items(), key=lambda item: item[1])
+    """Name the explicit lines, of the paper's pipeline where it is there, at the panel's right edge, kept apart where
+    they nearly coincide."""
+    heights, named = _heights(rows), EXPLICIT_PAPER
+    if not any(method == named for method, _ in heights):
+        named = EXPLICIT
+    medians = sorted(
+        ((budget, error) for (method, budget), error in heights.items() if method == named), key=lambda item: item[1]
+    )
     low, high = np.log(axes.get_ylim())
     places = _apart([(float(np.log(error)) - low) / (high - low) for _, error in medians], _LABEL_GAP_SHARE)
     for (budget, _), place in zip(medians, places, strict=True):

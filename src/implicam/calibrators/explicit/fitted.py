@@ -43,8 +43,8 @@ class Fitted:
     out in turn. alone: from boards alone, so that nothing is known and errors are those of corners as adjusted.
 
     Of the paper's presets: reference, the place in `cameras` of the one in whose frame points are triangulated;
-    inflation, what standard deviations are multiplied by (None, of every other preset: measured by maximum likelihood);
-    reprojection: rms distance of all corners from where they are predicted, pixels."""
+    inflation, what standard deviations are multiplied by (None, of every other preset: measured by maximum likelihood).
+    From boards and known points, reprojection: rms distance of the corners from where they are predicted, pixels."""
 
     trained: Observations
     frame: Frame

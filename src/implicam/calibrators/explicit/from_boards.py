@@ -81,7 +81,14 @@ def fit_to_boards(data: Dataset, groups: CameraGroups, boards: Dataset, how: str
         raise _too_few(parts, names, uncalibrated)
     told = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in sorted(uncalibrated)]
     fitted = _together(parts, trained, frame, [*copies_told, *_without_boards(data, trained), *told])
-    return replace(fitted, unused=(*fitted.unused, *copied))
+    return replace(fitted, unused=(*fitted.unused, *copied), reprojection=_reprojection(groups))
+
+
+def _reprojection(groups: CameraGroups) -> float:
+    """Rms distance in pixels of the corners that are used from where they are predicted."""
+    bundles = [group.bundle for group in groups.groups]
+    off = [np.linalg.norm(bundle.residuals(c), axis=1) for bundle in bundles for c in range(len(bundle.cameras))]
+    return float(np.sqrt(np.nanmean(np.concatenate(off) ** 2)))
 
 
 def _too_few(parts: Sequence[Part], names: tuple[str, ...], uncalibrated: Sequence[tuple[int, str]]) -> FitError:

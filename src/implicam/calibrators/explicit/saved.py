@@ -63,26 +63,26 @@ def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[
 
 
 def _of_the_paper(fitted: Fitted) -> dict[str, Any]:
-    """What the paper's presets measure with; nothing for the others."""
-    if fitted.inflation is None:
-        return {}
-    return {
-        "reference": fitted.reference,
-        "inflation": fitted.inflation,
-        "reprojection_px": fitted.reprojection,
-    }
+    """What the paper's presets measure with, and how far off the corners are; what there is not is left out."""
+    table: dict[str, Any] = {}
+    if np.isfinite(fitted.reprojection):
+        table["reprojection_px"] = fitted.reprojection
+    if fitted.inflation is not None:
+        table |= {"reference": fitted.reference, "inflation": fitted.inflation}
+    return table
 
 
 def _paper_from(table: Mapping[str, Any], cameras: int) -> tuple[int, float | None, float]:
     """The inverse of `_of_the_paper`."""
+    reprojection = float(table.get("reprojection_px", "nan"))
     if "inflation" not in table:
-        return 0, None, float("nan")
-    reference, inflation, reprojection = int(table["reference"]), float(table["inflation"]), table["reprojection_px"]
+        return 0, None, reprojection
+    reference, inflation = int(table["reference"]), float(table["inflation"])
     if not 0 <= reference < cameras:
         raise ValueError(f"there is no camera number {reference} to triangulate with")
     if not 1 <= inflation < np.inf:
         raise ValueError("inflation must be one or more, and finite")
-    return reference, inflation, float(reprojection)
+    return reference, inflation, reprojection
 
 
 def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[Fitted, Dataset | None]:

@@ -23,8 +23,6 @@ from implicam.simulate import CAMERA_SETS
 TESTS: dict[str, dict[str, Test]] = {"ball": ball.TESTS, "active": active.TESTS, "board": board.TESTS}
 FINDINGS_ABOUT_SEVERAL_SETS = ("more_cameras_lower_sd", "more_cameras_lower_rmse")
 """Findings about several sets of cameras at once."""
-FINDINGS_WITHOUT_GP = ("few_boards_hurt_explicit", "budget_matters_with_six_cameras")
-"""Findings that are about no Gaussian process."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Verdict:
         key: Of the finding.
         statement: The finding in words.
         sets: The sets of cameras.
-        method: The Gaussian process; empty for a finding that is about none.
+        method: The Gaussian process, and whose explicit calibration is meant: the paper's software, or ours.
         verdict: `HOLDS`, `FAILS` or `OPEN`.
         number: The case that decides, in words.
         remark: Where the paper's own table says otherwise.
@@ -66,7 +64,7 @@ def verdicts(rows: Mapping[str, Rows]) -> list[Verdict]:
         rigs = rows_by_rig(mine)
         for key, finding in published.load(experiment).findings.items() if mine else ():
             for sets in _groups(finding.sets, mine, key in FINDINGS_ABOUT_SEVERAL_SETS):
-                for method in ("",) if key in FINDINGS_WITHOUT_GP else (PAPER, GP):
+                for method in (PAPER, GP):
                     of_rigs = [tests[key](rig, method, sets) for rig in rigs]
                     whole = [cases for cases in of_rigs if len(cases) == max(map(len, of_rigs))]
                     cases = [over_rigs(same) for same in zip(*whole, strict=True)]

@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise, permutations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.experiments.evidence import Case, Row, Rows, Test, column, ratio, share_of_drop, stages, unpaired, where
-from implicam.experiments.plan import EXPLICIT, NETWORK
+from implicam.experiments.evidence import (
+    Case,
+    Row,
+    Rows,
+    Test,
+    column,
+    median_row,
+    ratio,
+    share_of_drop,
+    stages,
+    unpaired,
+    where,
+)
+from implicam.experiments.plan import EXPLICIT, EXPLICIT_BUNDLE, EXPLICIT_PAPER, GP, NETWORK, PAPER
 from implicam.experiments.source import BALL, BUDGETS
 from implicam.simulate import CAMERA_SETS
 
@@ -18,6 +30,9 @@ CAMERA_PAIR = next(iter(CAMERA_SETS))
 """The set of two cameras."""
 MUCH_WORSE_RATIO, CLEAR_GAIN_RATIO, ALIKE_RATIO = 1.5, 1.1, 1.1
 """Factors that stand for the paper's words: much worse, a clear gain, at most so far apart."""
+EXPLICIT_OF = {PAPER: (EXPLICIT_PAPER, EXPLICIT_BUNDLE), GP: (EXPLICIT,)}
+"""Explicit calibration that goes with a Gaussian process: the paper's software with the paper's, in both ways that the
+paper may have run it, and ours with ours."""
 TOO_FEW_RATIO = 2.0
 """Points are too few where twice as many of them more than halve the error."""
 
@@ -37,15 +52,35 @@ def _paired(a: Mapping[int, Row], b: Mapping[int, Row], key: str) -> tuple[Float
     return column([a[run] for run in runs], key), column([b[run] for run in runs], key)
 
 
-def _line(rows: Rows, cameras: str, budget: tuple[int, int]) -> Floats:
-    return column(where(rows, method=EXPLICIT, set=cameras, judged=BALL, budget="{}+{}".format(*budget)), "rmse")
+Budget = tuple[int, int]
 
 
-def _against(above: Floats, below: Floats, words: str, rows: Rows, cameras: str, *, least: float = 1.0) -> Case:
-    """A ratio with a line of explicit; the largest budget is one calibration, which scatters as the next one's do."""
-    next_one = np.log(_line(rows, cameras, BUDGETS[1]))
-    alone = float(next_one.std(ddof=1)) if len(next_one) > 1 else 0.0
-    return unpaired(above, below, words, least=least, alone=alone)
+class _Line(NamedTuple):
+    """What explicit calibration from a budget of pictures leaves, in mm: the error of the subset with the median
+    reprojection error, as the paper takes it (1,), or none; and the standard deviation of its logarithm. The largest
+    budget is one calibration, which scatters as those of the next one do."""
+
+    error: Floats
+    scatter: float
+
+    @classmethod
+    def of(cls, rows: Rows, explicit: str, cameras: str, budget: Budget) -> _Line:
+        mine = _subsets(rows, explicit, cameras, budget)
+        scattered = np.log(
+            column(_subsets(rows, explicit, cameras, max(budget, BUDGETS[1], key=BUDGETS.index)), "rmse")
+        )
+        scatter = float(scattered.std(ddof=1)) if len(scattered) > 1 else 0.0
+        return cls(column(median_row(mine, "reprojection"), "rmse"), scatter)
+
+
+def _subsets(rows: Rows, explicit: str, cameras: str, budget: Budget) -> list[Row]:
+    return where(rows, method=explicit, set=cameras, judged=BALL, budget="{}+{}".format(*budget))
+
+
+def _above(line: _Line, below: _Line | Floats, words: str, least: float = 1.0) -> Case:
+    """The error of a line over that of another, or over those of runs (n,)."""
+    under, scatter = below if isinstance(below, _Line) else (below, 0.0)
+    return unpaired(line.error, under, words, least=least, alone=(line.scatter, scatter))
 
 
 def _errors(rows: Rows, method: str, cameras: str, known: int) -> Floats:
@@ -62,50 +97,63 @@ def _network_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
 
 def _explicit_wins(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     known = _most(rows, gp, sets[0])
-    own = _errors(rows, gp, sets[0], known)
-    return [
-        _against(own, _line(rows, sets[0], budget), f"error with {known} points {{}} times that of {_words(budget)}",
-                 rows, sets[0])
-        for budget in BUDGETS
-    ]  # fmt: skip
+    own, cases = _errors(rows, gp, sets[0], known), []
+    for explicit in EXPLICIT_OF[gp]:
+        for budget in BUDGETS:
+            line = _Line.of(rows, explicit, sets[0], budget)
+            words = f"error with {known} points {{}} times that of {_words(explicit, budget)}"
+            cases.append(unpaired(own, line.error, words, alone=(0.0, line.scatter)))
+    return cases
 
 
 def _explicit_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
     """With the most points: the paper says "after surpassing a necessary threshold", 122 being an instance."""
-    line, known = _line(rows, sets[0], BUDGETS[0]), _most(rows, gp, sets[0])
-    if not known or not len(line):
-        return []
-    words = f"error of {_words(BUDGETS[0])} {{}} times its own with {known} points"
-    return [_against(line, _errors(rows, gp, sets[0], known), words, rows, sets[0])]
+    known = _most(rows, gp, sets[0])
+    errors = _errors(rows, gp, sets[0], known)
+    return [
+        _above(_Line.of(rows, explicit, sets[0], BUDGETS[0]), errors,
+               f"error of {_words(explicit, BUDGETS[0])} {{}} times its own with {known} points")
+        for explicit in EXPLICIT_OF[gp]
+        if known and _subsets(rows, explicit, sets[0], BUDGETS[0])
+    ]  # fmt: skip
 
 
 def _few_boards_hurt(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
-    many, few = (_line(rows, sets[0], budget) for budget in (BUDGETS[0], BUDGETS[-1]))
-    words = f"10 + 4 pictures: {{}} times the error of 50 + 10 (much: {MUCH_WORSE_RATIO:g})"
-    return [_against(few, many, words, rows, sets[0], least=MUCH_WORSE_RATIO)]
+    cases = []
+    for explicit in EXPLICIT_OF[gp]:
+        many, few = (_Line.of(rows, explicit, sets[0], budget) for budget in (BUDGETS[0], BUDGETS[-1]))
+        words = f"{explicit}: 10 + 4 pictures {{}} times the error of 50 + 10 (much: {MUCH_WORSE_RATIO:g})"
+        cases.append(_above(few, many, words, MUCH_WORSE_RATIO))
+    return cases
 
 
 def _budget_matters(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
-    lines = {budget: _line(rows, sets[0], budget) for budget in BUDGETS}
+    return [case for explicit in EXPLICIT_OF[gp] for case in _budgets_of(rows, explicit, sets[0])]
+
+
+def _budgets_of(rows: Rows, explicit: str, cameras: str) -> list[Case]:
+    lines = {budget: _Line.of(rows, explicit, cameras, budget) for budget in BUDGETS}
     most, middle, least = BUDGETS
 
-    def alike(a: tuple[int, int], b: tuple[int, int]) -> Case:
-        words = f"error of {a[0]} + {a[1]} over {b[0]} + {b[1]} pictures {{}} (alike: above {1 / ALIKE_RATIO:.2f})"
-        return _against(lines[a], lines[b], words, rows, sets[0], least=1 / ALIKE_RATIO)
+    def alike(a: Budget, b: Budget) -> Case:
+        words = f"{explicit}: error of {a[0]} + {a[1]} over {b[0]} + {b[1]} pictures {{}}"
+        return _above(lines[a], lines[b], f"{words} (alike: above {1 / ALIKE_RATIO:.2f})", 1 / ALIKE_RATIO)
 
-    if sets[0] == CAMERA_PAIR:
+    if cameras == CAMERA_PAIR:
         return [alike(a, b) for a, b in permutations(BUDGETS, 2)]
-    words = f"error of 10 + 4 over 25 + 6 pictures {{}} (clear: {CLEAR_GAIN_RATIO:g})"
-    return [_against(lines[least], lines[middle], words, rows, sets[0], least=CLEAR_GAIN_RATIO), alike(most, middle)]
+    words = f"{explicit}: error of 10 + 4 over 25 + 6 pictures {{}} (clear: {CLEAR_GAIN_RATIO:g})"
+    return [_above(lines[least], lines[middle], words, CLEAR_GAIN_RATIO), alike(most, middle)]
 
 
 def _poor_explicit_loses(rows: Rows, gp: str, sets: Sequence[str]) -> list[Case]:
-    line, cases = _line(rows, sets[0], BUDGETS[-1]), []
-    for method in (gp, NETWORK):
-        known = _most(rows, method, sets[0])
-        who = "the network's" if method == NETWORK else "its own"
-        words = f"error of {_words(BUDGETS[-1])} {{}} times {who} with {known} points"
-        cases.append(unpaired(line, _errors(rows, method, sets[0], known), words))
+    cases = []
+    for explicit in EXPLICIT_OF[gp]:
+        line = _Line.of(rows, explicit, sets[0], BUDGETS[-1])
+        for method in (gp, NETWORK):
+            known = _most(rows, method, sets[0])
+            who = "the network's" if method == NETWORK else "its own"
+            words = f"error of {_words(explicit, BUDGETS[-1])} {{}} times {who} with {known} points"
+            cases.append(_above(line, _errors(rows, method, sets[0], known), words))
     return cases
 
 
@@ -144,8 +192,8 @@ def _most(rows: Rows, method: str, cameras: str) -> int:
     return max(_known(rows, method=method, set=cameras, trained=BALL), default=0)
 
 
-def _words(budget: tuple[int, int]) -> str:
-    return "explicit with {} + {} pictures".format(*budget)
+def _words(explicit: str, budget: Budget) -> str:
+    return "{} with {} + {} pictures".format(explicit, *budget)
 
 
 TESTS: dict[str, Test] = {
