@@ -41,7 +41,7 @@ def prediction(spec: str, *, points: int = 36, places: int = 60, sd: float = 0.0
     placement, cameras = drawing_of(spec)
     assumed = Assumptions(position_sd=sd)
     rig = draw_rig(placement, assumed, unit, cameras)
-    workspace = Workspace.of_box(rig.volume)
+    workspace = Workspace.from_box(rig.volume)
     return predict(rig, assumed, workspace.design(points, 0), workspace.judged(places))
 
 

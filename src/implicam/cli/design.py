@@ -17,7 +17,7 @@ from implicam.cli.app import Json, Seed, command, need_plotly
 from implicam.dataset import Floats
 from implicam.design import Assumptions, Design, compare_designs
 from implicam.errors import UsageError
-from implicam.files import must_be_no_folder
+from implicam.files import refuse_folder
 from implicam.formatting import decimal_number, percent
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 
@@ -59,7 +59,7 @@ def design_command(
 ) -> None:
     """Predict how uncertain a placement of cameras will be with N known points, and which camera helps most."""
     if output is not None:
-        must_be_no_folder(output)
+        refuse_folder(output)
         if output.suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"{output} is no page.", fix="end the name in .html")
         need_plotly()

@@ -81,7 +81,7 @@ def compare_designs(
                 f"{drawings[0][0]} does not say what its cameras watch.",
                 fix="say where positions will be measured: --workspace=-120:120,-80:80,0:240",
             )
-        workspace = Workspace.of_box(draw_rig(first, assumed, unit).volume)
+        workspace = Workspace.from_box(draw_rig(first, assumed, unit).volume)
     known = workspace.design(points, seed) if isinstance(points, int) else points
     judged = workspace.judged(places, seed)
     found = []

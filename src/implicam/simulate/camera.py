@@ -101,7 +101,7 @@ def error_process(width: int, height: int, rms: float) -> tuple[float, float]:
     Returns:
         Its standard deviation in pixels, and its lengthscale in half the longer side of the image.
     """
-    lengthscale = RANGE * 0.5 * float(np.hypot(width, height))
+    lengthscale = LENGTH_SCALE_HALF_DIAGONALS * 0.5 * float(np.hypot(width, height))
     pixels = _pixel_grid(width, height)[::2]
     scaled = pixels / lengthscale
     squares = np.sum(scaled**2, axis=1)
