@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.tables import parse_toml
-from implicam.errors import CalibrationFileError, ImplicamError
+from implicam.errors import CalibrationFileError, ImplicamError, PartError
 from implicam.files import max_inflated_bytes, npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
 
 FORMAT_VERSION = 2
@@ -193,6 +193,8 @@ def refusing(path: Path) -> Iterator[None]:
     """
     try:
         yield
+    except PartError as error:  # the file is sound; what it needs is not here
+        raise CalibrationFileError(f"{path} cannot be used here: {error.what}", why=error.why, fix=error.fix) from error
     except ImplicamError as error:
         raise refusal(path, error.what) from error
     except KeyError as error:

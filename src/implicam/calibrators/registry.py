@@ -16,7 +16,7 @@ from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
 from implicam.calibrators.mlp import MLP, MLPCalibration
 from implicam.calibrators.protocol import Calibration, Calibrator
-from implicam.errors import CalibrationFileError, UsageError, did_you_mean, import_extra
+from implicam.errors import CalibrationFileError, PartError, UsageError, did_you_mean, import_extra
 from implicam.registry import Registry, missing_members
 
 
@@ -138,6 +138,8 @@ def method_for(**options: Any) -> str:
     for method in able:
         try:
             calibrator(method, **given)
+        except PartError:  # it is there, and broken
+            return method
         except UsageError:
             continue
         return method

@@ -21,7 +21,7 @@ from implicam.calibrators.explicit.boards import Boards, boards_of, has_boards
 from implicam.calibrators.explicit.camera_groups import CameraGroups, calibrate_groups
 from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_boards_alone, fit_to_points
 from implicam.calibrators.explicit.from_boards import fit_to_boards
-from implicam.calibrators.explicit.lenses import AUTO
+from implicam.calibrators.explicit.lenses import AUTO, dropped_notes
 from implicam.calibrators.explicit.opencv_pipeline import FAMILIES, OpenCVRig, calibrate_with_opencv
 from implicam.calibrators.explicit.paper_preset import (
     JOINT,
@@ -87,6 +87,8 @@ class Explicit(CalibratorBase):
                     f"explicit has no {what} {value!r}{did_you_mean(value, known)}.",
                     fix=f"choose one of {', '.join(known)}",
                 )
+        if self.lens != AUTO:
+            LENSES.find(self.lens)
 
         if self.preset != JOINT and self.lens not in (AUTO, *FAMILIES):
             raise UsageError(
@@ -127,6 +129,9 @@ class Explicit(CalibratorBase):
                 fitted = fit_to_points(data, self.lens, progress)
             else:
                 fitted = fit_to_boards(data, self._groups(data, progress), self.boards, self.align, progress)
+        if self.lens == AUTO:
+            names = [fitted.trained.camera_names[c] for c in fitted.cameras]
+            fitted = replace(fitted, notes=(*fitted.notes, *dropped_notes(names, fitted.choices)))
         return ExplicitCalibration(self, data, fitted)
 
     def _fitted_like_the_paper(self, data: Dataset, progress: Progress) -> Fitted:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from implicam.errors import FitError
+from implicam.errors import FitError, ImplicamError, PartError
 from implicam.geometry import Floats
 from implicam.lenses import LENSES, KannalaBrandt
 from implicam.rig_model import CentralCamera, RigModelSettings
@@ -24,11 +26,13 @@ USUAL_PIXELS = "square"
 
 
 class Choice(NamedTuple):
-    """The lens model a camera got; rms errors in pixels at views held out, of each that was tried; and its pixels."""
+    """The lens model a camera got; rms errors in pixels at views held out, of each that was tried; its pixels; and the
+    families that could not be tried, with the reason."""
 
     lens: str
     held_out: Mapping[str, float]
     pixels: str = USUAL_PIXELS
+    dropped: Mapping[str, str] = MappingProxyType({})
 
 
 def angles(camera: CentralCamera, points: Floats) -> Floats:
@@ -51,24 +55,40 @@ def choose_lens(family: str, make: Callable[[str], Made], held_out: Callable[[Ma
 
     A view that one of them keeps and another does not (NaN) counts as far off for that one, as `clipped` has it. A
     later family must be better than the first by more than the standard error of the difference: where there is little
-    to tell them apart, the first, `START_FAMILY`, is the safer one.
+    to tell them apart, the first, `START_FAMILY`, is the safer one. One that cannot be started, or whose package fails,
+    is left out, with the reason in the choice.
+
+    Raises:
+        FitError: no family, or not the one that is named, can be started.
+        PartError: the lens that is named, of another package, fails.
     """
     if family != AUTO:
-        return make(family), Choice(family, {})
+        with _named(family):
+            return make(family), Choice(family, {})
     started: dict[str, Made] = {}
     failure: FitError | None = None
+    dropped: dict[str, str] = {}
     for name in dict.fromkeys([START_FAMILY, *LENSES]):
         try:
-            started[name] = make(name)
+            with _named(name):
+                started[name] = make(name)
         except FitError as error:
-            failure = error
+            failure, dropped[name] = error, error.what
+        except PartError as error:
+            dropped[name] = f"{error.what} {error.why}"
     if not started:
         assert failure is not None
         raise failure
     if len(started) == 1:
         ((name, only),) = started.items()
-        return only, Choice(name, {})
-    squares = {name: held_out(one) for name, one in started.items()}
+        return only, Choice(name, {}, dropped=dropped)
+    squares: dict[str, Floats] = {}
+    for name, one in started.items():
+        try:
+            with _named(name):
+                squares[name] = held_out(one)
+        except PartError as error:
+            dropped[name] = f"{error.what} {error.why}"
     kept = ~np.logical_and.reduce([np.isnan(s) for s in squares.values()])
     squares = {name: _with_far(s[kept]) for name, s in squares.items()}
     best, *others = squares
@@ -76,7 +96,40 @@ def choose_lens(family: str, make: Callable[[str], Made], held_out: Callable[[Ma
         gain = squares[best] - squares[name]
         if np.mean(gain) > np.std(gain) / np.sqrt(len(gain)):
             best = name
-    return started[best], Choice(best, {name: float(np.sqrt(np.mean(s) / 2)) for name, s in squares.items()})
+    rms = {name: float(np.sqrt(np.mean(s) / 2)) for name, s in squares.items()}
+    return started[best], Choice(best, rms, dropped=dropped)
+
+
+@contextmanager
+def _named(family: str) -> Iterator[None]:
+    """An error that is no answer of a lens of another package is said to be its, and not a mistake in implicam."""
+    try:
+        yield
+    except (ImplicamError, np.linalg.LinAlgError):
+        raise
+    except Exception as error:
+        package = LENSES.package_of(family)
+        if package == "implicam":
+            raise
+        raise PartError(
+            f"the lens {family!r} of the package {package} fails.",
+            why=f"{type(error).__name__}: {' '.join(str(error).split())}",
+            fix=f"check it in the tests of {package}: implicam.testing.check_lens",
+        ) from error
+
+
+def dropped_notes(names: Sequence[str], choices: Sequence[Choice]) -> list[str]:
+    """A note for each family of lenses that could not be tried, with its cameras and the reason of the first; and for
+    each package that brings one under a name that is taken."""
+    reasons: dict[str, dict[str, str]] = {}
+    for name, choice in zip(names, choices, strict=True):
+        for family, reason in choice.dropped.items():
+            reasons.setdefault(family, {})[name] = reason
+    notes = []
+    for family, by_camera in reasons.items():
+        whose = "any camera" if len(by_camera) == len(names) else ", ".join(by_camera)
+        notes.append(f"lens {family} was not tried for {whose}: {next(iter(by_camera.values()))}")
+    return notes + [error.what for family, error in LENSES.refused().items() if family not in reasons]
 
 
 def _with_far(squares: Floats) -> Floats:

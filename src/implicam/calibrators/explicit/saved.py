@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import fields
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +18,8 @@ from implicam.calibrators.explicit.lenses import USUAL_PIXELS, Choice
 from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, arrays_from_dataset, dataset_from_arrays
 from implicam.dataset.unused import Rejected, Unused
-from implicam.lenses import LENSES
+from implicam.errors import PartError
+from implicam.lenses import LENSES, Lens
 from implicam.rig_model import (
     CameraModel,
     CentralCamera,
@@ -28,6 +33,11 @@ from implicam.rig_model import (
 
 BOARDS = "boards/"
 
+OWN_PACKAGE = "implicam"
+
+PACKAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
+"""Of a package or its version; anything else in a file is not shown as one."""
+
 
 def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """A readable table, and arrays: per camera lens and pose in the working frame, the roots of their covariance, and
@@ -36,8 +46,8 @@ def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[
     table = {
         "calibrated": [names[c] for c in fitted.cameras],
         "lenses": [
-            {"name": choice.lens, "held_out_px": dict(choice.held_out), "pixels": choice.pixels}
-            for choice in fitted.choices
+            {**_lens_table(model), "held_out_px": dict(choice.held_out), "pixels": choice.pixels}
+            for choice, model in zip(fitted.choices, posterior.models, strict=True)
         ],
         "notes": list(fitted.notes),
         "alone": fitted.alone,
@@ -98,13 +108,11 @@ def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[F
         raise ValueError("a rig has two calibrated cameras or more, each once")
     sizes = finite_column(arrays, "sizes", (len(cameras), 4))
     models, alone = [], []
-    for number, choice in enumerate(table["lenses"]):
-        model = _model(arrays, number, sizes[number], str(choice["name"]))
+    for number, (c, choice) in enumerate(zip(cameras, table["lenses"], strict=True)):
+        model = _model(arrays, number, sizes[number], _lens(choice, trained.camera_names[c]))
         models.append(model)
         q = len(arrays[f"{number}/root"])
         alone.append(finite_column(arrays, f"{number}/root", (q, model.size)))
-    if len(models) != len(cameras):
-        raise ValueError("lenses and calibrated cameras must be as many")
     joint = None
     if "joint" in arrays:
         joint = finite_column(arrays, "joint", (len(arrays["joint"]), sum(model.size for model in models)))
@@ -140,11 +148,57 @@ def _trained(data: Dataset, boards: Dataset | None) -> Any:
     return boards.observations.with_cameras(names)
 
 
-def _model(arrays: Arrays, number: int, sizes: NDArray[np.float64], lens: str) -> CameraModel:
-    if lens not in LENSES:
-        raise ValueError(f"camera {number} has a lens {lens!r}; this version knows {', '.join(LENSES)}")
+def _lens_table(model: CameraModel) -> dict[str, Any]:
+    """Of a camera's lens: its family, its parameters in their order, and the package that brings it."""
+    assert isinstance(model.camera, CentralCamera)
+    kind = type(model.camera.lens)
+    package = LENSES.package_of(kind.family) if kind.family in LENSES else kind.__module__.partition(".")[0]
+    table: dict[str, Any] = {"name": kind.family, "parameters": [field.name for field in fields(kind)]}
+    table["package"] = package
+    if package != OWN_PACKAGE:
+        with suppress(PackageNotFoundError):
+            table["package_version"] = version(package)
+    return table
+
+
+def _lens(table: Mapping[str, Any], camera: str) -> type[Lens]:
+    """The family of a camera's lens, by what `_lens_table` wrote; files of earlier versions have the name alone.
+
+    Raises:
+        PartError: it is not installed, cannot be imported, or has other parameters now.
+    """
+    family, maker = str(table["name"]), ""
+    package = table.get("package", "")
+    if isinstance(package, str) and PACKAGE_NAME.fullmatch(package) and package != OWN_PACKAGE:
+        maker = package
+        if PACKAGE_NAME.fullmatch(str(table.get("package_version", "?"))):
+            maker = f"{package} {table['package_version']}"
+    whose = f"camera {camera!r} has a lens of the family {family!r}"
+    if family not in LENSES:
+        raise PartError(
+            f"{whose}, which is not installed.",
+            why=f"it was made with that of the package {maker}" if maker else f"there are {', '.join(LENSES)}",
+            fix=f"install the package {maker}, as where the file was made"
+            if maker
+            else "install the package that brings it, as where the file was made; or pip install --upgrade implicam",
+        )
+    try:
+        lens = LENSES[family]
+    except PartError as error:
+        raise PartError(f"{whose}, which cannot be used: {error.what}", why=error.why, fix=error.fix) from error
+    now = [field.name for field in fields(lens)]
+    if table.get("parameters", now) != now:
+        raise PartError(
+            f"{whose}, which has other parameters now: {', '.join(now)}.",
+            why=f"the file has its numbers in the order {', '.join(map(str, table['parameters']))}",
+            fix=f"install the package {maker or package or 'implicam'}, as where the file was made, or calibrate again",
+        )
+    return lens
+
+
+def _model(arrays: Arrays, number: int, sizes: NDArray[np.float64], lens: type[Lens]) -> CameraModel:
     numbers = finite_column(arrays, f"{number}/camera", arrays[f"{number}/camera"].shape)
-    camera = CentralCamera.from_array(numbers, LENSES[lens])
+    camera = CentralCamera.from_array(numbers, lens)
     if not camera.sane:
         raise ValueError(f"camera {number} is inside out")
     noise, *centre, half = sizes.tolist()

@@ -33,6 +33,7 @@ from implicam.dataset import Dataset, remove_copies
 from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
+from implicam.lenses import LENSES
 from implicam.mistakes import explain_fit_error
 from implicam.progress import Progress, silent
 from implicam.rig_model.diagnostics import Diagnosis
@@ -66,9 +67,11 @@ class ForwardGP(CalibratorBase):
 
     def __post_init__(self) -> None:
         if self.lens not in LENS_OPTIONS:
+            hint = "" if self.lens in LENSES else did_you_mean(self.lens, (*LENS_OPTIONS, *LENSES))
             raise UsageError(
-                f"forward-gp has no lens {self.lens!r}{did_you_mean(self.lens, LENS_OPTIONS)}.",
-                fix=f"choose one of {', '.join(LENS_OPTIONS)}",
+                f"forward-gp has no lens {self.lens!r}{hint}.",
+                why=f"it has one model for all lenses; {', '.join(LENSES)} are lenses of explicit",
+                fix=f"choose one of {', '.join(LENS_OPTIONS)}, or write --method explicit --lens NAME",
             )
         if not isinstance(self.settings, ForwardGPSettings):
             raise UsageError(
