@@ -18,7 +18,9 @@ from implicam import calibration_file, registry
 from implicam.calibrators import Explicit, ExplicitCalibration, load_calibration
 from implicam.calibrators.explicit.lenses import Choice, choose_lens, dropped_notes
 from implicam.dataset import Dataset, write_dataset
-from implicam.errors import CalibrationFileError, FitError, PartError
+from implicam.errors import CalibrationFileError, DatasetError, FitError, PartError
+from implicam.exchange import ExplicitCamera, Rig, export_cameras
+from implicam.geometry import Pose
 from implicam.lenses import LENSES, KannalaBrandt, Lens
 from implicam.simulate import build_rig, random_positions, simulate
 from toy_lens import Equisolid
@@ -192,3 +194,24 @@ def test_a_lens_that_is_misspelt_is_found_in_explicit(
     assert ran.code == 2
     assert "did you mean 'double-sphere'?" in told
     assert "explicit" in told
+
+
+@pytest.mark.parametrize(
+    ("k1", "near"),
+    [(0.0, "or export to pose2sim, which comes within 1 px"), (-0.12, None)],
+)
+def test_export_recommends_a_format_only_where_it_holds_the_lens(tmp_path: Path, k1: float, near: str | None) -> None:
+    """It named dlt and pose2sim, which are 20 px off, or refuse."""
+    lens = Equisolid(1000.0, 1000.0, 639.5, 511.5, 0.25) if near else Equisolid(430.0, 430.0, 639.5, 511.5, k1)
+    pose = Pose(np.eye(3), np.array([0.0, 0.0, 500.0]))
+    rig = Rig((ExplicitCamera("cam1", 1280, 1024, lens, pose),), "mm")
+    with pytest.raises(DatasetError, match="has a lens of the family equisolid, which opencv does not know") as refused:
+        export_cameras(rig, "opencv", tmp_path / "a.yaml")
+    assert refused.value.fix == "calibrate with one of these" + (f", {near}" if near else "")
+    if near:
+        assert export_cameras(rig, "pose2sim", tmp_path / "a.toml")
+    else:
+        with pytest.raises(DatasetError) as refused:
+            export_cameras(rig, "pose2sim", tmp_path / "a.toml")
+        assert "calibrate with" in refused.value.fix
+        assert "dlt" not in refused.value.fix

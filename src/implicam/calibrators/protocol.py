@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from implicam import calibration_file
+from implicam.calibrators.cameras import FittedCamera, fitted_cameras
 from implicam.calibrators.position_processes import PositionProcesses
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.dataset.unused import Rejected, Unused
@@ -290,6 +292,11 @@ class RigCalibration(CalibrationBase):
     def camera_names(self) -> tuple[str, ...]:
         """The cameras that are calibrated."""
         return self.map.camera_names
+
+    @cached_property
+    def cameras(self) -> dict[str, FittedCamera]:
+        """The cameras that are calibrated, each with its lens and its pose in the world, by name."""
+        return {camera.name: camera for camera in fitted_cameras(self.map, self.data.xyz)}
 
     @property
     def trained(self) -> Observations:

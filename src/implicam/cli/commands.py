@@ -25,6 +25,7 @@ import implicam.cli.simulate  # noqa: F401  the seven register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards
+from implicam.calibrators.protocol import RigCalibration
 from implicam.cli import show
 from implicam.cli.app import (
     CALIBRATION_SUFFIX,
@@ -368,12 +369,17 @@ def info_command(
     """Show what a calibration file says about itself."""
     loaded = load_calibration(calibration)  # a damaged file must not look healthy
     table = calibration_file.describe(calibration)
+    cameras = loaded.cameras.values() if isinstance(loaded, RigCalibration) else ()
+    table["fitted_cameras"] = [camera.as_table() for camera in cameras]
     if json:
         show.emit_json(table)
         return
     settings: Any = getattr(getattr(loaded, "calibrator", None), "settings", None)
     saved = None if settings is None else table["options"].pop("settings", None)
+    fitted = table.pop("fitted_cameras")
     show.line(toml_text(table).rstrip())
+    if fitted:
+        show.line(show.table_lines("fitted_cameras", fitted))
     if saved is not None:
         usual = type(settings)().as_table()
         changed = {name: value for name, value in saved.items() if value != usual.get(name)}

@@ -8,7 +8,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -99,6 +99,22 @@ def _log_step(what: str, done: int, total: int) -> None:
 def emit_json(value: Any) -> None:
     """Print JSON; numbers that do not exist are null."""
     sys.stdout.write(json.dumps(json_safe(value), indent=2, ensure_ascii=False) + "\n")
+
+
+def table_lines(name: str, tables: Iterable[Mapping[str, Any]]) -> str:
+    """An array of tables in TOML, a key a line; numbers have six digits, for the eye."""
+    lines = []
+    for one in tables:
+        lines += ["", f"[[{name}]]", *(f"{key} = {_value(value)}" for key, value in one.items())]
+    return "\n".join(lines)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{key} = {_value(one)}' for key, one in value.items())} }}" if value else "{}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    return json.dumps(float(f"{value:.6g}") if isinstance(value, float) else value, ensure_ascii=False)
 
 
 def line(text: str) -> None:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from implicam.errors import DatasetError, UsageError, did_you_mean
-from implicam.exchange import anipose, colmap, dlt, kalibr, opencv
+from implicam.exchange import anipose, colmap, dlt, fits, kalibr, opencv
 from implicam.exchange.checks import read_text
 from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.lenses import BrownConrady, KannalaBrandt
@@ -66,9 +67,20 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
             raise DatasetError(
                 f"camera {camera.name!r} has a lens of the family {camera.lens.family}, which {to} does not know.",
                 why="it holds the two families of OpenCV, brown-conrady and kannala-brandt",
-                fix="calibrate with one of these, or export to dlt or pose2sim, which fit their own to it",
+                fix=", ".join(["calibrate with one of these", *_imitating(rig)]),
             )
     return form.write(rig, Path(path))
+
+
+def _imitating(rig: Rig) -> list[str]:
+    """The end of a cure: the formats whose own camera comes near enough to all of a rig's; empty where none does."""
+    near = []
+    for name, imitates in (("pose2sim", fits.fit_four_coefficients), ("dlt", fits.fit_projection_matrix)):
+        with suppress(DatasetError):
+            costs = [imitates(camera)[1] for camera in rig.cameras]
+            if all(cost is None or cost.largest <= fits.MAX_LENS_DIFFERENCE_PX for cost in costs):
+                near.append(name)
+    return [f"or export to {' or '.join(near)}, which comes within {fits.MAX_LENS_DIFFERENCE_PX:g} px"] if near else []
 
 
 def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | None = None) -> Rig:

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from implicam.errors import DatasetError
 from implicam.exchange.model import ExplicitCamera, has_distortion
 from implicam.geometry import Pose, rotation_from_vector
-from implicam.lenses import BrownConrady, Floats, KannalaBrandt
+from implicam.lenses import BrownConrady, Floats, KannalaBrandt, Lens
 
 LATTICE_POINTS_PER_SIDE = 25
 """Pixels of the lattice along each side of the image."""
@@ -68,6 +68,11 @@ def pixel_lattice(camera: ExplicitCamera) -> Floats:
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
+def _known(lens: Lens) -> bool:
+    """Whether formats with lenses of OpenCV hold it."""
+    return isinstance(lens, BrownConrady | KannalaBrandt)
+
+
 def image_rays(camera: ExplicitCamera, form: str) -> tuple[Floats, Floats]:
     """The rays of pixels that cover the image; pixels without a ray are left out.
 
@@ -90,7 +95,9 @@ def image_rays(camera: ExplicitCamera, form: str) -> tuple[Floats, Floats]:
             why="a part of its image looks sideways or backwards, which a perspective lens cannot hold"
             if len(rays)
             else "no pixel of its image has a ray",
-            fix="use a format with fisheye lenses: opencv, aniposelib, kalibr or colmap",
+            fix="use a format with fisheye lenses: opencv, aniposelib, kalibr or colmap"
+            if _known(camera.lens)
+            else "calibrate with kannala-brandt, and use opencv, aniposelib, kalibr or colmap, which hold that",
         )
     return rays / rays[:, 2:], uv
 
@@ -121,13 +128,12 @@ def fit_four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | 
     at, valid = found.pixel_from_camera_point(rays)
     cost = Cost.between(at, uv) if valid.all() else Cost(np.inf, np.inf)
     if not cost.largest <= MAX_LENS_DIFFERENCE_PX:
-        known = isinstance(lens, BrownConrady | KannalaBrandt)
         raise DatasetError(
             f"camera {camera.name!r} cannot be written as {form}.",
             why=f"the nearest such lens is off by {cost.largest:.3g} px somewhere in the image",
             fix="use a format that holds its lens: opencv, aniposelib or colmap"
-            if known
-            else "use dlt, or calibrate with brown-conrady or kannala-brandt",
+            if _known(lens)
+            else "calibrate with brown-conrady or kannala-brandt, which opencv, aniposelib and colmap hold",
         )
     return found, cost
 

@@ -13,19 +13,13 @@ from implicam.errors import UsageError
 from implicam.exchange import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.geometry import Floats, Pose
 from implicam.rig_model import (
-    CameraModel,
     CentralCamera,
     Frame,
-    GeneralCamera,
     Image,
     InitialCamera,
     Prior,
     lens_only_model,
-    levenberg_marquardt,
 )
-
-DRAWN = 2000
-"""Positions in the workspace at which a lens is fitted to what forward-gp predicts."""
 
 
 def rig_of(calibration: Calibration) -> tuple[Rig, list[str]]:
@@ -37,54 +31,17 @@ def rig_of(calibration: Calibration) -> tuple[Rig, list[str]]:
             why="it learns the map from pixels to positions as a whole",
             fix="calibrate the same data with --method explicit",
         )
-    fitted_rig, notes, cameras = calibration.map, [], []
-    for number, c in enumerate(fitted_rig.cameras):
-        described = fitted_rig.trained.cameras[c]
-        model = fitted_rig.posterior.models[number]
-        camera = model.camera
-        if isinstance(camera, GeneralCamera) and not camera.mirrored:
-            camera = camera.as_central()
-        if not isinstance(camera, CentralCamera):
-            what = "sees a mirror image" if isinstance(camera, GeneralCamera) else "has no lens model"
+    notes, cameras = [], []
+    for camera in calibration.cameras.values():
+        if camera.lens is None or camera.camera_from_world is None:
             raise UsageError(
-                f"{described.name} {what}, and no camera file can say so.",
+                f"{camera.name} {camera.note}, and no camera file can say so.",
                 why="other programs know lenses that see the world as it is",
                 fix="turn its pictures over, or calibrate the same data with --method explicit",
             )
-        if len(model.field.inducing):  # forward-gp
-            camera, note = _nearest(model, fitted_rig.frame.to_working(calibration.data.xyz), camera)
-            notes += [f"{described.name}: {note}"] if note else []
-        cameras.append(
-            ExplicitCamera(
-                described.name, described.width, described.height, camera.lens, _world(camera, fitted_rig.frame)
-            )
-        )
-    return Rig(tuple(cameras), fitted_rig.length_unit), notes
-
-
-def _world(camera: CentralCamera, frame: Frame) -> Pose:
-    """camera_from_world of a camera of the working frame: the inverse of its offset and scale."""
-    turned = camera.pose.rotation @ frame.offset
-    return Pose(camera.pose.rotation, camera.pose.translation * frame.scale - turned)
-
-
-def _nearest(model: CameraModel, points: Floats, camera: CentralCamera) -> tuple[CentralCamera, str]:
-    """The lens and place that come nearest to what forward-gp predicts around points, and the cost in pixels."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    drawn = np.random.default_rng(0).uniform(low, high, size=(DRAWN, 3))
-    uv = model.predict(drawn)[0]
-    seen = np.isfinite(uv).all(axis=1) & (np.abs(uv - model.image.centre) <= 1.2 * model.image.half).all(axis=1)
-    drawn, uv = drawn[seen], uv[seen]
-    nothing = Prior(camera.parameters, np.zeros((camera.size, camera.size)))
-    fitted = levenberg_marquardt(camera, nothing, drawn, uv, 0.1)
-    assert isinstance(fitted, CentralCamera)
-    off = np.linalg.norm(fitted.pixel(drawn) - uv, axis=1)
-    if np.nanmax(off) < 0.01:
-        return fitted, ""
-    return fitted, (
-        f"a lens model cannot hold all that forward-gp has learned: {np.sqrt(np.nanmean(off**2)):.2g} px rms are lost, "
-        f"at most {np.nanmax(off):.2g} px"
-    )
+        notes += [f"{camera.name}: {camera.note}"] if camera.note else []
+        cameras.append(ExplicitCamera(camera.name, camera.width, camera.height, camera.lens, camera.camera_from_world))
+    return Rig(tuple(cameras), calibration.map.length_unit), notes
 
 
 def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
