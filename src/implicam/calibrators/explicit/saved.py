@@ -108,6 +108,8 @@ def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[F
         raise ValueError("a rig has two calibrated cameras or more, each once")
     sizes = finite_column(arrays, "sizes", (len(cameras), 4))
     models, alone = [], []
+    if len(table["lenses"]) != len(cameras):
+        raise ValueError("lenses and calibrated cameras must be as many")
     for number, (c, choice) in enumerate(zip(cameras, table["lenses"], strict=True)):
         model = _model(arrays, number, sizes[number], _lens(choice, trained.camera_names[c]))
         models.append(model)
