@@ -496,7 +496,10 @@ def test_the_same_data_give_the_same_bits() -> None:
     ("spoil", "what"),
     [
         (lambda t, a: t["lenses"].pop(), "as many"),
-        (lambda t, a: t["lenses"][0].update(name="brown-conrady"), "family 'brown-conrady', which has other parameters now"),
+        (
+            lambda t, a: t["lenses"][0].update(name="brown-conrady"),
+            "family 'brown-conrady', which has other parameters now",
+        ),
         (lambda t, a: t["calibrated"].append("cam9"), "cam9"),
         (lambda t, a: a.update({"0/camera": np.zeros(20)}), "rotation"),
         (lambda t, a: a.update({"0/camera": a["0/camera"][:-1]}), "numbers is no kannala-brandt lens"),
