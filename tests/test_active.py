@@ -357,12 +357,6 @@ def test_the_short_path_is_as_short_as_any(known: Dataset, room: Workspace) -> N
     assert path_length(xyz, here) <= 1.1 * best
 
 
-def test_the_help_names_every_acquisition() -> None:
-    from implicam.cli.acquire import RULES
-
-    assert ", ".join(ACQUISITIONS) == RULES
-
-
 # stopping
 
 

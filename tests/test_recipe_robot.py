@@ -12,10 +12,10 @@ from command_line import Cli, cli  # noqa: F401  a fixture
 from implicam import registry
 from implicam.calibrators import load_calibration
 from implicam.errors import HardwareError, UsageError
-from implicam.hardware import CAMERAS, ROBOTS, camera_from, robot_from
+from implicam.hardware import CAMERAS, ROBOTS, TRIGGERS, camera_from, robot_from, trigger_from
 from implicam.session.controller import CALIBRATION_FILE
 from implicam.session.setup import Setup, open_session
-from toy_robot import RIG, Gantry, GantryCamera
+from toy_robot import RIG, Gantry, GantryCamera, GantryTrigger
 
 CORNERS = RIG.volume.world_from_box.apply((np.mgrid[0:2, 0:2, 0:2].reshape(3, -1).T - 0.5) * RIG.volume.size)
 BOX = CORNERS.min(axis=0), CORNERS.max(axis=0)
@@ -24,16 +24,18 @@ WORKSPACE = ",".join(f"{low:.1f}:{high:.1f}" for low, high in zip(*BOX, strict=T
 
 @pytest.fixture(autouse=True, params=["registered", "entry point"])
 def known_drivers(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    for drivers in (CAMERAS, ROBOTS):
+    for drivers in (CAMERAS, ROBOTS, TRIGGERS):
         monkeypatch.setattr(drivers, "_parts", dict(drivers._parts))  # so that they are gone after the test
     if request.param == "registered":
         ROBOTS.register("gantry", Gantry)
         CAMERAS.register("gantry", GantryCamera)
+        TRIGGERS.register("gantry", GantryTrigger)
     else:
         added = EntryPoints(
             [
                 EntryPoint("gantry", "toy_robot:Gantry", "implicam.robots"),
                 EntryPoint("gantry", "toy_robot:GantryCamera", "implicam.cameras"),
+                EntryPoint("gantry", "toy_robot:GantryTrigger", "implicam.triggers"),
             ]
         )
         monkeypatch.setattr(registry, "entry_points", lambda **by: added.select(**by))
@@ -52,6 +54,9 @@ def test_words_name_it_and_what_is_missing_is_told() -> None:
         robot_from("gantri:1", box=BOX)
     with pytest.raises(UsageError, match=r"names no camera[\s\S]*gantry:NUMBER"):
         camera_from("left", "gantry:left")
+    assert isinstance(trigger_from("gantry:3"), GantryTrigger)
+    with pytest.raises(UsageError, match=r"names no trigger[\s\S]*gantry:LINE"):
+        trigger_from("gantry")
 
 
 def test_it_keeps_the_contract_of_robots() -> None:
@@ -74,12 +79,14 @@ def test_it_keeps_the_contract_of_robots() -> None:
 
 def test_a_session_is_run_with_it_and_goes_on(tmp_path: Path) -> None:
     cameras = tuple((camera.name, f"gantry:{number}") for number, camera in enumerate(RIG.cameras))
-    setup = Setup(cameras=cameras, robot="gantry:1", workspace=WORKSPACE, budget=9, radius=8.0)
+    setup = Setup(cameras=cameras, robot="gantry:1", trigger="gantry:3", workspace=WORKSPACE, budget=9, radius=8.0)
     with open_session(tmp_path / "s", setup, say=lambda text: None) as controller:
         controller.start()
         for _ in range(4):
             controller.go()
             controller.accept()
+        assert isinstance(controller.equipment.trigger, GantryTrigger)
+        assert controller.equipment.trigger.fired == 4
     with open_session(tmp_path / "s", None, auto=True) as controller:
         controller.run()
         assert controller.state.phase == "done", controller.state.message
@@ -95,3 +102,6 @@ def test_the_command_line_knows_it(cli: Cli) -> None:
     told = " ".join(cli("acquire", "s", "--no-browser", "--camera", "cam1=gantry:0", "--robot", "gantri:1").err.split())
     assert "did you mean 'gantry'" in told
     assert "gantry:PORT" in told
+    told = " ".join(cli("acquire", "--help").out.replace("│", " ").split())
+    for spec in ("gantry:PORT", "gantry:NUMBER", "gantry:LINE"):
+        assert spec in told

@@ -9,11 +9,11 @@ from implicam.active.acquisitions import ACQUISITIONS
 from implicam.calibrators import CALIBRATORS
 from implicam.detect.registry import TARGETS
 from implicam.errors import PartError, UsageError
-from implicam.hardware import CAMERAS, ROBOTS
+from implicam.hardware import CAMERAS, ROBOTS, TRIGGERS
 from implicam.lenses import LENSES
 from implicam.registry import Registry
 
-REGISTRIES = (ACQUISITIONS, CALIBRATORS, CAMERAS, LENSES, ROBOTS, TARGETS)
+REGISTRIES = (ACQUISITIONS, CALIBRATORS, CAMERAS, LENSES, ROBOTS, TARGETS, TRIGGERS)
 
 
 def colours():
@@ -41,12 +41,18 @@ def test_a_name_that_is_taken_or_cannot_be_written_is_refused(name):
         colours().register(name, 9)
 
 
-def test_a_part_of_another_package_that_cannot_be_imported_is_named_with_the_package(monkeypatch):
-    there = EntryPoints([EntryPoint("mauve", "no_such_package.colours:MAUVE", "implicam.colours")])
+@pytest.mark.parametrize("how", ["import no_such_library", "import sys; sys.exit('no licence')"])
+def test_a_part_of_another_package_that_cannot_be_imported_is_named_with_the_package(monkeypatch, tmp_path, how):
+    (tmp_path / "broken_colours.py").write_text(how)
+    monkeypatch.syspath_prepend(tmp_path)
+    there = EntryPoints([EntryPoint("mauve", "broken_colours:MAUVE", "implicam.colours")])
     monkeypatch.setattr(registry, "entry_points", lambda **by: there.select(**by))
-    with pytest.raises(UsageError, match=r"the colour 'mauve' of the package no_such_package.colours") as error:
-        Registry("colour", {"red": 1}, "implicam.colours").find("mauve")
-    assert "ModuleNotFoundError" in error.value.why
+    made = Registry("colour", {"red": 1}, "implicam.colours")
+    with pytest.raises(UsageError, match=r"the colour 'mauve' of the package broken_colours") as error:
+        made.find("mauve")
+    assert error.value.why in ("ModuleNotFoundError: No module named 'no_such_library'", "SystemExit: no licence")
+    assert list(made) == ["red", "mauve"]
+    assert made.importable() == {"red": 1}
 
 
 def test_another_package_adds_a_part_by_an_entry_point(monkeypatch):

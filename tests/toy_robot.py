@@ -1,7 +1,7 @@
-"""A robot and a camera written by the recipe "A robot" of CONTRIBUTING.md alone.
+"""A robot, a camera and a trigger written by the recipe "A robot" of CONTRIBUTING.md alone.
 
 `Gantry` stands in for three axes that one commands over a serial port; `GantryCamera` photographs the ball where the
-gantry is. Neither is hardware.
+gantry is, `GantryTrigger` counts. None is hardware.
 """
 
 from __future__ import annotations
@@ -92,6 +92,30 @@ class GantryCamera:
     def frame(self, timeout: float = 5.0) -> Frame:
         self._ball.move(PLACE[0])
         return self._camera.frame(timeout)
+
+    def close(self) -> None:
+        pass
+
+
+class GantryTrigger:
+    """An output line of the gantry."""
+
+    spec: ClassVar[str] = "gantry:LINE"
+
+    @classmethod
+    def from_spec(cls, rest: str) -> Self:
+        if not rest.isdecimal():
+            raise incomplete_spec_error("trigger", cls, rest)
+        return cls(int(rest))
+
+    def __init__(self, line: int) -> None:
+        self.line, self.fired = line, 0
+
+    def open(self) -> None:
+        pass
+
+    def fire(self) -> None:
+        self.fired += 1
 
     def close(self) -> None:
         pass

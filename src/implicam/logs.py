@@ -13,6 +13,9 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import TextIO
 
+LOG = "implicam.log"
+"""The file in which a long command tells what it does, in the folder that it writes to."""
+
 MAX_BYTES = 10_000_000
 """A log file that is larger is put aside as FILE.1, and another is begun."""
 

@@ -1,4 +1,4 @@
-"""The parts that people add: lenses, calibrators, acquisitions, detectors, robots, cameras, each in a registry.
+"""The parts that people add, each kind in a registry: lenses, calibrators, acquisitions, detectors, hardware.
 
 A part is found by its name on the command line, in Python and in files. It is added by one line beside the others of
 its kind, by `REGISTRY.register(name, part)`, or from a package of its own by an entry point. CONTRIBUTING.md has the
@@ -21,14 +21,24 @@ class Option(NamedTuple):
     """An option of the command line that a part brings with it.
 
     Attributes:
-        help: What `--help` says of it.
+        help: What `--help` says of it, or a function that says it when it is asked for.
         metavar: What stands for its value there.
         minimum: The least value, of a number.
+        flags: Its name there, where it is not that of the parameter: "--camera", "--bright/--dark".
+        panel: The heading that `--help` lists it under.
+        kind: Its type there, where the parameter takes another one as well.
     """
 
-    help: str
+    help: str | Callable[[], str]
     metavar: str = "NAME"
     minimum: float | None = None
+    flags: str = ""
+    panel: str | None = None
+    kind: Any = None
+
+    def told(self) -> str:
+        """The help, now."""
+        return self.help() if callable(self.help) else self.help
 
 
 class Registry(Mapping[str, Part]):

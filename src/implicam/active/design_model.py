@@ -448,17 +448,21 @@ def can_design_experiments(calibration: Calibration | type) -> bool:
     return any(hasattr(calibration, name) for name in ("sensitivities", "position_processes"))
 
 
+def design_methods() -> list[str]:
+    """The methods that say what one more known point would add, of those that can be imported."""
+    return [name for name, (_, made) in CALIBRATORS.importable().items() if can_design_experiments(made)]
+
+
 def design_error(method: str) -> UsageError:
     """The error for a method that does not say what one more known point would add.
 
     Args:
         method: Its name.
     """
-    able = [name for name, (_, calibration) in CALIBRATORS.items() if can_design_experiments(calibration)]
     return UsageError(
         f"{method} cannot say where to measure next.",
         why="its error bars do not say what one more known point would change",
-        fix=f"use one of {', '.join(able)}",
+        fix=f"use one of {', '.join(design_methods())}",
     )
 
 

@@ -99,6 +99,7 @@ class InverseGP(CalibratorBase):
     shortest_lengthscale: float = UNIFORM_EXTENT_SDS
 
     method: ClassVar[str] = "inverse-gp"
+    compared_variants: ClassVar[tuple[str, ...]] = ("paper",)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "preset", FORMER_PRESETS.get(self.preset, self.preset))

@@ -60,6 +60,7 @@ class MLP(CalibratorBase):
     dropout: float = 0.2
 
     method: ClassVar[str] = "mlp"
+    compared_variants: ClassVar[tuple[str, ...]] = ("no-dropout",)
 
     def __post_init__(self) -> None:
         if not 0 <= self.dropout <= MAX_DROPOUT:

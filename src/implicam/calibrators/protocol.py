@@ -220,6 +220,8 @@ class Calibrator(Protocol):
     """A method and its options, not fitted yet: a frozen dataclass, whose fields are the options."""
 
     method: ClassVar[str]
+    compared_variants: ClassVar[tuple[str, ...]]
+    """Those that `compare` shows beside the method itself unless it is told which."""
 
     @classmethod
     def variants(cls) -> Mapping[str, Mapping[str, Any]]:
@@ -235,6 +237,8 @@ class Calibrator(Protocol):
 
 class CalibratorBase:
     """What most calibrators do alike; to be inherited, or written anew."""
+
+    compared_variants: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def variants(cls) -> Mapping[str, Mapping[str, Any]]:

@@ -108,6 +108,15 @@ def library_of(name: str) -> tuple[str, str] | None:
     return calibrator(name).library
 
 
+def compared_names() -> list[str]:
+    """The methods, each with the variants that stand beside it in a comparison."""
+    return [
+        name
+        for method, (made, _) in CALIBRATORS.items()
+        for name in (method, *(f"{method}:{variant}" for variant in made.compared_variants))
+    ]
+
+
 _NEEDY = ("inverse-gp:paper", "explicit:paper", "explicit:paper-bundle", "mlp", "mlp:no-dropout")
 NEEDED = {name: library for name in _NEEDY if (library := library_of(name))}
 """`library_of` the methods and variants here that need one."""

@@ -1,7 +1,7 @@
 """The command line: thin. Each command reads, calls the library, prints.
 
 Exit codes: 0 fine, 1 failed, 2 wrong usage. Errors are three lines (what, why, fix). Anywhere on the line, `--debug`
-adds the traceback, and `--verbose` shows what a command does as it goes.
+adds the traceback, and `--verbose` or `-v` shows what a command does as it goes.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run `implicam ...` and exit."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
-    verbose = "--verbose" in given
-    given = [word for word in given if word not in ("--debug", "--verbose")]
+    verbose = not {"--verbose", "-v"}.isdisjoint(given)
+    given = [word for word in given if word not in ("--debug", "--verbose", "-v")]
     from implicam.cli.commands import app  # late: `import implicam.cli` stays cheap
+    from implicam.cli.options import load_options
 
     try:
         with log_to_stream(sys.stderr) if verbose else nullcontext():
+            load_options(app, given)
             app(given, prog_name="implicam")
     except ImplicamError as error:
         _fail(str(error), 2 if isinstance(error, UsageError) else 1, debug)

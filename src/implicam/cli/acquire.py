@@ -2,74 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
 
 from implicam.calibrators import load_calibration
 from implicam.cli import show
-from implicam.cli.app import LOG, Json, Seed, command, command_line, must_not_replace
+from implicam.cli.app import Json, Seed, command, command_line, must_not_replace
+from implicam.cli.options import Options, OptionsOfParts, options_of_fields
 from implicam.dataset import Floats
 from implicam.dataset.folder import csv_text
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.files import write_text
 from implicam.formatting import decimal_number, percent
 from implicam.images import opencv
-from implicam.logs import log_to_file
+from implicam.logs import LOG, log_to_file
 
-RULES = "random, sobol, variance, excess, integrated, d-optimal"
-Room = Annotated[
-    str | None,
-    typer.Option(
-        "--workspace",
-        metavar="WHERE",
-        help="x0:x1,y0:y1,z0:z1, a CSV of places (x,y,z), or box or hull of the known points; suggest: or view.",
-    ),
-]
-Rule = Annotated[str | None, typer.Option("--acquisition", metavar="NAME", help=f"{RULES}.")]
-Reach = Annotated[
-    float | None,
-    typer.Option("--reach", metavar="LENGTH", help="A way that costs as much time as one measurement: no zigzag."),
-]
+if TYPE_CHECKING:
+    from implicam.session.controller import SessionController
 
 
-@command("suggest")
-def suggest_command(
+def _setup_options(*names: str) -> Options:
+    """Those of a session, or some of them."""
+    from implicam.session.setup import Setup
+
+    return {"": options_of_fields(Setup, *names)}
+
+
+def _suggest(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     count: Annotated[int, typer.Option("--count", "-n", min=1, max=200, metavar="N", help="How many targets.")] = 5,
-    workspace: Room = None,
-    acquisition: Rule = None,
+    workspace: Annotated[
+        str,
+        typer.Option(
+            metavar="WHERE", help="x0:x1,y0:y1,z0:z1, a CSV of places, box or hull of the known points, or view."
+        ),
+    ] = "box",
     here: Annotated[
         str | None, typer.Option("--from", metavar="X,Y,Z", help="Where the robot is: the targets in a short order.")
     ] = None,
-    reach: Reach = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="Also write a CSV of them.")
     ] = None,
     seed: Seed = 0,
     json: Json = False,
+    **options: Any,
 ) -> None:
     """Where to put the next known points, and what each camera will see."""
     from implicam.active import acquisition_from_name, suggest, workspace_from
     from implicam.active.acquisitions import DEFAULT_ACQUISITION
+    from implicam.session.setup import position_from_text
 
+    reach = options["reach"]
     if output is not None:
         must_not_replace(output, calibration)
     fitted = load_calibration(calibration)
     if reach is not None and not reach > 0:
         raise UsageError(f"a reach of {reach:g} is no length.", fix="give one greater than zero")
-    room = None if workspace == "view" else workspace_from(workspace or "box", fitted.data.xyz)
-    place = None if here is None else _place(here)
+    space = None if workspace == "view" else workspace_from(workspace, fitted.data.xyz)
     found = suggest(
         fitted,
-        room,
+        space,
         count=count,
-        rule=acquisition_from_name(acquisition or DEFAULT_ACQUISITION),
-        here=place,
+        rule=acquisition_from_name(options["acquisition"] or DEFAULT_ACQUISITION),
+        here=None if here is None else position_from_text(here, "--from"),
         reach=np.inf if reach is None else reach,
         seed=seed,
     )
@@ -105,6 +110,10 @@ def suggest_command(
         show.line(f"{output}: {len(found.targets)} targets")
 
 
+_shared_options = partial(_setup_options, "acquisition", "reach")
+suggest_command = command("suggest")(OptionsOfParts(_suggest, "workspace", _shared_options))
+
+
 def _pairs(cameras: Sequence[str], uv: Floats) -> list[tuple[str, Floats]]:
     return list(zip(cameras, uv, strict=True))
 
@@ -122,122 +131,17 @@ def _pixel(uv: Floats) -> str:
     return f"{uv[0]:.0f}, {uv[1]:.0f}" if np.isfinite(uv[0]) else "-"
 
 
-def _place(text: str) -> Floats:
-    try:
-        place = np.array([float(number) for number in text.split(",")], dtype=np.float64)
-        if place.shape != (3,) or not np.isfinite(place).all():
-            raise ValueError("it takes three numbers")
-    except ValueError as error:
-        raise UsageError(f"{text!r} is no position.", why=str(error), fix="write --from=120,-40,300") from error
-    return place
+_PAGE = "The page"
+
+CLOSING_SECONDS = 1.5
+"""How long a session may take to close after SIGTERM; one that still waits for a camera or a robot then is cut off, as
+by `kill -9`, which loses nothing."""
 
 
-_SIMULATED, _REAL, _PLAN, _PAGE = "Without hardware", "Cameras and robot", "Where, and how long", "The page"
-
-
-@command("acquire")
-def acquire_command(
+def _acquire(
     folder: Annotated[Path, typer.Argument(help="The session: a new folder, or one to go on with.")],
-    rig: Annotated[
-        str | None,
-        typer.Option("--rig", metavar="NAME", help="bar6 (default), stereo, dome8.", rich_help_panel=_SIMULATED),
-    ] = None,
-    rig_cameras: Annotated[
-        str | None,
-        typer.Option(
-            "--cameras", metavar="LIST", help="Some cameras of it: 2R, cam1,cam4.", rich_help_panel=_SIMULATED
-        ),
-    ] = None,
-    camera: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--camera",
-            metavar="NAME=WHAT",
-            help="One a camera: left=0, left=rtsp://..., left=folder/, left=genicam:SERIAL@FILE.cti.",
-            rich_help_panel=_REAL,
-        ),
-    ] = None,
-    robot: Annotated[
-        str | None,
-        typer.Option("--robot", metavar="WHAT", help="person (default), ur:HOST, csv:FILE.", rich_help_panel=_REAL),
-    ] = None,
-    trigger: Annotated[
-        str | None,
-        typer.Option("--trigger", metavar="WHAT", help="udp://HOST:PORT or tcp://HOST:PORT.", rich_help_panel=_REAL),
-    ] = None,
-    speed: Annotated[
-        float | None, typer.Option("--speed", metavar="M/S", help="Of the robot.", rich_help_panel=_REAL)
-    ] = None,
-    sd: Annotated[
-        float | None,
-        typer.Option("--sd", metavar="LENGTH", help="Standard uncertainty of known positions.", rich_help_panel=_REAL),
-    ] = None,
-    tool: Annotated[
-        str | None,
-        typer.Option("--tool", metavar="X,Y,Z", help="ur: the ball's centre, from the flange.", rich_help_panel=_REAL),
-    ] = None,
-    dry_run: Annotated[
-        bool | None,
-        typer.Option("--dry-run/--no-dry-run", help="ur: say where it would go; move nothing.", rich_help_panel=_REAL),
-    ] = None,
-    radius: Annotated[
-        float | None,
-        typer.Option("--radius", metavar="LENGTH", help="Of the ball, to correct its outline.", rich_help_panel=_REAL),
-    ] = None,
-    bright: Annotated[
-        bool | None,
-        typer.Option("--bright/--dark", help="The ball is lighter than what is behind.", rich_help_panel=_REAL),
-    ] = None,
-    unit: Annotated[
-        str | None, typer.Option("--unit", metavar="UNIT", help="Of lengths (default mm).", rich_help_panel=_REAL)
-    ] = None,
-    workspace: Annotated[
-        str | None,
-        typer.Option(
-            "--workspace",
-            metavar="WHERE",
-            help="x0:x1,y0:y1,z0:z1 or a CSV of places (x,y,z): where the ball can be.",
-            rich_help_panel=_PLAN,
-        ),
-    ] = None,
-    below: Annotated[
-        float | None,
-        typer.Option(
-            "--below", metavar="LENGTH", help="Stop at this 95 % uncertainty, everywhere.", rich_help_panel=_PLAN
-        ),
-    ] = None,
-    within: Annotated[
-        float | None,
-        typer.Option(
-            "--within",
-            metavar="TIMES",
-            help="Or at so many times what pixel noise leaves (default 1.2).",
-            rich_help_panel=_PLAN,
-        ),
-    ] = None,
-    budget: Annotated[
-        int | None,
-        typer.Option("--budget", min=1, metavar="N", help="Or after N points (default 60).", rich_help_panel=_PLAN),
-    ] = None,
-    acquisition: Annotated[
-        str | None, typer.Option("--acquisition", metavar="NAME", help=f"{RULES}.", rich_help_panel=_PLAN)
-    ] = None,
-    reach: Annotated[
-        float | None,
-        typer.Option("--reach", metavar="LENGTH", help="A way that costs as much as one point.", rich_help_panel=_PLAN),
-    ] = None,
-    method: Annotated[
-        str | None,
-        typer.Option(
-            "--method", metavar="NAME", help="forward-gp (default), inverse-gp, explicit.", rich_help_panel=_PLAN
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", min=0, metavar="N", help="Rig and choices.", rich_help_panel=_PLAN)
-    ] = None,
     unattended: Annotated[
-        bool,
-        typer.Option("--unattended", help="No page: the simulated rig by itself.", rich_help_panel=_PAGE),
+        bool, typer.Option("--unattended", help="No page: the simulated rig by itself.", rich_help_panel=_PAGE)
     ] = False,
     host: Annotated[
         str, typer.Option("--host", help="Another than localhost asks for a token.", rich_help_panel=_PAGE)
@@ -248,48 +152,70 @@ def acquire_command(
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.", rich_help_panel=_PAGE)
     ] = True,
     json: Json = False,
+    **options: Any,
 ) -> None:
     """A guided calibration in the browser: put the ball here, and now you can stop.
 
     Without cameras it shows the simulated rig. Every accepted point is on disk; run it again to go on.
     """
+    from implicam.session.folder import is_session, make_folder
     from implicam.session.setup import Setup, changed, open_session
 
-    given = {
-        "rig": rig, "rig_cameras": rig_cameras, "cameras": _cameras(camera), "robot": robot, "trigger": trigger,
-        "speed": speed, "sd": sd, "dry_run": dry_run, "radius": radius, "bright": bright, "unit": unit,
-        "workspace": workspace, "below": below, "within": within, "budget": budget, "acquisition": acquisition,
-        "reach": reach, "method": method, "seed": seed, "tool": None if tool is None else tuple(_place(tool)),
-    }  # fmt: skip
-    before = _stored(folder)
-    setup = changed(before or Setup(), **given)
-    if unattended and not setup.simulated:
-        raise UsageError(
-            "nothing is moved, and nobody is asked, while nobody looks.",
-            why="--unattended is for the simulated rig",
-            fix="use the page: leave --unattended out",
-        )
-    opencv()  # what is missing is said before anything is begun
+    changed(Setup(), **options)  # what is wrong with the words is said before anything is begun
+    opencv()
     if not unattended:
         import_extra("viser", "viewer", "the page of implicam acquire")
-    with (
-        open_session(folder, None if setup == before else setup, say=show.say) as controller,
-        log_to_file(folder / LOG, command_line()),
-    ):
-        if not unattended:
-            from implicam.viewer import serve
-
-            serve(controller, host=host, port=port, token=token, open_browser=browser, say=show.say)
-        else:
-            with show.progress(json) as progress:
-                controller.run(progress)
-            if controller.state.problem is not None:
-                raise controller.state.problem
-            if controller.state.phase != "done":
-                raise ImplicamError(
-                    "nothing was calibrated.", why=controller.state.message, fix="run it again to go on"
+    if not is_session(folder):
+        make_folder(folder)
+    log = folder / LOG
+    try:
+        with _ended_by_sigterm(log), log_to_file(log, command_line()):
+            before = _stored(folder)
+            setup = changed(before or Setup(), **options)
+            if unattended and not setup.simulated:
+                raise UsageError(
+                    "nothing is moved, and nobody is asked, while nobody looks.",
+                    why="--unattended is for the simulated rig",
+                    fix="use the page: leave --unattended out",
                 )
-        _tell(controller, json)
+            with open_session(folder, None if setup == before else setup, say=show.say) as controller:
+                if unattended:
+                    _run(controller, json)
+                else:
+                    from implicam.viewer import serve
+
+                    serve(controller, host=host, port=port, token=token, open_browser=browser, say=show.say)
+                _tell(controller, json)
+    except KeyboardInterrupt:
+        show.say(f"interrupted; what was measured is kept in {folder}: the same command goes on from there")
+        raise typer.Exit(130) from None
+
+
+acquire_command = command("acquire")(OptionsOfParts(_acquire, "folder", _setup_options))
+
+
+@contextmanager
+def _ended_by_sigterm(log: Path) -> Iterator[None]:
+    """SIGTERM is as Ctrl-C while the block runs, and the block ends within `CLOSING_SECONDS` of it."""
+
+    def cut_off() -> None:
+        with suppress(OSError), log.open("a", encoding="utf-8") as file:
+            file.write(f"cut off: not closed {CLOSING_SECONDS:g} s after SIGTERM\n")
+        os._exit(128 + signal.SIGTERM)
+
+    def end(number: int, frame: object) -> None:
+        signal.signal(number, signal.SIG_IGN)
+        late.start()
+        raise KeyboardInterrupt
+
+    late = threading.Timer(CLOSING_SECONDS, cut_off)
+    late.daemon = True
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        late.cancel()
+        signal.signal(signal.SIGTERM, before)
 
 
 def _stored(folder: Path) -> Any:
@@ -303,17 +229,17 @@ def _stored(folder: Path) -> Any:
         return Setup.from_settings(session.settings)
 
 
-def _cameras(words: list[str] | None) -> tuple[tuple[str, str], ...] | None:
-    if not words:
-        return None
-    pairs = [word.partition("=") for word in words]
-    for name, equals, what in pairs:
-        if not (name and equals and what):
-            raise UsageError(f"--camera {name}{equals}{what} names no camera.", fix="write --camera left=0")
-    return tuple((name, what) for name, _, what in pairs)
+def _run(controller: SessionController, json: bool) -> None:
+    """By itself, to the end; ImplicamError where nothing is calibrated."""
+    with show.progress(json) as progress:
+        controller.run(progress)
+    if controller.state.problem is not None:
+        raise controller.state.problem
+    if controller.state.phase != "done":
+        raise ImplicamError("nothing was calibrated.", why=controller.state.message, fix="run it again to go on")
 
 
-def _tell(controller: Any, json: bool) -> None:
+def _tell(controller: SessionController, json: bool) -> None:
     from implicam.session.controller import CALIBRATION_FILE
 
     state, folder = controller.state, controller.session.folder

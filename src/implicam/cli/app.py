@@ -24,7 +24,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Start with: implicam demo.  Any command: --verbose tells what it does, --debug the traceback of an error.",
+    epilog="Start with: implicam demo.  Any command: -v or --verbose tells what it does, --debug where an error is.",
 )
 
 EXAMPLES = {
@@ -46,9 +46,6 @@ EXAMPLES = {
     "info": "implicam info my-rig.implicam",
 }
 """Command -> an example, in an order in which they can be run."""
-
-LOG = "implicam.log"
-"""The file in which a long command tells what it does, in the folder that it writes to."""
 
 
 def command_line() -> str:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from implicam.calibrators import METHODS, MLP, ForwardGP, InverseGP, calibrator_from_name, library_of
+from implicam.calibrators import calibrator_from_name, compared_names, library_of
 from implicam.cli import show
 from implicam.cli.app import Cameras, Json, LeaveOut, Unit, Without, check_figure, command, must_be_shot, read
 from implicam.cli.compare_table import compare_failures, compare_table
@@ -69,25 +69,16 @@ def compare_command(
     show.notes(compare_failures(trials))
 
 
-SHOWN_VARIANTS = {ForwardGP.method: ("none",), InverseGP.method: ("paper",), MLP.method: ("no-dropout",)}
-"""Variants that stand beside their method unless --methods names others."""
-
-
 def _available_methods() -> list[str]:
     """All methods and the variants worth showing, as far as their libraries are installed."""
-    names = [name for method in METHODS for name in (method, *_variants(method))]
     available = []
-    for name in names:
+    for name in compared_names():
         library = library_of(name)
         if library is None or find_spec(library[0]) is not None:
             available.append(name)
         else:
             show.note(f'left out {name}: pip install "implicam[{library[1]}]" to add it')
     return available
-
-
-def _variants(method: str) -> list[str]:
-    return [f"{method}:{variant}" for variant in SHOWN_VARIANTS.get(method, ())]
 
 
 def _splits(

@@ -9,14 +9,14 @@ from typing import Annotated, Any
 import typer
 
 from implicam.cli import show
-from implicam.cli.app import LOG, Json, command, command_line
+from implicam.cli.app import Json, command, command_line
 from implicam.cli.options import OptionsOfParts
 from implicam.dataset.folder import IMAGES
 from implicam.detect import TARGETS, DetectionRun, detect_folder, detector_from_options, options_of
 from implicam.detect.folder import DETECTIONS
 from implicam.errors import UsageError
 from implicam.images import PATTERN
-from implicam.logs import log_to_file
+from implicam.logs import LOG, log_to_file
 
 
 def _options() -> dict[str, dict[str, inspect.Parameter]]:

@@ -11,10 +11,10 @@ import typer
 from rich.table import Table
 
 from implicam.cli import show
-from implicam.cli.app import LOG, Json, Seed, command, command_line, must_be_folder
+from implicam.cli.app import Json, Seed, command, command_line, must_be_folder
 from implicam.errors import UsageError
 from implicam.formatting import decimal_number
-from implicam.logs import log_to_file
+from implicam.logs import LOG, log_to_file
 
 
 class Experiment(StrEnum):

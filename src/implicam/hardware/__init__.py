@@ -7,7 +7,7 @@ robot.move(xyz); frame = camera.frame()
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware.csv_player import CsvPlayer
@@ -24,16 +24,18 @@ from implicam.hardware.protocol import (
     RobotDriver,
     RobotOptions,
     Trigger,
+    TriggerDriver,
     take_frames,
 )
 from implicam.hardware.simulated import PhotographingCamera, SimulatedRobot, simulated_rig
-from implicam.hardware.trigger import NetworkTrigger, TriggerSimulator
+from implicam.hardware.trigger import NetworkTrigger, TCPTrigger, TriggerSimulator
 from implicam.hardware.ur import URRobot
 from implicam.registry import Registry, offers
 
 __all__ = [
     "CAMERAS",
     "ROBOTS",
+    "TRIGGERS",
     "CsvPlayer",
     "FolderCamera",
     "Frame",
@@ -71,17 +73,22 @@ ROBOTS: Registry[type[RobotDriver]] = Registry(
 )
 """Name -> driver."""
 
+TRIGGERS: Registry[type[TriggerDriver]] = Registry(
+    "trigger", {"udp": NetworkTrigger, "tcp": TCPTrigger}, "implicam.triggers", offers(TriggerDriver)
+)
+"""Name -> driver."""
+
 
 def list_specs(drivers: Registry[Any]) -> str:
-    """What the specs of all drivers look like, for help texts and errors.
+    """What the specs of all drivers look like that can be imported, for help texts and errors.
 
     Args:
-        drivers: `CAMERAS` or `ROBOTS`.
+        drivers: `CAMERAS`, `ROBOTS` or `TRIGGERS`.
 
     Returns:
         The `spec` of each driver, with commas between them.
     """
-    return ", ".join(driver.spec for driver in drivers.values())
+    return ", ".join(driver.spec for driver in drivers.importable().values())
 
 
 def camera_from(name: str, spec: str, *, triggered: bool = False) -> FrameSource:
@@ -102,7 +109,7 @@ def camera_from(name: str, spec: str, *, triggered: bool = False) -> FrameSource
         if kind.takes(spec):
             return kind.from_spec(name, spec, triggered=triggered)
     known = (*CAMERAS, "/dev/video0", *STREAM_PREFIXES)
-    raise _unknown_error("camera", spec, known, CAMERAS, why="there is no such file or folder either")
+    raise _unknown_error(CAMERAS, spec, known, why="there is no such file or folder either")
 
 
 def robot_from(spec: str, **options: Any) -> Robot:
@@ -115,24 +122,33 @@ def robot_from(spec: str, **options: Any) -> Robot:
     Raises:
         UsageError: There is no such driver, or something that it needs is missing.
     """
-    name, _, rest = spec.partition(":")
-    if name not in ROBOTS:
-        raise _unknown_error("robot", spec, tuple(ROBOTS), ROBOTS)
-    return ROBOTS[name].from_spec(rest, RobotOptions(**options))
+    driver, rest = _find_driver(ROBOTS, spec)
+    return driver.from_spec(rest, RobotOptions(**options))
 
 
 def trigger_from(spec: str) -> Trigger:
-    """The trigger box at an address; it is not connected.
+    """The trigger that the words of a command line name; it is not connected.
 
     Args:
-        spec: "udp://host:port" or "tcp://host:port".
+        spec: A driver's name, a colon, and what it asks for: "udp://192.168.0.50:4000".
 
     Raises:
-        UsageError: The address is of no such form.
+        UsageError: There is no such driver, or the spec is not complete.
     """
-    return NetworkTrigger(spec)
+    driver, rest = _find_driver(TRIGGERS, spec)
+    return driver.from_spec(rest)
 
 
-def _unknown_error(what: str, spec: str, known: tuple[str, ...], drivers: Registry[Any], why: str = "") -> UsageError:
+Driver = TypeVar("Driver")
+
+
+def _find_driver(drivers: Registry[Driver], spec: str) -> tuple[Driver, str]:
+    name, _, rest = spec.partition(":")
+    if name not in drivers:
+        raise _unknown_error(drivers, spec, tuple(drivers))
+    return drivers[name], rest
+
+
+def _unknown_error(drivers: Registry[Any], spec: str, known: tuple[str, ...], why: str = "") -> UsageError:
     hint = did_you_mean(spec, known) or did_you_mean(spec.partition(":")[0], [word.partition(":")[0] for word in known])
-    return UsageError(f"{spec!r} names no {what}{hint}.", why=why, fix=f"write {list_specs(drivers)}")
+    return UsageError(f"{spec!r} names no {drivers.kind}{hint}.", why=why, fix=f"write {list_specs(drivers)}")

@@ -34,6 +34,7 @@ __all__ = [
     "RobotDriver",
     "RobotOptions",
     "Trigger",
+    "TriggerDriver",
     "check_position",
     "incomplete_spec_error",
     "take_frames",
@@ -119,6 +120,24 @@ class Trigger(Protocol):
 
     def close(self) -> None:
         """Disconnect. Closing twice is harmless."""
+
+
+class TriggerDriver(Protocol):
+    """What the registry of triggers asks of a driver's class."""
+
+    spec: ClassVar[str]
+    """What its specs look like, for help and errors: "udp://HOST:PORT"."""
+
+    @classmethod
+    def from_spec(cls, rest: str) -> Trigger:
+        """A trigger of this driver, not yet connected.
+
+        Args:
+            rest: What follows the driver's name and a colon.
+
+        Raises:
+            UsageError: The spec is not complete.
+        """
 
 
 class Robot(Protocol):
@@ -228,11 +247,11 @@ class RobotDriver(Protocol):
         """
 
 
-def incomplete_spec_error(what: str, driver: type[CameraDriver] | type[RobotDriver], rest: str) -> UsageError:
+def incomplete_spec_error(what: str, driver: type[CameraDriver | RobotDriver | TriggerDriver], rest: str) -> UsageError:
     """The error of a spec that names a driver and does not say what it needs.
 
     Args:
-        what: "camera" or "robot".
+        what: "camera", "robot" or "trigger".
         driver: The driver's class; its `spec` says what to write.
         rest: What follows the colon in the spec.
 

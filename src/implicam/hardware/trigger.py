@@ -17,7 +17,7 @@ import socket
 import threading
 import time
 from types import TracebackType
-from typing import Self
+from typing import ClassVar, Self
 from urllib.parse import urlsplit
 
 from implicam.errors import HardwareError, UsageError, did_you_mean
@@ -30,6 +30,13 @@ MAX_LINE_BYTES = 200
 
 class NetworkTrigger:
     """The `Trigger` at "udp://host:port" or "tcp://host:port"; it has `timeout` seconds to acknowledge."""
+
+    spec: ClassVar[str] = "udp://HOST:PORT"
+
+    @classmethod
+    def from_spec(cls, rest: str) -> Self:
+        """As of `TriggerDriver`."""
+        return cls(f"{cls.spec.partition(':')[0]}:{rest}")
 
     def __init__(self, address: str, timeout: float = 1.0) -> None:
         self.address, self._timeout = address, timeout
@@ -122,6 +129,12 @@ class NetworkTrigger:
             why=why,
             fix="check its power, its cable and its address; it must speak the protocol of docs/hardware.md",
         )
+
+
+class TCPTrigger(NetworkTrigger):
+    """The same, named by "tcp"."""
+
+    spec: ClassVar[str] = "tcp://HOST:PORT"
 
 
 def _split_address(address: str) -> tuple[str, int, bool]:

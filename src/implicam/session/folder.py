@@ -15,11 +15,13 @@ from implicam.dataset.folder import DESCRIPTION, IMAGES, POINTS, VIEWS, descript
 from implicam.errors import DatasetError, ImageError, ImplicamError, UsageError
 from implicam.files import convert_write_errors, replacing
 from implicam.images import Grey, write_picture
+from implicam.logs import LOG
 from implicam.session.database import DATABASE
 
 UNDONE = "undone"
 """The folder of what was taken out of the dataset: undone/<camera>/<shot>.png, and tables edited by hand."""
 
+_LOGS = (LOG, f"{LOG}.1")  # what the command line may have written before the session is begun
 _PARTIAL_PATTERN = ".*.partial-*"  # left by `files.replacing` in a process that was killed
 _MAX_NAME_BYTES = 200  # bytes of a name that becomes a file's; most disks take 255, and `replacing` adds some
 
@@ -160,7 +162,7 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        found = sorted({entry.name for entry in folder.iterdir()} - {DATABASE, f"{DATABASE}-journal"})
+        found = sorted({entry.name for entry in folder.iterdir()} - {DATABASE, f"{DATABASE}-journal", *_LOGS})
     except OSError as error:
         raise ImplicamError(
             f"cannot make the folder {folder}.", why=str(error), fix="choose a place you may write to"

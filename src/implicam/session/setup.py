@@ -2,34 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition_from_name, workspace_from
-from implicam.active.acquisitions import DEFAULT_ACQUISITION
-from implicam.active.design_model import can_design_experiments, design_error
+from implicam.active.acquisitions import ACQUISITIONS, DEFAULT_ACQUISITION
+from implicam.active.design_model import can_design_experiments, design_error, design_methods
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
 from implicam.dataset.model import METRES_PER_UNIT
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import (
+    CAMERAS,
+    ROBOTS,
+    TRIGGERS,
     FrameSource,
     Person,
     Robot,
     Trigger,
     camera_from,
+    list_specs,
     robot_from,
     simulated_rig,
     take_frames,
     trigger_from,
 )
+from implicam.registry import Option
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
@@ -43,44 +49,55 @@ SIMULATED_SPEED = 0.4
 PATIENCE = 60.0
 """Seconds for the next picture of a camera that has none to spare: somebody, or another program, has to take it."""
 
+# options under the headings of `implicam acquire --help`
+_rig = partial(Option, panel="Without hardware")
+_real = partial(Option, panel="Cameras and robot")
+_plan = partial(Option, panel="Where, and how long")
+
+Tool = tuple[float, ...]
+
 
 @dataclass(frozen=True)
 class Setup:
-    """Plain values; lengths in the dataset's unit but where it says so.
+    """What a session is begun with, as plain values: the options of `implicam acquire`, and what a session keeps.
 
-    cameras: (name, spec) of real cameras, none for the simulated `rig` (with `rig_cameras` of it, built with `seed`).
-    robot: "" for what goes with the cameras, else a spec of `robot_from`. radius: of the ball, to correct its outline.
-    workspace: words as `workspace_from` takes them, "" for what the robot can reach. below: stop when the 95 %
-    uncertainty is below it everywhere; within: or when it is so many times what pixel noise alone leaves; budget: or
-    after so many points. reach: as in `Loop`. speed: m/s.
-    sd: standard uncertainty of the robot's positions, or of what a person types, None for the robot's own. tool: the
-    ball's centre in the frame of a UR robot's flange, None for the TCP that is set on it.
+    Lengths are in the dataset's unit. Without `cameras`, (name, spec) each, it is the simulated `rig`, built with
+    `seed`. robot: "" for what goes with the cameras, else a spec of `robot_from`. workspace: words as `workspace_from`
+    takes them, "" for what the robot can reach. reach: as in `Loop`. sd: standard uncertainty of the robot's positions,
+    or of what a person types, None for the robot's own. tool: the ball's centre in the frame of a UR robot's flange,
+    None for the TCP that is set on it. `cameras` and `tool` may be the words of a command line.
+
+    Raises:
+        UsageError: a value is not possible.
     """
 
-    rig: str = "bar6"
-    rig_cameras: str | None = None
-    cameras: tuple[tuple[str, str], ...] = ()
-    robot: str = ""
-    trigger: str | None = None
-    unit: str = "mm"
-    radius: float | None = None
-    bright: bool = False
-    workspace: str = ""
-    method: str = DEFAULT_METHOD
-    acquisition: str = DEFAULT_ACQUISITION
-    below: float | None = None
-    within: float = 1.2
-    budget: int = 60
-    reach: float | None = None
-    speed: float | None = None
-    sd: float | None = None
-    tool: tuple[float, ...] | None = None
-    dry_run: bool = False
-    seed: int = 0
+    rig: Annotated[str, _rig("bar6, stereo, dome8")] = "bar6"
+    rig_cameras: Annotated[str | None, _rig("Some of its cameras: 2R, cam1,cam4", "LIST", flags="--cameras")] = None
+    cameras: Annotated[
+        tuple[tuple[str, str], ...],
+        _real(lambda: f"One a camera; WHAT is {list_specs(CAMERAS)}", "NAME=WHAT", flags="--camera", kind=list[str]),
+    ] = ()
+    robot: Annotated[str, _real(lambda: f"{list_specs(ROBOTS)} (default {Person.spec})", "WHAT")] = ""
+    trigger: Annotated[str | None, _real(partial(list_specs, TRIGGERS), "WHAT")] = None
+    speed: Annotated[float | None, _real("Of the robot", "M/S")] = None
+    sd: Annotated[float | None, _real("Standard uncertainty of known positions", "LENGTH")] = None
+    tool: Annotated[Tool | None, _real("ur: the ball's centre, from the flange", "X,Y,Z", kind=str)] = None
+    dry_run: Annotated[bool, _real("ur: say where it would go; move nothing", flags="--dry-run/--no-dry-run")] = False
+    radius: Annotated[float | None, _real("Of the ball, to correct its outline", "LENGTH")] = None
+    bright: Annotated[bool, _real("The ball is lighter than what is behind", flags="--bright/--dark")] = False
+    unit: Annotated[str, _real("Of lengths", "UNIT")] = "mm"
+    workspace: Annotated[str, _plan("x0:x1,y0:y1,z0:z1 or a CSV of places: where the ball can be", "WHERE")] = ""
+    below: Annotated[float | None, _plan("Stop at this 95 % uncertainty, everywhere", "LENGTH")] = None
+    within: Annotated[float, _plan("Or at so many times what pixel noise leaves", "TIMES")] = 1.2
+    budget: Annotated[int, _plan("Or after N points", "N", 1)] = 60
+    acquisition: Annotated[str, _plan(lambda: ", ".join(ACQUISITIONS))] = DEFAULT_ACQUISITION
+    reach: Annotated[float | None, _plan("A way that costs as much time as one point: no zigzag", "LENGTH")] = None
+    method: Annotated[str, _plan(lambda: ", ".join(design_methods()))] = DEFAULT_METHOD
+    seed: Annotated[int, _plan("Rig and choices", "N", 0)] = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cameras", tuple((str(name), str(spec)) for name, spec in self.cameras))
-        object.__setattr__(self, "tool", None if self.tool is None else tuple(map(float, self.tool)))
+        object.__setattr__(self, "cameras", tuple(map(_camera, self.cameras)))
+        object.__setattr__(self, "tool", None if self.tool is None else _tool(self.tool))
         if self.unit not in METRES_PER_UNIT:
             raise UsageError(
                 f"there is no length unit {self.unit!r}{did_you_mean(self.unit, METRES_PER_UNIT)}.",
@@ -128,6 +145,32 @@ class Setup:
         return build_rig(self.rig, seed=self.seed, unit=self.unit, cameras=self.rig_cameras)  # type: ignore[arg-type]
 
 
+def _camera(camera: str | Sequence[str]) -> tuple[str, str]:
+    """Name and spec of a camera, as they are or as "name=spec"."""
+    if not isinstance(camera, str):
+        name, spec = camera
+        return str(name), str(spec)
+    name, _, spec = camera.partition("=")
+    if not (name and spec):
+        raise UsageError(f"--camera {camera} names no camera.", fix="write --camera left=0")
+    return name, spec
+
+
+def _tool(tool: str | Sequence[float]) -> Tool:
+    return tuple(position_from_text(tool, "--tool").tolist()) if isinstance(tool, str) else tuple(map(float, tool))
+
+
+def position_from_text(text: str, option: str) -> Floats:
+    """(3,) the position that "120,-40,300" means; UsageError, which names the option, where it is none."""
+    try:
+        position = np.array([float(number) for number in text.split(",")], dtype=np.float64)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise ValueError("it takes three numbers")
+    except ValueError as error:
+        raise UsageError(f"{text!r} is no position.", why=str(error), fix=f"write {option}=120,-40,300") from error
+    return position
+
+
 def open_session(
     folder: Path, setup: Setup | None, *, auto: bool = False, say: Callable[[str], None] = print
 ) -> SessionController:
@@ -150,15 +193,15 @@ def open_session(
             session.close()
             raise
     setup = setup or Setup()
-    eyes, robot, room = _hardware(setup, say)
+    hardware = _hardware(setup, say)
     session = Session.create(
         folder,
         name=folder.absolute().name,
         length_unit=setup.unit,
-        cameras=_sized(setup, eyes, say),
+        cameras=_sized(setup, hardware[0], say),
         settings=setup.as_settings(),
     )
-    return _made(session, setup, (eyes, robot, room), auto)
+    return _made(session, setup, hardware, auto)
 
 
 def _continued(session: Session, setup: Setup | None) -> Setup:
@@ -182,16 +225,16 @@ Hardware = tuple[list[FrameSource], Robot, Workspace]
 
 
 def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> SessionController:
-    eyes, robot, room = hardware
+    cameras, robot, workspace = hardware
     trigger = None if setup.trigger is None else trigger_from(setup.trigger)
     radius = setup.radius
     if radius is None and setup.simulated:
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
-    timeout = 10.0 if trigger is not None or all(source.live for source in eyes) else PATIENCE
-    equipment = Equipment(eyes, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run)
+    timeout = 10.0 if trigger is not None or all(source.live for source in cameras) else PATIENCE
+    equipment = Equipment(cameras, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run)
     loop = Loop(
         calibrator_from_name(setup.method),
-        room,
+        workspace,
         acquisition_from_name(setup.acquisition),
         setup.rule,
         reach=np.inf if setup.reach is None else setup.reach,
@@ -203,10 +246,10 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
 def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
     if setup.simulated:
         return _simulated(setup)
-    eyes = [camera_from(name, spec, triggered=setup.trigger is not None) for name, spec in setup.cameras]
+    cameras = [camera_from(name, spec, triggered=setup.trigger is not None) for name, spec in setup.cameras]
     robot = _robot(setup, say)
     if setup.workspace:
-        return eyes, robot, workspace_from(setup.workspace, None)
+        return cameras, robot, workspace_from(setup.workspace, None)
     robot.open()
     places = robot.reachable()
     if places is None:
@@ -215,7 +258,7 @@ def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
             why="where the target can be put is not known",
             fix="give it in the dataset's unit: --workspace=x0:x1,y0:y1,z0:z1, or a CSV file of places",
         )
-    return eyes, robot, Workspace.only(places)
+    return cameras, robot, Workspace.only(places)
 
 
 def _simulated(setup: Setup) -> Hardware:
@@ -226,9 +269,9 @@ def _simulated(setup: Setup) -> Hardware:
             fix="give cameras (--camera NAME=WHAT), or leave --robot out",
         )
     speed = (setup.speed or SIMULATED_SPEED) / METRES_PER_UNIT[setup.unit]
-    eyes, robot = simulated_rig(rig, seed=setup.seed, sd=setup.sd or 0.0, speed=speed)
-    room = workspace_from(setup.workspace, None) if setup.workspace else Workspace.from_box(rig.volume)
-    return list(eyes), robot, room
+    cameras, robot = simulated_rig(rig, seed=setup.seed, sd=setup.sd or 0.0, speed=speed)
+    workspace = workspace_from(setup.workspace, None) if setup.workspace else Workspace.from_box(rig.volume)
+    return list(cameras), robot, workspace
 
 
 def _robot(setup: Setup, say: Callable[[str], None]) -> Robot:
@@ -253,21 +296,21 @@ def _corners(setup: Setup) -> tuple[Floats, Floats] | None:
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def _sized(setup: Setup, eyes: list[FrameSource], say: Callable[[str], None]) -> list[Camera]:
+def _sized(setup: Setup, cameras: list[FrameSource], say: Callable[[str], None]) -> list[Camera]:
     """The cameras with the size of their pictures: one of each is taken, and they are closed again."""
     if setup.simulated:
         return [Camera(camera.name, camera.width, camera.height) for camera in setup.built().cameras]
     trigger = None if setup.trigger is None else trigger_from(setup.trigger)
-    if trigger is None and not all(source.live for source in eyes):
+    if trigger is None and not all(source.live for source in cameras):
         say("waiting for one picture of each camera, to learn its size")
-    with ExitStack() as devices, ThreadPoolExecutor(len(eyes)) as pool:
-        needed: list[FrameSource | Trigger] = [*eyes, *([] if trigger is None else [trigger])]
+    with ExitStack() as devices, ThreadPoolExecutor(len(cameras)) as pool:
+        needed: list[FrameSource | Trigger] = [*cameras, *([] if trigger is None else [trigger])]
         for device in needed:
             devices.callback(device.close)
             device.open()
-        frames = take_frames(eyes, trigger, PATIENCE if trigger is None else 10.0, pool)
+        frames = take_frames(cameras, trigger, PATIENCE if trigger is None else 10.0, pool)
         sizes = [frame.picture.shape for frame in frames]
-    return [Camera(source.name, width, height) for source, (height, width) in zip(eyes, sizes, strict=True)]
+    return [Camera(source.name, width, height) for source, (height, width) in zip(cameras, sizes, strict=True)]
 
 
 def changed(setup: Setup, **given: Any) -> Setup:

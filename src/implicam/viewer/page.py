@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout, suppress
+from contextlib import redirect_stdout
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
@@ -371,9 +371,11 @@ def serve(
             import webbrowser
 
             webbrowser.open(front.url)
-        with suppress(KeyboardInterrupt):
-            while not page.closed.wait(0.5):
-                pass
+        while not page.closed.wait(0.5):
+            pass
+    except KeyboardInterrupt:
+        if controller.state.phase == "moving":
+            controller.stop_robot()
     finally:
         front.close()
         page.close()

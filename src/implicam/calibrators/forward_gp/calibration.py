@@ -64,6 +64,7 @@ class ForwardGP(CalibratorBase):
     settings: ForwardGPSettings = DEFAULT_SETTINGS
 
     method: ClassVar[str] = "forward-gp"
+    compared_variants: ClassVar[tuple[str, ...]] = ("none",)
 
     def __post_init__(self) -> None:
         if self.lens not in LENS_OPTIONS:
