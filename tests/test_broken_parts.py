@@ -15,7 +15,7 @@ from implicam.session.setup import Setup, open_session
 BROKEN = "raise OSError('libgantry.so.3: cannot open shared object file')\n"
 
 NEEDS = {
-    "lenses": "calibrate {rig} -o x.implicam --method explicit",
+    "lenses": "calibrate {rig} -o x.implicam --method explicit --lens broken",
     "calibrators": "calibrate {rig} -o x.implicam",
     "acquisitions": "suggest {rig}.implicam --acquisition broken",
     "detectors": "detect {rig}",
