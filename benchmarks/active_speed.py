@@ -15,7 +15,7 @@ import numpy as np
 
 from implicam.active import Loop, SimulatedOracle, Workspace, acquisition_from_name
 from implicam.calibrators import ForwardGP, InverseGP
-from implicam.calibrators.inverse_gp import Scaling
+from implicam.calibrators.every_camera import Scaling
 from implicam.simulate import build_rig, random_positions, simulate
 
 POINTS, REPEATS = 135, 7

@@ -28,8 +28,10 @@ from scipy.linalg import lapack
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from implicam.calibrators.inverse_gp import UNIFORM_EXTENT_SDS, Scaling
-from implicam.calibrators.paper_preset import LEARNING_RATE, exact_gp
+from implicam.calibrators.every_camera import Scaling
+from implicam.calibrators.inverse_gp import UNIFORM_EXTENT_SDS
+from implicam.calibrators.inverse_gp_settings import InverseGPSettings
+from implicam.calibrators.paper_preset import exact_gp
 from implicam.files import write_text
 from implicam.gp import Fit, GaussianProcess, Kernel, maximise_each
 from implicam.simulate import simulated
@@ -58,7 +60,7 @@ def _gpytorch_one(X, y):
     ).double()
     model = exact_gp(X, y, likelihood)
     objective = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
-    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+    optimiser = torch.optim.Adam(model.parameters(), lr=InverseGPSettings.paper_learning_rate)
     for _ in range(GPYTORCH_STEPS):
         optimiser.zero_grad()
         loss = -objective(model(X), y)

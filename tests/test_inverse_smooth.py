@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from implicam.calibrators import InverseGP, InverseGPCalibration, load_calibration
+from implicam.calibrators.inverse_gp_settings import InverseGPSettings
 from implicam.calibrators.inverse_maps import SmoothMap, is_principal
-from implicam.calibrators.pixel_cloud import MAX_DISTANCE_RATIO, PixelCloud
+from implicam.calibrators.pixel_cloud import PixelCloud
 from implicam.dataset import Dataset, read_dataset
 from implicam.evaluation import evaluate
 from implicam.gp import Kernel, Kriging, LengthscalePrior, Smoothness, maximise_posterior
@@ -165,7 +166,7 @@ def test_farness_is_that_of_the_farthest_known_point_and_knows_no_units() -> Non
     pixels, new = (d.observations.uv[d.observations.seen.all(axis=1)].reshape(-1, 12) for d in (known, others))
     far = PixelCloud.of(pixels).farness(new)
     assert np.median(far) < 1
-    assert far.max() < MAX_DISTANCE_RATIO
+    assert far.max() < InverseGPSettings.max_distance_ratio
     np.testing.assert_allclose(PixelCloud.of(3 * pixels + 7).farness(3 * new + 7), far, rtol=1e-6)
 
 

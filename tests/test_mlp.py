@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from implicam.calibrators import MLP, MLPCalibration, load_calibration
-from implicam.calibrators.mlp_network import HIDDEN, SLOPE, Network, draw_masks, layer_shapes
+from implicam.calibrators.mlp_network import HIDDEN, Network, draw_masks, layer_shapes
+from implicam.calibrators.mlp_settings import DEFAULT_SETTINGS, MLPSettings
 from implicam.calibrators.mlp_training import (
-    CHECK_EVERY_EPOCHS,
     Examples,
     _Batch,
     _Masks,
@@ -185,7 +185,7 @@ def test_its_gradients_are_those_of_the_chain_rule() -> None:
             inputs, factors = [X[i]], []
             for weight, bias, mask in zip(weights, biases, given, strict=False):
                 sums = inputs[-1] @ weight + bias
-                factors.append(np.where(sums > 0, 1, SLOPE) * mask[i])
+                factors.append(np.where(sums > 0, 1, DEFAULT_SETTINGS.leaky_relu_slope_ratio) * mask[i])
                 inputs.append(sums * factors[-1])
             slope = 2 / 21 * (inputs[-1] @ weights[-1] + biases[-1] - Y[i])
             for layer in reversed(range(len(weights))):
@@ -220,7 +220,7 @@ def test_a_network_that_stays_is_not_disturbed_by_others_that_leave() -> None:
 def test_training_is_the_usual_loop_of_torch() -> None:
     """Without dropout, a loop written down here again with PyTorch's layers and Adam: float64 against our float32."""
     run = examples()
-    (ours,) = train([run], 0.0, silent, epochs=40)
+    (ours,) = train([run], 0.0, silent, MLPSettings(max_epochs=40))
     arrays = initial_weights(4, np.random.default_rng([run.seed, 1]))
     model = layers_of(Network(tuple(arrays[::2]), tuple(b[0] for b in arrays[1::2])))
     optimiser = torch.optim.Adam(model.parameters())
@@ -233,7 +233,8 @@ def test_training_is_the_usual_loop_of_torch() -> None:
         optimiser.step()
         with torch.no_grad():
             losses.append(torch.nn.functional.mse_loss(model(X[check]), Y[check]).item())
-    assert ours.epoch == CHECK_EVERY_EPOCHS * (1 + int(np.argmin(losses[CHECK_EVERY_EPOCHS - 1 :: CHECK_EVERY_EPOCHS])))
+    every = DEFAULT_SETTINGS.check_every_epochs
+    assert ours.epoch == every * (1 + int(np.argmin(losses[every - 1 :: every])))
     assert ours.loss == pytest.approx(losses[ours.epoch - 1], rel=1e-3)
 
 
@@ -288,25 +289,31 @@ def test_masks_do_not_depend_on_the_company() -> None:
 def test_it_stops_early_and_restores_the_best_weights() -> None:
     run = examples(noise=0.8)
     looked: list[int] = []
-    (best,) = train([run], 0.0, lambda what, done, of: looked.append(done), epochs=2000, patience=100)
+    (best,) = train(
+        [run], 0.0, lambda what, done, of: looked.append(done), MLPSettings(max_epochs=2000, patience_epochs=100)
+    )
     assert looked[-2] == best.epoch + 100 < 2000  # then it gave up, and all is done
     assert looked[-1] == 2000
     assert best.loss == pytest.approx(held_out_loss(run, best.network), rel=1e-5)
-    same_network(train([run], 0.0, silent, epochs=best.epoch)[0].network, best.network)
-    patient = train([run], 0.0, silent, epochs=best.epoch + 100, patience=2000)[0]
+    same_network(train([run], 0.0, silent, MLPSettings(max_epochs=best.epoch))[0].network, best.network)
+    patient = train([run], 0.0, silent, MLPSettings(max_epochs=best.epoch + 100, patience_epochs=2000))[0]
     same_network(patient.network, best.network)  # nothing better came in the epochs it waited
 
 
 def test_no_weight_is_fitted_to_the_points_kept_for_early_stopping() -> None:
     run = examples()
     other = run._replace(Y=np.where(run.held_out[:, None], 50.0, run.Y), X=np.where(run.held_out[:, None], -1.0, run.X))
-    (a,), (b,) = (train([r], 0.2, silent, epochs=CHECK_EVERY_EPOCHS) for r in (run, other))
+    (a,), (b,) = (
+        train([r], 0.2, silent, MLPSettings(max_epochs=DEFAULT_SETTINGS.check_every_epochs)) for r in (run, other)
+    )
     same_network(a.network, b.network)
     assert b.loss > 100 * a.loss
 
 
 def test_it_learns_a_map_and_not_noise() -> None:
-    (learned,), (guessed,) = (train([examples(200, noise=noise)], 0.0, silent, epochs=600) for noise in (0.0, 1.0))
+    (learned,), (guessed,) = (
+        train([examples(200, noise=noise)], 0.0, silent, MLPSettings(max_epochs=600)) for noise in (0.0, 1.0)
+    )
     assert learned.loss < 0.05
     assert guessed.loss > 0.5
 
@@ -314,17 +321,18 @@ def test_it_learns_a_map_and_not_noise() -> None:
 def test_networks_do_not_depend_on_their_company() -> None:
     """Other sizes, others that stop sooner, another place in the batch."""
     runs = [examples(noise=0.3, seed=0), examples(60, seed=1), examples(noise=1.0, seed=2), examples(seed=3)]
-    together = train(runs, 0.2, silent, epochs=300, patience=100)
+    together = train(runs, 0.2, silent, MLPSettings(max_epochs=300, patience_epochs=100))
     assert len({found.epoch for found in together}) > 1
     for run, found in zip(runs, together, strict=True):
-        (alone,) = train([run], 0.2, silent, epochs=300, patience=100)
+        (alone,) = train([run], 0.2, silent, MLPSettings(max_epochs=300, patience_epochs=100))
         assert alone.epoch == found.epoch
         same_network(alone.network, found.network, atol=1e-5)
 
 
 def test_the_seed_is_all_that_chance_depends_on() -> None:
     (a,), (b,), (other,) = (
-        train([run], 0.2, silent, epochs=50) for run in (examples(), examples(), examples()._replace(seed=1))
+        train([run], 0.2, silent, MLPSettings(max_epochs=50))
+        for run in (examples(), examples(), examples()._replace(seed=1))
     )
     same_network(a.network, b.network)
     assert not np.allclose(a.network.weights[0], other.network.weights[0])
@@ -333,7 +341,7 @@ def test_the_seed_is_all_that_chance_depends_on() -> None:
 def test_training_leaves_the_threads_of_torch_alone() -> None:
     before = torch.get_num_threads()
     during: list[int] = []
-    train([examples()], 0.2, lambda *_: during.append(torch.get_num_threads()), epochs=10)
+    train([examples()], 0.2, lambda *_: during.append(torch.get_num_threads()), MLPSettings(max_epochs=10))
     assert set(during) <= {1, before}
     assert during[0] == 1
     assert torch.get_num_threads() == before
@@ -342,7 +350,7 @@ def test_training_leaves_the_threads_of_torch_alone() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train([examples()], 0.2, interrupt, epochs=10)
+        train([examples()], 0.2, interrupt, MLPSettings(max_epochs=10))
     assert torch.get_num_threads() == before
 
 

@@ -28,7 +28,7 @@ from implicam.calibrators import (
     Unused,
     calibrator,
 )
-from implicam.calibrators.inverse_gp import lattice_note, missing_view_reasons, pixels_of, seen_by_all
+from implicam.calibrators.every_camera import lattice_note, missing_view_reasons, pixels_of, seen_by_all
 from implicam.calibrators.protocol import finite_column, option, per_axis
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.dataset.requirements import match_cameras, require_points

@@ -1,33 +1,27 @@
-"""Settings of forward-gp: each at its default changes nothing, each is in the file, a changed one changes something."""
+"""What settings of forward-gp and of the rig model do; test_settings_contract.py has what holds for every method."""
 
 from __future__ import annotations
 
-import copy
-import pickle
-import re
 from dataclasses import fields, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import implicam
 from forward_gp_cases import IMAGE, fitted, known, rig, rotation, with_positions
-from implicam.calibration_file import describe
-from implicam.calibrators import ForwardGP, ForwardGPCalibration, ForwardGPSettings, load_calibration
+from implicam.calibrators import ForwardGP, ForwardGPCalibration, ForwardGPSettings
 from implicam.dataset import Dataset
 from implicam.errors import UsageError
 from implicam.geometry import Pose
 from implicam.lenses import KannalaBrandt
 from implicam.rig_model.camera import CentralCamera, ProjectiveCamera
 from implicam.rig_model.level_errors import find_levels
-from implicam.rig_model.settings import BELOW_ONE, RigModelSettings
+from implicam.rig_model.settings import RigModelSettings
 from implicam.rig_model.shot_errors import Shots
+from implicam.settings import BELOW_ONE
 from implicam.simulate import moving_board, random_positions, simulate
 
-ROOT = Path(implicam.__file__).parent
 FIELDS = {field.name: field for field in fields(ForwardGPSettings)}
 
 
@@ -39,64 +33,10 @@ def other(name: str) -> Any:
     return default + 1 if isinstance(default, int) else 0.9 * default
 
 
-every_field = pytest.mark.parametrize("name", FIELDS)
-
-
-@every_field
-def test_each_setting_is_in_the_file(name: str, tmp_path: Path) -> None:
-    settings = ForwardGPSettings(**{name: other(name)})
-    assert ForwardGPSettings.from_table(settings.as_table()) == settings
-    assert settings != ForwardGPSettings()
-    calibration = replace(fitted(), calibrator=ForwardGP(settings=settings))
-    calibration.save(tmp_path / "rig.implicam")
-    loaded = load_calibration(tmp_path / "rig.implicam")
-    assert isinstance(loaded, ForwardGPCalibration)
-    assert loaded.calibrator.settings == settings
-    assert describe(tmp_path / "rig.implicam")["options"]["settings"] == settings.as_table()
-
-
-@every_field
-def test_each_setting_is_used_and_documented(name: str) -> None:
-    """By the code beside the settings; one line of documentation follows it."""
-    sources = {path: path.read_text() for path in ROOT.rglob("*.py")}
-    own = [text for path, text in sources.items() if path.name == "settings.py"]
-    assert sum(len(re.findall(rf'^    {name}: .*\n    """', text, re.M)) for text in own) == 1
-    uses = sum(len(re.findall(rf"\.{name}\b", text)) for text in sources.values())
-    assert uses or name.endswith("_kind")
-
-
-def test_settings_at_their_defaults_change_nothing() -> None:
-    stated = ForwardGPSettings(**{name: field.default for name, field in FIELDS.items()})
-    again = ForwardGP(settings=stated).fit(known())
-    np.testing.assert_array_equal(again.posterior.root(0), fitted().posterior.root(0))
-    assert again.calibrator == fitted().calibrator
-
-
 def test_settings_are_shown_as_they_would_be_written() -> None:
     shown = repr(ForwardGP(settings=ForwardGPSettings(max_rounds=9, min_lengthscale=(1.0, 0.2))))
     assert shown.endswith("settings=ForwardGPSettings(min_lengthscale=(1.0, 0.2), max_rounds=9))")
     assert repr(RigModelSettings()) == "RigModelSettings()"
-
-
-def test_settings_go_to_other_processes() -> None:
-    settings = ForwardGPSettings(max_rounds=9)
-    assert pickle.loads(pickle.dumps(settings)) == copy.deepcopy(settings) == replace(settings) == settings
-    assert len({settings, replace(settings), ForwardGPSettings()}) == 2
-
-
-def test_a_file_from_before_there_were_settings_has_the_defaults() -> None:
-    table, arrays = fitted().state()
-    del table["settings"]
-    assert ForwardGPCalibration.from_state(fitted().data, table, arrays).calibrator == ForwardGP()
-
-
-def test_a_refit_after_loading_is_the_same_fit(tmp_path: Path) -> None:
-    calibration = ForwardGP(settings=ForwardGPSettings(camera_noise_log_sd=1.0)).fit(known())
-    calibration.save(tmp_path / "rig.implicam")
-    again = load_calibration(tmp_path / "rig.implicam").refit(known())
-    assert isinstance(again, ForwardGPCalibration)
-    np.testing.assert_array_equal(again.posterior.root(0), calibration.posterior.root(0))
-    assert (again.posterior.root(0) != fitted().posterior.root(0)).any()
 
 
 @cache
@@ -265,28 +205,5 @@ def test_a_setting_that_is_not_there_is_refused_with_the_nearest() -> None:
         ForwardGPSettings(max_round=3)  # type: ignore[call-arg]
     with pytest.raises(UsageError, match="no setting 'max_rounds'"):
         RigModelSettings.from_table({"max_rounds": 3})
-    with pytest.raises(UsageError, match="settings of forward-gp"):
+    with pytest.raises(UsageError, match="settings of forward-gp are of the type"):
         ForwardGP(settings=RigModelSettings())  # type: ignore[arg-type]
-
-
-def test_a_file_whose_settings_make_no_sense_is_refused() -> None:
-    table, arrays = fitted().state()
-    for wrong in ({"max_rounds": -3}, {"max_rounds": [3]}, {"nothing": 3}):
-        with pytest.raises(UsageError):
-            ForwardGPCalibration.from_state(fitted().data, table | {"settings": wrong}, arrays)
-
-
-def test_info_shows_the_settings_that_were_changed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from implicam.cli import main
-
-    for settings, shown in ((ForwardGPSettings(), "113"), (ForwardGPSettings(max_squared_mahalanobis=30.0), "112")):
-        ForwardGP(settings=settings).fit(implicam.simulated("stereo", points=20, seed=1)).save(
-            tmp_path / "rig.implicam"
-        )
-        capsys.readouterr()
-        with pytest.raises(SystemExit):
-            main(["info", str(tmp_path / "rig.implicam")])
-        told = capsys.readouterr().out
-        assert f"the other {shown} settings are at their defaults" in told
-        assert ("max_squared_mahalanobis = 30.0" in told) == (shown == "112")
-        assert "noise_prior" not in told

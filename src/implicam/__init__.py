@@ -21,12 +21,15 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.calibrators import Calibration as Calibration
     from implicam.calibrators import Explicit as Explicit
     from implicam.calibrators import ExplicitCalibration as ExplicitCalibration
+    from implicam.calibrators import ExplicitSettings as ExplicitSettings
     from implicam.calibrators import ForwardGP as ForwardGP
     from implicam.calibrators import ForwardGPCalibration as ForwardGPCalibration
     from implicam.calibrators import ForwardGPSettings as ForwardGPSettings
     from implicam.calibrators import InverseGP as InverseGP
     from implicam.calibrators import InverseGPCalibration as InverseGPCalibration
+    from implicam.calibrators import InverseGPSettings as InverseGPSettings
     from implicam.calibrators import MLPCalibration as MLPCalibration
+    from implicam.calibrators import MLPSettings as MLPSettings
     from implicam.calibrators import calibrator as calibrator
     from implicam.calibrators import load_calibration as load_calibration
     from implicam.coverage import Coverage as Coverage
@@ -61,8 +64,9 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
 
 _NAMES = {
     "implicam.calibrators": (
-        "METHODS", "MLP", "Calibration", "Explicit", "ExplicitCalibration", "ForwardGP", "ForwardGPCalibration",
-        "ForwardGPSettings", "InverseGP", "InverseGPCalibration", "MLPCalibration", "calibrator", "load_calibration",
+        "METHODS", "MLP", "Calibration", "Explicit", "ExplicitCalibration", "ExplicitSettings", "ForwardGP",
+        "ForwardGPCalibration", "ForwardGPSettings", "InverseGP", "InverseGPCalibration", "InverseGPSettings",
+        "MLPCalibration", "MLPSettings", "calibrator", "load_calibration",
     ),
     "implicam.coverage": ("Coverage", "assess"),
     "implicam.dataset": (

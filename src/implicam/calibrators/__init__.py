@@ -1,9 +1,11 @@
 """The methods: known points in, a map from pixels to position with its uncertainty out."""
 
-from implicam.calibrators.explicit import Explicit, ExplicitCalibration
+from implicam.calibrators.explicit import Explicit, ExplicitCalibration, ExplicitSettings
 from implicam.calibrators.forward_gp import ForwardGP, ForwardGPCalibration, ForwardGPSettings
 from implicam.calibrators.inverse_gp import InverseGP, InverseGPCalibration
+from implicam.calibrators.inverse_gp_settings import InverseGPSettings
 from implicam.calibrators.mlp import MLP, MLPCalibration
+from implicam.calibrators.mlp_settings import MLPSettings
 from implicam.calibrators.protocol import (
     Calibration,
     CalibrationBase,
@@ -45,6 +47,7 @@ __all__ = [
     "CalibratorBase",
     "Explicit",
     "ExplicitCalibration",
+    "ExplicitSettings",
     "FitSummary",
     "ForwardGP",
     "ForwardGPCalibration",
@@ -52,7 +55,9 @@ __all__ = [
     "HasPositionProcesses",
     "InverseGP",
     "InverseGPCalibration",
+    "InverseGPSettings",
     "MLPCalibration",
+    "MLPSettings",
     "Method",
     "PredictsPixels",
     "Rejected",

@@ -14,15 +14,26 @@ the three GPs know nothing of each other.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.every_camera import (
+    Scaling,
+    flat_note,
+    lattice_note,
+    missing_view_reasons,
+    pixels_of,
+    scaling_arrays,
+    scalings,
+    seen_by_all,
+)
+from implicam.calibrators.inverse_gp_settings import DEFAULT_SETTINGS, InverseGPSettings
 from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_principal, learn_smooth
-from implicam.calibrators.pixel_cloud import MAX_DISTANCE_RATIO, MAX_DISTANCE_RATIO_OF_PLANE, PixelCloud
+from implicam.calibrators.pixel_cloud import PixelCloud
 from implicam.calibrators.position_processes import PositionProcess, PositionProcesses
 from implicam.calibrators.protocol import (
     Arrays,
@@ -33,11 +44,10 @@ from implicam.calibrators.protocol import (
     finite_column,
     option,
     per_axis,
-    why_not_all_seen,
 )
-from implicam.dataset import Dataset, Floats, Names, Observations, describe_copies, remove_copies
-from implicam.dataset.requirements import MAX_RELATIVE_THICKNESS, match_cameras, require_points, require_two_values
-from implicam.dataset.unused import Unused, list_copied_points
+from implicam.dataset import Dataset, Floats, Observations, describe_copies, remove_copies
+from implicam.dataset.requirements import match_cameras
+from implicam.dataset.unused import Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
 from implicam.gp.linalg import solve_lower
@@ -48,30 +58,7 @@ from implicam.threads import side_by_side
 PRESETS = ("smooth", "plain", "paper")
 FORMER_PRESETS = {"standardised": "plain"}
 """Name in earlier versions -> name now."""
-AXES = "xyz"
 UNIFORM_EXTENT_SDS = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
-MAX_THIN_ERROR_RATIO = 0.25
-"""Errors of known points across their plane, over their thickness, at which little is learned of that direction."""
-SUSPECT_ERROR_SDS = 5.0  # leave-one-out error, in its own standard deviations: one in a million if all is well
-MIN_LATTICE_REPEATS = 8  # positions of which each coordinate is shared by so many points are no random positions
-
-
-@dataclass(frozen=True)
-class Scaling:
-    """Standardised = (value - offset) / scale, column by column."""
-
-    offset: Floats
-    scale: Floats
-
-    @classmethod
-    def of(cls, values: Floats) -> Scaling:
-        """The scaling that gives each column of (n, d) mean 0 and standard deviation 1."""
-        scale = values.std(axis=0)
-        return cls(values.mean(axis=0), np.where(scale > 0, scale, 1.0))
-
-    def apply(self, values: Floats) -> Floats:
-        """Standardise (n, d)."""
-        return (values - self.offset) / self.scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +76,7 @@ class InverseGP(CalibratorBase):
 
     shortest_lengthscale: bound of every lengthscale, in standard deviations of the pixels. Optics are smooth across
     the image, so by default it is the extent of the pixels themselves (docs/decisions/0004-lattices.md).
+    settings: all priors and thresholds; a calibration file carries them, so that a refit years later is the same fit.
     """
 
     kernel: str = field(default="squared-exponential", metadata=option(" or ".join(SHAPES)))
@@ -97,11 +85,13 @@ class InverseGP(CalibratorBase):
     )
     seed: int = 0
     shortest_lengthscale: float = UNIFORM_EXTENT_SDS
+    settings: InverseGPSettings = DEFAULT_SETTINGS
 
     method: ClassVar[str] = "inverse-gp"
     compared_variants: ClassVar[tuple[str, ...]] = ("paper",)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "preset", FORMER_PRESETS.get(self.preset, self.preset))
         for what, value, known in (("kernel", self.kernel, SHAPES), ("preset", self.preset, PRESETS)):
             if value not in known:
@@ -152,35 +142,10 @@ class InverseGP(CalibratorBase):
         X, Y = pixels.apply(inputs), positions.apply(outputs)
         progress("fitting", 0, 1)
         found = learn_smooth(
-            X, Y, pixels.scale, self.kernel, self.shortest_lengthscale, self.seed, start=start, anew=anew
+            X, Y, pixels.scale, self.kernel, self.shortest_lengthscale, self.seed, self.settings, start, anew=anew
         )
         progress("fitting", 1, 1)
         return InverseGPCalibration(self, data, unused, pixels, positions, (), *found)
-
-
-def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
-    """The points with every view, each once, and why the others are not used; FitError where they are too few."""
-    copied = list_copied_points(data)
-    data = remove_copies(data, cameras_too=True)
-    seen = data.observations.seen
-    complete = seen.all(axis=1)
-    names = data.observations.camera_names
-    unused = tuple(
-        Unused(str(data.points[i]), why_not_all_seen(seen[i], names, method)) for i in np.flatnonzero(~complete)
-    )
-    _ = data.positions  # a clear error where there are none
-    per_camera = ", ".join(f"{name} sees {count}" for name, count in zip(names, seen.sum(axis=0), strict=True))
-    least = 5  # fewer than a line and a noise can be learned from
-    why = f"only points seen by every camera can be used; of {len(data)} points, {per_camera}" if unused else ""
-    require_points(len(np.unique(data.places[complete])), least, method, why)
-    usable = data.select(complete)
-    require_two_values(usable.xyz, method)
-    return usable, (*unused, *copied)
-
-
-def pixels_of(data: Dataset) -> Floats:
-    """(n, 2 cameras) the concatenated pixels u1, v1, u2, v2, ..."""
-    return data.observations.uv.reshape(len(data), -1)
 
 
 Train = Callable[[InverseGP, Floats, Floats, Progress], tuple[Hyperparameters, ...]]
@@ -248,12 +213,14 @@ class InverseGPCalibration(CalibrationBase):
         """From standardised pixels to standardised positions."""
         if self.smoothness is None or self.basis is None:
             return ThreeMaps(self.processes)
-        return SmoothMap.condition(self.smoothness, self.basis, self.pixels.scale, *self._known)
+        return SmoothMap.condition(
+            self.smoothness, self.basis, self.pixels.scale, *self._known, self.calibrator.settings
+        )
 
     @cached_property
     def cloud(self) -> PixelCloud:
         """The pixels that it has learned from."""
-        return PixelCloud.of(pixels_of(self._usable))
+        return PixelCloud.of(pixels_of(self._usable), self.calibrator.settings)
 
     def farness(self, uv: Floats) -> Floats:
         """(k,) the factor by which error bars at pixels (k, d) grow away from those learned from: 1 among them; what
@@ -343,7 +310,12 @@ class InverseGPCalibration(CalibrationBase):
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         flat = flat_note(self.data) or self._thin_note()
-        return [*describe_copies(self.data), *flat, *lattice_note(self.data, self.method), *self._suspects()]
+        return [
+            *describe_copies(self.data),
+            *flat,
+            *lattice_note(self.data, self.method, self.calibrator.settings),
+            *self._suspects(),
+        ]
 
     @cached_property
     def _thickness(self) -> tuple[float, float]:
@@ -357,17 +329,23 @@ class InverseGPCalibration(CalibrationBase):
     @cached_property
     def farthest(self) -> float:
         """How far pixels may be and still be measured: less where the known positions are nearly in one plane."""
+        settings = self.calibrator.settings
+        return settings.max_plane_distance_ratio if self._is_thin else settings.max_distance_ratio
+
+    @property
+    def _is_thin(self) -> bool:
+        """Whether the known positions are no thicker than what the pixels tell of them."""
         thickness, error = self._thickness
-        return MAX_DISTANCE_RATIO if error < MAX_THIN_ERROR_RATIO * thickness else MAX_DISTANCE_RATIO_OF_PLANE
+        return not error < self.calibrator.settings.max_thin_error_ratio * thickness
 
     def _thin_note(self) -> list[str]:
         """A note on known points that are no thicker than what the pixels tell of them."""
-        thickness, error = self._thickness
-        if error < MAX_THIN_ERROR_RATIO * thickness:
+        if not self._is_thin:
             return []
-        unit = self.data.length_unit
+        (thickness, error), unit = self._thickness, self.data.length_unit
+        most = self.calibrator.settings.max_thin_error_ratio
         errors = self.map.leave_one_out()[0] * self.positions.scale
-        if (np.sqrt(np.mean(errors**2, axis=0)) > MAX_THIN_ERROR_RATIO * np.std(self._usable.xyz, axis=0)).all():
+        if (np.sqrt(np.mean(errors**2, axis=0)) > most * np.std(self._usable.xyz, axis=0)).all():
             return [
                 "The pixels tell little of any coordinate of the known positions: they are too few, or some are wrong."
             ]
@@ -382,7 +360,8 @@ class InverseGPCalibration(CalibrationBase):
         errors, variances = self.map.leave_one_out()
         worst = np.max(np.abs(errors) / np.sqrt(variances), axis=1)
         names = self.used.points[self.used.observations.seen.all(axis=1)]
-        found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > SUSPECT_ERROR_SDS]
+        most = self.calibrator.settings.max_left_out_error_sds
+        found = [f"{names[i]} ({worst[i]:.0f} sd)" for i in np.argsort(-worst) if worst[i] > most]
         if not found:
             return []
         more = f" and {len(found) - 5} more" if len(found) > 5 else ""
@@ -405,7 +384,7 @@ class InverseGPCalibration(CalibrationBase):
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """Options, and the hyperparameters in standardised units with the scaling."""
         h = self.hyperparameters
-        table = asdict(self.calibrator)
+        table = self.calibrator.as_table()
         if self.smoothness is not None and self.basis is not None:
             return table, {
                 **scaling_arrays(self.pixels, self.positions),
@@ -426,9 +405,7 @@ class InverseGPCalibration(CalibrationBase):
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> InverseGPCalibration:
         """Restore a calibration; the factors are computed again, which takes less time than reading them would."""
-        calibrator = InverseGP(
-            str(table["kernel"]), str(table["preset"]), int(table["seed"]), float(table["shortest_lengthscale"])
-        )
+        calibrator = InverseGP.from_table(table)
         _, unused = seen_by_all(data, cls.method)
         used = remove_copies(data, cameras_too=True)
         d = 2 * len(used.cameras)
@@ -455,64 +432,9 @@ class InverseGPCalibration(CalibrationBase):
         return cls(calibrator, data, unused, pixels, positions, hyper)
 
 
-def scaling_arrays(pixels: Scaling, positions: Scaling) -> dict[str, NDArray[Any]]:
-    """The two scalings as arrays of a calibration file."""
-    return {
-        "pixel_offset": pixels.offset,
-        "pixel_scale": pixels.scale,
-        "position_offset": positions.offset,
-        "position_scale": positions.scale,
-    }
-
-
-def scalings(arrays: Arrays, data: Dataset) -> tuple[Scaling, Scaling]:
-    """The inverse of `scaling_arrays`: of pixels, of positions; ValueError where they do not fit the data."""
-    pixels, positions = (
-        Scaling(
-            finite_column(arrays, f"{what}_offset", (d,)), finite_column(arrays, f"{what}_scale", (d,), positive=True)
-        )
-        for what, d in (("pixel", 2 * len(data.cameras)), ("position", 3))
-    )
-    return pixels, positions
-
-
-def missing_view_reasons(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> Names:
-    """(n,) why a point was not measured, from seen (n, cameras); empty where every camera saw it."""
-    reasons = ["" if row.all() else why_not_all_seen(row, names, method) for row in seen]
-    return np.array(reasons, dtype=np.str_)
-
-
 def unlike_reason(far: float) -> str:
     """Why pixels so far from all known points are not measured."""
     return (
         f"pixels unlike any it has learned: {far:.0f} times as far from the known points' as the farthest of these "
         "(a wrong match, or a place away from where known points are)"
     )
-
-
-def flat_note(data: Dataset) -> list[str]:
-    """A note on known points in one plane, whichever way it lies."""
-    extents = np.linalg.svd(data.xyz - data.xyz.mean(axis=0), compute_uv=False)
-    if extents[-1] > MAX_RELATIVE_THICKNESS * extents[0]:
-        return []
-    return [
-        "The known positions lie in one plane. Positions off it are not measured but guessed, and their error bars "
-        "cannot say how badly: add known points in front of it and behind."
-    ]
-
-
-def lattice_note(data: Dataset, method: str) -> list[str]:
-    """A note on known positions that share their coordinates, which a map from pixels to positions can learn."""
-    lattice = [
-        f"{axis} has {len(np.unique(values))} values"
-        for axis, values in zip(AXES, data.xyz.T, strict=True)
-        if len(np.unique(values)) <= len(values) / MIN_LATTICE_REPEATS
-    ]
-    if not lattice:
-        return []
-    in_shots = len(np.unique(data.shots)) < len(data)
-    return [
-        f"The known positions lie on a lattice ({', '.join(lattice)} at {len(data)} points). {method} may "
-        "learn its planes instead of the space between them: judge it by points off the lattice"
-        f"{' or by --leave-out shot' * in_shots}, not by a random split."
-    ]

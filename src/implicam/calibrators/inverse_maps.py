@@ -14,23 +14,13 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from implicam.calibrators.inverse_gp_settings import DEFAULT_SETTINGS, InverseGPSettings
 from implicam.dataset import Floats
 from implicam.gp import GaussianProcess, Kriging, LengthscalePrior, Smoothness, maximise_posterior
 from implicam.threads import blas_threads, cores, side_by_side
 
 DEGREES_OF_FREEDOM = 3
 """Of a position, and so of the pixels of any number of cameras."""
-MAX_POINTS_FOR_BOTH_BASES = 100
-"""Up to so many points both bases are tried, for both cost little; beyond, principal axes were always as good."""
-MEDIAN_AXIS_LENGTHSCALE_SDS, MEDIAN_PIXEL_LENGTHSCALE_SDS = 6.0, 12.0
-"""Median lengthscales: in standard deviations of a principal component, and of a pixel coordinate. A map that is
-linear up to a tenth over the image has about the first; the second only says the same of more coordinates."""
-COMMON_LOG_LENGTHSCALE_SD, OWN_LOG_LENGTHSCALE_SD = 1.0, 0.5
-"""Prior sd of the log lengthscales: of all together, and of each beside."""
-MIN_RESIDUALS = 8
-"""The mean is not given a function more unless so many points are left to learn the covariance from."""
-
-
 MAX_POINTS_ON_ONE_THREAD = 3000
 """Points up to which several BLAS threads may lose more by waiting for each other than they gain."""
 
@@ -127,9 +117,17 @@ class SmoothMap:
     axes: Floats
 
     @classmethod
-    def condition(cls, smoothness: Smoothness, basis: Floats, spread: Floats, X: Floats, Y: Floats) -> SmoothMap:
+    def condition(
+        cls,
+        smoothness: Smoothness,
+        basis: Floats,
+        spread: Floats,
+        X: Floats,
+        Y: Floats,
+        settings: InverseGPSettings = DEFAULT_SETTINGS,
+    ) -> SmoothMap:
         """On known points: standardised pixels X (n, d), whose standard deviations in pixels are spread (d,)."""
-        axes = _mean_axes(X, spread)
+        axes = _mean_axes(X, spread, settings)
         with few_threads(len(X)):
             return cls(Kriging.condition(smoothness, X @ basis, Y, _with_one(X @ axes)), basis, axes)
 
@@ -187,32 +185,35 @@ def _principal(X: Floats, spread: Floats) -> tuple[Floats, Floats]:
     return weights[:, None] * directions.T, sd
 
 
-def _mean_axes(X: Floats, spread: Floats) -> Floats:
+def _mean_axes(X: Floats, spread: Floats, settings: InverseGPSettings) -> Floats:
     """(d, q) what the mean is linear in: up to three principal components, of unit size; fewer with few points."""
     directions, sd = _principal(X, spread)
-    q = min(DEGREES_OF_FREEDOM, int(np.sum(sd > 1e-9 * sd[0])), max(0, len(X) - 1 - MIN_RESIDUALS))
+    q = min(DEGREES_OF_FREEDOM, int(np.sum(sd > 1e-9 * sd[0])), max(0, len(X) - 1 - settings.min_residuals))
     return directions[:, :q] / sd[:q]
 
 
-def _bases(X: Floats, spread: Floats, shortest: float) -> list[tuple[Floats, LengthscalePrior]]:
+def _bases(
+    X: Floats, spread: Floats, shortest: float, settings: InverseGPSettings
+) -> list[tuple[Floats, LengthscalePrior]]:
     """The coordinates that lengthscales are given in, and their priors. Principal axes: what is a small difference of
     large pixels (depth, for two cameras) has a size of its own. Pixel by pixel: with few points of many cameras it is
     cameras that differ in what they are worth."""
     d = X.shape[1]
+    common, own = settings.common_lengthscale_prior_log_sd, settings.own_lengthscale_prior_log_sd
     directions, sd = _principal(X, spread)
     q = min(DEGREES_OF_FREEDOM, d)
     unit = np.full(d, sd[q - 1])
     unit[:q] = sd[:q]
     leading = np.arange(d) < q
     rest = ~leading
-    covariance = np.diag(
-        np.where(leading, COMMON_LOG_LENGTHSCALE_SD**2, OWN_LOG_LENGTHSCALE_SD**2)
-    ) + COMMON_LOG_LENGTHSCALE_SD**2 * np.outer(rest, rest)
+    covariance = np.diag(np.where(leading, common**2, own**2)) + common**2 * np.outer(rest, rest)
     principal = directions / np.maximum(unit, 1e-9 * sd[0])
-    found = [(principal, LengthscalePrior(np.full(d, MEDIAN_AXIS_LENGTHSCALE_SDS), covariance, shortest))]
-    if len(X) <= MAX_POINTS_FOR_BOTH_BASES:
-        alike = COMMON_LOG_LENGTHSCALE_SD**2 * np.ones((d, d)) + OWN_LOG_LENGTHSCALE_SD**2 * np.eye(d)
-        found.append((np.eye(d), LengthscalePrior(np.full(d, MEDIAN_PIXEL_LENGTHSCALE_SDS), alike, shortest)))
+    along_axes = np.full(d, settings.axis_lengthscale_prior_median_sds)
+    found = [(principal, LengthscalePrior(along_axes, covariance, shortest))]
+    if len(X) <= settings.max_points_for_both_bases:
+        alike = common**2 * np.ones((d, d)) + own**2 * np.eye(d)
+        of_pixels = np.full(d, settings.pixel_lengthscale_prior_median_sds)
+        found.append((np.eye(d), LengthscalePrior(of_pixels, alike, shortest)))
     return found
 
 
@@ -223,6 +224,7 @@ def learn_smooth(
     shape: str,
     shortest: float,
     seed: int,
+    settings: InverseGPSettings = DEFAULT_SETTINGS,
     start: tuple[Smoothness, bool] | None = None,
     anew: bool = True,
 ) -> tuple[Smoothness, Floats]:
@@ -230,8 +232,8 @@ def learn_smooth(
 
     start: an earlier smoothness, and whether it was along principal axes; without `anew` only that is gone on from.
     """
-    bases = _bases(X, spread, shortest)
-    H = _with_one(X @ _mean_axes(X, spread))
+    bases = _bases(X, spread, shortest, settings)
+    H = _with_one(X @ _mean_axes(X, spread, settings))
 
     def one(number: int) -> tuple[Smoothness, Floats]:
         basis, prior = bases[number]

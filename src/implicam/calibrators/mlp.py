@@ -11,14 +11,14 @@ stopping how many lie within the error bars, and always says so.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.inverse_gp import (
+from implicam.calibrators.every_camera import (
     Scaling,
     flat_note,
     lattice_note,
@@ -29,6 +29,7 @@ from implicam.calibrators.inverse_gp import (
     seen_by_all,
 )
 from implicam.calibrators.mlp_network import Network, draw_masks, layer_shapes
+from implicam.calibrators.mlp_settings import DEFAULT_SETTINGS, MLPSettings
 from implicam.calibrators.mlp_training import Examples, train
 from implicam.calibrators.protocol import Arrays, CalibrationBase, CalibratorBase, FitSummary, finite_column, per_axis
 from implicam.dataset import Dataset, Floats, Observations, describe_copies, remove_copies
@@ -40,10 +41,6 @@ from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import blas_threads
 
-HELD_OUT_SHARE = 0.15
-"""Share of the known points kept for early stopping, at least one."""
-DROPOUT_PASSES = 200
-"""Passes with dropout: a standard deviation is then known to 5 %."""
 MAX_DROPOUT = 0.9  # with more, many passes have no unit at work in the last layer
 INTERVAL_95_SDS = 1.959964  # standard deviations of a normal distribution
 SPLIT, SPREAD = 0, 3  # streams of random numbers of one seed; mlp_training.py has others
@@ -54,15 +51,18 @@ class MLP(CalibratorBase):
     """The paper's network. dropout: probability that a hidden unit is switched off, 0 to 0.9.
 
     With dropout = 0 there is no spread, and the error bars are the rms errors of the points kept for early stopping.
+    settings: all thresholds; a calibration file carries them, so that a refit years later is the same fit.
     """
 
     seed: int = 0
     dropout: float = 0.2
+    settings: MLPSettings = DEFAULT_SETTINGS
 
     method: ClassVar[str] = "mlp"
     compared_variants: ClassVar[tuple[str, ...]] = ("no-dropout",)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 <= self.dropout <= MAX_DROPOUT:
             raise UsageError(
                 f"dropout is {self.dropout!r}; it must be between 0 and {MAX_DROPOUT}.",
@@ -94,7 +94,7 @@ class MLP(CalibratorBase):
         """
         prepared = [_prepare(replace(self, seed=self.seed + i), data) for i, data in enumerate(datasets)]
         examples = [ready.examples for ready in prepared if isinstance(ready, _Prepared)]
-        trained = iter(train(examples, self.dropout, progress))
+        trained = iter(train(examples, self.dropout, progress, self.settings))
         return [
             ready if isinstance(ready, FitError) else MLPCalibration(*ready[:-1], network=next(trained).network)
             for ready in prepared
@@ -120,17 +120,17 @@ def _prepare(method: MLP, data: Dataset) -> _Prepared | FitError:
     except FitError as error:
         return error
     X, Y = pixels_of(usable), usable.xyz
-    held_out = _split(len(usable), method.seed)
+    held_out = _split(len(usable), method.seed, method.settings.held_out_share)
     pixels, positions = Scaling.of(X[~held_out]), Scaling.of(Y[~held_out])
     examples = Examples(pixels.apply(X), positions.apply(Y), held_out, method.seed)
     return _Prepared(method, data, unused, held_out, pixels, positions, examples)
 
 
-def _split(n: int, seed: int) -> NDArray[np.bool_]:
+def _split(n: int, seed: int, share: float) -> NDArray[np.bool_]:
     """(n,) which points are kept for early stopping."""
     held_out = np.zeros(n, dtype=np.bool_)
     order = np.random.default_rng([seed, SPLIT]).permutation(n)
-    held_out[order[: max(1, round(HELD_OUT_SHARE * n))]] = True
+    held_out[order[: min(max(1, round(share * n)), n - 1)]] = True
     return held_out
 
 
@@ -183,7 +183,7 @@ class MLPCalibration(CalibrationBase):
             squares = np.mean(self._held_out_errors**2, axis=0)
             return np.broadcast_to(np.diag(squares), (len(uv), 3, 3))
         rng = np.random.default_rng([self.calibrator.seed, SPREAD])
-        masks = draw_masks(rng, DROPOUT_PASSES, self.calibrator.dropout)
+        masks = draw_masks(rng, self.calibrator.settings.dropout_passes, self.calibrator.dropout)
         with blas_threads(1):
             spread = self.network.spread(self.pixels.apply(uv), masks)
         return spread * np.multiply.outer(self.positions.scale, self.positions.scale)
@@ -213,7 +213,7 @@ class MLPCalibration(CalibrationBase):
             self._worth_of_error_bars(),
             *describe_copies(self.data),
             *flat_note(self.data),
-            *lattice_note(self.data, self.method),
+            *lattice_note(self.data, self.method, self.calibrator.settings),
         ]
 
     def _worth_of_error_bars(self) -> str:
@@ -249,12 +249,12 @@ class MLPCalibration(CalibrationBase):
         arrays: dict[str, NDArray[Any]] = {"held_out": self.held_out, **scaling_arrays(self.pixels, self.positions)}
         for k, (weight, bias) in enumerate(zip(self.network.weights, self.network.biases, strict=True)):
             arrays |= {f"weight{k}": weight, f"bias{k}": bias}
-        return asdict(self.calibrator), arrays
+        return self.calibrator.as_table(), arrays
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> MLPCalibration:
         """Restore a calibration; PyTorch is not needed."""
-        calibrator = MLP(int(table["seed"]), float(table["dropout"]))
+        calibrator = MLP.from_table(table)
         usable, unused = seen_by_all(data, cls.method)
         held_out = arrays["held_out"]
         if held_out.dtype != np.bool_ or held_out.shape != (len(usable),) or held_out.all() or not held_out.any():
@@ -265,5 +265,6 @@ class MLPCalibration(CalibrationBase):
         network = Network(
             tuple(finite_column(arrays, f"weight{k}", shape) for k, shape in shapes),
             tuple(finite_column(arrays, f"bias{k}", shape[1:]) for k, shape in shapes),
+            calibrator.settings.leaky_relu_slope_ratio,
         )
         return cls(calibrator, data, unused, held_out, pixels, positions, network)

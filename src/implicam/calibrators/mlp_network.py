@@ -11,10 +11,10 @@ from itertools import pairwise
 
 import numpy as np
 
+from implicam.calibrators.mlp_settings import DEFAULT_SETTINGS
 from implicam.dataset import Floats
 
 HIDDEN = (128, 128, 64)
-SLOPE = 0.01  # of the leaky ReLU below zero: PyTorch's default, the paper states none
 
 
 def layer_shapes(inputs: int) -> list[tuple[int, int]]:
@@ -24,10 +24,12 @@ def layer_shapes(inputs: int) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Weights (inputs, outputs) and biases (outputs,) of each layer; inputs and outputs are standardised."""
+    """Weights (inputs, outputs) and biases (outputs,) of each layer; slope of the leaky ReLU below zero; inputs and
+    outputs are standardised."""
 
     weights: tuple[Floats, ...]
     biases: tuple[Floats, ...]
+    slope: float = DEFAULT_SETTINGS.leaky_relu_slope_ratio
 
     def predict(self, X: Floats) -> Floats:
         """(n, 3) outputs of inputs (n, d), with every unit at work."""
@@ -49,12 +51,12 @@ class Network:
         return (squares - len(masks) * mean[:, :, None] * mean[:, None, :]) / (len(masks) - 1)
 
     def _first(self, X: Floats) -> Floats:
-        return _leaky_relu(X @ self.weights[0] + self.biases[0])
+        return _leaky_relu(X @ self.weights[0] + self.biases[0], self.slope)
 
     def _above_first(self, hidden: Floats, masks: list[Floats]) -> Floats:
         """(n, 3) outputs from the first hidden layer (n, 128), each hidden layer times its mask."""
         for mask, weight, bias in zip(masks[:-1], self.weights[1:-1], self.biases[1:-1], strict=True):
-            hidden = _leaky_relu((hidden * mask) @ weight + bias)
+            hidden = _leaky_relu((hidden * mask) @ weight + bias, self.slope)
         return np.asarray((hidden * masks[-1]) @ self.weights[-1] + self.biases[-1])
 
 
@@ -63,5 +65,5 @@ def draw_masks(rng: np.random.Generator, passes: int, dropout: float) -> Floats:
     return (rng.random((passes, sum(HIDDEN))) >= dropout) / (1 - dropout)
 
 
-def _leaky_relu(x: Floats) -> Floats:
-    return np.maximum(x, SLOPE * x)
+def _leaky_relu(x: Floats, slope: float) -> Floats:
+    return np.maximum(x, slope * x)

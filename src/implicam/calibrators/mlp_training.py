@@ -17,21 +17,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.calibrators.mlp_network import HIDDEN, SLOPE, Network, layer_shapes
+from implicam.calibrators.mlp_network import HIDDEN, Network, layer_shapes
+from implicam.calibrators.mlp_settings import DEFAULT_SETTINGS, MLPSettings
 from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.progress import Progress
 
-MAX_EPOCHS = 5000
-"""At most; with dropout most networks have found their best weights within 1000."""
-PATIENCE_EPOCHS = 1000
-"""Epochs without better weights after which a network stops."""
-CHECK_EVERY_EPOCHS = 10
 LAYERS = len(HIDDEN) + 1
 ALIGNED_NUMBERS = 16
 """Numbers of a network are filled up to a multiple of this, the longest vector of a processor. Adam's fused step works
 on vectors and rounds the rest at the end differently: a network would depend on its place in the batch."""
-LEARNING_RATE = 1e-3
 WEIGHTS, MASKS = 1, 2  # streams of random numbers of one seed; mlp.py has others
 
 
@@ -61,22 +56,20 @@ def train(
     runs: Sequence[Examples],
     dropout: float,
     progress: Progress,
-    *,
-    epochs: int = MAX_EPOCHS,
-    patience: int = PATIENCE_EPOCHS,
+    settings: MLPSettings = DEFAULT_SETTINGS,
 ) -> list[Trained]:
     """Train one network for each run; those of the same size as one batch.
 
     Filling up small ones with zeros instead would make large batches of unequal networks, and round differently from a
     run of its own: without dropout that was seen to end in another optimum.
     """
-    sizes = sorted({run.size for run in runs})
+    sizes, epochs = sorted({run.size for run in runs}), settings.max_epochs
     found: dict[int, Trained] = {}
     with _one_thread() as torch:
         for k, size in enumerate(sizes):
             which = [i for i, run in enumerate(runs) if run.size == size]
-            batch = _Batch(torch, [runs[i] for i in which], dropout)
-            for epoch in batch.train(epochs, patience):
+            batch = _Batch(torch, [runs[i] for i in which], dropout, settings)
+            for epoch in batch.train():
                 progress("training", k * epochs + epoch, len(sizes) * epochs)
             found |= {i: batch.best(j) for j, i in enumerate(which)}
             progress("training", (k + 1) * epochs, len(sizes) * epochs)
@@ -120,7 +113,13 @@ def _layers(lines: Any, inputs: int) -> list[Any]:
     ]
 
 
-def forward(torch: Any, parameters: Sequence[Any], X: Any, masks: Sequence[Any] = ()) -> Any:
+def forward(
+    torch: Any,
+    parameters: Sequence[Any],
+    X: Any,
+    masks: Sequence[Any] = (),
+    slope: float = DEFAULT_SETTINGS.leaky_relu_slope_ratio,
+) -> Any:
     """Outputs of every network.
 
     Args:
@@ -128,6 +127,7 @@ def forward(torch: Any, parameters: Sequence[Any], X: Any, masks: Sequence[Any] 
         parameters: Weight (networks, inputs, outputs), bias (networks, 1, outputs), weight, ... of the layers.
         X: Standardised inputs (networks, n, d).
         masks: The factors (networks, n, units) of each hidden layer, zero or positive; or none.
+        slope: Of the leaky ReLU below zero.
 
     Returns:
         Standardised outputs (networks, n, 3).
@@ -136,14 +136,21 @@ def forward(torch: Any, parameters: Sequence[Any], X: Any, masks: Sequence[Any] 
         X = torch.baddbmm(parameters[2 * layer + 1], X, parameters[2 * layer])
         if layer < len(HIDDEN):
             # a leaky ReLU of m x is m times that of x where m >= 0: in this order both can be done in place
-            X = torch.nn.functional.leaky_relu_(X.mul_(masks[layer]) if masks else X, SLOPE)
+            X = torch.nn.functional.leaky_relu_(X.mul_(masks[layer]) if masks else X, slope)
     return X
 
 
-def gradients(torch: Any, parameters: Sequence[Any], X: Any, Y: Any, masks: Sequence[Any] = ()) -> tuple[Any, ...]:
+def gradients(
+    torch: Any,
+    parameters: Sequence[Any],
+    X: Any,
+    Y: Any,
+    masks: Sequence[Any] = (),
+    slope: float = DEFAULT_SETTINGS.leaky_relu_slope_ratio,
+) -> tuple[Any, ...]:
     """Gradients of every network's mean squared error, shaped as `parameters`; Y is (networks, n, 3), the rest as in
     `forward`."""
-    predicted = forward(torch, parameters, X, masks)
+    predicted = forward(torch, parameters, X, masks, slope)
     # a network's weights are in no loss but its own
     loss = torch.nn.functional.mse_loss(predicted, Y, reduction="sum") / Y[0].numel()
     found: tuple[Any, ...] = torch.autograd.grad(loss, parameters)
@@ -178,8 +185,10 @@ class _Masks:
 class _Batch:
     """Networks of one size: those still `running`, by number, and the best weights of all."""
 
-    def __init__(self, torch: Any, runs: Sequence[Examples], dropout: float) -> None:
-        self.torch, self.dropout, self.running = torch, dropout, np.arange(len(runs))
+    def __init__(
+        self, torch: Any, runs: Sequence[Examples], dropout: float, settings: MLPSettings = DEFAULT_SETTINGS
+    ) -> None:
+        self.torch, self.dropout, self.settings, self.running = torch, dropout, settings, np.arange(len(runs))
         self.training, self.checking = (
             [self._stack([(run.X, run.Y)[k][run.held_out == aside] for run in runs]) for k in range(2)]
             for aside in (False, True)
@@ -190,6 +199,10 @@ class _Batch:
         self.kept = self.weights.clone()
         self.losses, self.epochs = np.full(len(runs), np.inf), np.zeros(len(runs), dtype=np.int64)
 
+    @property
+    def slope(self) -> float:
+        return self.settings.leaky_relu_slope_ratio
+
     def _stack(self, arrays: Sequence[Floats]) -> Any:
         return self.torch.from_numpy(np.stack(arrays).astype(np.float32))
 
@@ -197,7 +210,7 @@ class _Batch:
         """All that a step of the running networks needs, from their weights (running, numbers)."""
         _, n, inputs = self.training[0].shape
         self.weights, weights.grad = weights, self.torch.zeros_like(weights)
-        self.optimiser = self.torch.optim.Adam([weights], lr=LEARNING_RATE, fused=True)
+        self.optimiser = self.torch.optim.Adam([weights], lr=self.settings.learning_rate, fused=True)
         self.parameters = _layers(weights, inputs)
         for parameter in self.parameters:
             parameter.requires_grad_()
@@ -205,12 +218,13 @@ class _Batch:
         self.filling = weights.new_zeros(len(weights), weights.shape[1] - numbers)
         self.masks = _Masks(self.torch, [self.streams[i] for i in self.running], n, self.dropout)
 
-    def train(self, epochs: int, patience: int) -> Iterator[int]:
+    def train(self) -> Iterator[int]:
         """Train until every network has stopped; yields the epochs at which it looks."""
+        epochs, every = self.settings.max_epochs, self.settings.check_every_epochs
         for epoch in range(1, epochs + 1):
             self._step()
-            if epoch % CHECK_EVERY_EPOCHS == 0 or epoch == epochs:
-                self._check(epoch, patience)
+            if epoch % every == 0 or epoch == epochs:
+                self._check(epoch)
                 yield epoch
             if not len(self.running):
                 return
@@ -219,26 +233,26 @@ class _Batch:
         """The best weights of network i."""
         parameters = _layers(self.kept[[i]], self.training[0].shape[2])
         arrays = [parameter[0].numpy().astype(np.float64) for parameter in parameters]
-        network = Network(tuple(arrays[::2]), tuple(bias[0] for bias in arrays[1::2]))
+        network = Network(tuple(arrays[::2]), tuple(bias[0] for bias in arrays[1::2]), self.slope)
         return Trained(network, int(self.epochs[i]), float(self.losses[i]))
 
     def _step(self) -> None:
         """One step of each running network on all its points."""
         X, Y = self.training
-        found = gradients(self.torch, self.parameters, X, Y, self.masks.draw())
+        found = gradients(self.torch, self.parameters, X, Y, self.masks.draw(), self.slope)
         self.torch.cat([*(one.flatten(1) for one in found), self.filling], 1, out=self.weights.grad)
         self.optimiser.step()
 
-    def _check(self, epoch: int, patience: int) -> None:
+    def _check(self, epoch: int) -> None:
         """Note the weights that do better than before on the points kept aside, and stop who has not for too long."""
         X, Y = self.checking
         with self.torch.no_grad():
-            losses = ((forward(self.torch, self.parameters, X) - Y) ** 2).mean(dim=(1, 2)).numpy()
+            losses = ((forward(self.torch, self.parameters, X, slope=self.slope) - Y) ** 2).mean(dim=(1, 2)).numpy()
         better = losses < self.losses[self.running]
         improved = self.running[better]
         self.losses[improved], self.epochs[improved] = losses[better], epoch
         self.kept[improved] = self.weights[better]
-        going_on = epoch - self.epochs[self.running] < patience
+        going_on = epoch - self.epochs[self.running] < self.settings.patience_epochs
         if not going_on.all():
             self._keep(going_on)
 

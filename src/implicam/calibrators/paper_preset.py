@@ -21,8 +21,7 @@ from implicam.progress import Progress
 
 if TYPE_CHECKING:
     from implicam.calibrators.inverse_gp import Hyperparameters, InverseGP
-
-STEPS, LEARNING_RATE = 200, 0.1
+    from implicam.calibrators.inverse_gp_settings import InverseGPSettings
 
 
 def train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperparameters, ...]:
@@ -36,12 +35,14 @@ def train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple[
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # see implicam.threads: its pool was measured to stall for 20 s beside another process
     try:
-        return _train(torch, X, Y, progress)
+        return _train(torch, X, Y, method.settings, progress)
     finally:
         torch.set_num_threads(threads)
 
 
-def _train(torch: Any, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperparameters, ...]:
+def _train(
+    torch: Any, X: Floats, Y: Floats, settings: InverseGPSettings, progress: Progress
+) -> tuple[Hyperparameters, ...]:
     import gpytorch
 
     from implicam.calibrators.inverse_gp import Hyperparameters
@@ -51,15 +52,16 @@ def _train(torch: Any, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperp
     likelihood = gpytorch.likelihoods.GaussianLikelihood(batch_shape=outputs.shape[:1]).double()
     model = exact_gp(inputs, outputs, likelihood)
     objective = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
-    optimiser = torch.optim.Adam(model.parameters(), lr=LEARNING_RATE)
+    optimiser = torch.optim.Adam(model.parameters(), lr=settings.paper_learning_rate)
     model.train()
     likelihood.train()
-    for step in range(STEPS):
+    steps = settings.paper_training_steps
+    for step in range(steps):
         optimiser.zero_grad()
         loss = -objective(model(inputs), outputs).sum()
         loss.backward()
         optimiser.step()
-        progress("training", step + 1, STEPS)
+        progress("training", step + 1, steps)
     signal, lengthscale, noise, mean = (
         value.detach().numpy().reshape(len(outputs), -1)
         for value in (

@@ -12,16 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from implicam.calibrators.inverse_gp_settings import DEFAULT_SETTINGS, InverseGPSettings
 from implicam.dataset import Floats
 
-MAX_DISTANCE_RATIO = 8.0
-"""So many times as far as the farthest known point is from the others: nothing learned says what is there. In 36
-simulated rigs no point within the volume of 17 to 157 known points was beyond 6.6."""
-MAX_DISTANCE_RATIO_OF_PLANE = 2.0
-"""The same where known positions lie nearly in one plane: across it nothing is learned but noise."""
 LEADING_COMPONENTS = 2
-MIN_SPARE_POINTS = 8
-"""Points to spare before the sheet may be curved."""
 ROUNDING_SDS = 1e-9
 """Of the pixels' spread: differences below it are rounding."""
 
@@ -42,7 +36,7 @@ class PixelCloud:
     farthest: float
 
     @classmethod
-    def of(cls, X: Floats) -> PixelCloud:
+    def of(cls, X: Floats, settings: InverseGPSettings = DEFAULT_SETTINGS) -> PixelCloud:
         """Of pixels (n, d) of the known points."""
         n, d = X.shape
         offset = X.mean(axis=0)
@@ -50,7 +44,8 @@ class PixelCloud:
         directions = np.asarray(np.linalg.svd((X - offset) / spread)[2].T / spread)
         Z = (X - offset) @ directions
         q = min(LEADING_COMPONENTS, d - 1)
-        degree = 2 if n >= _terms(Z[:1, :q], 2).shape[1] + MIN_SPARE_POINTS else 1
+        curved = _terms(Z[:1, :q], 2).shape[1] + settings.min_points_for_curved_sheet
+        degree = 2 if n >= curved else 1
         B = _terms(Z[:, :q], degree)
         Q, _ = np.linalg.qr(B)
         residual = Z[:, q:] - Q @ (Q.T @ Z[:, q:])

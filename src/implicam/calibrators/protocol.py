@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import Field, asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
@@ -23,10 +23,11 @@ from implicam.calibrators.cameras import FittedCamera, fitted_cameras
 from implicam.calibrators.position_processes import PositionProcesses
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.dataset.unused import Rejected, Unused
-from implicam.errors import FitError
+from implicam.errors import FitError, UsageError
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig, Sensitivity
+from implicam.settings import Settings
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -236,9 +237,23 @@ class Calibrator(Protocol):
 
 
 class CalibratorBase:
-    """What most calibrators do alike; to be inherited, or written anew."""
+    """What most calibrators do alike; to be inherited, or written anew.
+
+    A method with priors and thresholds has them in a field `settings: MySettings = MySettings()`, a
+    `implicam.settings.Settings`: then a calibration file carries them, `implicam calibrate --settings` sets them and
+    `implicam info --settings` shows them.
+    """
 
     compared_variants: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        usual = settings_type(type(self))
+        given = getattr(self, SETTINGS, None)
+        if usual is not None and not isinstance(given, usual):
+            raise UsageError(
+                f"the settings of {self.method} are of the type {usual.__name__}, and not {type(given).__name__}.",  # type: ignore[attr-defined]
+                fix=f"{type(self).__name__}(settings={usual.__name__}({fields(usual)[0].name}=...))",
+            )
 
     @classmethod
     def variants(cls) -> Mapping[str, Mapping[str, Any]]:
@@ -249,6 +264,46 @@ class CalibratorBase:
     def library(self) -> tuple[str, str] | None:
         """None: what is always installed is enough."""
         return None
+
+    def as_table(self) -> dict[str, Any]:
+        """The options and all settings, as a calibration file keeps them; without options that are datasets."""
+        given = ((field, getattr(self, field.name)) for field in fields(self) if not _is_dataset(field))  # type: ignore[arg-type]
+        return {field.name: v.as_table() if isinstance(v, Settings) else v for field, v in given}
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], **datasets: Dataset | None) -> Self:
+        """The inverse of `as_table`, with the options that are datasets.
+
+        A file from before a method had settings, or one of them, has the defaults: what it was made with.
+
+        Raises:
+            KeyError, ValueError, TypeError, UsageError: an option is missing, or makes no sense.
+        """
+        options: dict[str, Any] = {}
+        for one in fields(cls):  # type: ignore[arg-type]
+            if isinstance(one.default, Settings):
+                options[one.name] = type(one.default).from_table(table.get(one.name, {}))
+            elif not _is_dataset(one):
+                options[one.name] = _as(one.default, table[one.name])
+        return cls(**options, **datasets)
+
+
+SETTINGS = "settings"
+"""The field of a calibrator that holds its settings."""
+
+
+def settings_type(calibrator: type[Any]) -> type[Settings] | None:
+    """What the settings of a method are; None for a method that has none."""
+    usual = {field.name: field.default for field in fields(calibrator)}.get(SETTINGS)
+    return type(usual) if isinstance(usual, Settings) else None
+
+
+def _as(usual: Any, value: Any) -> Any:
+    return type(usual)(value) if isinstance(usual, str | int | float) else value
+
+
+def _is_dataset(field: Field[Any]) -> bool:
+    return bool(field.metadata.get("is_dataset", False))
 
 
 class CalibrationBase:
@@ -331,12 +386,6 @@ class RigCalibration(CalibrationBase):
     def centres(self) -> dict[str, Floats]:
         """Where the calibrated cameras are: name -> (3,) in the world."""
         return {name: self.lines_of_sight(name, np.zeros((1, 2)))[0] for name in self.camera_names}
-
-
-def why_not_all_seen(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> str:
-    """The reason for a point that not every camera saw."""
-    blind = [name for name, ok in zip(names, seen, strict=True) if not ok]
-    return f"{method} needs every camera; not seen by {', '.join(blind)}"
 
 
 @contextmanager

@@ -25,7 +25,7 @@ import implicam.cli.simulate  # noqa: F401  the seven register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards
-from implicam.calibrators.protocol import RigCalibration
+from implicam.calibrators.protocol import SETTINGS, RigCalibration
 from implicam.cli import show
 from implicam.cli.app import (
     CALIBRATION_SUFFIX,
@@ -49,6 +49,14 @@ from implicam.cli.app import (
     read,
 )
 from implicam.cli.options import OptionsOfParts, calibrator_from_options, options_of_calibrators
+from implicam.cli.settings import (
+    SettingsFile,
+    ShowSettings,
+    settings_of,
+    settings_table,
+    settings_text,
+    with_settings,
+)
 from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
@@ -98,6 +106,7 @@ def _calibrate(
     cameras: Cameras = None,
     without: Without = None,
     unit: Unit = None,
+    settings: SettingsFile = None,
     seed: Seed = 0,
     force: Annotated[bool, typer.Option("--force", help="Write the file even if it is not usable.")] = False,
     json: Json = False,
@@ -110,7 +119,7 @@ def _calibrate(
         data, _ = data.split(points, seed=seed)
     if data.known is None and has_boards(data) and not _any_given(method, options):
         method = Explicit.method  # nothing else can be made of boards
-    made = calibrator_from_options(method, seed, options)
+    made = with_settings(calibrator_from_options(method, seed, options), settings)
     with show.progress(json) as progress:
         calibration = made.fit(data, progress)
         verdict = judge(calibration, progress)
@@ -364,27 +373,31 @@ def convert_command(
 @command("info")
 def info_command(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    settings: ShowSettings = False,
     json: Json = False,
 ) -> None:
     """Show what a calibration file says about itself."""
     loaded = load_calibration(calibration)  # a damaged file must not look healthy
+    if settings:
+        show.emit_json(settings_table(loaded)) if json else show.line(settings_text(loaded))
+        return
     table = calibration_file.describe(calibration)
     cameras = loaded.cameras.values() if isinstance(loaded, RigCalibration) else ()
     table["fitted_cameras"] = [camera.as_table() for camera in cameras]
     if json:
         show.emit_json(table)
         return
-    settings: Any = getattr(getattr(loaded, "calibrator", None), "settings", None)
-    saved = None if settings is None else table["options"].pop("settings", None)
+    made_with = settings_of(loaded)
+    table["options"].pop(SETTINGS, None)
     fitted = table.pop("fitted_cameras")
     show.line(toml_text(table).rstrip())
     if fitted:
         show.line(show.table_lines("fitted_cameras", fitted))
-    if saved is not None:
-        usual = type(settings)().as_table()
-        changed = {name: value for name, value in saved.items() if value != usual.get(name)}
-        text = f"\n[options.settings]\n{toml_text(changed).rstrip()}\n" if changed else "\n"
-        show.line(f"{text}# the other {len(saved) - len(changed)} settings are at their defaults; --json shows all")
+    if made_with is not None:
+        changed, count = made_with.changed(), len(made_with.described())
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in changed.items()}
+        text = f"\n[options.settings]\n{toml_text(plain).rstrip()}\n" if changed else "\n"
+        show.line(f"{text}# the other {count - len(changed)} settings are at their defaults; --settings shows all")
 
 
 def _version(shown: bool) -> None:

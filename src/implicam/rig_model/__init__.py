@@ -29,7 +29,7 @@ from implicam.rig_model.linearise import iterate_linearisation
 from implicam.rig_model.normal_equations import solve_normal
 from implicam.rig_model.posterior import Posterior, condition
 from implicam.rig_model.rig import FittedRig, Sensitivity
-from implicam.rig_model.settings import RigModelSettings
+from implicam.rig_model.settings import CameraSettings, RigModelSettings
 from implicam.rig_model.training_data import (
     MIN_POINTS_PER_CAMERA,
     Frame,
@@ -44,6 +44,7 @@ __all__ = [
     "MAX_NAMED_IN_NOTE",
     "MIN_POINTS_PER_CAMERA",
     "CameraModel",
+    "CameraSettings",
     "CameraViews",
     "CentralCamera",
     "Diagnosis",

@@ -13,7 +13,7 @@ import numpy as np
 
 from implicam.geometry import Floats, Pose, camera_centre, rotation_from_vector
 from implicam.lenses import Lens
-from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
+from implicam.rig_model.settings import DEFAULT_SETTINGS, CameraSettings, RigModelSettings
 
 
 class Image(NamedTuple):
@@ -101,7 +101,7 @@ class CentralCamera:
         turn = rotation_from_vector(step[-6:-3])
         return CentralCamera(lens, Pose(turn @ self.pose.rotation, self.pose.translation + step[-3:]))
 
-    def prior(self, image: Image, widest: float, settings: RigModelSettings = DEFAULT_SETTINGS) -> Prior:
+    def prior(self, image: Image, widest: float, settings: CameraSettings = DEFAULT_SETTINGS) -> Prior:
         """Eq. (3), for a lens that is used up to `widest` radians off its axis."""
         mean, precision = np.zeros(self.size), np.zeros((self.size, self.size))
         aspect = 1 / (settings.log_aspect_prior_sd * self.lens.fx) ** 2

@@ -12,7 +12,6 @@ from implicam.rig_model.camera_model import CameraViews, apply_covariance_root
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.position_errors import Agreement
 from implicam.rig_model.posterior import Posterior
-from implicam.rig_model.settings import DEFAULT_SETTINGS
 from implicam.threads import side_by_side
 
 MIN_ONE_MINUS_LEVERAGE = 1e-9
@@ -91,7 +90,7 @@ def update_inliers(
     points: Floats,
     seen: tuple[CameraViews, ...],
     inliers: tuple[Bools, ...],
-    limit: float = DEFAULT_SETTINGS.max_squared_mahalanobis,
+    limit: float,
 ) -> tuple[Bools, ...]:
     """The views to use next: not those that contradict the others.
 

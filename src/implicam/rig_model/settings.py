@@ -1,38 +1,27 @@
-"""Every prior and threshold of the rig model, in one frozen value with the numbers of docs/method.md as its defaults.
+"""Priors and thresholds of the rig model, with the numbers of docs/method.md as their defaults.
 
-A name ends in its unit. `wf` is a length in the working frame, whose unit is the spread of the known points; half sides
-are half the longer side of the image; a ratio, share, probability, p-value or level has none, as the sd of a logarithm.
-
-Here are numbers that are judgements: of what is usual, of what is clear, of what counts. What only says how closely an
-equation is solved (steps, tolerances, jitters, sizes of chunks) is a constant beside the code.
+`CameraSettings` are those of every method that has cameras; `RigModelSettings` those of cameras with a field as well.
+How a name is read, and what is no setting: `implicam.settings`.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import Field, asdict, dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass
 
-from implicam.errors import UsageError, did_you_mean
 from implicam.lenses import DistortionSds, KannalaBrandt
 from implicam.lenses.kannala_brandt import AT_EDGE_PRIOR_SD, PRIOR_SD
-
-BELOW_ONE = ("_share", "_probability", "_p_value", "_p_values", "error_bar_level")
-"""What a setting's name ends in where its value must be below one."""
+from implicam.settings import Settings
 
 
-@dataclass(frozen=True, kw_only=True)
-class RigModelSettings:
-    """The settings of cameras, of the posterior, of errors of known positions, and of measuring."""
+@dataclass(frozen=True, kw_only=True, repr=False)
+class CameraSettings(Settings):
+    """The settings of cameras, of views that contradict each other, and of the alarm."""
 
     # a camera's start, eq. (7)
     max_start_error_medians: float = 8.0
     """Times the median error: farther off, a view does not start the fit; the fit itself has the finer test."""
     max_start_error_half_extents: float = 0.05
     """Median error of a start, in half the extent of the pixels, beyond which it is none."""
-    max_start_error_half_extents_without_lens: float = 0.3
-    """The same of a linear projection, which leaves the lens to its field."""
 
     # priors of cameras, eqs. (3) and (4); those of single lens families are with the lenses
     distortion_prior_sd: tuple[float, float, float, float] = PRIOR_SD
@@ -43,6 +32,54 @@ class RigModelSettings:
     """Prior sd of log(fy / fx) of an ordinary camera: pixels are square."""
     centre_prior_sd_sides: float = 0.02
     """Prior sd of the principal point about the image's centre, in the longer side."""
+
+    # views that contradict the others, eq. (18)
+    max_squared_mahalanobis: float = 25.0
+    """Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
+
+    # wrong views of a point, eqs. (21) and (W1) to (W3)
+    disagree_p_value: float = 1e-4
+    """Below this p-value the views disagree, and those are looked for that the others would do better without."""
+    agree_p_value: float = 1e-3
+    """The p-value that the others must have among themselves then."""
+    clearly_better_ratio: float = 100.0
+    """How many times better they must agree than without any other choice of as many views."""
+    min_p_value: float = 1e-10
+    """Below this p-value there is no position, but a wrong match: a number would be worse than none."""
+    max_suspects_of_two: int = 8
+    """Views of a point, the farthest off, that are combined to pairs."""
+    max_suspects_of_three: int = 4
+    """Views that are combined to triples."""
+
+    # the alarm of a measured table
+    min_alarm_points: int = 10
+    """Of fewer points that can be tested nothing is said."""
+    max_contradicting_share: float = 0.3
+    """Share of the points that contradict, beyond which it is no longer them."""
+    usual_wrong_share: float = 0.2
+    """Share of wrong views in a table whose detection is bad, and whose rig is as it was."""
+    false_alarm_probability: float = 5e-4
+    """Probability that a sign is there where nothing is wrong."""
+    alarm_p_values: tuple[float, ...] = (0.05, 0.01, 0.001)
+    """p-values below each of these are few."""
+    tolerated_error_bar_ratio: float = 1.3
+    """By how much error bars may be too small without an alarm."""
+    max_independent_points: int = 50
+    """Points of a table that count as independent at most: all share what is not known of the cameras."""
+
+    def distortion_sds(self, family: str) -> DistortionSds | None:
+        """What these settings say of the distortion of a family of lenses; None where its own numbers hold."""
+        known = family == KannalaBrandt.family
+        return (self.distortion_prior_sd, self.distortion_at_edge_prior_sd) if known else None
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class RigModelSettings(CameraSettings):
+    """And of cameras with a field: the posterior, errors of known positions, heavy tails."""
+
+    # cameras that are linear projections, eqs. (4) and (7)
+    max_start_error_half_extents_without_lens: float = 0.3
+    """Median error of the start of a linear projection, which leaves the lens to its field, beyond which it is none."""
     projection_prior_relative_sd: float = 0.3
     """Prior sd of the numbers of a linear projection about those of its start, as a part of them."""
 
@@ -51,9 +88,7 @@ class RigModelSettings:
     """Sd of the log distance of the known points in an ordinary rig. Where the volume is thinner, depth counts in its
     own spread: what a window or water does varies over the volume, however far that is."""
 
-    # views that contradict the others, eq. (18)
-    max_squared_mahalanobis: float = 25.0
-    """Squared distance, in its own covariance, of a view from what all others predict: one in 270,000 of good ones."""
+    # views that contradict the others, eq. (18): what a point's own view tells
     max_left_out_variance_ratio: float = 3.0
     """Variance of a view predicted without its own point over that of the noise: beyond it the point says how a camera
     is, and not how it is off itself."""
@@ -146,108 +181,6 @@ class RigModelSettings:
     nothing says which."""
     reweightings: int = 3
     """Times that the views of tied cameras are weighted to measure a point."""
-
-    # wrong views of a point, eqs. (21) and (W1) to (W3)
-    disagree_p_value: float = 1e-4
-    """Below this p-value the views disagree, and those are looked for that the others would do better without."""
-    agree_p_value: float = 1e-3
-    """The p-value that the others must have among themselves then."""
-    clearly_better_ratio: float = 100.0
-    """How many times better they must agree than without any other choice of as many views."""
-    min_p_value: float = 1e-10
-    """Below this p-value there is no position, but a wrong match: a number would be worse than none."""
-    max_suspects_of_two: int = 8
-    """Views of a point, the farthest off, that are combined to pairs."""
-    max_suspects_of_three: int = 4
-    """Views that are combined to triples."""
-
-    # the alarm of a measured table
-    min_alarm_points: int = 10
-    """Of fewer points that can be tested nothing is said."""
-    max_contradicting_share: float = 0.3
-    """Share of the points that contradict, beyond which it is no longer them."""
-    usual_wrong_share: float = 0.2
-    """Share of wrong views in a table whose detection is bad, and whose rig is as it was."""
-    false_alarm_probability: float = 5e-4
-    """Probability that a sign is there where nothing is wrong."""
-    alarm_p_values: tuple[float, ...] = (0.05, 0.01, 0.001)
-    """p-values below each of these are few."""
-    tolerated_error_bar_ratio: float = 1.3
-    """By how much error bars may be too small without an alarm."""
-    max_independent_points: int = 50
-    """Points of a table that count as independent at most: all share what is not known of the cameras."""
-
-    def distortion_sds(self, family: str) -> DistortionSds | None:
-        """What these settings say of the distortion of a family of lenses; None where its own numbers hold."""
-        known = family == KannalaBrandt.family
-        return (self.distortion_prior_sd, self.distortion_at_edge_prior_sd) if known else None
-
-    def __new__(cls, **given: Any) -> Self:
-        """UsageError, instead of a TypeError, for a name that is no setting."""
-        known = [field.name for field in fields(cls)]
-        for name in given:
-            if name not in known:
-                raise UsageError(
-                    f"there is no setting {name!r}{did_you_mean(name, known)}.",
-                    fix=f"the settings are the fields of {cls.__name__}",
-                )
-        return super().__new__(cls)
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            problem = _problem(field, value)
-            if problem:
-                raise UsageError(
-                    f"the setting {field.name} must be {problem}, and is {value!r}.",
-                    fix=f"leave it out: {field.default!r} is the default",
-                )
-
-    def __repr__(self) -> str:
-        """As it would be written: the settings that are not at their default."""
-        changed = (f"{f.name}={value!r}" for f in fields(self) if (value := getattr(self, f.name)) != f.default)
-        return f"{type(self).__name__}({', '.join(changed)})"
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any]) -> Self:
-        """The settings of a table, the others at their default.
-
-        Args:
-            table: Name to value, as `as_table` writes it and a calibration file keeps it.
-
-        Raises:
-            UsageError: A name is not known, or a value makes no sense.
-        """
-        defaults = {field.name: field.default for field in fields(cls)}
-        return cls(**{name: _as_default(defaults.get(name), value) for name, value in table.items()})
-
-    def as_table(self) -> dict[str, Any]:
-        """All settings, as a calibration file keeps them: numbers and lists of numbers."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
-
-
-def _as_default(default: Any, value: Any) -> Any:
-    """A value of a table in the type of the default, where it has one of that kind."""
-    if isinstance(default, tuple) and isinstance(value, list):
-        return tuple(value)
-    return float(value) if isinstance(default, float) and type(value) is int else value
-
-
-def _problem(field: Field[Any], value: Any) -> str:
-    """What a setting must be that it is not; empty where it is."""
-    numbers = value if isinstance(field.default, tuple) else (value,)
-    kinds = int if isinstance(field.default, int) else int | float
-    if not isinstance(numbers, tuple) or not all(isinstance(n, kinds) and not isinstance(n, bool) for n in numbers):
-        return "a whole number" if kinds is int else "a number" if numbers == (value,) else "a tuple of numbers"
-    if isinstance(field.default, tuple) and "..." not in str(field.type) and len(numbers) != len(field.default):
-        return f"{len(field.default)} numbers"
-    if not numbers:
-        return "at least one number"
-    lowest = 2 if field.name.endswith("degrees_of_freedom") else 0
-    highest = 1 if field.name.endswith(BELOW_ONE) else math.inf
-    if not all(lowest < n < highest for n in numbers):
-        return f"above {lowest}" + (" and below 1" if highest == 1 else "" if lowest else ", and finite")
-    return ""
 
 
 DEFAULT_SETTINGS = RigModelSettings()

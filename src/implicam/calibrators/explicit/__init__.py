@@ -2,5 +2,6 @@
 
 from implicam.calibrators.explicit.calibration import Explicit, ExplicitCalibration
 from implicam.calibrators.explicit.exchanged import calibration_of, rig_of
+from implicam.calibrators.explicit.settings import ExplicitSettings
 
-__all__ = ["Explicit", "ExplicitCalibration", "calibration_of", "rig_of"]
+__all__ = ["Explicit", "ExplicitCalibration", "ExplicitSettings", "calibration_of", "rig_of"]

@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.explicit.boards import BoardView
+from implicam.calibrators.explicit.settings import DEFAULT_SETTINGS, ExplicitSettings
 from implicam.geometry import Bools, Floats, Pose, rotation_from_vector
 from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera, Prior, solve_normal
 
-CAUCHY_SCALE_SDS = 3.0
-"""Residuals, in standard deviations, beyond which a view counts less: Cauchy's loss."""
-
 LOST_SQUARED_RESIDUAL = 1e4
 """Squared residual of a corner that the lens has no pixel for."""
+
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a residual with sd 1 in u and in v."""
 
 MAX_ITERATIONS = 60
 
@@ -108,7 +109,9 @@ class Bundle:
     noise: (C,) in pixels; held: the cameras are known, and only the boards move.
 
     slack: sd of how far the board was elsewhere in each view of its own, in the board's length unit, where pictures are
-    not of the same instants; it turned by as much at its rim. It is integrated out, not with the robust cost."""
+    not of the same instants; it turned by as much at its rim. It is integrated out, not with the robust cost.
+
+    settings: priors and thresholds."""
 
     cameras: tuple[CentralCamera, ...]
     priors: tuple[Prior, ...]
@@ -117,6 +120,7 @@ class Bundle:
     noise: Floats
     held: bool = False
     slack: float = 0.0
+    settings: ExplicitSettings = DEFAULT_SETTINGS
 
     @property
     def starts(self) -> list[int]:
@@ -198,7 +202,8 @@ def _cost(bundle: Bundle, robust: bool) -> float:
             total += float(np.sum(_whitened(bundle, c, robust)[0] ** 2))
             continue
         squares = _squares(bundle, c)
-        total += float(np.sum(CAUCHY_SCALE_SDS**2 * np.log1p(squares / CAUCHY_SCALE_SDS**2) if robust else squares))
+        scale = bundle.settings.cauchy_scale_sds**2
+        total += float(np.sum(scale * np.log1p(squares / scale) if robust else squares))
     return total
 
 
@@ -286,7 +291,7 @@ def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Flo
     weight = 1 / (bundle.noise[c] * stack.relative)
     if robust:  # iteratively reweighted: Cauchy's weight
         squares = np.sum((stack.uv - seen.uv) ** 2, axis=1) * weight**2
-        weight = weight / np.sqrt(1 + squares / CAUCHY_SCALE_SDS**2)
+        weight = weight / np.sqrt(1 + squares / bundle.settings.cauchy_scale_sds**2)
     there = np.isfinite(seen.uv).all(axis=1) & np.isfinite(seen.by_parameters).all(axis=(1, 2))
     weight = np.where(there, weight, 0)[:, None]
     by_board = np.concatenate([np.cross(turned[:, None, :], seen.by_point), seen.by_point], axis=2)
@@ -368,8 +373,7 @@ def log_marginal(bundle: Bundle) -> float:
 
 def spreads(bundle: Bundle) -> Floats:
     """(C,) the usual residual of each camera in pixels per coordinate, whatever a few wrong corners say."""
-    rayleigh = 1.1774  # the median length of a residual with sd 1 in u and in v
-    return np.array([np.median(bundle.lengths(c)) / rayleigh for c in range(len(bundle.cameras))])
+    return np.array([np.median(bundle.lengths(c)) / RAYLEIGH_MEDIAN for c in range(len(bundle.cameras))])
 
 
 def adjust_in_steps(bundle: Bundle, half: Floats, *, one_noise: bool = False, progress: Progress = silent) -> Adjusted:

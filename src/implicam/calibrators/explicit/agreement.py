@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from implicam.calibrators.explicit.adjust import (
+    RAYLEIGH_MEDIAN,
     Adjusted,
     Bundle,
     adjust,
@@ -24,61 +25,34 @@ from implicam.calibrators.explicit.adjust import (
     unexplained,
 )
 from implicam.calibrators.explicit.boards import BoardView
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.geometry import Floats, Pose
 from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera
 
-MAX_RESIDUAL_RATIO = 2.0
-"""Together so many times what is left alone: lens models that do not hold their lenses make at most 1.25 of it where
-they leave as much as the noise, 1.7 where they leave three times as much (docs/decisions/0018)."""
-
-MIN_SHARED_BOARDS = 3
-"""Boards that two cameras must share before what they leave says anything of the rig."""
-
-MAX_WRONG_SHARE = 0.15
-"""Share of the corners that do not fit, beyond which cameras contradict each other and nothing makes up for it."""
-
-MAX_MOVED_EXTENTS = 0.1
-"""Part of the boards' extent that they may seem to have moved: more is no lag of a camera."""
-
-MAX_RESIDUAL_HALF_SIDES = 0.01
-"""Usual residual together, in half the longer side of the image, beyond which no error bar makes up for it."""
-
-WRONG_CORNER_SDS = 5.0
-"""Standard deviations off, beyond which a corner is wrong: one in 270,000 of good ones."""
-
-UNNOTICED_MOVES_EXTENTS = (3e-4, 1e-3)
-"""Parts of the extent of the boards that they may have moved without anybody having noticed."""
-
-MIN_GAIN_NATS = 10.0
-"""Log evidence that moved boards must gain."""
-
-MAX_MIRRORED_RATIO = 0.3
-"""Two cameras that leave so many times less with one turned left to right are mirrored."""
-
-RAYLEIGH_MEDIAN = 1.1774
-"""Median length of a residual with sd 1 in u and in v."""
-
 
 class Agreement(NamedTuple):
     """Of two cameras (numbers in the bundle) on the boards that both saw: the usual residual, pixels per coordinate, of
-    each alone and of both together; half: of half the longer side of the image, the larger of both."""
+    each alone and of both together; half: of half the longer side of the image, the larger of both; settings: when that
+    is a contradiction."""
 
     pair: tuple[int, int]
     boards: int
     alone: float
     together: float
     half: float
+    settings: ExplicitSettings
 
     @property
     def contradict(self) -> bool:
         """They fit alone and not together."""
-        return self.boards >= MIN_SHARED_BOARDS and self.together > MAX_RESIDUAL_RATIO * self.alone
+        enough = self.boards >= self.settings.min_shared_boards
+        return enough and self.together > self.settings.max_together_ratio * self.alone
 
     @property
     def hopeless(self) -> bool:
         """They contradict each other, and by so much that it is not for a board held by hand that moved a little."""
-        return self.contradict and self.together > MAX_RESIDUAL_HALF_SIDES * self.half
+        return self.contradict and self.together > self.settings.max_together_error_half_sides * self.half
 
 
 def agreements(bundle: Bundle, half: Floats, alone: Mapping[tuple[int, int], Floats]) -> list[Agreement]:
@@ -96,7 +70,8 @@ def agreements(bundle: Bundle, half: Floats, alone: Mapping[tuple[int, int], Flo
             of_each, of_both = (
                 _usual([by[a, k] for k in shared], [by[b, k] for k in shared]) for by in (alone, together)
             )
-            found.append(Agreement((a, b), len(shared), of_each, of_both, float(max(half[a], half[b]))))
+            widest = float(max(half[a], half[b]))
+            found.append(Agreement((a, b), len(shared), of_each, of_both, widest, bundle.settings))
     return found
 
 
@@ -115,15 +90,15 @@ def with_slack(bundle: Bundle, progress: Progress = silent) -> tuple[Adjusted, l
     know for it is in its covariance.
     """
     everything, wrong = bundle.views, [np.zeros(len(stack.uv), dtype=np.bool_) for stack in bundle.views.stacks]
-    alone = bundle.noise
+    alone, settings = bundle.noise, bundle.settings
     for _ in range(2):
         bundle = _most_probable(replace(bundle, views=everything.select([~bad for bad in wrong])), progress)
         whole = replace(bundle, views=everything)
         off = [unexplained(whole, c) for c in range(len(bundle.cameras))]
-        now = [length > WRONG_CORNER_SDS * noise for length, noise in zip(off, alone, strict=True)]
+        now = [length > settings.max_corner_error_sds * noise for length, noise in zip(off, alone, strict=True)]
         same = all((a == b).all() for a, b in zip(now, wrong, strict=True))
         wrong = now
-        if same or np.mean(np.concatenate(wrong)) > MAX_WRONG_SHARE:
+        if same or np.mean(np.concatenate(wrong)) > settings.max_wrong_corner_share:
             break
     found = adjust(bundle, robust=False)
     listed = [
@@ -138,16 +113,17 @@ def loosened(found: Adjusted, progress: Progress = silent) -> Adjusted:
     """The same with the covariance that it has if boards moved a little between the pictures of them, where the views
     clearly say so. Errors that all corners of a view share, those of a lens that its model does not hold, too, are not
     errors of single corners, which would cancel; the cameras stay as they are, since it is not known which it was."""
-    bundle, seen = found.bundle, np.zeros(len(found.bundle.boards.translation), dtype=np.int64)
+    bundle, settings = found.bundle, found.bundle.settings
+    seen = np.zeros(len(bundle.boards.translation), dtype=np.int64)
     for view in bundle.views.each:
         seen[view.board] += 1
-    if np.sum(seen >= 2) < MIN_SHARED_BOARDS:
+    if np.sum(seen >= 2) < settings.min_shared_boards:
         return found
     extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
     before = log_marginal_with_slack(bundle)
-    for part in UNNOTICED_MOVES_EXTENTS:
+    for part in settings.unnoticed_moves_extents:
         trial = adjust(replace(bundle, slack=part * extent), robust=False, iterations=4).bundle
-        if log_marginal_with_slack(trial) > before + MIN_GAIN_NATS:
+        if log_marginal_with_slack(trial) > before + settings.min_moved_gain_nats:
             slack = _most_probable(trial, progress).slack
             return found._replace(root=root_with_slack(replace(bundle, slack=slack), found.root))
     return found

@@ -14,27 +14,16 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.dataset import Names
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, register, rotation_from_vector
 from implicam.rig_model import CameraModel, CentralCamera
 
-MAX_SQUARED_MAHALANOBIS = 25.0
-"""Squared distance, in its own covariance, of a known point from where it should be: one in 65,000 of good ones."""
-
 POINTS, ICP = "points", "icp"
 MATCHING = (POINTS, ICP)
 
 MAX_ROUNDS = 60
-
-MIN_RESIDUAL_RATIO = 1.3
-"""Two ways to match points by closeness are told apart where one leaves so many times what the other leaves."""
-
-MAX_MIRRORED_RATIO = 0.3
-"""What is left with one axis turned, over what is left as they are: less, and the known points are mirrored."""
-
-MAX_RESIDUAL_EXTENTS = 0.05
-"""Part of the extent of the known points that the boards may be off without being of another rig."""
 
 
 class Known(NamedTuple):
@@ -65,7 +54,14 @@ class Alignment(NamedTuple):
 
 
 def align(
-    models: tuple[CameraModel, ...], root: Floats, uv: Floats, noise: Floats, start: Floats, known: Known, how: str
+    models: tuple[CameraModel, ...],
+    root: Floats,
+    uv: Floats,
+    noise: Floats,
+    start: Floats,
+    known: Known,
+    how: str,
+    settings: ExplicitSettings,
 ) -> Alignment:
     """models: cameras in the rig's frame; root (q, P) of their covariance. uv (n, C, 2) and noise (n, C): their views
     of the known points, NaN where not used; start (n, 3): where they are in the rig's frame, roughly, NaN where not
@@ -81,11 +77,13 @@ def align(
     cov = point + spread @ spread.swapaxes(1, 2)
     used = there
     for _ in range(8):
-        pose, pairs = matched(measured, known.xyz, used, how)
+        pose, pairs = matched(measured, known.xyz, used, how, settings)
         xyz, sd = known.xyz[pairs], known.sd[pairs]
         pose, Q, G, W, residual = _weighted(pose, measured, cov, xyz, sd, used, there)
         distance = np.einsum("ni,nij,nj->n", residual, W, residual)
-        good = there & (distance <= max(MAX_SQUARED_MAHALANOBIS, float(np.quantile(distance[used], 0.9))))
+        good = there & (
+            distance <= max(settings.max_aligned_squared_mahalanobis, float(np.quantile(distance[used], 0.9)))
+        )
         if (good == used).all():
             break
         if good.sum() < max(3, 0.5 * there.sum()):  # no few wrong points: the whole does not fit, and a note says so
@@ -101,7 +99,8 @@ def align(
     left = left + pose.rotation @ (sd[used][:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
     errors, sds = left_out(pose, Q, G[used], W[used], residual[used], left)
     found = Alignment(pose, used, K, own, errors, sds, extent_ratio(measured[used], xyz[used]))
-    check_alignment(found, residual[there], xyz[there], measured[there], float(np.sqrt(np.sum(known.xyz.var(axis=0)))))
+    extent = float(np.sqrt(np.sum(known.xyz.var(axis=0))))
+    check_alignment(found, residual[there], xyz[there], measured[there], extent, settings)
     return found
 
 
@@ -129,25 +128,28 @@ def _by_pixels(
     return x, point, point @ back
 
 
-def matched(measured: Floats, xyz: Floats, used: Bools, how: str) -> tuple[Pose, NDArray[np.int64]]:
+def matched(
+    measured: Floats, xyz: Floats, used: Bools, how: str, settings: ExplicitSettings
+) -> tuple[Pose, NDArray[np.int64]]:
     """rig_from_world in closed form, and the number of each measured point's known one: its own, or the closest."""
     if how == POINTS:
         return register(xyz[used], measured[used])[0], np.arange(len(xyz))
-    pose = closest_points(xyz, measured[used], register(xyz[used], measured[used])[0])
+    named = register(xyz[used], measured[used])[0]
+    pose = closest_points(xyz, measured[used], named, settings.min_icp_residual_ratio)
     _, nearest = cKDTree(xyz).query(pose.inverse().apply(measured))
     return pose, np.asarray(nearest, dtype=np.int64)
 
 
-def closest_points(known: Floats, measured: Floats, named: Pose) -> Pose:
+def closest_points(known: Floats, measured: Floats, named: Pose, min_ratio: float) -> Pose:
     """measured_from_known by iterative closest point, from the principal axes in all 24 ways, whatever the names.
 
     Where a symmetric target fits in several ways, that which the names lead to (`named`) is taken if it is one of them;
-    else FitError.
+    else FitError. min_ratio: two ways are told apart where one leaves so many times what the other leaves.
     """
     starts = [named, *_by_axes(known, measured)]
     found = sorted(((icp(known, measured, start), i) for i, start in enumerate(starts)), key=lambda one: one[0][1])
     least = max(found[0][0][1], 1e-9 * float(np.ptp(known)))
-    alike = [(pose, i) for (pose, rms), i in found if rms <= MIN_RESIDUAL_RATIO * least]
+    alike = [(pose, i) for (pose, rms), i in found if rms <= min_ratio * least]
     for pose, i in alike:
         if i == 0:
             return pose
@@ -239,13 +241,16 @@ def extent_ratio(measured: Floats, xyz: Floats) -> float:
     return float(np.sqrt(np.sum(b**2) / np.sum(a**2)))
 
 
-def check_alignment(found: Alignment, residual: Floats, xyz: Floats, measured: Floats, extent: float) -> None:
+def check_alignment(
+    found: Alignment, residual: Floats, xyz: Floats, measured: Floats, extent: float, settings: ExplicitSettings
+) -> None:
     """FitError where boards and known points are not of one rig, or not of one unit."""
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
-    if rms < MAX_RESIDUAL_EXTENTS * extent and abs(found.scale - 1) < MAX_RESIDUAL_EXTENTS:
+    most = settings.max_alignment_error_extents
+    if rms < most * extent and abs(found.scale - 1) < most:
         return
     _, mirrored = register(xyz * np.array([1.0, 1.0, -1.0]), measured)
-    if mirrored < MAX_MIRRORED_RATIO * min(rms, MAX_RESIDUAL_EXTENTS * extent):
+    if mirrored < settings.max_mirrored_ratio * min(rms, most * extent):
         raise FitError(
             f"the known points are as in a mirror: aligned, {rms:.3g} are left; with one axis turned, {mirrored:.2g}.",
             why="the pictures are flipped (webcams do so), v is counted from below, or the known positions are "

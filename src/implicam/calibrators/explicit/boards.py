@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.explicit.settings import DEFAULT_SETTINGS, ExplicitSettings
 from implicam.dataset import Camera, Dataset, Names
 from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.rig_model import Image, image_of, relative_noise, stated_noise
-
-MIN_CORNERS = 12
-"""Corners of one picture; with fewer it says little more than that there is a board."""
 
 MAX_ROWS_OR_COLUMNS = 500
 """Rows or columns of a board."""
@@ -47,13 +45,14 @@ class BoardView:
 @dataclass(frozen=True, eq=False)
 class Boards:
     """All views of all boards. shots: (n,) of each row of the dataset; images: of each camera, where its pixels are
-    measured from; stated: (C,) its noise."""
+    measured from; stated: (C,) its noise; settings: priors and thresholds of all that is made of them."""
 
     cameras: tuple[Camera, ...]
     shots: Names
     views: tuple[BoardView, ...]
     images: tuple[Image, ...]
     stated: Floats
+    settings: ExplicitSettings = DEFAULT_SETTINGS
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -65,13 +64,13 @@ class Boards:
         return tuple(view for view in self.views if view.camera == c)
 
 
-def boards_of(data: Dataset, scale: float = 1.0) -> Boards:
+def boards_of(data: Dataset, scale: float = 1.0, settings: ExplicitSettings = DEFAULT_SETTINGS) -> Boards:
     """The boards of a dataset: corners as [target] in dataset.toml lays them out, or as its known positions do; lengths
     times `scale`.
 
     FitError where neither says where the corners are on the board.
     """
-    shots, flat = _laid_out(data)
+    shots, flat = _laid_out(data, settings.min_corners)
     flat = flat * scale
     names, number = np.unique(shots, return_inverse=True)
     observations = data.observations
@@ -81,11 +80,11 @@ def boards_of(data: Dataset, scale: float = 1.0) -> Boards:
     for c in range(len(observations.cameras)):
         for board in range(len(names)):
             rows = np.flatnonzero(observations.seen[:, c] & (number == board))
-            if len(rows) >= MIN_CORNERS and _spread(flat[rows]):
+            if len(rows) >= settings.min_corners and _spread(flat[rows]):
                 xyz = np.column_stack([flat[rows], np.zeros(len(rows))])
                 views.append(BoardView(c, board, xyz, observations.uv[rows, c], relative[rows, c], rows))
     images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
-    return Boards(observations.cameras, shots, tuple(views), images, stated)
+    return Boards(observations.cameras, shots, tuple(views), images, stated, settings)
 
 
 def has_boards(data: Dataset) -> bool:
@@ -94,8 +93,8 @@ def has_boards(data: Dataset) -> bool:
     return isinstance(target, Mapping) and target.get("kind") in ("board", "charuco")
 
 
-def _laid_out(data: Dataset) -> tuple[Names, Floats]:
-    """(n,) the shot of each corner, and (n, 2) where it is on the board."""
+def _laid_out(data: Dataset, least: int) -> tuple[Names, Floats]:
+    """(n,) the shot of each corner, and (n, 2) where it is on the board; least: corners of one."""
     if has_boards(data):
         return _by_target(data, data.extra["target"])
     if data.known is None:
@@ -104,7 +103,7 @@ def _laid_out(data: Dataset) -> tuple[Names, Floats]:
             why="[target] in dataset.toml is no board, or not there, and there is no points.csv",
             fix='write into dataset.toml: [target] kind = "board", rows = 8, columns = 11, square = 13.29',
         )
-    return data.shots, _by_positions(data)
+    return data.shots, _by_positions(data, least)
 
 
 def _by_target(data: Dataset, target: Mapping[str, Any]) -> tuple[Names, Floats]:
@@ -135,17 +134,17 @@ def _by_target(data: Dataset, target: Mapping[str, Any]) -> tuple[Names, Floats]
     return shots, np.asarray(np.column_stack([numbers % columns, numbers // columns]) * square, dtype=np.float64)
 
 
-def _by_positions(data: Dataset) -> Floats:
+def _by_positions(data: Dataset, least: int) -> Floats:
     """(n, 2) known positions of each shot, in the plane of the shot."""
     flat = np.zeros((len(data), 2))
     for shot in np.unique(data.shots):
         rows = data.shots == shot
         centred = data.xyz[rows] - data.xyz[rows].mean(axis=0)
         _, extents, axes = np.linalg.svd(centred, full_matrices=False)
-        if len(centred) < MIN_CORNERS or extents[2] > 1e-3 * extents[0]:
+        if len(centred) < least or extents[2] > 1e-3 * extents[0]:
             raise FitError(
                 f"the points of shot {str(shot)!r} are no flat board.",
-                why=f"it has {len(centred)} points; a board has {MIN_CORNERS} or more, on one plane",
+                why=f"it has {len(centred)} points; a board has {least} or more, on one plane",
                 fix="give pictures of a board with --boards, and balls as the dataset itself",
             )
         flat[rows] = centred @ axes[:2].T
@@ -161,14 +160,8 @@ def usable_cameras(boards: Boards) -> tuple[list[int], list[tuple[int, str]]]:
     """Numbers of the cameras that saw enough boards; number and reason of the others."""
     counts = [len(boards.of_camera(c)) for c in range(len(boards.cameras))]
     good = [c for c, count in enumerate(counts) if count >= MIN_BOARDS]
-    poor = [
-        (
-            c,
-            f"it saw {count} of the {MIN_BOARDS} boards that it takes, each with {MIN_CORNERS} corners or more",
-        )
-        for c, count in enumerate(counts)
-        if count < MIN_BOARDS
-    ]
+    why = f"of the {MIN_BOARDS} boards that it takes, each with {boards.settings.min_corners} corners or more"
+    poor = [(c, f"it saw {count} {why}") for c, count in enumerate(counts) if count < MIN_BOARDS]
     return good, poor
 
 

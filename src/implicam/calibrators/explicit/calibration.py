@@ -30,6 +30,7 @@ from implicam.calibrators.explicit.paper_preset import (
     fit_like_the_paper,
     measure_linearly,
 )
+from implicam.calibrators.explicit.settings import DEFAULT_SETTINGS, ExplicitSettings
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -60,7 +61,8 @@ class Explicit(CalibratorBase):
     how a calibration from boards is brought into the world: `points`, by the names of the known points, or `icp`, by
     the closest ones as in the paper. preset: `joint`, all cameras, lenses and boards adjusted together; `paper`, the
     paper's own pipeline with OpenCV, to compare with (paper_preset.py); `paper-bundle`, the same with a joint
-    adjustment at its end. seed changes nothing: no part of this method is left to chance.
+    adjustment at its end. seed changes nothing: no part of this method is left to chance. settings: all priors and
+    thresholds; a calibration file carries them, so that a refit years later is the same fit.
     """
 
     lens: str = field(default=AUTO, metadata=option(f"auto, {', '.join(LENSES)}"))
@@ -73,10 +75,12 @@ class Explicit(CalibratorBase):
     boards: Dataset | None = field(
         default=None, metadata=option("learn the cameras from these pictures of a board", "DATASET", is_dataset=True)
     )
+    settings: ExplicitSettings = DEFAULT_SETTINGS
 
     method: ClassVar[str] = "explicit"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for what, value, known in (
             ("lens", self.lens, (AUTO, *LENSES)),
             ("align", self.align, MATCHING),
@@ -124,9 +128,9 @@ class Explicit(CalibratorBase):
                     fix="give them with --boards, or leave it out",
                 )
             if self.boards is None and data.known is None and has_boards(data):
-                data, fitted = fit_to_boards_alone(data, self.lens, progress)
+                data, fitted = fit_to_boards_alone(data, self.lens, self.settings, progress)
             elif self.boards is None:
-                fitted = fit_to_points(data, self.lens, progress)
+                fitted = fit_to_points(data, self.lens, self.settings, progress)
             else:
                 fitted = fit_to_boards(data, self._groups(data, progress), self.boards, self.align, progress)
         if self.lens == AUTO:
@@ -147,7 +151,7 @@ class Explicit(CalibratorBase):
         if key not in self._by_opencv:
             joint = self.preset == PAPER_BUNDLE
             self._by_opencv[key] = calibrate_with_opencv(self._boards_for(data), self.lens, joint, progress)
-        return fit_like_the_paper(data, self._by_opencv[key], self.boards, self.align)
+        return fit_like_the_paper(data, self._by_opencv[key], self.boards, self.align, self.settings)
 
     def _groups(self, data: Dataset, progress: Progress) -> CameraGroups:
         """The cameras from the boards: adjusted once for all known points of the same cameras in the same unit."""
@@ -162,7 +166,7 @@ class Explicit(CalibratorBase):
         scale = 1.0
         if self.boards.length_unit != data.length_unit:
             scale = self.boards.metres_per_unit / data.metres_per_unit
-        return boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)), scale)
+        return boards_of(replace(self.boards, observations=by_cameras_of(data, self.boards)), scale, self.settings)
 
     @cached_property
     def _adjusted(self) -> dict[tuple[str, tuple[str, ...]], CameraGroups]:
@@ -188,7 +192,13 @@ class ExplicitCalibration(RigCalibration):
         """The cameras, and how they measure."""
         fitted = self.fitted
         return FittedRig(
-            fitted.trained, self.data.length_unit, fitted.frame, fitted.cameras, fitted.posterior, misfit_adds=True
+            fitted.trained,
+            self.data.length_unit,
+            fitted.frame,
+            fitted.cameras,
+            fitted.posterior,
+            misfit_adds=True,
+            settings=self.calibrator.settings.rig_model,
         )
 
     def measure(self, observations: Observations) -> Measurement:
@@ -239,21 +249,17 @@ class ExplicitCalibration(RigCalibration):
         )
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """The options; and per camera lens, pose and covariance, in the working frame."""
-        options = {"lens": self.calibrator.lens, "align": self.calibrator.align, "seed": self.calibrator.seed}
-        if self.calibrator.preset != JOINT:
-            options["preset"] = self.calibrator.preset
+        """The options with all settings; and per camera lens, pose and covariance, in the working frame."""
         table, arrays = saved.state(self.fitted, self.calibrator.boards)
-        return {**options, **table}, arrays
+        return self.calibrator.as_table() | table, arrays
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ExplicitCalibration:
         """Restore a calibration; nothing is computed again."""
         fitted, boards = saved.restored(data, table, arrays)
-        preset = str(table.get("preset", JOINT))
-        if (preset == JOINT) != (fitted.inflation is None):
-            raise ValueError(f"a calibration of the preset {preset} cannot measure like this one")
-        calibrator = Explicit(str(table["lens"]), str(table["align"]), preset, int(table["seed"]), boards)
+        calibrator = Explicit.from_table({"preset": JOINT, **table}, boards=boards)  # files had none before
+        if (calibrator.preset == JOINT) != (fitted.inflation is None):
+            raise ValueError(f"a calibration of the preset {calibrator.preset} cannot measure like this one")
         return cls(calibrator, data, fitted)
 
 

@@ -13,9 +13,6 @@ import numpy as np
 
 from implicam.calibrators.explicit.adjust import Adjusted, Bundle, Placed, Views, adjust, adjust_in_steps, spreads
 from implicam.calibrators.explicit.agreement import (
-    MAX_MIRRORED_RATIO,
-    MAX_MOVED_EXTENTS,
-    MAX_WRONG_SHARE,
     Agreement,
     agreements,
     lengths_alone,
@@ -27,7 +24,6 @@ from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, 
 from implicam.calibrators.explicit.lenses import Choice, angles
 from implicam.calibrators.explicit.pixels import prior_of
 from implicam.calibrators.explicit.zhang import (
-    MAX_BOARD_ERROR_RATIO,
     OneCamera,
     calibrate_camera,
     median_error,
@@ -39,15 +35,6 @@ from implicam.geometry import Bools, Floats, Pose
 from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera, Image
 from implicam.threads import side_by_side
-
-WRONG_CORNER_SDS = 5.0
-"""Standard deviations off, beyond which a corner is wrong: one in 270,000 of good ones."""
-
-PRIOR_RESIDUALS = 2.0
-"""The stated noise counts like so many residuals."""
-
-MAX_RESIDUAL_HALF_SIDES = 0.02
-"""Usual residual of a camera in the whole rig, in half the longer side of its image, beyond which there is no fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +143,7 @@ def _singles(
     def one(c: int) -> tuple[OneCamera, Choice] | FitError:
         nonlocal done
         try:
-            return calibrate_camera(boards.of_camera(c), boards.images[c], family)
+            return calibrate_camera(boards.of_camera(c), boards.images[c], family, boards.settings)
         except FitError as error:
             return error
         except np.linalg.LinAlgError as error:
@@ -267,9 +254,10 @@ def _bundle(
     for c, camera in zip(cameras, there, strict=True):
         own = np.concatenate([rig_from_board[v.board].apply(v.xyz) for v in views if v.camera == number[c]])
         widest = min(float(np.quantile(angles(camera, own), 0.98)), 3.0)
-        priors.append(prior_of(camera, boards.images[c], widest, singles[c].pixels))
+        priors.append(prior_of(camera, boards.images[c], widest, singles[c].pixels, boards.settings))
     noise = np.array([singles[c].noise for c in cameras])
-    return Bundle(there, tuple(priors), Placed.of(rig_from_board), Views(views, len(cameras)), noise)
+    placed_there = Placed.of(rig_from_board)
+    return Bundle(there, tuple(priors), placed_there, Views(views, len(cameras)), noise, settings=boards.settings)
 
 
 def _placed_again(bundle: Bundle) -> Bundle | None:
@@ -280,7 +268,7 @@ def _placed_again(bundle: Bundle) -> Bundle | None:
     stuck = set()
     for c, view, rows in bundle.views.in_stacks():
         views.setdefault(view.board, []).append(view)
-        if np.median(lengths[c][rows]) > MAX_BOARD_ERROR_RATIO * usual[c]:
+        if np.median(lengths[c][rows]) > bundle.settings.max_board_error_ratio * usual[c]:
             stuck.add(view.board)
     rotation, translation, changed = bundle.boards.rotation.copy(), bundle.boards.translation.copy(), False
     for k in sorted(stuck):
@@ -300,7 +288,7 @@ def _seen_by(bundle: Bundle, view: BoardView, now: Pose) -> list[Pose]:
     """rig_from_board as one camera sees it: its best pose, and the mirrored one."""
     camera = bundle.cameras[view.camera]
     alone = CentralCamera(camera.lens, Pose(np.eye(3), np.zeros(3)))
-    both = pose_and_mirror(alone, view, camera.pose @ now, float(bundle.noise[view.camera]))
+    both = pose_and_mirror(alone, view, camera.pose @ now, float(bundle.noise[view.camera]), bundle.settings)
     return [camera.pose.inverse() @ pose for pose in both]
 
 
@@ -312,7 +300,7 @@ def _off(bundle: Bundle, usual: Floats, views: list[BoardView], pose: Pose) -> f
 def _check(boards: Boards, cameras: tuple[int, ...], found: Adjusted, half: Floats) -> None:
     usual = spreads(found.bundle)
     worst = int(np.argmax(usual / half))
-    if usual[worst] < MAX_RESIDUAL_HALF_SIDES * half[worst]:
+    if usual[worst] < boards.settings.max_camera_error_half_sides * half[worst]:
         return
     raise _contradiction(boards, [cameras[worst]], f"its corners are left {usual[worst]:.3g} px off")
 
@@ -349,11 +337,12 @@ def _with_slack(
     own = np.maximum([singles[c].noise for c in cameras], 1e-5 * half)
     found, wrong = with_slack(replace(bundle, noise=own), progress)
     extent = float(np.median([np.ptp(view.xyz, axis=0).max() for view in bundle.views.each]))
+    settings, most = boards.settings, boards.settings.max_moved_extents * extent
     wrong_share = len(wrong) / sum(len(stack.uv) for stack in bundle.views.stacks)
-    if wrong_share > MAX_WRONG_SHARE or found.bundle.slack > MAX_MOVED_EXTENTS * extent:
+    if wrong_share > settings.max_wrong_corner_share or found.bundle.slack > most:
         worst = max(doubts, key=lambda one: one.together / one.alone)
         told = f"alone {worst.alone:.2g} px, together {worst.together:.2g} px"
-        if found.bundle.slack > MAX_MOVED_EXTENTS * extent:
+        if found.bundle.slack > most:
             told += f", as if boards had moved by {np.sqrt(6) * found.bundle.slack:.1g} between their pictures"
         raise _contradiction(boards, [cameras[c] for c in _culprits(doubts)], told)
     pairs = {one.pair for one in doubts}
@@ -383,7 +372,7 @@ def _check_mirrors(
     for one in doubts:
         a, b = (cameras[c] for c in one.pair)
         left = mirrored(singles[a].camera, seen[a], placed[a], placed[b])
-        if left < MAX_MIRRORED_RATIO * one.together:
+        if left < boards.settings.max_mirrored_ratio * one.together:
             found.append(one._replace(alone=left))
     if not found:
         return
@@ -403,10 +392,11 @@ def _refined(
 ) -> tuple[Adjusted, list[tuple[int, int, float]]]:
     """Without the corners that are wrong, by plain least squares, with the noise that the residuals show."""
     everything, stated = found.bundle.views, boards.stated[list(cameras)]
+    most = boards.settings.max_corner_error_sds
     bundle = replace(found.bundle, noise=np.maximum(spreads(found.bundle), 1e-6))
     for _ in range(3):
         bundle = replace(bundle, views=everything)
-        inliers = [bundle.lengths(c) <= WRONG_CORNER_SDS * bundle.noise[c] for c in range(len(cameras))]
+        inliers = [bundle.lengths(c) <= most * bundle.noise[c] for c in range(len(cameras))]
         found = adjust(replace(bundle, views=everything.select(inliers)), robust=False, progress=progress)
         noise = _noise(found.bundle, stated)
         settled = np.allclose(noise, bundle.noise, rtol=0.02)
@@ -431,7 +421,7 @@ def _check_shared(boards: Boards, cameras: tuple[int, ...], views: Views, inlier
     for seen in rows_of.values():
         for a, b in combinations(sorted(seen), 2):
             lost.setdefault((a, b), []).append(1 - float(np.mean(np.concatenate([seen[a], seen[b]]))))
-    bad = [pair for pair, shares in lost.items() if np.mean(shares) > MAX_WRONG_SHARE]
+    bad = [pair for pair, shares in lost.items() if np.mean(shares) > boards.settings.max_wrong_corner_share]
     if not bad:
         return
     in_all = set(bad[0]).intersection(*bad)
@@ -468,7 +458,6 @@ def _noise(bundle: Bundle, stated: Floats) -> Floats:
         freedom[c] += float(np.sum(2 - 6 / corners[stack.board]))
     own = np.sqrt(squares / np.maximum(freedom, 1.0))
     told = np.isfinite(stated)
-    mixed = np.sqrt(
-        (squares + PRIOR_RESIDUALS * np.nan_to_num(stated) ** 2) / (np.maximum(freedom, 1.0) + PRIOR_RESIDUALS)
-    )
+    prior = bundle.settings.noise_prior_residuals
+    mixed = np.sqrt((squares + prior * np.nan_to_num(stated) ** 2) / (np.maximum(freedom, 1.0) + prior))
     return np.asarray(np.maximum(np.where(told, mixed, own), 1e-6), dtype=np.float64)

@@ -12,6 +12,7 @@ from implicam.calibrators.explicit.camera_groups import CameraGroup, calibrate_l
 from implicam.calibrators.explicit.from_points import fit_points
 from implicam.calibrators.explicit.lenses import Choice
 from implicam.calibrators.explicit.pixels import told
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.dataset import Dataset, KnownPositions, Observations, remove_copies
 from implicam.dataset.requirements import match_cameras
 from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
@@ -62,11 +63,12 @@ class Fitted:
     reprojection: float = float("nan")
 
 
-def fit_to_points(data: Dataset, family: str, progress: Progress) -> Fitted:
+def fit_to_points(data: Dataset, family: str, settings: ExplicitSettings, progress: Progress) -> Fitted:
     """Every camera from the known points; FitError where fewer than two can be calibrated."""
     used = remove_copies(data)
     frame = Frame.of(used, METHOD)
-    fitted, choices = fit_points(TrainingData.of("central", used, frame, shots_off=False), family, progress)
+    training = TrainingData.of("central", used, frame, settings.rig_model, shots_off=False)
+    fitted, choices = fit_points(training, family, settings, progress)
     fitted = replace(fitted, uncalibrated=explain_copied_cameras(data, fitted.uncalibrated))
     diagnosis = Diagnosis(used, frame, fitted)
     return Fitted(
@@ -95,14 +97,23 @@ def _pixel_notes(data: Dataset, fitted: FitResult, choices: Mapping[int, Choice]
     return notes
 
 
-def fit_to_boards_alone(data: Dataset, family: str, progress: Progress) -> tuple[Dataset, Fitted]:
+def fit_to_boards_alone(
+    data: Dataset, family: str, settings: ExplicitSettings, progress: Progress
+) -> tuple[Dataset, Fitted]:
     """Cameras in the frame of the first; and the data with the positions that the boards have there."""
-    group = calibrate_largest_group(boards_of(data), family, progress)
+    group = calibrate_largest_group(boards_of(data, settings=settings), family, progress)
     placed = _placed(data, group)
     posterior = group_posterior(group, group.bundle.cameras, group.root)
-    measured = FittedRig(
-        data.observations, data.length_unit, WORLD_FRAME, group.cameras, posterior, misfit_adds=True
-    ).measure(placed.observations)
+    rig = FittedRig(
+        data.observations,
+        data.length_unit,
+        WORLD_FRAME,
+        group.cameras,
+        posterior,
+        misfit_adds=True,
+        settings=settings.rig_model,
+    )
+    measured = rig.measure(placed.observations)
     first = data.observations.camera_names[group.cameras[0]]
     fitted = Fitted(
         data.observations,
@@ -211,7 +222,7 @@ def _lens_notes(group: CameraGroup, trained: Observations) -> list[str]:
         name, lens = trained.camera_names[c], bundle.cameras[number].lens
         notes += told(name, bundle.cameras[number], group.images[number], group.choices[c].pixels)
         loose = float(sd[bundle.starts[number]] / lens.fx)
-        if loose > MAX_UNKNOWN_FOCAL_PART:
+        if loose > bundle.settings.max_unknown_focal_share:
             notes.append(
                 f"{name}: the boards fix its focal length to {100 * loose:.1g} % only. Show them tilted, near and far."
             )
@@ -223,7 +234,3 @@ def _lens_notes(group: CameraGroup, trained: Observations) -> list[str]:
     if not group.converged:
         notes.append("The bundle adjustment had not settled when it was stopped: look for wrong pictures.")
     return notes
-
-
-MAX_UNKNOWN_FOCAL_PART = 0.01
-"""Part of the focal length that may be unknown without a note."""

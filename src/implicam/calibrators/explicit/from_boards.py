@@ -130,12 +130,21 @@ def _aligned(data: Dataset, trained: Observations, group: CameraGroup, boards: D
     """A group of cameras that boards join, by the known points that it measures."""
     known, bundle = data.positions, group.bundle
     posterior = group_posterior(group, bundle.cameras, group.root)
-    in_rig = FittedRig(trained, data.length_unit, WORLD_FRAME, group.cameras, posterior, misfit_adds=True)
+    settings = bundle.settings
+    in_rig = FittedRig(
+        trained,
+        data.length_unit,
+        WORLD_FRAME,
+        group.cameras,
+        posterior,
+        misfit_adds=True,
+        settings=settings.rig_model,
+    )
     uv, noise = in_rig.views(data.observations)
-    found = locate(posterior, uv, noise)
+    found = locate(posterior, uv, noise, settings=settings.rig_model)
     uv[found.left_out] = np.nan
     points = Known(known.xyz, np.nan_to_num(known.sd), known.shots)
-    alignment = align(posterior.models, group.root, uv, noise, found.xyz, points, how)
+    alignment = align(posterior.models, group.root, uv, noise, found.xyz, points, how, settings)
     cameras, root = in_frame(*in_world(bundle.cameras, group.root, alignment), frame.offset, frame.scale)
     return Part(
         group.cameras,
@@ -164,8 +173,9 @@ def _placed(
 ) -> tuple[Part, list[tuple[int, str]]]:
     """Cameras that saw their boards alone, by the known points; and why not the others."""
     mine = data.with_cameras(trained.camera_names)
-    training = TrainingData.of("central", mine, frame, shots_off=False)
-    fitted = place(training, {group.cameras[0]: group for group in groups}, progress)
+    settings = groups[0].bundle.settings
+    training = TrainingData.of("central", mine, frame, settings.rig_model, shots_off=False)
+    fitted = place(training, {group.cameras[0]: group for group in groups}, settings, progress)
     uncalibrated = list(fitted.uncalibrated)
     by_camera = {group.cameras[0]: group for group in groups}
     if not fitted.cameras:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from implicam.calibrators.explicit.lenses import Choice
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.calibrators.explicit.start import MirroredError, start_with_lens
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats
@@ -41,21 +42,20 @@ MAX_ROUNDS = 8
 MAX_MISFIT_RATIO = 2.0
 """Times what was left: a step to more than that was no step towards the optimum."""
 
-PRIOR_RESIDUALS = 2.0
-"""The stated noise counts like so many residuals; so does the noise of all cameras together where none is stated."""
 
-
-def fit_points(training: TrainingData, family: str, progress: Progress) -> tuple[FitResult, dict[int, Choice]]:
+def fit_points(
+    training: TrainingData, family: str, settings: ExplicitSettings, progress: Progress
+) -> tuple[FitResult, dict[int, Choice]]:
     """Fit every camera that can be fitted; and the lens model that each got, by its number."""
     progress("fitting", 0, 3)
     choices: dict[int, Choice] = {}
 
     def start(c: int, points: Floats, uv: Floats) -> InitialCamera:
-        started, choices[c] = start_with_lens(points, uv, training.images[c], family)
+        started, choices[c] = start_with_lens(points, uv, training.images[c], family, settings)
         return started
 
     started, uncalibrated = _started(training, start)
-    fitted = refined(training, started, uncalibrated, progress)
+    fitted = refined(training, started, uncalibrated, settings, progress)
     return fitted, {c: choices[c] for c in fitted.cameras}
 
 
@@ -63,6 +63,7 @@ def refined(
     training: TrainingData,
     started: Mapping[int, InitialCamera],
     uncalibrated: Sequence[tuple[int, str]],
+    settings: ExplicitSettings,
     progress: Progress,
 ) -> FitResult:
     """Cameras from where they start, with the noise that the residuals show and without the views that contradict."""
@@ -80,10 +81,11 @@ def refined(
             for s, k, m in zip(seen, inliers, models, strict=True)
         )
         posterior = _settled(models, training, used, first)
-        noise = _noise(training, posterior, used, stated)
+        noise = _noise(training, posterior, used, stated, settings.noise_prior_residuals)
         close = np.allclose(noise, [m.noise for m in models], rtol=0.01)
         models = with_noise(posterior.models, noise)
-        judged = update_inliers(replace(posterior, models=models), training.points, seen, inliers)
+        limit = settings.max_squared_mahalanobis
+        judged = update_inliers(replace(posterior, models=models), training.points, seen, inliers, limit)
         if close and all((a == b).all() for a, b in zip(judged, inliers, strict=True)):
             break
         if number < MAX_ROUNDS - 1:
@@ -174,10 +176,14 @@ def _first_noise(
     return np.array(noise)
 
 
-def _noise(training: TrainingData, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats) -> Floats:
-    """(C,) the noise of each camera in pixels: the residuals' sum of squares over the degrees of freedom left."""
+def _noise(
+    training: TrainingData, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats, prior: float
+) -> Floats:
+    """(C,) the noise of each camera in pixels: the residuals' sum of squares over the degrees of freedom left.
+
+    prior: so many residuals the stated noise counts like."""
     if training.errors is not None:
-        return _noise_beside_errors(training, posterior, used, stated)
+        return _noise_beside_errors(training, posterior, used, stated, prior)
     squares, freedom = np.zeros(len(used)), np.zeros(len(used))
     for c, seen in enumerate(used):
         model = posterior.models[c]
@@ -190,13 +196,13 @@ def _noise(training: TrainingData, posterior: Posterior, used: tuple[CameraViews
     believed = np.where(told, np.nan_to_num(stated) ** 2, together)
     floor = np.array([1e-6 * model.image.half for model in posterior.models])
     return np.asarray(
-        np.maximum(np.sqrt((squares + PRIOR_RESIDUALS * believed) / (freedom + PRIOR_RESIDUALS)), floor),
+        np.maximum(np.sqrt((squares + prior * believed) / (freedom + prior)), floor),
         dtype=np.float64,
     )
 
 
 def _noise_beside_errors(
-    training: TrainingData, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats
+    training: TrainingData, posterior: Posterior, used: tuple[CameraViews, ...], stated: Floats, prior: float
 ) -> Floats:
     """(C,) where known positions have errors of their own: one factor for all cameras, the most probable one."""
     now = np.array([model.noise for model in posterior.models])
@@ -206,7 +212,7 @@ def _noise_beside_errors(
         models = with_noise(posterior.models, base * np.exp(log_factor))
         return (
             -iterate_linearisation(models, training.points, used, training.errors).evidence
-            + 0.5 * PRIOR_RESIDUALS * log_factor**2
+            + 0.5 * prior * log_factor**2
         )
 
     found = minimize_scalar(loss, bounds=(-3.0, 3.0), method="bounded", options={"xatol": 0.02})

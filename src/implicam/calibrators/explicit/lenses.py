@@ -12,14 +12,12 @@ import numpy as np
 from implicam.errors import FitError, ImplicamError, PartError
 from implicam.geometry import Floats
 from implicam.lenses import LENSES, KannalaBrandt
-from implicam.rig_model import CentralCamera, RigModelSettings
+from implicam.rig_model import CentralCamera
 
 AUTO = "auto"
 
 START_FAMILY = KannalaBrandt.family
 """The family of the cameras that known points and boards give first; the others start from it."""
-
-FOLDS = 5
 
 USUAL_PIXELS = "square"
 """The name of the usual pixels (pixels.py)."""
@@ -50,10 +48,13 @@ def with_lens(camera: CentralCamera, family: str, points: Floats) -> CentralCame
 Made = TypeVar("Made")
 
 
-def choose_lens(family: str, make: Callable[[str], Made], held_out: Callable[[Made], Floats]) -> tuple[Made, Choice]:
+def choose_lens(
+    family: str, make: Callable[[str], Made], held_out: Callable[[Made], Floats], max_medians: float
+) -> tuple[Made, Choice]:
     """The named family, or of all that can be started the one with the least squared errors (n,) at held-out views.
 
-    A view that one of them keeps and another does not (NaN) counts as far off for that one, as `clipped` has it. A
+    A view that one of them keeps and another does not (NaN) counts as far off for that one, as `clipped` has it with
+    max_medians. A
     later family must be better than the first by more than the standard error of the difference: where there is little
     to tell them apart, the first, `START_FAMILY`, is the safer one. One that cannot be started, or whose package fails,
     is left out, with the reason in the choice.
@@ -90,7 +91,7 @@ def choose_lens(family: str, make: Callable[[str], Made], held_out: Callable[[Ma
         except PartError as error:
             dropped[name] = f"{error.what} {error.why}"
     kept = ~np.logical_and.reduce([np.isnan(s) for s in squares.values()])
-    squares = {name: _with_far(s[kept]) for name, s in squares.items()}
+    squares = {name: _with_far(s[kept], max_medians) for name, s in squares.items()}
     best, *others = squares
     for name in others:
         gain = squares[best] - squares[name]
@@ -132,12 +133,12 @@ def dropped_notes(names: Sequence[str], choices: Sequence[Choice]) -> list[str]:
     return notes + [error.what for family, error in LENSES.refused().items() if family not in reasons]
 
 
-def _with_far(squares: Floats) -> Floats:
+def _with_far(squares: Floats, max_medians: float) -> Floats:
     """(n,) squared errors, with NaN replaced by what `clipped` makes of an error that is far off."""
-    return np.where(np.isnan(squares), RigModelSettings.max_start_error_medians**2 * np.nanmedian(squares), squares)
+    return np.where(np.isnan(squares), max_medians**2 * np.nanmedian(squares), squares)
 
 
-def clipped(errors: Floats) -> Floats:
-    """Errors, none of them so far off that it decides alone."""
+def clipped(errors: Floats, max_medians: float) -> Floats:
+    """Errors, none of them so many medians off that it decides alone."""
     errors = np.where(np.isfinite(errors), errors, np.inf)
-    return np.minimum(errors, RigModelSettings.max_start_error_medians * float(np.median(errors)))
+    return np.minimum(errors, max_medians * float(np.median(errors)))

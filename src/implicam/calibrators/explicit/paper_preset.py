@@ -18,6 +18,7 @@ from scipy.special import chdtrc
 from implicam.calibrators.explicit.align import Alignment, check_alignment, extent_ratio, left_out, matched
 from implicam.calibrators.explicit.fitted import WORLD_FRAME, Fitted, by_cameras_of, posterior_of
 from implicam.calibrators.explicit.opencv_pipeline import OpenCVRig
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.dataset import Dataset, Observations, remove_copies
 from implicam.dataset.requirements import match_cameras
 from implicam.dataset.unused import Unused, describe_point_copies, list_copied_points
@@ -31,7 +32,7 @@ PRESETS = (JOINT, PAPER, PAPER_BUNDLE)
 """Ours; the paper's pipeline without a joint adjustment at its end, and with one: the paper does not say which."""
 
 
-def fit_like_the_paper(data: Dataset, rig: OpenCVRig, boards: Dataset, how: str) -> Fitted:
+def fit_like_the_paper(data: Dataset, rig: OpenCVRig, boards: Dataset, how: str, settings: ExplicitSettings) -> Fitted:
     """The cameras of OpenCV in the world of the known points.
 
     Args:
@@ -39,6 +40,7 @@ def fit_like_the_paper(data: Dataset, rig: OpenCVRig, boards: Dataset, how: str)
         rig: the cameras, in the unit of the known points.
         boards: what the rig was calibrated from.
         how: matched with known positions by name (`points`) or by closeness (`icp`).
+        settings: when known points and boards contradict each other.
 
     Raises:
         FitError: the known points do not fix where the rig is, or contradict the boards.
@@ -58,14 +60,14 @@ def fit_like_the_paper(data: Dataset, rig: OpenCVRig, boards: Dataset, how: str)
         )
     known = data.positions.xyz
     measured = np.where(there[:, None], xyz, 0)
-    pose, pairs = matched(measured, known, there, how)
+    pose, pairs = matched(measured, known, there, how, settings)
     residual = measured - pose.apply(known[pairs])
     inflation = _inflation(residual[there], cov[there])
     errors, sds = _left_out(pose, known[pairs][there], residual[there], inflation**2 * cov[there])
     scale = extent_ratio(measured[there], known[pairs][there])
     found = Alignment(pose, there, np.zeros((6, 0)), np.zeros((6, 6)), errors, sds, scale)
     extent = float(np.sqrt(np.sum(known.var(axis=0))))
-    check_alignment(found, residual[there], known[pairs][there], measured[there], extent)
+    check_alignment(found, residual[there], known[pairs][there], measured[there], extent, settings)
     cameras = [_in_frame(camera, pose, frame) for camera in rig.bundle.cameras]
     unused = tuple(
         Unused(str(data.points[i]), reason)

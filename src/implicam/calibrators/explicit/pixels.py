@@ -13,22 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.calibrators.explicit.lenses import USUAL_PIXELS
-from implicam.rig_model import CentralCamera, Image, Prior, RigModelSettings
+from implicam.calibrators.explicit.settings import ExplicitSettings
+from implicam.rig_model import CentralCamera, Image, Prior
 
 ASPECTS = (1.0, 0.5, 0.63, 0.79, 1.26, 1.59, 2.0)
 """Ratios fy / fx that a start tries: the steps of 26 % are close enough for what follows."""
 
-FREE_LOG_ASPECT_SD = 0.35
-"""Prior sd of log(fy / fx) of pixels that need not be square: 0.5 and 2 are two of them away."""
 
-FREE_CENTRE_SD = 0.4
-"""Prior sd of the principal point of a cut-out picture, as a part of the longer side."""
-
-NOISE_PRIOR_MEDIAN, NOISE_PRIOR_LOG_SD = 3e-4, 2.0
-"""Prior of the noise, median in half the longer side and log sd: without it six views would be explained exactly."""
-
-MAX_USUAL_GAIN_NATS = 6.0
-"""The widest prior loses less than so much log evidence to the usual one: then those between are looked at, too."""
+CROPPED = "cropped"
+"""The name of square pixels of a picture that was cut out."""
 
 
 class Pixels(NamedTuple):
@@ -41,28 +34,29 @@ class Pixels(NamedTuple):
     odds: float
 
 
-def square(centre: float = RigModelSettings.centre_prior_sd_sides) -> Pixels:
-    """Square pixels and a lens over the middle of the picture: the usual."""
-    return Pixels(USUAL_PIXELS, RigModelSettings.log_aspect_prior_sd, centre, 1.0)
+def square(settings: ExplicitSettings, widening: float = 1.0) -> Pixels:
+    """Square pixels and a lens over the middle of the picture: the usual. widening: of the prior of the middle."""
+    return Pixels(USUAL_PIXELS, settings.log_aspect_prior_sd, widening * settings.centre_prior_sd_sides, 1.0)
 
 
-def kinds(usual: Pixels) -> tuple[Pixels, ...]:
+def kinds(usual: Pixels, settings: ExplicitSettings) -> tuple[Pixels, ...]:
     """The usual and what else there is; the last allows all."""
+    aspect, centre = settings.stretched_log_aspect_prior_sd, settings.cropped_centre_prior_sd_sides
     return (
         usual,
-        Pixels("stretched", FREE_LOG_ASPECT_SD, usual.centre, 20.0),
-        Pixels("cropped", RigModelSettings.log_aspect_prior_sd, FREE_CENTRE_SD, 20.0),
-        Pixels("any", FREE_LOG_ASPECT_SD, FREE_CENTRE_SD, 50.0),
+        Pixels("stretched", aspect, usual.centre, settings.stretched_odds_ratio),
+        Pixels(CROPPED, usual.aspect, centre, settings.cropped_odds_ratio),
+        Pixels("any", aspect, centre, settings.any_pixels_odds_ratio),
     )
 
 
-def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels) -> Prior:
+def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels, settings: ExplicitSettings) -> Prior:
     """The prior of a camera's lens (eq. (3) of docs/method.md) with this one of its pixels."""
-    usual = camera.prior(image, widest)
+    usual = camera.prior(image, widest, settings)
     mean, precision = usual.mean.copy(), usual.precision.copy()
     lens = camera.lens
     # log(fy / fx) about 0, made linear where the lens is: (fy - fx) over their mean has the same slope
-    typical = lens.fx if pixels.aspect == RigModelSettings.log_aspect_prior_sd else 0.5 * (lens.fx + lens.fy)
+    typical = lens.fx if pixels.name in (USUAL_PIXELS, CROPPED) else 0.5 * (lens.fx + lens.fy)
     precision[:2, :2] = np.array([[1, -1], [-1, 1]]) / (pixels.aspect * typical) ** 2
     precision[2, 2] = precision[3, 3] = 1 / (pixels.centre * 2 * image.half) ** 2
     return Prior(mean, precision)
@@ -73,7 +67,7 @@ def told(name: str, camera: CentralCamera, image: Image, pixels: str) -> list[st
     lens, notes = camera.lens, []
     if pixels in ("stretched", "any"):
         notes.append(f"its pixels are not square, fy / fx = {lens.fy / lens.fx:.4g}")
-    if pixels in ("cropped", "any"):
+    if pixels in (CROPPED, "any"):
         off = np.array([lens.cx, lens.cy]) - image.centre
         notes.append(f"its lens is {off[0]:+.3g}, {off[1]:+.3g} px off the middle of the picture")
     return [f"{name}: {' and '.join(notes)}, as its views clearly say."] if notes else []
@@ -86,6 +80,7 @@ def log_density_at_peak(prior: Prior, camera: CentralCamera, image: Image, pixel
     return float(own + 0.5 * distortion - np.log(pixels.odds))
 
 
-def noise_prior(sd: float, image: Image) -> float:
+def noise_prior(sd: float, image: Image, settings: ExplicitSettings) -> float:
     """Log prior of a noise in pixels."""
-    return float(-0.5 * (np.log(sd / (NOISE_PRIOR_MEDIAN * image.half)) / NOISE_PRIOR_LOG_SD) ** 2)
+    median = settings.noise_prior_median_half_sides * image.half
+    return float(-0.5 * (np.log(sd / median) / settings.noise_prior_log_sd) ** 2)

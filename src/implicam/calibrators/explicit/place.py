@@ -13,7 +13,8 @@ import numpy as np
 
 from implicam.calibrators.explicit.camera_groups import CameraGroup
 from implicam.calibrators.explicit.from_points import refined
-from implicam.calibrators.explicit.start import MAX_MIRRORED_RATIO, MIRROR_FROM_HALF_SIDES, median_pixel_error
+from implicam.calibrators.explicit.settings import ExplicitSettings
+from implicam.calibrators.explicit.start import median_pixel_error
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, poses_from_rays
 from implicam.progress import Progress
@@ -24,7 +25,6 @@ from implicam.rig_model import (
     InitialCamera,
     Posterior,
     Prior,
-    RigModelSettings,
     TrainingData,
     levenberg_marquardt,
 )
@@ -32,20 +32,13 @@ from implicam.rig_model import (
 MIN_POINTS = 4
 """Known points that place a camera whose lens is known: three leave up to four places."""
 
-MIN_RELATIVE_WIDTH = 0.02
-"""Extent of the known points across their longest line, as a part of that: less is a line."""
-
-MAX_ERROR_HALF_SIDES = 0.02
-"""Median error of the best place, in half the longer side of the image, beyond which it is none."""
-
-MAX_SQUARES_AS_GOOD = 9.0
-"""Squared residuals, in the noise, that a second place may have more than the first and be as good."""
-
 RANDOM_SUBSETS = 30
 """Random sets of five points; with a third of the views wrong, four of them are clean."""
 
 
-def place(training: TrainingData, groups: Mapping[int, CameraGroup], progress: Progress) -> FitResult:
+def place(
+    training: TrainingData, groups: Mapping[int, CameraGroup], settings: ExplicitSettings, progress: Progress
+) -> FitResult:
     """The cameras of groups of one camera, by number, placed by the training data; there may be none."""
     stated = training.stated.copy()
     started: dict[int, InitialCamera] = {}
@@ -63,24 +56,25 @@ def place(training: TrainingData, groups: Mapping[int, CameraGroup], progress: P
     if not started:
         none = Hyperparameters(np.ones(2), np.zeros(0), np.zeros(0))
         return FitResult(Posterior((), (), None, (), 0.0), (), tuple(uncalibrated), (), none, None, None)
-    return refined(training, started, uncalibrated, progress)
+    return refined(training, started, uncalibrated, settings, progress)
 
 
 def _placed(group: CameraGroup, points: Floats, uv: Floats) -> InitialCamera:
     """The camera of a group of one, in the place from which it sees points (n, 3) at uv (n, 2)."""
     known, sd, half = group.bundle.cameras[0], float(group.bundle.noise[0]), group.images[0].half
+    settings = group.bundle.settings
     rays, valid = known.lens.ray_from_pixel(uv)
-    _check_spread(points[valid])
+    _check_spread(points[valid], settings)
     prior = _prior(group)
-    found = _best(known, prior, points, uv, rays, valid, sd)
+    found = _best(known, prior, points, uv, rays, valid, sd, settings)
     left = median_pixel_error(found[0][0], points, uv) if found else np.inf
-    if left > max(RigModelSettings.max_start_error_medians * sd, MIRROR_FROM_HALF_SIDES * half):
-        _check_mirror(known, prior, points, uv, rays, valid, sd, left)
+    if left > max(settings.max_start_error_medians * sd, settings.min_mirrored_error_half_sides * half):
+        _check_mirror(known, prior, points, uv, rays, valid, sd, left, settings)
     if not found:
         raise FitError("from no place does its lens see the known points at these pixels.")
     (camera, inliers), *others = found
     error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    if not np.median(error) < MAX_ERROR_HALF_SIDES * half or inliers.sum() < MIN_POINTS:
+    if not np.median(error) < settings.max_place_error_half_sides * half or inliers.sum() < MIN_POINTS:
         raise FitError(
             f"with the lens from its boards, the known points are left {np.median(error):.3g} px off: they are not "
             "where they are said to be, or its pictures are of another size or another zoom."
@@ -89,7 +83,7 @@ def _placed(group: CameraGroup, points: Floats, uv: Floats) -> InitialCamera:
     for other, _ in others:
         more = np.sum((other.pixel(points[inliers]) - uv[inliers]) ** 2) - np.sum(error[inliers] ** 2)
         apart = np.linalg.norm(other.pose.centre - camera.pose.centre) / np.linalg.norm(camera.pose.translation)
-        if more < MAX_SQUARES_AS_GOOD * usual**2 and apart > 0.02:
+        if more < settings.max_second_place_chi_squared * usual**2 and apart > 0.02:
             raise FitError(
                 f"its {int(inliers.sum())} known points place it in two ways: show it more, spread out in depth."
             )
@@ -97,26 +91,34 @@ def _placed(group: CameraGroup, points: Floats, uv: Floats) -> InitialCamera:
 
 
 def _check_mirror(
-    known: CentralCamera, prior: Prior, points: Floats, uv: Floats, rays: Floats, valid: Bools, sd: float, left: float
+    known: CentralCamera,
+    prior: Prior,
+    points: Floats,
+    uv: Floats,
+    rays: Floats,
+    valid: Bools,
+    sd: float,
+    left: float,
+    settings: ExplicitSettings,
 ) -> None:
     """FitError where known points seen in a mirror would fit."""
     other = points * np.array([1.0, 1.0, -1.0])
-    found = _best(known, prior, other, uv, rays, valid, sd)
+    found = _best(known, prior, other, uv, rays, valid, sd, settings)
     mirrored = median_pixel_error(found[0][0], other, uv) if found else np.inf
-    if mirrored < MAX_MIRRORED_RATIO * left:
+    if mirrored < settings.max_mirrored_ratio * left:
         raise FitError(
             f"it sees the known points as in a mirror: as they are {left:.3g} px are left, mirrored {mirrored:.2g} px. "
             "Are its pictures flipped, or is v counted from below, or are the known positions left-handed?"
         )
 
 
-def _check_spread(points: Floats) -> None:
+def _check_spread(points: Floats, settings: ExplicitSettings) -> None:
     if len(points) < MIN_POINTS:
         raise FitError(
             f"{len(points)} known points are seen; with the lens from its boards it takes {MIN_POINTS} to place it."
         )
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if extents[1] < MIN_RELATIVE_WIDTH * extents[0]:
+    if extents[1] < settings.min_width_ratio * extents[0]:
         raise FitError(f"its {len(points)} known points lie on one line, which does not place it.")
 
 
@@ -132,14 +134,23 @@ def _prior(group: CameraGroup) -> Prior:
 
 
 def _best(
-    known: CentralCamera, prior: Prior, points: Floats, uv: Floats, rays: Floats, valid: Bools, sd: float
+    known: CentralCamera,
+    prior: Prior,
+    points: Floats,
+    uv: Floats,
+    rays: Floats,
+    valid: Bools,
+    sd: float,
+    settings: ExplicitSettings,
 ) -> list[tuple[CentralCamera, Bools]]:
     """Places, the best first, and the views (n,) that agree with each: from all points, and from a few of them where
     all do not agree."""
-    found = [_refined(replace(known, pose=pose), prior, points, uv, valid, sd) for pose in _poses(points, rays, valid)]
+    most = settings.max_start_error_medians
+    starts = _poses(points, rays, valid)
+    found = [_refined(replace(known, pose=pose), prior, points, uv, valid, sd, most) for pose in starts]
     off = min((median_pixel_error(camera, points, uv) for camera, _ in found), default=np.inf)
     good = np.flatnonzero(valid)
-    if off > RigModelSettings.max_start_error_medians * sd and len(good) > MIN_POINTS + 1:
+    if off > most * sd and len(good) > MIN_POINTS + 1:
         rng = np.random.default_rng(0)
         some = np.zeros(len(points), dtype=np.bool_)
         for _ in range(RANDOM_SUBSETS):
@@ -150,7 +161,7 @@ def _best(
                 error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
                 near = valid & (error <= np.nanquantile(error, 0.6))
                 if near.sum() >= MIN_POINTS:
-                    found.append(_refined(camera, prior, points, uv, np.asarray(near), sd))
+                    found.append(_refined(camera, prior, points, uv, np.asarray(near), sd, most))
     return sorted(found, key=lambda one: median_pixel_error(one[0], points, uv))
 
 
@@ -159,9 +170,10 @@ def _poses(points: Floats, rays: Floats, some: Bools) -> list[Pose]:
 
 
 def _refined(
-    camera: CentralCamera, prior: Prior, points: Floats, uv: Floats, inliers: Bools, sd: float
+    camera: CentralCamera, prior: Prior, points: Floats, uv: Floats, inliers: Bools, sd: float, most: float
 ) -> tuple[CentralCamera, Bools]:
-    """Levenberg-Marquardt on the views kept, and again without those far off the others."""
+    """Levenberg-Marquardt on the views kept, and again without those that are off more than `most` times the
+    others."""
     for _ in range(4):
         usual = max(sd, median_pixel_error(camera, points[inliers], uv[inliers]))
         if not np.isfinite(usual):
@@ -171,7 +183,7 @@ def _refined(
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         typical = max(float(np.median(error[inliers])), sd)
-        inside = np.asarray(error <= RigModelSettings.max_start_error_medians * typical)
+        inside = np.asarray(error <= most * typical)
         if inside.sum() < MIN_POINTS or (inside == inliers).all():
             break
         inliers = inside

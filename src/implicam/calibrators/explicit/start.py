@@ -14,7 +14,6 @@ import numpy as np
 from implicam.calibrators.explicit.lenses import START_FAMILY, Choice, angles, choose_lens, clipped, with_lens
 from implicam.calibrators.explicit.pixels import (
     ASPECTS,
-    MAX_USUAL_GAIN_NATS,
     Pixels,
     kinds,
     log_density_at_peak,
@@ -22,6 +21,7 @@ from implicam.calibrators.explicit.pixels import (
     prior_of,
     square,
 )
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, resect_any_pixels
 from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
@@ -30,23 +30,8 @@ from implicam.rig_model import (
     CentralCamera,
     Image,
     InitialCamera,
-    RigModelSettings,
     levenberg_marquardt,
 )
-
-CENTRE_PRIOR_WIDENING = 5.0
-"""How many times wider the prior of the principal point is here than in forward-gp, whose field can make up for it."""
-
-FOLDS = 5
-
-MAX_LACKING_NATS = 100.0
-"""Log evidence that a kind of pixels may lack from one start and still be looked at from others."""
-
-MAX_MIRRORED_RATIO = 0.3
-"""A mirrored picture leaves less than this part of what the picture as it is leaves: then it is mirrored."""
-
-MIRROR_FROM_HALF_SIDES = 2e-3
-"""Median error of a start, in half the longer side, above which the pictures may be mirrored."""
 
 
 class MirroredError(FitError):
@@ -65,79 +50,94 @@ class _Candidate(NamedTuple):
         return self.started.inliers
 
 
-def start_with_lens(points: Floats, uv: Floats, image: Image, family: str) -> tuple[InitialCamera, Choice]:
+class Scene(NamedTuple):
+    """What one camera saw: known points (n, 3) at pixels uv (n, 2) of an image; settings: what is usual."""
+
+    points: Floats
+    uv: Floats
+    image: Image
+    settings: ExplicitSettings
+
+    def select(self, some: Bools) -> Scene:
+        """Some of the points."""
+        return self._replace(points=self.points[some], uv=self.uv[some])
+
+
+def start_with_lens(
+    points: Floats, uv: Floats, image: Image, family: str, settings: ExplicitSettings
+) -> tuple[InitialCamera, Choice]:
     """A camera from known points (n, 3), all seen at uv (n, 2), its lens model and pixels; FitError where they do not
     fix one, MirroredError where a mirrored camera would see them so."""
     if len(points) < MIN_POINTS_PER_CAMERA:
         raise FitError(f"{len(points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
-    first = _resected(points, uv, image)
-    _check_mirror(first, points, uv, image)
-    tried = _with_pixels([first], points, uv, image)
+    scene = Scene(points, uv, image, settings)
+    first = _resected(scene)
+    _check_mirror(first, scene)
+    tried = _with_pixels([first], scene)
 
     def with_family(name: str) -> _Candidate:
         if name == START_FAMILY:
             return tried[0]
         starts = [one._replace(camera=with_lens(one.camera, name, points[one.inliers])) for one in tried]
-        return _with_pixels(starts, points, uv, image)[0]
+        return _with_pixels(starts, scene)[0]
 
-    found, choice = choose_lens(family, with_family, lambda one: _held_out(one.started, points, uv, image))
+    found, choice = choose_lens(
+        family, with_family, lambda one: _held_out(one.started, scene), settings.max_start_error_medians
+    )
     return found.started, choice._replace(pixels=found.pixels.name)
 
 
-def _resected(points: Floats, uv: Floats, image: Image) -> _Candidate:
+def _resected(scene: Scene) -> _Candidate:
     """The ladder's best, refined with the usual pixels where they fit, and with any where they do not."""
-    found, aspect = resect_any_pixels(points, uv, middle=image.centre, aspects=ASPECTS)
+    image, usual = scene.image, square(scene.settings)
+    found, aspect = resect_any_pixels(scene.points, scene.uv, middle=image.centre, aspects=ASPECTS)
     k = PERSPECTIVE_K if found.pinhole else np.zeros(4)
     lens = KannalaBrandt(found.focal, found.focal * aspect, *image.centre.tolist(), *k.tolist())
-    pixels = square() if aspect == 1 else kinds(square())[1]
-    return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.inliers, points, uv, image, 1e-3)
+    pixels = usual if aspect == 1 else kinds(usual, scene.settings)[1]
+    return _refined(CentralCamera(lens, found.camera_from_world), pixels, found.inliers, scene, 1e-3)
 
 
-def _with_pixels(starts: Sequence[_Candidate], points: Floats, uv: Floats, image: Image) -> list[_Candidate]:
+def _with_pixels(starts: Sequence[_Candidate], scene: Scene) -> list[_Candidate]:
     """The cameras refined with each prior of their pixels that may be right, the most probable one first; one alone
     where the usual one is clearly right."""
-    usual, *between, widest = kinds(square(CENTRE_PRIOR_WIDENING * RigModelSettings.centre_prior_sd_sides))
+    settings = scene.settings
+    usual, *between, widest = kinds(square(settings, settings.centre_prior_widening_ratio), settings)
 
     def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
-        return _refined(start.camera, pixels, start.inliers, points, uv, image)
+        return _refined(start.camera, pixels, start.inliers, scene)
 
     found = [fitted(usual, starts[0]), fitted(widest, starts[0])]
-    simple, free = _evidence(found, points, uv, image)
-    if free < simple - MAX_USUAL_GAIN_NATS:
+    simple, free = _evidence(found, scene)
+    if free < simple - settings.max_usual_gain_nats:
         return found[:1]
     found = [found[0], *(fitted(pixels, starts[0]) for pixels in between), found[1]]
-    evidence = _evidence(found, points, uv, image)
+    evidence = _evidence(found, scene)
     best = found[int(np.argmax(evidence))]
-    found = [one for one, log in zip(found, evidence, strict=True) if log > max(evidence) - MAX_LACKING_NATS]
+    found = [one for one, log in zip(found, evidence, strict=True) if log > max(evidence) - settings.max_lacking_nats]
     for i, one in enumerate(found):  # an unusual lens has optima that are not the best
         others = [start for start in (best, *starts[1:]) if start is not one]
         tries = [one, *(fitted(one.pixels, start) for start in others)]
-        found[i] = tries[int(np.argmax(_evidence(tries, points, uv, image)))]
-    order = np.argsort(_evidence(found, points, uv, image), kind="stable")[::-1]
+        found[i] = tries[int(np.argmax(_evidence(tries, scene)))]
+    order = np.argsort(_evidence(found, scene), kind="stable")[::-1]
     return [found[i] for i in order]
 
 
 def _refined(
-    camera: CentralCamera,
-    pixels: Pixels,
-    inliers: Bools,
-    points: Floats,
-    uv: Floats,
-    image: Image,
-    first: float | None = None,
+    camera: CentralCamera, pixels: Pixels, inliers: Bools, scene: Scene, first: float | None = None
 ) -> _Candidate:
     """Levenberg-Marquardt on the views kept, and again with those it brings back or shows to be wrong; first: the noise
     to begin with in half the longer side, where the start is rough."""
-    sd = _sd(camera, points[inliers], uv[inliers], image) if first is None else first * image.half
+    points, uv, image, settings = scene
+    sd = _sd(camera, scene.select(inliers)) if first is None else first * image.half
     for _ in range(4):
         widest = float(angles(camera, points[inliers]).max())
-        prior = prior_of(camera, image, widest, pixels)
+        prior = prior_of(camera, image, widest, pixels, settings)
         fitted = levenberg_marquardt(camera, prior, points[inliers], uv[inliers], sd)
         assert isinstance(fitted, CentralCamera)
         camera = fitted
         error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
         sd = max(float(np.median(error[inliers])), 1e-5 * image.half)
-        limit = RigModelSettings.max_start_error_medians * float(np.median(error[inliers]))
+        limit = settings.max_start_error_medians * float(np.median(error[inliers]))
         inside = np.asarray(error <= max(limit, 1e-4 * image.half))
         if inside.sum() < MIN_POINTS_PER_CAMERA or (inside == inliers).all():
             break
@@ -145,17 +145,18 @@ def _refined(
     return _Candidate(InitialCamera(camera, prior, inliers), camera, pixels)
 
 
-def _evidence(found: list[_Candidate], points: Floats, uv: Floats, image: Image) -> list[float]:
+def _evidence(found: list[_Candidate], scene: Scene) -> list[float]:
     """Log marginal likelihood of each, by Laplace's method at its best noise, on the views that all of them keep."""
     common = np.logical_and.reduce([one.inliers for one in found])
     if common.sum() < MIN_POINTS_PER_CAMERA:
         common = found[-1].inliers
-    return [_log_evidence(one, points[common], uv[common], image) for one in found]
+    return [_log_evidence(one, scene.select(common)) for one in found]
 
 
-def _log_evidence(one: _Candidate, points: Floats, uv: Floats, image: Image) -> float:
+def _log_evidence(one: _Candidate, scene: Scene) -> float:
+    points, uv, image, settings = scene
     camera, prior = one.camera, one.started.prior
-    sd = _sd(camera, points, uv, image)
+    sd = _sd(camera, scene)
     for _ in range(3):
         fitted = levenberg_marquardt(camera, prior, points, uv, sd)
         assert isinstance(fitted, CentralCamera)
@@ -175,22 +176,23 @@ def _log_evidence(one: _Candidate, points: Floats, uv: Floats, image: Image) -> 
     off = prior.mean - camera.parameters
     determinant = np.linalg.slogdet(normal * scale[:, None] * scale)[1] - 2 * np.sum(np.log(scale))
     likelihood = -J.shape[0] * np.log(sd) - 0.5 * squares / sd**2 - 0.5 * float(off @ prior.precision @ off)
-    before = log_density_at_peak(prior, camera, image, one.pixels) + noise_prior(sd, image)
+    before = log_density_at_peak(prior, camera, image, one.pixels) + noise_prior(sd, image, settings)
     return float(likelihood - 0.5 * determinant + before)
 
 
-def _check_mirror(found: _Candidate, points: Floats, uv: Floats, image: Image) -> None:
+def _check_mirror(found: _Candidate, scene: Scene) -> None:
     """MirroredError where the picture turned left to right fits far better than it does as it is."""
+    points, uv, image, settings = scene
     left = median_pixel_error(found.camera, points, uv)
-    if left < MIRROR_FROM_HALF_SIDES * image.half:
+    if left < settings.min_mirrored_error_half_sides * image.half:
         return
     turned = np.column_stack([2 * image.centre[0] - uv[:, 0], uv[:, 1]])
     try:
-        other = _resected(points, turned, image)
+        other = _resected(scene._replace(uv=turned))
     except FitError:
         return
     mirrored = median_pixel_error(other.camera, points, turned)
-    if mirrored < MAX_MIRRORED_RATIO * left:
+    if mirrored < settings.max_mirrored_ratio * left:
         raise MirroredError(
             f"its pictures are mirrored, or the known positions are: as they are {left:.3g} px are left, mirrored "
             f"{mirrored:.2g} px."
@@ -204,23 +206,24 @@ def median_pixel_error(camera: CentralCamera, points: Floats, uv: Floats) -> flo
     return float(np.median(np.where(np.isfinite(error), error, np.inf)))
 
 
-def _sd(camera: CentralCamera, points: Floats, uv: Floats, image: Image) -> float:
-    error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
-    return max(float(np.nanmedian(error)), 1e-5 * image.half)
+def _sd(camera: CentralCamera, scene: Scene) -> float:
+    error = np.linalg.norm(camera.pixel(scene.points) - scene.uv, axis=1)
+    return max(float(np.nanmedian(error)), 1e-5 * scene.image.half)
 
 
-def _held_out(started: InitialCamera, points: Floats, uv: Floats, image: Image) -> Floats:
-    """(n,) squared errors of views in `FOLDS` random folds, each predicted from the others; far ones count little, and
-    views that the camera could not keep are NaN."""
-    squares = np.full(len(points), np.nan)
-    points, uv = points[started.inliers], uv[started.inliers]
+def _held_out(started: InitialCamera, scene: Scene) -> Floats:
+    """(n,) squared errors of views in random folds, each predicted from the others; far ones count little, and views
+    that the camera could not keep are NaN."""
+    squares, folds = np.full(len(scene.points), np.nan), scene.settings.point_folds
+    kept = scene.select(started.inliers)
+    points, uv = kept.points, kept.uv
     assert isinstance(started.camera, CentralCamera)
-    sd = _sd(started.camera, points, uv, image)
-    fold = np.random.default_rng(0).permutation(np.arange(len(points)) % FOLDS)
+    sd = _sd(started.camera, kept)
+    fold = np.random.default_rng(0).permutation(np.arange(len(points)) % folds)
     errors = np.full(len(points), np.inf)
-    for k in range(FOLDS):
+    for k in range(folds):
         others = fold != k
         camera = levenberg_marquardt(started.camera, started.prior, points[others], uv[others], sd)
         errors[~others] = np.linalg.norm(camera.pixel(points[~others]) - uv[~others], axis=1)
-    squares[started.inliers] = clipped(errors) ** 2
+    squares[started.inliers] = clipped(errors, scene.settings.max_start_error_medians) ** 2
     return squares

@@ -23,11 +23,10 @@ from implicam.calibrators.explicit.adjust import (
     log_marginal,
     spreads,
 )
-from implicam.calibrators.explicit.boards import MIN_CORNERS, BoardView, renumbered
+from implicam.calibrators.explicit.boards import BoardView, renumbered
 from implicam.calibrators.explicit.lenses import START_FAMILY, Choice, angles, choose_lens, clipped, with_lens
 from implicam.calibrators.explicit.pixels import (
     ASPECTS,
-    MAX_USUAL_GAIN_NATS,
     Pixels,
     kinds,
     log_density_at_peak,
@@ -35,24 +34,11 @@ from implicam.calibrators.explicit.pixels import (
     prior_of,
     square,
 )
+from implicam.calibrators.explicit.settings import DEFAULT_SETTINGS, ExplicitSettings
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose, candidate_rays, rotation_from_vector
 from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
 from implicam.rig_model import CentralCamera, Image, Prior
-
-MAX_BOARDS_FOR_LENS = 30
-"""Boards that the lens is looked for with; the adjustment has them all."""
-
-MAX_BOARDS_FOR_PIXELS = 6
-"""Boards that the shape of the pixels is first looked for with."""
-
-MAX_START_ERROR_HALF_SIDES = 0.03
-"""Median error of a start, in half the longer side of the image, beyond which it is none."""
-
-FOLDS = 3
-
-MAX_BOARD_ERROR_RATIO = 4.0
-"""Median error of a board, in the camera's usual residual, beyond which its pose is looked for again."""
 
 RANDOM_SUBSETS = 40
 """Random sets of eight corners; with a fifth of the corners wrong, seven of them are clean."""
@@ -65,7 +51,7 @@ class OneCamera(NamedTuple):
     camera: CentralCamera
     boards: Placed
     noise: float
-    pixels: Pixels = square()
+    pixels: Pixels
 
 
 class _Candidate(NamedTuple):
@@ -77,12 +63,14 @@ class _Candidate(NamedTuple):
         return self.adjusted.bundle
 
 
-def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> tuple[OneCamera, Choice]:
+def calibrate_camera(
+    views: Sequence[BoardView], image: Image, family: str, settings: ExplicitSettings = DEFAULT_SETTINGS
+) -> tuple[OneCamera, Choice]:
     """From the views of one camera, and the lens model it got. FitError where the boards do not fix a lens."""
     own, _ = renumbered([replace(view, camera=0) for view in views])
-    first = _with_pixels(_starts(own, image), Views(own, 1), image)
+    first = _with_pixels(_starts(own, image, settings), Views(own, 1), image, settings)
     left = float(spreads(first.bundle)[0])
-    if not left < MAX_START_ERROR_HALF_SIDES * image.half:
+    if not left < settings.max_board_start_error_half_sides * image.half:
         raise FitError(
             f"no lens explains the corners of its {len(own)} boards: the best of all fits leaves {left:.3g} px.",
             fix="look at the overlays of its pictures (detections/), and take out those with wrong corners",
@@ -92,23 +80,27 @@ def calibrate_camera(views: Sequence[BoardView], image: Image, family: str) -> t
         if name == START_FAMILY:
             return first
         camera = with_lens(first.bundle.cameras[0], name, first.bundle.corners(0))
-        return _with_pixels([(camera, first.bundle.boards)], first.bundle.views, image)
+        return _with_pixels([(camera, first.bundle.boards)], first.bundle.views, image, settings)
 
-    found, choice = choose_lens(family, with_family, lambda one: _held_out(one.adjusted))
+    found, choice = choose_lens(
+        family, with_family, lambda one: _held_out(one.adjusted), settings.max_start_error_medians
+    )
     one = OneCamera(found.bundle.cameras[0], found.bundle.boards, float(spreads(found.bundle)[0]), pixels=found.pixels)
     return one, choice._replace(pixels=found.pixels.name)
 
 
-def _with_pixels(starts: Sequence[tuple[CentralCamera, Placed]], views: Views, image: Image) -> _Candidate:
+def _with_pixels(
+    starts: Sequence[tuple[CentralCamera, Placed]], views: Views, image: Image, settings: ExplicitSettings
+) -> _Candidate:
     """Adjusted with each prior of the pixels that may be right, and of these the most probable one. starts: with square
     pixels, and with others where they fit better."""
-    usual, *between, widest = kinds(square())
+    usual, *between, widest = kinds(square(settings), settings)
 
     def fitted(pixels: Pixels, camera: CentralCamera, boards: Placed) -> _Candidate:
-        found = _adjusted(camera, boards, views, image, pixels)
+        found = _adjusted(camera, boards, views, image, pixels, settings)
         better = placed_again(found.bundle)
         if better is not None:
-            found = _adjusted(better.cameras[0], better.boards, better.views, image, pixels)
+            found = _adjusted(better.cameras[0], better.boards, better.views, image, pixels, settings)
         return _Candidate(found, pixels)
 
     def evidence(one: _Candidate) -> float:
@@ -117,9 +109,9 @@ def _with_pixels(starts: Sequence[tuple[CentralCamera, Placed]], views: Views, i
     simple = fitted(usual, *starts[0])
     camera = simple.bundle.cameras[0]
     if len(starts) == 1:  # two steps tell whether there is anything to gain
-        prior = prior_of(camera, image, _widest(simple.bundle), widest)
+        prior = prior_of(camera, image, _widest(simple.bundle), widest, settings)
         nearly = adjust(replace(simple.bundle, priors=(prior,)), iterations=2)
-        if evidence(_Candidate(nearly, widest)) < evidence(simple) - MAX_USUAL_GAIN_NATS:
+        if evidence(_Candidate(nearly, widest)) < evidence(simple) - settings.max_usual_gain_nats:
             return simple
     free = fitted(widest, *[(camera, simple.bundle.boards), *starts[1:]][-1])
     start = (free.bundle.cameras[0], free.bundle.boards)
@@ -132,18 +124,22 @@ def log_evidence(bundle: Bundle, image: Image, pixels: Pixels) -> float:
     noise = max(float(spreads(bundle)[0]), 1e-5 * image.half)
     corners = len(bundle.views.stacks[0].uv)
     likelihood = -2 * corners * np.log(noise) + log_marginal(replace(bundle, noise=np.array([noise])))
-    before = log_density_at_peak(bundle.priors[0], bundle.cameras[0], image, pixels) + noise_prior(noise, image)
+    before = log_density_at_peak(bundle.priors[0], bundle.cameras[0], image, pixels) + noise_prior(
+        noise, image, bundle.settings
+    )
     return float(likelihood + before)
 
 
-def _starts(views: Sequence[BoardView], image: Image) -> list[tuple[CentralCamera, Placed]]:
+def _starts(views: Sequence[BoardView], image: Image, settings: ExplicitSettings) -> list[tuple[CentralCamera, Placed]]:
     """A start with square pixels; and one with others, where they fit better."""
-    some = sorted(views, key=lambda view: -len(view.rows))[:MAX_BOARDS_FOR_PIXELS]
-    best = min(ASPECTS, key=lambda aspect: _start(some, image, aspect)[0])
-    return [_start(views, image, aspect)[1] for aspect in dict.fromkeys((1.0, best))]
+    some = sorted(views, key=lambda view: -len(view.rows))[: settings.max_boards_for_pixels]
+    best = min(ASPECTS, key=lambda aspect: _start(some, image, aspect, settings)[0])
+    return [_start(views, image, aspect, settings)[1] for aspect in dict.fromkeys((1.0, best))]
 
 
-def _start(views: Sequence[BoardView], image: Image, aspect: float) -> tuple[float, tuple[CentralCamera, Placed]]:
+def _start(
+    views: Sequence[BoardView], image: Image, aspect: float, settings: ExplicitSettings
+) -> tuple[float, tuple[CentralCamera, Placed]]:
     """The rung of the ladder that fits the boards best for pixels with this fy / fx, and the poses camera_from_board
     that go with it; before it, the squared errors that are left."""
     offsets = [(view.uv - image.centre) / np.array([1.0, aspect]) for view in views]
@@ -154,7 +150,7 @@ def _start(views: Sequence[BoardView], image: Image, aspect: float) -> tuple[flo
         return focal, pinhole, rays[:, :-1]
 
     total: Floats | float = 0.0
-    for i in sorted(range(len(views)), key=lambda i: -len(views[i].rows))[:MAX_BOARDS_FOR_LENS]:
+    for i in sorted(range(len(views)), key=lambda i: -len(views[i].rows))[: settings.max_boards_for_lens]:
         focal, pinhole, rays = ladder(offsets[i])
         _, errors = planar_poses(views[i].xyz[:, :2], rays, focal)
         total = total + np.sum(np.minimum(errors, 3 * np.median(errors, axis=1, keepdims=True)) ** 2, axis=1)
@@ -162,7 +158,7 @@ def _start(views: Sequence[BoardView], image: Image, aspect: float) -> tuple[flo
     k = PERSPECTIVE_K if pinhole[best] else np.zeros(4)
     lens = KannalaBrandt(float(focal[best]), float(focal[best] * aspect), *image.centre.tolist(), *k.tolist())
     poses = [
-        _trimmed_pose(view.xyz[:, :2], ladder(offset)[2][best], float(focal[best]))
+        _trimmed_pose(view.xyz[:, :2], ladder(offset)[2][best], float(focal[best]), settings.min_corners)
         for view, offset in zip(views, offsets, strict=True)
     ]
     left = float(np.ravel(total)[best]) * aspect  # no ratio may win by making pixels large
@@ -194,15 +190,16 @@ def planar_poses(flat: Floats, rays: Floats, focal: Floats) -> tuple[list[Pose],
     return [Pose(r, t) for r, t in zip(rotations, translations, strict=True)], np.asarray(errors, dtype=np.float64)
 
 
-def _trimmed_pose(flat: Floats, rays: Floats, focal: float) -> Pose:
-    """camera_from_board from rays (n, 3) of one lens, some of which may be wrong: those far off are left out."""
+def _trimmed_pose(flat: Floats, rays: Floats, focal: float, least: int) -> Pose:
+    """camera_from_board from rays (n, 3) of one lens, some of which may be wrong: those far off are left
+    out, while `least` stay."""
     keep, lens = np.ones(len(flat), dtype=np.bool_), np.array([focal])
     for _ in range(3):
         poses, _ = planar_poses(flat[keep], rays[None, keep], lens)
         there = poses[0].apply(np.column_stack([flat, np.zeros(len(flat))]))
         off = np.arccos(np.clip(np.sum(there * rays, axis=1) / np.linalg.norm(there, axis=1), -1, 1))
         inside = off <= 3 * np.median(off)
-        if inside.sum() < MIN_CORNERS or (inside == keep).all():
+        if inside.sum() < least or (inside == keep).all():
             break
         keep = inside
     return poses[0]
@@ -215,21 +212,22 @@ def placed_again(bundle: Bundle) -> Bundle | None:
     rotation, translation, changed = bundle.boards.rotation.copy(), bundle.boards.translation.copy(), False
     for (k, rows), view in zip(bundle.views.stacks[0].sections, bundle.views.each, strict=True):
         now = float(np.median(lengths[rows]))
-        if now <= MAX_BOARD_ERROR_RATIO * usual:
+        if now <= bundle.settings.max_board_error_ratio * usual:
             continue
-        pose, error = _best_pose(bundle.cameras[0], view, bundle.boards.pose(k), float(bundle.noise[0]))
+        pose, error = _best_pose(bundle, view, bundle.boards.pose(k))
         if error < 0.5 * now:
             rotation[k], translation[k], changed = pose.rotation, pose.translation, True
     return replace(bundle, boards=Placed(rotation, translation)) if changed else None
 
 
-def _best_pose(camera: CentralCamera, view: BoardView, now: Pose, noise: float) -> tuple[Pose, float]:
+def _best_pose(bundle: Bundle, view: BoardView, now: Pose) -> tuple[Pose, float]:
     """The better of both, and its median error in pixels."""
+    camera = bundle.cameras[0]
 
     def error(pose: Pose) -> float:
         return median_error(camera, view, pose)
 
-    best = min(pose_and_mirror(camera, view, now, noise), key=error)
+    best = min(pose_and_mirror(camera, view, now, float(bundle.noise[0]), bundle.settings), key=error)
     return best, error(best)
 
 
@@ -239,7 +237,9 @@ def median_error(camera: CentralCamera, view: BoardView, pose: Pose) -> float:
     return float(np.median(np.nan_to_num(off, nan=np.inf)))
 
 
-def pose_and_mirror(camera: CentralCamera, view: BoardView, now: Pose, noise: float) -> list[Pose]:
+def pose_and_mirror(
+    camera: CentralCamera, view: BoardView, now: Pose, noise: float, settings: ExplicitSettings
+) -> list[Pose]:
     """The best pose from random corners (RANSAC) or the present one, and that with the tilt the other way; refined."""
     rng = np.random.default_rng(0)
     rays, valid = camera.lens.ray_from_pixel(view.uv)
@@ -253,7 +253,7 @@ def pose_and_mirror(camera: CentralCamera, view: BoardView, now: Pose, noise: fl
     prior = Prior(np.zeros(camera.size), np.zeros((camera.size, camera.size)))
     refined = []
     for start in (best, _mirrored(best, view.xyz.mean(axis=0))):
-        bundle = Bundle((camera,), (prior,), Placed.of([start]), only, np.array([noise]), held=True)
+        bundle = Bundle((camera,), (prior,), Placed.of([start]), only, np.array([noise]), True, settings=settings)
         refined.append(adjust(bundle).bundle.boards.pose(0))
     return refined
 
@@ -278,26 +278,29 @@ def _widest(bundle: Bundle) -> float:
     return min(float(np.quantile(angles(bundle.cameras[0], bundle.corners(0)), 0.98)), 3.0)
 
 
-def _adjusted(camera: CentralCamera, boards: Placed, views: Views, image: Image, pixels: Pixels) -> Adjusted:
+def _adjusted(
+    camera: CentralCamera, boards: Placed, views: Views, image: Image, pixels: Pixels, settings: ExplicitSettings
+) -> Adjusted:
     """Lens and poses of the boards, refined."""
-    bundle = Bundle((camera,), (camera.prior(image, 1.0),), boards, views, np.ones(1))
-    prior = prior_of(camera, image, _widest(bundle), pixels)
+    first = camera.prior(image, 1.0, settings)
+    bundle = Bundle((camera,), (first,), boards, views, np.ones(1), settings=settings)
+    prior = prior_of(camera, image, _widest(bundle), pixels, settings)
     return adjust_in_steps(replace(bundle, priors=(prior,)), np.array([image.half]))
 
 
 def _held_out(adjusted: Adjusted) -> Floats:
-    """(n,) squared errors of corners: a third of the boards held out in turn, the lens from the others, and a pose from
+    """(n,) squared errors of corners: a part of the boards held out in turn, the lens from the others, and a pose from
     every second corner."""
     bundle = adjusted.bundle
-    views, count = bundle.views.each, len(bundle.boards.translation)
-    fold = np.random.default_rng(0).permutation(np.arange(count) % min(FOLDS, count))
+    views, count, folds = bundle.views.each, len(bundle.boards.translation), bundle.settings.board_folds
+    fold = np.random.default_rng(0).permutation(np.arange(count) % min(folds, count))
     errors = []
-    for k in range(min(FOLDS, count)):
+    for k in range(min(folds, count)):
         train, boards = renumbered([view for view in views if fold[view.board] != k])
         kept = Placed(bundle.boards.rotation[boards], bundle.boards.translation[boards])
         camera = adjust(replace(bundle, views=Views(train, 1), boards=kept), iterations=15).bundle.cameras[0]
         errors.append(_of_placed_boards(replace(bundle, cameras=(camera,)), [v for v in views if fold[v.board] == k]))
-    return clipped(np.concatenate(errors)) ** 2
+    return clipped(np.concatenate(errors), bundle.settings.max_start_error_medians) ** 2
 
 
 def _of_placed_boards(bundle: Bundle, views: Sequence[BoardView]) -> Floats:

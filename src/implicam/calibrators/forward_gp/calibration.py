@@ -74,11 +74,7 @@ class ForwardGP(CalibratorBase):
                 why=f"it has one model for all lenses; {', '.join(LENSES)} are lenses of explicit",
                 fix=f"choose one of {', '.join(LENS_OPTIONS)}, or write --method explicit --lens NAME",
             )
-        if not isinstance(self.settings, ForwardGPSettings):
-            raise UsageError(
-                f"the settings of forward-gp are a ForwardGPSettings, and not a {type(self.settings).__name__}.",
-                fix="ForwardGP(settings=ForwardGPSettings(max_squared_mahalanobis=30.0))",
-            )
+        super().__post_init__()
 
     @classmethod
     def variants(cls) -> dict[str, dict[str, Any]]:
@@ -251,16 +247,13 @@ class ForwardGPCalibration(RigCalibration):
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The options with all settings; and per camera lens, field, weights and covariance, in the working frame."""
         table, arrays = saved.state(self.fitted, self.data.observations.camera_names)
-        options = {"lens": self.calibrator.lens, "seed": self.calibrator.seed}
-        settings = {"settings": self.calibrator.settings.as_table()}
-        return options | table | settings, arrays | {"frame": self.frame.as_array()}
+        return self.calibrator.as_table() | table, arrays | {"frame": self.frame.as_array()}
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ForwardGPCalibration:
         """Restore a calibration; nothing is computed again."""
-        settings = ForwardGPSettings.from_table(table.get("settings", {}))  # files had none before there were settings
-        calibrator = ForwardGP(str(table["lens"]), int(table["seed"]), settings)
+        calibrator = ForwardGP.from_table(table)
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = remove_copies(data)
-        fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, settings)
+        fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, calibrator.settings)
         return cls(calibrator, data, working, fitted)

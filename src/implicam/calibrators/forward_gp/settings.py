@@ -1,6 +1,6 @@
 """Every prior and threshold of forward-gp: those of the rig model, and those of the method itself.
 
-How to read a name: `implicam.rig_model.settings`.
+How to read a name: `implicam.settings`.
 """
 
 from __future__ import annotations
