@@ -12,7 +12,7 @@ import pytest
 from command_line import Cli, cli  # noqa: F401  a fixture
 from implicam.active import Workspace
 from implicam.calibrators.forward_gp import PlannedRig, plan_rig
-from implicam.design import Assumptions, Prediction, camera_parts, compare_designs, draw_rig, drawing_of, predict
+from implicam.design import Assumptions, Prediction, judge_cameras, compare_designs, draw_rig, drawing_of, predict
 from implicam.design.prediction import planned_camera, views_of
 from implicam.errors import FitError, UsageError
 from implicam.geometry import Pose
@@ -115,9 +115,9 @@ def test_without_a_camera_is_the_rig_without_it(sd: float) -> None:
 
 
 def test_the_parts_of_cameras() -> None:
-    pair = camera_parts(prediction("2R"))
+    pair = judge_cameras(prediction("2R"))
     assert [(part.lost, part.blind) for part in pair] == [(1.0, 1.0)] * 2
-    six = camera_parts(prediction("bar6"))
+    six = judge_cameras(prediction("bar6"))
     assert all(0 < part.lost < 0.3 and part.blind == 0 and part.known_seen == 36 for part in six)
 
 
@@ -129,7 +129,7 @@ def test_a_camera_that_sees_too_few_known_points_is_worth_nothing() -> None:
     more = predict(replace(found.rig, cameras=(*found.rig.cameras, aside)), found.assumed, found.known, found.places)
     assert more.uncalibrated == ("aside",)
     np.testing.assert_allclose(more.predicted.total, found.predicted.total)
-    last = camera_parts(more)[-1]
+    last = judge_cameras(more)[-1]
     assert (last.name, last.known_seen, last.lost) == ("aside", 0, 0.0)
 
 
@@ -137,7 +137,7 @@ def test_cameras_that_see_nothing_in_common_are_an_error() -> None:
     placement, _ = drawing_of("2R")
     rig = draw_rig(placement, Assumptions(), None, "2R")
     known = np.random.default_rng(0).uniform(2000, 2100, size=(20, 3))
-    with pytest.raises(FitError, match="forward-gp needs at least 8"):
+    with pytest.raises(FitError, match="0 of 20 known points would be seen"):
         predict(rig, Assumptions(), known, known)
     some = np.random.default_rng(0).uniform(-50, 50, size=(20, 3))
     seen = views_of(rig, some)
@@ -216,7 +216,27 @@ def test_the_command_says_what_a_placement_will_be_worth(cli: Cli, tmp_path: Pat
 def test_what_is_blind_is_said(cli: Cli, tmp_path: Path) -> None:
     ran = cli("design", str(drawing(tmp_path)))
     assert ran.code == 0
-    assert re.search(r"narrow: 3 cameras; \d+ % of the workspace is seen by fewer than two of them", ran.out)
+    assert re.search(r"narrow: 3 cameras; \d+ % of the workspace is blind: fewer than two of them see it", ran.out)
+
+
+def test_cameras_at_one_place_measure_nothing(cli: Cli, tmp_path: Path) -> None:
+    at = "[[cameras]]\nposition = [-500, -400, 300]\n"
+    ran = cli("design", str(drawing(tmp_path, NARROW.split("[[cameras]]")[0] + at + at)))
+    assert ran.code == 0
+    assert "narrow: 2 cameras; 100 % of the workspace is blind" in ran.out
+    assert "nan" not in ran.out
+
+
+def test_a_workspace_and_known_points_from_files(cli: Cli, tmp_path: Path) -> None:
+    corners = ["0,0,0", "100,0,0", "0,100,0", "0,0,100", "100,100,100"]
+    (tmp_path / "corners.csv").write_text("\n".join(["x,y,z", *corners]))
+    some = np.random.default_rng(0).uniform(-50, 50, size=(20, 3)).tolist()
+    (tmp_path / "known.csv").write_text("\n".join(["x,y,z", *(f"{x},{y},{z}" for x, y, z in some)]))
+    files = ["--workspace", str(tmp_path / "corners.csv"), "--points", str(tmp_path / "known.csv")]
+    (found,) = cli("design", "bar6", *files, "--json").json["designs"]
+    assert found["known_points"] == 20
+    assert found["blind_share"] == 0
+    assert cli("design", "bar6", *files[:2]).code == 0  # and 36 points between the corners
 
 
 def test_the_check_builds_rigs(cli: Cli) -> None:
@@ -250,6 +270,9 @@ def test_the_page_loads_nothing_and_escapes_names(cli: Cli, tmp_path: Path) -> N
         (["bar6", "--points", "none.csv"], "none.csv"),
         (["bar6", "--workspace", "1:0,0:1,0:1"], "is empty"),
         (["bar6", "--workspace", "0:100,0:100,-900:-800"], "needs at least 8"),
+        (["zero.toml"], "left has a noise of 0 px"),
+        (["bar6", "--points", "few.csv"], "5 of 5 known points would be seen"),
+        (["bar6", "--points", "semicolons.csv"], "no single column x, y, z"),
         (["bar6", "--noise", "0"], "noise = 0 px"),
         (["bar6", "--noise", "nan"], "noise = nan px"),
         (["bar6", "--lens-error", "-1"], "lens_error = -1"),
@@ -258,7 +281,14 @@ def test_the_page_loads_nothing_and_escapes_names(cli: Cli, tmp_path: Path) -> N
         (["bar6", "--unit", "inch"], "inch"),
     ],
 )
-def test_what_cannot_be_designed(cli: Cli, words: list[str], said: str) -> None:
+def test_what_cannot_be_designed(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    places = [f"{x},{y},{z}" for x, y, z in np.random.default_rng(0).uniform(-50, 50, size=(5, 3)).tolist()]
+    (tmp_path / "few.csv").write_text("\n".join(["x,y,z", *places]))
+    (tmp_path / "semicolons.csv").write_text("\n".join(["x,y,z", *places]).replace(",", ";"))
+    (tmp_path / "zero.toml").write_text(NARROW.replace('name = "<b>left"', 'name = "left"\nnoise = 0'))
     ran = cli("design", *words)
     assert ran.code != 0
     assert said in ran.err.replace("\n", " ")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from implicam.active import workspace_from
+from implicam.active import Workspace, workspace_from
 from implicam.active.workspace import read_places
 from implicam.cli import show
 from implicam.cli.app import Json, Seed, command, need_plotly
@@ -21,7 +21,7 @@ from implicam.files import refuse_folder
 from implicam.formatting import decimal_number, percent
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 
-MOST_CAMERAS_SHOWN = 16
+MAX_CAMERAS_SHOWN = 16
 
 
 class LengthUnit(StrEnum):
@@ -64,6 +64,8 @@ def design_command(
             raise UsageError(f"{output} is no page.", fix="end the name in .html")
         need_plotly()
     box = None if workspace is None else workspace_from(workspace, None)
+    if box is not None and box.places is not None:
+        box = Workspace.hull(box.places)  # what lies between them is measured too, and may be known
     assumed = Assumptions(noise, lens_error, robot_noise)
     specs = [rig] if other is None else [rig, other]
     with show.progress(json) as progress:
@@ -128,7 +130,7 @@ def _words(design: Design) -> str:
     found = design.prediction
     text = f"{len(found.rig.cameras)} cameras"
     if found.blind:
-        text += f"; {percent(found.blind)} of the workspace is seen by fewer than two of them"
+        text += f"; {percent(found.blind)} of the workspace is blind: fewer than two of them see it, or from one place"
     if found.uncalibrated:
         names = ", ".join(found.uncalibrated)
         text += f"; not calibrated, for want of {MIN_POINTS_PER_CAMERA} known points: {names}"
@@ -146,7 +148,7 @@ def _print_spreads(designs: list[Design]) -> None:
         row = [f"{name}, {unit}" if unit else f"{name}, %"]
         for each in spreads:
             values = (each.median, each.usual, each.worst)
-            row += [decimal_number(x) if unit else percent(x).replace(" %", "") for x in values]
+            row += [decimal_number(x) if unit else percent(x, none="-").replace(" %", "") for x in values]
         rows.append(row)
     show.table(show.text_table("Predicted over the workspace", headings, rows))
 
@@ -170,13 +172,13 @@ def _print_parts(design: Design, *, several: bool) -> None:
     parts = sorted(design.parts, key=lambda part: -part.lost)
     rows = [
         [p.name, str(p.known_seen), percent(p.part_seen), percent(p.lost, 1), percent(p.blind)]
-        for p in parts[:MOST_CAMERAS_SHOWN]
+        for p in parts[:MAX_CAMERAS_SHOWN]
     ]
     title = f"{design.name}: which camera helps most" if several else "Which camera helps most"
     headings = ["camera", "known points\nit sees", "of the work-\nspace", "accuracy lost\nwithout it", "blind\nthen"]
     show.table(show.text_table(title, headings, rows))
-    if len(parts) > MOST_CAMERAS_SHOWN:
-        show.line(f"and {len(parts) - MOST_CAMERAS_SHOWN} cameras more that help less; --json lists them all\n")
+    if len(parts) > MAX_CAMERAS_SHOWN:
+        show.line(f"and {len(parts) - MAX_CAMERAS_SHOWN} cameras more that help less; --json lists them all\n")
 
 
 def _as_json(design: Design) -> dict[str, Any]:

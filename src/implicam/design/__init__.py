@@ -8,8 +8,8 @@
 
 from implicam.design.check import Realised, realise
 from implicam.design.designs import Design, compare_designs
-from implicam.design.prediction import Assumptions, Prediction, draw_rig, drawing_of, predict, watching
-from implicam.design.summary import CameraPart, Spread, camera_parts, spreads_of
+from implicam.design.prediction import Assumptions, Prediction, draw_rig, drawing_of, predict, set_workspace
+from implicam.design.summary import CameraPart, Spread, judge_cameras, summarise_spreads
 
 __all__ = [
     "Assumptions",
@@ -18,12 +18,12 @@ __all__ = [
     "Prediction",
     "Realised",
     "Spread",
-    "camera_parts",
+    "judge_cameras",
     "compare_designs",
     "draw_rig",
     "drawing_of",
     "predict",
     "realise",
-    "spreads_of",
-    "watching",
+    "summarise_spreads",
+    "set_workspace",
 ]

@@ -14,7 +14,7 @@ from implicam.errors import FitError
 from implicam.progress import Progress, silent
 from implicam.simulate import Placement, Target, build_rig, simulate
 
-OTHER_SHOTS = 1_000_003
+CHECK_SEED_OFFSET = 1_000_003
 """From the seed of the known points to that of the positions to judge by."""
 
 
@@ -122,7 +122,7 @@ def _measured(placement: Placement, prediction: Prediction, seed: int) -> tuple[
         cameras=",".join(camera.name for camera in prediction.rig.cameras),
     )
     known = simulate(rig, _balls(prediction.known), seed=seed, robot_noise=assumed.position_sd)
-    shown = simulate(rig, _balls(prediction.places), seed=seed + OTHER_SHOTS)
+    shown = simulate(rig, _balls(prediction.places), seed=seed + CHECK_SEED_OFFSET)
     measured = ForwardGP().fit(known).measure(shown.observations)
     return measured.xyz - prediction.places, np.diagonal(measured.cov, axis1=1, axis2=2)
 

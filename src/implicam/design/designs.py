@@ -9,12 +9,12 @@ from pathlib import Path
 from implicam.active import Workspace
 from implicam.dataset import Floats
 from implicam.design.check import Realised, as_rows, realise
-from implicam.design.prediction import Assumptions, Prediction, draw_rig, drawing_of, predict, watching
-from implicam.design.summary import CameraPart, Spread, camera_parts, spreads_of
+from implicam.design.prediction import Assumptions, Prediction, draw_rig, drawing_of, predict, set_workspace
+from implicam.design.summary import CameraPart, Spread, judge_cameras, summarise_spreads
 from implicam.errors import FitError, UsageError
 from implicam.progress import Progress, silent
 
-PLACES = 1000
+PLACE_COUNT = 1000
 """Places at which a placement is judged."""
 
 
@@ -50,7 +50,7 @@ def compare_designs(
     *,
     workspace: Workspace | None = None,
     unit: str | None = None,
-    places: int = PLACES,
+    places: int = PLACE_COUNT,
     check: int = 0,
     seed: int = 0,
     progress: Progress = silent,
@@ -86,15 +86,15 @@ def compare_designs(
     judged = workspace.judged(places, seed)
     found = []
     for name, drawn, cameras in drawings:
-        placement = watching(drawn, workspace, unit)
+        placement = set_workspace(drawn, workspace, unit)
         rig = draw_rig(placement, assumed, unit, cameras)
         try:
             prediction = predict(rig, assumed, known, judged)
         except FitError as error:
             raise FitError(f"{name}: {error.what}", why=error.why, fix=error.fix) from error
-        parts = camera_parts(prediction, progress)
+        parts = judge_cameras(prediction, progress)
         realised = realise(placement, prediction, check, seed=seed, progress=progress) if check else None
-        found.append(Design(name, workspace, prediction, spreads_of(prediction), parts, realised))
+        found.append(Design(name, workspace, prediction, summarise_spreads(prediction), parts, realised))
     return found
 
 

@@ -13,7 +13,7 @@ from implicam.dataset import Floats
 from implicam.design.designs import Design
 from implicam.design.prediction import Prediction
 from implicam.figures.interactive3d import POLICY, figure_json, plotly_js
-from implicam.figures.placement_figure import AXES, UncertaintyScale, placement_scene, uncertainty_slices
+from implicam.figures.placement_figure import SLICE_AXES, UncertaintyScale, placement_scene, uncertainty_slices
 from implicam.files import write_text
 from implicam.formatting import number, percent
 from implicam.simulate.camera import SimulatedCamera
@@ -84,7 +84,10 @@ def _headline(designs: Sequence[Design]) -> str:
     for design in designs:
         (usual,) = (spread.usual for spread in design.spreads if spread.name == "95 % uncertainty")
         blind = design.prediction.blind
-        dark = f", and {percent(blind)} of it is seen by fewer than two cameras" if blind else ""
+        if not np.isfinite(usual):
+            parts.append(f"{design.name}: nothing of the workspace can be measured.")
+            continue
+        dark = f", and {percent(blind)} of it is blind" if blind else ""
         parts.append(f"{design.name}: 95 % uncertainty below {number(usual)} {unit} in 95 % of the workspace{dark}.")
     return " ".join(parts)
 
@@ -169,7 +172,7 @@ def _slices(design: Design, scale: UncertaintyScale) -> Any:
     middle = (low + high) / 2
     ends = tuple(np.linspace(a, b, SLICE_STEPS) for a, b in zip(low, high, strict=True))
     planes = []
-    for across, upward, _ in AXES:
+    for across, upward, _ in SLICE_AXES:
         x, y = np.meshgrid(ends[across], ends[upward])
         xyz = np.tile(middle, (x.size, 1))
         xyz[:, across], xyz[:, upward] = x.ravel(), y.ravel()

@@ -84,7 +84,8 @@ class Prediction:
 
     @property
     def blind(self) -> float:
-        """The part of the workspace that fewer than two calibrated cameras see."""
+        """The part of the workspace that cannot be measured: fewer than two calibrated cameras see it, or only from one
+        and the same place."""
         return float(np.mean(~self.predicted.measured))
 
     @property
@@ -151,7 +152,7 @@ def draw_rig(placement: Placement, assumed: Assumptions, unit: str | None = None
     )
 
 
-def watching(placement: Placement, workspace: Workspace, unit: str) -> Placement:
+def set_workspace(placement: Placement, workspace: Workspace, unit: str) -> Placement:
     """A placement whose cameras watch the box around a workspace.
 
     Args:
@@ -187,7 +188,15 @@ def planned_camera(camera: SimulatedCamera, lens_error: float) -> PlannedCamera:
     Args:
         camera: As drawn.
         lens_error: Root mean square in pixels of what no lens model contains.
+
+    Raises:
+        UsageError: It has no noise.
     """
+    if camera.noise_sd < MIN_NOISE_PX:
+        raise UsageError(
+            f"{camera.name} has a noise of {camera.noise_sd:g} px; a design needs at least {MIN_NOISE_PX:g} px.",
+            fix="correct noise in its drawing, for example noise = 0.2",
+        )
     sd, reach = error_process(camera.width, camera.height, lens_error)
     return PlannedCamera(
         camera.name, camera.width, camera.height, camera.lens, camera.camera_from_world, camera.noise_sd, sd, reach

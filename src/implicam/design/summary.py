@@ -11,7 +11,7 @@ from implicam.design.prediction import Prediction
 from implicam.progress import Progress, silent
 
 USUAL_QUANTILE = 0.95
-PLACES_WITHOUT_EACH = 300
+PLACE_COUNT_WITHOUT_EACH = 300
 """Places at which a rig is judged without each of its cameras."""
 
 
@@ -53,7 +53,7 @@ class CameraPart:
     blind: float
 
 
-def spreads_of(prediction: Prediction) -> tuple[Spread, ...]:
+def summarise_spreads(prediction: Prediction) -> tuple[Spread, ...]:
     """The distribution over the workspace of what a position will be measured with.
 
     Args:
@@ -83,7 +83,7 @@ def _spread(name: str, unit: str, values: Floats) -> Spread:
     return Spread(name, unit, float(np.median(values)), float(np.quantile(values, USUAL_QUANTILE)), float(values.max()))
 
 
-def camera_parts(prediction: Prediction, progress: Progress = silent) -> tuple[CameraPart, ...]:
+def judge_cameras(prediction: Prediction, progress: Progress = silent) -> tuple[CameraPart, ...]:
     """What each camera is worth: the accuracy without it, and what would be blind.
 
     Args:
@@ -93,7 +93,7 @@ def camera_parts(prediction: Prediction, progress: Progress = silent) -> tuple[C
     Returns:
         One for each camera, in the order of the drawing. A camera that sees too few known points is worth nothing.
     """
-    some = slice(PLACES_WITHOUT_EACH)
+    some = slice(PLACE_COUNT_WITHOUT_EACH)
     xyz, seen = prediction.places[some], prediction.seen[some]
     with_all = prediction.predicted.sd[some]
     without = {c: (0.0, float(np.mean(~np.isfinite(with_all)))) for c in range(len(prediction.rig.cameras))}

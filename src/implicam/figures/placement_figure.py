@@ -15,9 +15,9 @@ from implicam.figures.panels3d import line_segments
 from implicam.figures.style import BLUE, GREY, INK, VERMILLION, axis, figure_3d, graph_objects, layout, plain, points_3d
 from implicam.formatting import number
 
-COLOURS = "Cividis"
+COLOUR_SCALE = "Cividis"
 """Of the uncertainty: dark is certain."""
-AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))
+SLICE_AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))
 """Of each slice: across, up, and the axis that it is square to."""
 EYE_DISTANCE = 2.4
 """From where the scene is seen, in its own size, so that all of it fits into half a page."""
@@ -80,7 +80,7 @@ def placement_scene(
     centres = np.array([each[0] for each in cameras.values()])
     measured = np.isfinite(u95)
     marker = {
-        "size": 4.5, "color": u95[measured], "colorscale": COLOURS, "cmin": scale.low, "cmax": scale.high,
+        "size": 4.5, "color": u95[measured], "colorscale": COLOUR_SCALE, "cmin": scale.low, "cmax": scale.high,
         "colorbar": scale.bar(len=0.7, x=SCENE_WIDTH), "opacity": 0.85,
     }  # fmt: skip
     texts = [f"95 % uncertainty {number(u)} {plain(scale.unit)}" for u in u95[measured]]
@@ -105,7 +105,7 @@ def placement_scene(
     ]
     if not measured.all():
         blind = {"symbol": "x", "size": 3, "color": GREY}
-        traces.append(points_3d(places[~measured], "seen by fewer than two cameras", marker=blind, hoverinfo="skip"))
+        traces.append(points_3d(places[~measured], "blind", marker=blind, hoverinfo="skip"))
     extent = np.ptp(np.concatenate([pyramids[np.isfinite(pyramids[:, 0])], corners]), axis=0)
     length = float(extent.max() / np.cbrt(np.prod(extent)))
     return figure_3d(
@@ -141,7 +141,7 @@ def uncertainty_slices(
 
     Args:
         ends: (k,) coordinates along x, y and z.
-        planes: Uncertainty (k, k) in each of the slices `AXES`, rows along the axis that goes up; NaN for nothing.
+        planes: Uncertainty (k, k) in each of the slices `SLICE_AXES`, rows along the axis that goes up; NaN for nothing.
         middle: (3,) where the slices meet.
         up: (3,) which way is up.
         scale: What colours mean.
@@ -152,10 +152,10 @@ def uncertainty_slices(
     go = graph_objects()
     figure = go.Figure(layout=layout(margin={"l": 62, "r": 100, "t": TOOLBAR_PX + 28, "b": 52}))
     width = (1 - 2 * SLICE_GAP) / 3
-    for k, ((across, upward, fixed), values) in enumerate(zip(AXES, planes, strict=True)):
+    for k, ((across, upward, fixed), values) in enumerate(zip(SLICE_AXES, planes, strict=True)):
         suffix = "" if k == 0 else str(k + 1)
         heat = go.Heatmap(
-            x=ends[across], y=ends[upward], z=values, zmin=scale.low, zmax=scale.high, colorscale=COLOURS,
+            x=ends[across], y=ends[upward], z=values, zmin=scale.low, zmax=scale.high, colorscale=COLOUR_SCALE,
             xaxis=f"x{suffix}", yaxis=f"y{suffix}", showscale=k == 0, colorbar=scale.bar(len=1.0, x=1.02),
             hovertemplate=f"{'xyz'[across]} %{{x:.4~g}}, {'xyz'[upward]} %{{y:.4~g}}: %{{z:.3~g}}<extra></extra>",
         )  # fmt: skip

@@ -28,7 +28,7 @@ BAR_DISTANCE_MM = 380.0
 """From the bar, or the plane of a grid, to the middle of the working volume."""
 GRID_HALF_WIDTH_MM, GRID_HALF_HEIGHT_MM = 300.0, 200.0
 """Of a grid of cameras: as wide as the bar."""
-LONGEST_GRID_ASPECT = 2.0
+MAX_GRID_ASPECT_RATIO = 2.0
 """Columns over rows of a grid of N cameras, beyond which its rows are rather not all full."""
 PERSPECTIVE_FROM_PX = 850.0
 """Shorter lenses are wide: Kannala-Brandt, not Brown-Conrady."""
@@ -36,7 +36,7 @@ PERSPECTIVE_DISTORTION, WIDE_DISTORTION = (-0.08, 0.02, 0.0, 0.0), (-0.01, 0.0, 
 """k1, k2, p1, p2 and k1 ... k4 of the two kinds of lenses, as drawn."""
 
 SPECS = ("bar6", "grid9", "stereo", "dome8")
-MOST_CAMERAS = 999
+MAX_CAMERAS = 999
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +96,12 @@ def named_placement(spec: str) -> Placement:
     if spec == "stereo":
         return _aimed(spec, [(x, 0.0, -700.0) for x in (-120.0, 120.0)], [1200.0], (1280, 1024), (300, 240, 240))
     found = re.fullmatch(r"(?:(bar|grid|dome)([1-9][0-9]{0,2})|grid([1-9][0-9]?)x([1-9][0-9]?))", spec)
-    if found and found[3] and 2 <= int(found[3]) * int(found[4]) <= MOST_CAMERAS:
+    if found and found[3] and 2 <= int(found[3]) * int(found[4]) <= MAX_CAMERAS:
         return _grid(spec, [int(found[3])] * int(found[4]))
     if not found or found[3] or int(found[2]) < 2:
         raise UsageError(
             f"there is no rig {spec!r}{did_you_mean(spec, SPECS)}.",
-            why=f"a rig is stereo, bar<N>, grid<N>, grid<COLUMNS>x<ROWS> or dome<N>, with 2 to {MOST_CAMERAS} cameras",
+            why=f"a rig is stereo, bar<N>, grid<N>, grid<COLUMNS>x<ROWS> or dome<N>, with 2 to {MAX_CAMERAS} cameras",
             fix=f"use one of {', '.join(SPECS)}, for example dome12, or your own drawing: RIG.toml (docs/design.md)",
         )
     n = int(found[2])
@@ -120,7 +120,7 @@ def grid_rows(n: int) -> list[int]:
         The number in each row, the upper row first.
     """
     for rows in range(int(np.sqrt(n)), 0, -1):
-        if n % rows == 0 and n // rows <= LONGEST_GRID_ASPECT * rows:
+        if n % rows == 0 and n // rows <= MAX_GRID_ASPECT_RATIO * rows:
             return [n // rows] * rows
     columns = int(np.ceil(np.sqrt(n)))
     rows = -(-n // columns)

@@ -17,7 +17,7 @@ from implicam.dataset.tables import read_toml
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.geometry import Pose, look_at, rotation_from_vector
 from implicam.lenses import LENSES, Lens
-from implicam.simulate.placements import MOST_CAMERAS, PERSPECTIVE_FROM_PX, Mount, Placement
+from implicam.simulate.placements import MAX_CAMERAS, PERSPECTIVE_FROM_PX, Mount, Placement
 
 SUFFIX = ".toml"
 MM_PER_UNIT = {"mm": 1.0, "m": 1e3}
@@ -69,9 +69,9 @@ def read_placement(path: Path) -> Placement:
         raise UsageError(
             f"{path}: there is no [[cameras]] table.", fix="add for each camera [[cameras]], with position and look_at"
         )
-    if not 2 <= len(cameras) <= MOST_CAMERAS:
+    if not 2 <= len(cameras) <= MAX_CAMERAS:
         raise UsageError(
-            f"{path}: a rig has 2 to {MOST_CAMERAS} cameras, and this one has {len(cameras)}.",
+            f"{path}: a rig has 2 to {MAX_CAMERAS} cameras, and this one has {len(cameras)}.",
             fix="write [[cameras]] for each",
         )
     mounts = tuple(

@@ -17,7 +17,7 @@ import numpy as np
 from implicam.calibrators.forward_gp.families import family_prior, widest_angle
 from implicam.calibrators.forward_gp.hyperparameters import FIELD_VARIANCE_TOLERANCE
 from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings
-from implicam.dataset.requirements import require_points, require_volume
+from implicam.dataset.requirements import require_volume
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose
 from implicam.lenses import KannalaBrandt, Lens
@@ -226,7 +226,12 @@ def plan_rig(
         FitError: Fewer than two cameras see enough known points, or these do not fill a volume.
     """
     used = known_xyz[seen.any(axis=1)]
-    require_points(len(used), MIN_POINTS_PER_CAMERA, "forward-gp", "a known point counts where any camera sees it")
+    if len(used) < MIN_POINTS_PER_CAMERA:
+        raise FitError(
+            f"{len(used)} of {len(known_xyz)} known points would be seen by any camera; forward-gp needs at least "
+            f"{MIN_POINTS_PER_CAMERA}.",
+            fix="plan more known points, where the cameras look; positions and poses are in one frame and unit",
+        )
     require_volume(used, "forward-gp")
     offset = used.mean(axis=0)
     frame = Frame(offset, float(np.sqrt(np.mean((used - offset) ** 2))))
