@@ -12,7 +12,7 @@ import pytest
 from command_line import Cli, cli  # noqa: F401  a fixture
 from implicam.active import Workspace
 from implicam.calibrators.forward_gp import PlannedRig, plan_rig
-from implicam.design import Assumptions, Prediction, judge_cameras, compare_designs, draw_rig, drawing_of, predict
+from implicam.design import Assumptions, Prediction, compare_designs, draw_rig, drawing_of, judge_cameras, predict
 from implicam.design.prediction import planned_camera, views_of
 from implicam.errors import FitError, UsageError
 from implicam.geometry import Pose

@@ -141,7 +141,7 @@ def uncertainty_slices(
 
     Args:
         ends: (k,) coordinates along x, y and z.
-        planes: Uncertainty (k, k) in each of the slices `SLICE_AXES`, rows along the axis that goes up; NaN for nothing.
+        planes: Uncertainty (k, k) in each of the slices `SLICE_AXES`, rows along the axis that goes up; NaN for none.
         middle: (3,) where the slices meet.
         up: (3,) which way is up.
         scale: What colours mean.

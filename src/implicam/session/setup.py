@@ -71,7 +71,7 @@ class Setup:
         UsageError: a value is not possible.
     """
 
-    rig: Annotated[str, _rig("bar6, stereo, dome8")] = "bar6"
+    rig: Annotated[str, _rig("bar6, grid9, dome8 ..., or a drawing RIG.toml")] = "bar6"
     rig_cameras: Annotated[str | None, _rig("Some of its cameras: 2R, cam1,cam4", "LIST", flags="--cameras")] = None
     cameras: Annotated[
         tuple[tuple[str, str], ...],
