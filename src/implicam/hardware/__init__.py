@@ -7,12 +7,14 @@ robot.move(xyz); frame = camera.frame()
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware.csv_player import CsvPlayer
 from implicam.hardware.folder_camera import FolderCamera
 from implicam.hardware.genicam import GenICamCamera
+from implicam.hardware.guard import GuardedRobot, guard_robot
 from implicam.hardware.opencv_camera import STREAM_PREFIXES, OpenCVCamera
 from implicam.hardware.person import Person
 from implicam.hardware.protocol import (
@@ -41,6 +43,7 @@ __all__ = [
     "Frame",
     "FrameSource",
     "GenICamCamera",
+    "GuardedRobot",
     "MovedByHand",
     "NetworkTrigger",
     "OpenCVCamera",
@@ -53,6 +56,7 @@ __all__ = [
     "TriggerSimulator",
     "URRobot",
     "camera_from",
+    "guard_robot",
     "list_specs",
     "robot_from",
     "simulated_rig",
@@ -77,6 +81,9 @@ TRIGGERS: Registry[type[TriggerDriver]] = Registry(
     "trigger", {"udp": NetworkTrigger, "tcp": TCPTrigger}, "implicam.triggers", offers(TriggerDriver)
 )
 """Name -> driver."""
+
+HEEDED = ("speed", "sd", "tool")
+"""The `RobotOptions` that only a driver can heed; the guard sees to the others."""
 
 
 def list_specs(drivers: Registry[Any]) -> str:
@@ -112,18 +119,31 @@ def camera_from(name: str, spec: str, *, triggered: bool = False) -> FrameSource
     raise _unknown_error(CAMERAS, spec, known, why="there is no such file or folder either")
 
 
-def robot_from(spec: str, **options: Any) -> Robot:
-    """The robot that the words of a command line name; it is not connected.
+def robot_from(spec: str, **options: Any) -> GuardedRobot:
+    """The robot that the words of a command line name, guarded; it is not connected.
 
     Args:
         spec: A driver's name; for most a colon, and what it asks for: "ur:192.168.0.10".
         options: The fields of `RobotOptions`.
 
     Raises:
-        UsageError: There is no such driver, or something that it needs is missing.
+        UsageError: There is no such driver, something that it needs is missing, or it cannot heed an option.
     """
     driver, rest = _find_driver(ROBOTS, spec)
-    return driver.from_spec(rest, RobotOptions(**options))
+    name, wishes = spec.partition(":")[0], RobotOptions(**options)
+    made = guard_robot(driver.from_spec(rest, replace(wishes, confirm=None)), wishes, spec)  # the guard asks
+    for option in HEEDED:
+        if getattr(wishes, option) is not None and option not in driver.options:
+            raise UsageError(
+                f"the robot {name!r} does not heed {option}.",
+                why="its driver cannot tell it so" if made.alone else "nothing moves by itself there",
+                fix=f"leave {option} out",
+            )
+    if wishes.dry_run and not made.alone:
+        raise UsageError(
+            f"the robot {name!r} has no dry run.", why="nothing moves by itself there", fix="leave the dry run out"
+        )
+    return made
 
 
 def trigger_from(spec: str) -> Trigger:

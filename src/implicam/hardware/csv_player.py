@@ -25,6 +25,7 @@ class CsvPlayer:
     moves = True
     alone = False  # a person or another machine puts the target there
     spec: ClassVar[str] = "csv:FILE"
+    options: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:

@@ -16,6 +16,7 @@ class Person:
 
     moves = alone = False
     spec: ClassVar[str] = "person"
+    options: ClassVar[tuple[str, ...]] = ("sd",)
 
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:

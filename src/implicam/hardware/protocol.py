@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, wait
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from implicam.geometry import Floats
 from implicam.images import Grey
 
 __all__ = [
+    "Box",
     "CameraDriver",
     "Floats",
     "Frame",
@@ -36,6 +37,7 @@ __all__ = [
     "Trigger",
     "TriggerDriver",
     "check_position",
+    "format_position",
     "incomplete_spec_error",
     "take_frames",
     "wait_for",
@@ -161,13 +163,13 @@ class Robot(Protocol):
         """Whether it gets there without a person's help."""
 
     def open(self) -> None:
-        """Connect. Opening twice is harmless. HardwareError with the cure."""
+        """Connect; nothing moves. Opening twice is harmless. HardwareError with the cure."""
 
     def position(self) -> Floats:
-        """(3,) where the target is now. HardwareError where that is not known."""
+        """(3,) where the target stands now. HardwareError where that is not known, or while it moves without `move`."""
 
     def move(self, xyz: Floats) -> Floats:
-        """Go somewhere, and wait until there.
+        """Go somewhere in a straight line, and wait until there; after any error the robot is told to stop.
 
         Args:
             xyz: (3,) in the dataset's unit and world frame.
@@ -176,11 +178,11 @@ class Robot(Protocol):
             (3,) where the target is then.
 
         Raises:
-            HardwareError: It was stopped, the place is out of its box, or it refuses.
+            HardwareError: It was stopped, the place is out of its box, it refuses, or it has fallen silent.
         """
 
     def stop(self) -> None:
-        """Stop at once, from any thread. Harmless when it stands still."""
+        """Stop at once, from any thread, without waiting for `move`. Harmless when it stands still, and twice."""
 
     def reachable(self) -> Floats | None:
         """(n, 3) the only places it can still go to; None for anywhere in its box."""
@@ -203,7 +205,7 @@ class MovedByHand(Protocol):
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """What a session knows when it makes a robot; a driver takes what it needs.
+    """What a session knows when it makes a robot; a driver takes what it needs, and does nothing else.
 
     Attributes:
         ask: Shows a person where the target is to go, a position (3,).
@@ -233,6 +235,9 @@ class RobotDriver(Protocol):
 
     spec: ClassVar[str]
     """What its specs look like, for help and errors: "ur:HOST"."""
+
+    options: ClassVar[tuple[str, ...]]
+    """Which of "speed", "sd" and "tool" it heeds; `robot_from` refuses one that is given and not heeded."""
 
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Robot:
@@ -282,6 +287,79 @@ def check_position(xyz: Floats, what: str = "position") -> Floats:
             f"{xyz} is no {what}.", why="it takes three finite numbers x, y, z", fix="give the place to go to"
         )
     return out
+
+
+def format_position(xyz: Floats) -> str:
+    """A position in words, to five digits.
+
+    Args:
+        xyz: (3,).
+    """
+    return "(" + ", ".join(f"{value:.5g}" for value in xyz) + ")"
+
+
+ROUNDING = 1e-12
+"""Of numbers that are computed: a corner of the workspace is inside of its box."""
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """The space that a robot may move in: convex, so that a straight way between two points of it stays in it.
+
+    Attributes:
+        low: (3,) its lowest corner.
+        high: (3,) its highest corner.
+        unit: Of both, for messages.
+    """
+
+    low: Floats
+    high: Floats
+    unit: str = "mm"
+
+    @classmethod
+    def from_corners(cls, corners: tuple[Sequence[float] | Floats, Sequence[float] | Floats], unit: str = "mm") -> Self:
+        """The box between two opposite corners.
+
+        Args:
+            corners: Each (3,), in any order.
+            unit: Of both.
+
+        Raises:
+            UsageError: These are not two corners, or it is flat.
+        """
+        try:
+            both = np.array(corners, dtype=np.float64)
+        except (TypeError, ValueError):
+            both = np.full(0, np.nan)
+        if both.shape != (2, 3) or not np.isfinite(both).all():
+            raise UsageError("the robot's box has two corners of three numbers.", fix="box=((x, y, z), (x, y, z))")
+        low, high = both.min(axis=0), both.max(axis=0)
+        if (low == high).any():
+            raise UsageError(
+                f"the box from {format_position(low)} to {format_position(high)} is flat.",
+                fix="give two opposite corners",
+            )
+        return cls(low, high, unit)
+
+    def check(self, xyz: Floats, what: str, slack: float = 0.0) -> None:
+        """Refuse what is outside.
+
+        Args:
+            xyz: (3,).
+            what: What to call it in the error.
+            slack: How far outside it may be.
+
+        Raises:
+            HardwareError: It is outside.
+        """
+        slack = max(slack, ROUNDING * float(np.abs([self.low, self.high]).max()))
+        if not ((xyz >= self.low - slack) & (xyz <= self.high + slack)).all():
+            raise HardwareError(
+                f"{what} at {format_position(xyz)} {self.unit} is outside of the box; nothing was moved.",
+                why=f"the box goes from {format_position(self.low)} to {format_position(self.high)}, and the straight "
+                "line leaves it",
+                fix="move the robot into it by hand, or choose a target inside, or give the box that is free",
+            )
 
 
 ARMING_SECONDS = 0.05

@@ -10,13 +10,22 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from implicam.dataset.model import METRES_PER_UNIT
 from implicam.errors import HardwareError, UsageError, import_extra
-from implicam.hardware.protocol import Floats, RobotOptions, check_position, incomplete_spec_error, wait_for
+from implicam.hardware.protocol import (
+    Box,
+    Floats,
+    RobotOptions,
+    check_position,
+    format_position,
+    incomplete_spec_error,
+    wait_for,
+)
 from implicam.hardware.ur_worker import DECELERATION_M_S2, Worker
 
 MAX_SPEED_M_S = 0.25
@@ -56,6 +65,7 @@ class URRobot:
 
     moves = alone = True
     spec: ClassVar[str] = "ur:HOST"
+    options: ClassVar[tuple[str, ...]] = ("speed", "sd", "tool")
 
     @classmethod
     def from_spec(cls, rest: str, options: RobotOptions) -> Self:
@@ -74,7 +84,8 @@ class URRobot:
             raise UsageError(
                 f"ur:{rest} needs a box that it may move in.",
                 why="without one, a mistyped number is a collision",
-                fix="give two opposite corners of the free space, in the dataset's unit, robot base frame",
+                fix="give two opposite corners of the free space, in the dataset's unit, robot base frame; on the "
+                "command line --workspace=x0:x1,y0:y1,z0:z1",
             )
         kept = ("unit", "box", "sd", "dry_run", "confirm", "say", "speed")
         given = {key: value for key in kept if (value := getattr(options, key)) is not None}
@@ -99,7 +110,7 @@ class URRobot:
             raise UsageError(f"speed = {speed} m/s is out of range.", fix=f"0.1 is calm; {MAX_SPEED_M_S} is the most")
         self.host, self.unit, self._speed = host, unit, speed
         self._metres = METRES_PER_UNIT[unit]
-        self._low, self._high = _sort_corners(box)
+        self._box = Box.from_corners(box, unit)
         self._tool = None if tool is None else check_position(np.asarray(tool, dtype=np.float64), "tool") * self._metres
         self._dry, self._confirm, self._say = dry_run, confirm, say
         x, y, z = (REPEATABILITY_M / self._metres,) * 3 if sd is None else tuple(float(value) for value in sd)
@@ -128,9 +139,15 @@ class URRobot:
             raise
 
     def position(self) -> Floats:
-        """(3,) where the TCP is now, as the robot measures it."""
+        """(3,) where the TCP stands now, as the robot measures it; HardwareError where it moves by itself."""
         self.open()
         self._check_state()
+        if wait_for(lambda: True if self._read_speed() < STANDSTILL_SPEED_M_S else None, HALT_SECONDS) is None:
+            raise HardwareError(
+                f"the robot at {self.host} moves: it is at {format_position(self._read_position())} {self.unit}.",
+                why="a move that the connection was lost on goes on, or somebody else moves it",
+                fix="press its red button where it must not go on; else wait until it stands, and try again",
+            )
         return self._read_position()
 
     def move(self, xyz: Floats) -> Floats:
@@ -148,19 +165,21 @@ class URRobot:
         """
         self._stop.clear()
         target, here = check_position(xyz), self.position()
-        self._check_inside(target, "the target")
-        self._check_inside(here, "the robot")
-        words = f"{self.host}: from {_format(here)} to {_format(target)} {self.unit} at {self._speed:g} m/s"
+        self._box.check(target, "the target")
+        self._box.check(here, "the robot", slack=ARRIVAL_DISTANCE_M / self._metres)
+        way = f"from {format_position(here)} to {format_position(target)} {self.unit}"
+        words = f"{self.host}: {way} at {self._speed:g} m/s"
         if self._dry:
             self._say(f"dry run, {words}")
             return here
         if self._confirm is not None and self._confirm(here, target) is not True:
             raise HardwareError(f"the move was refused; {words}.", why="it was not confirmed", fix="choose another one")
-        self._start(target)
         try:
+            self._start(target)
             self._wait(target)
-        except KeyboardInterrupt:
-            self.stop()
+        except BaseException:
+            with suppress(HardwareError):
+                self.stop()
             raise
         return self._read_position()
 
@@ -219,6 +238,10 @@ class URRobot:
     def _read_position(self) -> Floats:
         return np.array(self._ask("receive", "getActualTCPPose")[:3], dtype=np.float64) / self._metres
 
+    def _read_speed(self) -> float:
+        """Of the TCP, m/s."""
+        return float(np.linalg.norm(self._ask("receive", "getActualTCPSpeed")[:3]))
+
     def _check_state(self) -> None:
         """HardwareError where the robot is silent, stopped by its safety system, or not running."""
         before = self._ask("receive", "getTimestamp")
@@ -247,17 +270,8 @@ class URRobot:
         here = self._read_position()
         self._disconnect()
         return HardwareError(
-            f"the robot at {self.host} has {what}.", why=f"it stands at {_format(here)} {self.unit}", fix=fix
+            f"the robot at {self.host} has {what}.", why=f"it stands at {format_position(here)} {self.unit}", fix=fix
         )
-
-    def _check_inside(self, xyz: Floats, what: str) -> None:
-        slack = ARRIVAL_DISTANCE_M / self._metres if what == "the robot" else 0.0
-        if (xyz < self._low - slack).any() or (xyz > self._high + slack).any():
-            raise HardwareError(
-                f"{what} at {_format(xyz)} {self.unit} is outside of the box; nothing was moved.",
-                why=f"the box goes from {_format(self._low)} to {_format(self._high)}, and the straight line leaves it",
-                fix="move the robot into it by hand, or choose a target inside, or give the box that is free",
-            )
 
     def _start(self, target: Floats) -> None:
         with self._commands:
@@ -279,22 +293,21 @@ class URRobot:
                 raise self._stopped_error()
             here = self._read_position()
             off = float(np.linalg.norm(here - target)) * self._metres
-            speed = float(np.linalg.norm(self._ask("receive", "getActualTCPSpeed")[:3]))
-            if off < ARRIVAL_DISTANCE_M and speed < STANDSTILL_SPEED_M_S:
+            if off < ARRIVAL_DISTANCE_M and self._read_speed() < STANDSTILL_SPEED_M_S:
                 return
             if np.linalg.norm(here - place) * self._metres > ARRIVAL_DISTANCE_M / 5:
                 place, since = here, time.monotonic()
             if time.monotonic() - since > STANDSTILL_SECONDS:
                 self.stop()
                 raise HardwareError(
-                    f"the robot stands {off * 1e3:.2f} mm from its target {_format(target)} {self.unit}.",
+                    f"the robot stands {off * 1e3:.2f} mm from its target {format_position(target)} {self.unit}.",
                     why=f"no motion for {STANDSTILL_SECONDS:g} s: out of reach, at a joint limit, or speed slider at 0",
                     fix="read the pendant's log, and choose another target",
                 )
 
     def _stopped_error(self) -> HardwareError:
         return HardwareError(
-            f"the robot was stopped at {_format(self._read_position())} {self.unit}.",
+            f"the robot was stopped at {format_position(self._read_position())} {self.unit}.",
             why="stop() was called",
             fix="move again when it is safe",
         )
@@ -306,16 +319,3 @@ class URRobot:
             fix="switch it to remote control, end other programs on it, and look at its pendant",
         )
 
-
-def _sort_corners(box: tuple[Sequence[float] | Floats, Sequence[float] | Floats]) -> tuple[Floats, Floats]:
-    corners = np.asarray(box, dtype=np.float64)
-    if corners.shape != (2, 3) or not np.isfinite(corners).all():
-        raise UsageError("the robot's box has two corners of three numbers.", fix="box=((x, y, z), (x, y, z))")
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    if (low == high).any():
-        raise UsageError(f"the box from {_format(low)} to {_format(high)} is flat.", fix="give two opposite corners")
-    return low, high
-
-
-def _format(xyz: Floats) -> str:
-    return "(" + ", ".join(f"{value:.5g}" for value in xyz) + ")"

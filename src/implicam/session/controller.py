@@ -29,7 +29,17 @@ from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observatio
 from implicam.detect import Detected, Detector, View, correct_outlines
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.formatting import json_safe
-from implicam.hardware import Frame, FrameSource, MovedByHand, Robot, Trigger, take_frames
+from implicam.hardware import (
+    Frame,
+    FrameSource,
+    GuardedRobot,
+    MovedByHand,
+    Robot,
+    RobotOptions,
+    Trigger,
+    guard_robot,
+    take_frames,
+)
 from implicam.images import blank
 from implicam.progress import Progress, silent
 from implicam.session.detections import Look, reject_implausible
@@ -54,8 +64,18 @@ MIN_REPORTED_POINTS = 12
 
 @dataclass(frozen=True, eq=False)
 class Equipment:
-    """What the session works with. radius: of the ball, in the session's length unit, None for no correction. timeout:
-    seconds for a picture. dry_run: the robot does not really move, so nothing is kept."""
+    """What the session works with; the robot is guarded (`guard_robot`), whatever it is.
+
+    Attributes:
+        cameras: One or more.
+        robot: That puts the ball somewhere.
+        detector: Finds the ball in a picture.
+        trigger: That exposes all cameras; None where they run freely.
+        radius: Of the ball, in `unit`; None for no correction.
+        timeout: Seconds for a picture.
+        dry_run: The robot is never told to move, so nothing is kept.
+        unit: The session's length unit.
+    """
 
     cameras: Sequence[FrameSource]
     robot: Robot
@@ -64,6 +84,12 @@ class Equipment:
     radius: float | None = None
     timeout: float = 10.0
     dry_run: bool = False
+    unit: str = "mm"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.robot, GuardedRobot) or (self.dry_run and not self.robot.dry_run):
+            options = RobotOptions(unit=self.unit, dry_run=self.dry_run)
+            object.__setattr__(self, "robot", guard_robot(self.robot, options))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +138,7 @@ class SessionController:
         self._changed = threading.Condition()
         self._camera_lock = threading.Lock()  # a camera answers one thread at a time
         self._halted = threading.Event()  # stop was pressed: nothing moves until `go`
+        self._ending = threading.Event()  # the session is being left: nothing moves, whoever says go
         self._targets_without_ball = 0
         self._live = equipment.trigger is None and all(source.live for source in equipment.cameras)
         loop.history = _read_history(session)
@@ -129,6 +156,7 @@ class SessionController:
 
     def start(self) -> None:
         """Open cameras and robot, fit the points that the session has, and propose the first target."""
+        self._ending.clear()
         with self._working("starting", "connecting to the cameras and the robot"):
             for device in self._list_devices():
                 device.open()
@@ -145,7 +173,7 @@ class SessionController:
         if not self.equipment.robot.moves:
             raise UsageError("nothing moves the ball but you.", fix="put it there, and type where it is")
         with self._working("moving", "the robot is on its way"):
-            if self._halted.is_set():
+            if self._halted.is_set() or self._ending.is_set():
                 raise HardwareError("the robot was stopped by hand.", fix="press Go when it may move again")
             where = self.equipment.robot.move(target.xyz)
             self._take_pictures(where)
@@ -229,6 +257,18 @@ class SessionController:
         finally:
             with suppress(ImplicamError):
                 self.session.log("robot stopped by hand")
+
+    def leave(self) -> None:
+        """The session is being left, by Ctrl-C for one: stop a robot that is on its way, at once, and let none begin.
+
+        Never raises: what comes after it lets go of the equipment. `start` takes the session up again.
+        """
+        self._ending.set()
+        try:
+            if self.state.phase == "moving" or self.state.auto:
+                self.stop_robot()
+        except Exception as error:  # the link is dead: nothing more can be told
+            _LOG.warning("the robot could not be told to stop: %s", error)
 
     def set_auto(self, auto: bool) -> None:
         """Turn on or off that good points are accepted, and the next target is gone to, without being asked.

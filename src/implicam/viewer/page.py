@@ -79,7 +79,8 @@ class Page:
             thread.start()
 
     def close(self) -> None:
-        """Stop, after what is being done now; the guide stays open."""
+        """Stop a robot that is on its way, and the page after what is being done now; the guide stays open."""
+        self._controller.leave()
         self._running = False
         self._worker.close()
         for thread in self._threads:
@@ -354,7 +355,8 @@ def serve(
     open_browser: bool = True,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Show the page until the person closes the session, or Ctrl-C; the guide is still open then.
+    """Show the page until the person closes the session, or Ctrl-C, which stops a robot first; the guide is still open
+    then.
 
     host: what to listen on; another than this machine asks for a token, made up where none is given. port: 0 for any.
     ImplicamError where it cannot listen.
@@ -377,6 +379,7 @@ def serve(
         if controller.state.phase == "moving":
             controller.stop_robot()
     finally:
+        controller.leave()  # before anything is waited for: the robot may be on its way
         front.close()
         page.close()
 

@@ -22,7 +22,7 @@ class Worker:
     def __init__(self, controller: SessionController, complain: Callable[[ImplicamError], None]) -> None:
         self._controller, self._complain = controller, complain
         self._jobs: queue.Queue[Action | None] = queue.Queue()
-        self._lock, self._taken = threading.Lock(), True
+        self._lock, self._taken, self._closed = threading.Lock(), True, False
         self._thread = threading.Thread(target=self._run, name="implicam-worker", daemon=True)
 
     def start(self) -> None:
@@ -38,7 +38,8 @@ class Worker:
         return True
 
     def close(self) -> None:
-        """After what it is doing now."""
+        """After what it is doing now; what waits is not begun."""
+        self._closed = True
         self._jobs.put(None)
         if self._thread.is_alive():
             self._thread.join(timeout=60)
@@ -51,7 +52,7 @@ class Worker:
                 if not self._controller.state.auto or not self._take():
                     continue
                 job = self._by_itself
-            if job is None:
+            if job is None or self._closed:
                 return
             self._do(job)
 
