@@ -22,6 +22,7 @@ from implicam.hardware import (
     CsvPlayer,
     FolderCamera,
     GenICamCamera,
+    MovedByHand,
     NetworkTrigger,
     OpenCVCamera,
     Person,
@@ -440,9 +441,12 @@ def test_words_name_drivers(tmp_path: Path) -> None:
         camera = camera_from("cam7", spec)
         assert type(camera) is kind
         assert camera.name == "cam7"
-    assert isinstance(robot_from("csv:a.csv"), CsvPlayer)
-    assert isinstance(robot_from("ur:10.0.0.2", box=BOX, dry_run=True), URRobot)
-    assert isinstance(robot_from("person", ask=lambda xyz: None), Person)
+    assert isinstance(robot_from("csv:a.csv").driver, CsvPlayer)
+    assert isinstance(robot_from("ur:10.0.0.2", box=BOX, dry_run=True).driver, URRobot)
+    person = robot_from("person", ask=lambda xyz: None)
+    assert isinstance(person.driver, Person)
+    assert isinstance(person, MovedByHand)
+    assert not isinstance(robot_from("csv:a.csv"), MovedByHand)
 
 
 @pytest.mark.parametrize(
@@ -454,7 +458,7 @@ def test_words_name_drivers(tmp_path: Path) -> None:
         (lambda s: camera_from("c", s), "flim.avi", "names no camera"),
         (robot_from, "ur10", "names no robot"),
         (robot_from, "persn", "did you mean 'person'"),
-        (robot_from, "ur:10.0.0.2", "needs a box"),
+        (robot_from, "ur:10.0.0.2", r"needs a box[\s\S]*--workspace="),
         (trigger_from, "upd://box:1", "did you mean 'udp'"),
         (trigger_from, "udp://box", "no address of a trigger box"),
         (trigger_from, "udp://box:99999", "no address of a trigger box"),

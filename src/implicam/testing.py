@@ -6,6 +6,8 @@ from implicam.testing import check_lens
 def test_my_lens() -> None:
     check_lens(MyLens(400.0, 400.0, 639.5, 511.5, 0.1))
 ```
+
+`check_robot` does the same for a robot, with a stand-in for its hardware.
 """
 
 from __future__ import annotations
@@ -19,9 +21,10 @@ from typing import Any
 import numpy as np
 
 from implicam.errors import FitError
+from implicam.hardware.contract import StandIn, check_robot
 from implicam.lenses import FIRST_FIELDS, LENSES, Bools, Floats, Lens, focal_lengths
 
-__all__ = ["check_lens", "edge_of"]
+__all__ = ["StandIn", "check_lens", "check_robot", "edge_of"]
 
 PART_OF_EDGE = 0.97
 """What a lens sees up to there must hold to the last digit; the rest is the last hair before it ends."""

@@ -40,6 +40,9 @@ REPEATABILITY_M = 1e-4
 ARRIVAL_DISTANCE_M, STANDSTILL_SPEED_M_S = 5e-4, 1e-4
 """A robot that is nearer to its target and slower than this has arrived."""
 
+HALT_SECONDS = 0.5
+"""What it may take to come to a stand once it was told to stop."""
+
 SILENCE_SECONDS, STANDSTILL_SECONDS = 1.0, 3.0
 """Without data for so long, the connection is taken as lost; without motion, the robot as stuck."""
 
@@ -318,4 +321,3 @@ class URRobot:
             why=why.strip() or "it does not say why",
             fix="switch it to remote control, end other programs on it, and look at its pendant",
         )
-

@@ -26,6 +26,7 @@ import numpy as np
 from implicam.active import Loop, PredictedCovariance, Step, Target
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
+from implicam.dataset.model import METRES_PER_UNIT
 from implicam.detect import Detected, Detector, View, correct_outlines
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.formatting import json_safe
@@ -51,6 +52,9 @@ CALIBRATION_FILE, REPORT_FILE = "calibration.implicam", "report.html"
 
 MAX_TARGETS_WITHOUT_BALL = 5
 """In a row, after which a session does not go on by itself."""
+
+MAX_DRIFT_M = 5e-4
+"""Metres that a robot may have gone from its position when the pictures are taken; further where its `sd` is larger."""
 
 STOP_REPEAT_SECONDS = 2.0
 """For so long a robot that is to stop is told so again and again."""
@@ -393,7 +397,8 @@ class SessionController:
         return self.state
 
     def close(self) -> None:
-        """Close the equipment and the session; closing twice is harmless."""
+        """Stop a robot that is on its way, and close the equipment and the session; closing twice is harmless."""
+        self.leave()
         with self._camera_lock:
             for device in self._list_devices():
                 device.close()
@@ -436,6 +441,9 @@ class SessionController:
             self._report_trouble(error)
         except Exception as error:  # an error of a library: the session waits, and shows it
             self._report_unexpected(error)
+        except BaseException:  # Ctrl-C in this thread: nothing is being done any more
+            self._show(phase=before.phase, message=before.message, auto=False)
+            raise
 
     def _report_unexpected(self, error: Exception) -> None:
         """An error of another kind than ours."""
@@ -514,6 +522,7 @@ class SessionController:
     def _take_pictures(self, where: Floats) -> None:
         with self._camera_lock:
             frames = self._take_frames(self.equipment.trigger)
+        self._check_standing(where)
         looks = reject_implausible(
             self._detect_all(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration
         )
@@ -522,6 +531,19 @@ class SessionController:
         if not count:
             words = "the ball was not found in any camera: redo, or skip this target"
         self._show(phase="shown", looks=looks, position=where, message=words)
+
+    def _check_standing(self, where: Floats) -> None:
+        """HardwareError where the robot has left a position while it was photographed."""
+        robot, unit = self.equipment.robot, self.equipment.unit
+        if not robot.alone:
+            return
+        far = float(np.linalg.norm(robot.position() - where))
+        if far > max(MAX_DRIFT_M / METRES_PER_UNIT[unit], *np.nan_to_num(robot.sd)):
+            raise HardwareError(
+                f"the robot moved {far:.3g} {unit} while the pictures were taken.",
+                why="somebody else moves it, or it goes on by itself",
+                fix="let it stand still, and look again",
+            )
 
     def _take_frames(self, trigger: Trigger | None) -> list[Frame]:
         return take_frames(self.equipment.cameras, trigger, self.equipment.timeout, self._pool)
