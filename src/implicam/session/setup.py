@@ -231,7 +231,9 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
     if radius is None and setup.simulated:
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
     timeout = 10.0 if trigger is not None or all(source.live for source in cameras) else PATIENCE
-    equipment = Equipment(cameras, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run, setup.unit)
+    equipment = Equipment(
+        cameras, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run, setup.unit
+    )
     loop = Loop(
         calibrator_from_name(setup.method),
         workspace,
