@@ -61,6 +61,7 @@ CASES = [
     Case("inverse-gp", (("kernel", "matern-5/2"),), 2.0, 0.05),
     Case("inverse-gp", (("preset", "plain"),), 1.5, 0.05),
     Case("inverse-gp", (("preset", "paper"),), 20.0, 1e-3),
+    Case("inverse-gp", (("outputs", "coregionalised"),), 2.0, 0.05),
     Case("mlp", (), 25.0, 1e-3),
 ]
 """To add a method: add it here, with its bound."""

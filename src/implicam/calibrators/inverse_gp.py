@@ -8,7 +8,8 @@ maximum marginal likelihood. `paper`: the same, trained with the paper's softwar
 
 The stated covariance is that of a new noisy output: the function's plus the noise, since a pixel error of the
 measurement moves the position as much as one in the training data did. Of `plain` and `paper` it is diagonal, because
-the three GPs know nothing of each other.
+the three GPs know nothing of each other; unless outputs are coregionalised: one kernel for correlated x, y and z
+(gp/coregionalised.py), the paper's model with its "future work".
 """
 
 from __future__ import annotations
@@ -50,12 +51,15 @@ from implicam.dataset.requirements import match_cameras
 from implicam.dataset.unused import Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
+from implicam.gp.coregionalised import maximise_coregionalised
 from implicam.gp.linalg import solve_lower
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
 
 PRESETS = ("smooth", "plain", "paper")
+INDEPENDENT, COREGIONALISED = "independent", "coregionalised"
+OUTPUTS = (INDEPENDENT, COREGIONALISED)
 FORMER_PRESETS = {"standardised": "plain"}
 """Name in earlier versions -> name now."""
 UNIFORM_EXTENT_SDS = 2 * 3**0.5  # what a uniform spread extends over, in its standard deviations
@@ -72,7 +76,8 @@ class Hyperparameters:
 
 @dataclass(frozen=True)
 class InverseGP(CalibratorBase):
-    """kernel: `squared-exponential` or `matern-5/2`; preset: `smooth`, `plain` or `paper`.
+    """kernel: `squared-exponential` or `matern-5/2`; preset: `smooth`, `plain` or `paper`; outputs: of `plain`,
+    `independent` as in the paper, or `coregionalised`, which makes the preset `plain`.
 
     shortest_lengthscale: bound of every lengthscale, in standard deviations of the pixels. Optics are smooth across
     the image, so by default it is the extent of the pixels themselves (docs/decisions/0004-lattices.md).
@@ -82,6 +87,10 @@ class InverseGP(CalibratorBase):
     kernel: str = field(default="squared-exponential", metadata=option(" or ".join(SHAPES)))
     preset: str = field(
         default="smooth", metadata=option('smooth; "plain", the paper\'s model; "paper", its own software')
+    )
+    outputs: str = field(
+        default=INDEPENDENT,
+        metadata=option('independent, or "coregionalised": one kernel for correlated x, y and z (preset plain)'),
     )
     seed: int = 0
     shortest_lengthscale: float = UNIFORM_EXTENT_SDS
@@ -93,12 +102,22 @@ class InverseGP(CalibratorBase):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "preset", FORMER_PRESETS.get(self.preset, self.preset))
-        for what, value, known in (("kernel", self.kernel, SHAPES), ("preset", self.preset, PRESETS)):
+        for what, value, known in (
+            ("kernel", self.kernel, SHAPES),
+            ("preset", self.preset, PRESETS),
+            ("outputs", self.outputs, OUTPUTS),
+        ):
             if value not in known:
                 raise UsageError(
                     f"inverse-gp has no {what} {value!r}{did_you_mean(value, known)}.",
                     fix=f"choose one of {', '.join(known)}",
                 )
+        if self.outputs == COREGIONALISED and self.preset == "paper":
+            raise UsageError(
+                "the paper preset has independent outputs only.", fix="--preset plain --outputs coregionalised"
+            )
+        if self.outputs == COREGIONALISED:  # `smooth` has one process for correlated outputs as it is
+            object.__setattr__(self, "preset", "plain")
         if not 0 < self.shortest_lengthscale < np.inf:
             raise UsageError(f"shortest_lengthscale is {self.shortest_lengthscale!r}; it must be positive and finite.")
         if self.preset == "paper" and self.kernel != "squared-exponential":
@@ -106,8 +125,9 @@ class InverseGP(CalibratorBase):
 
     @classmethod
     def variants(cls) -> dict[str, dict[str, Any]]:
-        """The presets and the kernels."""
-        return {preset: {"preset": preset} for preset in PRESETS} | {shape: {"kernel": shape} for shape in SHAPES}
+        """The presets, the kernels, and coregionalised outputs."""
+        presets = {preset: {"preset": preset} for preset in PRESETS}
+        return presets | {shape: {"kernel": shape} for shape in SHAPES} | {COREGIONALISED: {"outputs": COREGIONALISED}}
 
     @property
     def library(self) -> tuple[str, str] | None:
@@ -130,8 +150,14 @@ class InverseGP(CalibratorBase):
         pixels, positions = Scaling.of(inputs), Scaling.of(outputs)
         if self.preset == "paper":  # it never standardised its positions: they are in metres, from the robot's origin
             positions = Scaling(np.zeros(3), np.full(3, 1.0 / data.metres_per_unit))
-        hyper = train(self, pixels.apply(inputs), positions.apply(outputs), progress)
-        return InverseGPCalibration(self, data, unused, pixels, positions, hyper)
+        X, Y = pixels.apply(inputs), positions.apply(outputs)
+        hyper = train(self, X, Y, progress)
+        if self.outputs == INDEPENDENT:
+            return InverseGPCalibration(self, data, unused, pixels, positions, hyper)
+        starts = [Fit(h.kernel, h.noise_variance, 0.0) for h in hyper]
+        found = maximise_coregionalised(X, Y, self.kernel, starts, shortest=self.shortest_lengthscale)
+        hyper = tuple(Hyperparameters(kernel, 1.0) for kernel in found.kernels)
+        return InverseGPCalibration(self, data, unused, pixels, positions, hyper, mixing=found.mixing)
 
     def _fitted_smooth(
         self, data: Dataset, progress: Progress, start: tuple[Smoothness, bool] | None = None, anew: bool = True
@@ -173,7 +199,8 @@ def _train(
 class InverseGPCalibration(CalibrationBase):
     """GPs conditioned on the known points that every camera saw.
 
-    hyperparameters: of the three of `plain` and `paper`; smoothness and basis: of the one of `smooth`.
+    hyperparameters: of the three of `plain` and `paper`; smoothness and basis: of the one of `smooth`; mixing (3, 3):
+    of coregionalised outputs, the three are of `positions @ mixing`.
     """
 
     calibrator: InverseGP
@@ -184,6 +211,7 @@ class InverseGPCalibration(CalibrationBase):
     hyperparameters: tuple[Hyperparameters, ...] = field(repr=False)
     smoothness: Smoothness | None = field(default=None, repr=False)
     basis: Floats | None = field(default=None, repr=False)
+    mixing: Floats | None = field(default=None, repr=False)
 
     method: ClassVar[str] = "inverse-gp"
 
@@ -201,6 +229,7 @@ class InverseGPCalibration(CalibrationBase):
     def processes(self) -> tuple[GaussianProcess, ...]:
         """The three conditioned GPs of `plain` and `paper`, in standardised units; none of `smooth`."""
         X, Y = self._known
+        Y = Y if self.mixing is None else Y @ self.mixing
 
         def one(pair: tuple[Hyperparameters, Floats]) -> GaussianProcess:
             h, y = pair
@@ -212,7 +241,8 @@ class InverseGPCalibration(CalibrationBase):
     def map(self) -> Map:
         """From standardised pixels to standardised positions."""
         if self.smoothness is None or self.basis is None:
-            return ThreeMaps(self.processes)
+            axes = np.eye(3) if self.mixing is None else np.linalg.inv(self.mixing)
+            return ThreeMaps(self.processes, np.asarray(axes, dtype=np.float64))
         return SmoothMap.condition(
             self.smoothness, self.basis, self.pixels.scale, *self._known, self.calibrator.settings
         )
@@ -400,6 +430,8 @@ class InverseGPCalibration(CalibrationBase):
             "noise_variance": np.array([x.noise_variance for x in h]),
             "mean": np.array([x.mean for x in h]),
         }
+        if self.mixing is not None:
+            arrays["mixing"] = self.mixing
         return table, arrays
 
     @classmethod
@@ -429,7 +461,12 @@ class InverseGPCalibration(CalibrationBase):
             )
             for i in range(3)
         )
-        return cls(calibrator, data, unused, pixels, positions, hyper)
+        mixing = None
+        if calibrator.outputs == COREGIONALISED:
+            mixing = finite_column(arrays, "mixing", (3, 3))
+            if np.linalg.matrix_rank(mixing) < 3:
+                raise ValueError("the mixing of the outputs is singular")
+        return cls(calibrator, data, unused, pixels, positions, hyper, mixing=mixing)
 
 
 def unlike_reason(far: float) -> str:

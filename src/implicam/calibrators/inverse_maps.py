@@ -63,14 +63,21 @@ class Map(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ThreeMaps:
-    """Three Gaussian processes that know nothing of each other: the paper's."""
+    """Three Gaussian processes that know nothing of each other: the paper's, one an axis; or, coregionalised, of three
+    mixtures of the axes.
+
+    Attributes:
+        processes: The three.
+        axes: (3, 3) what each adds to x, y and z: positions are `outputs @ axes`. Unity for one an axis.
+    """
 
     processes: tuple[GaussianProcess, ...]
+    axes: Floats
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """One an axis."""
-        return tuple(Part(gp, np.outer(e, e), 1) for gp, e in zip(self.processes, np.eye(3), strict=True))
+        """The processes, each with its share of the covariance."""
+        return tuple(Part(gp, np.outer(axis, axis), 1) for gp, axis in zip(self.processes, self.axes, strict=True))
 
     def inputs(self, X: Floats) -> Floats:
         """The pixels themselves."""
@@ -85,26 +92,32 @@ class ThreeMaps:
         return np.zeros((len(X), 3, 3))
 
     def predict(self, X: Floats) -> tuple[Floats, Floats]:
-        """The axes side by side; the covariance is diagonal."""
+        """The processes side by side; with one an axis the covariance is diagonal."""
 
         def one(gp: GaussianProcess) -> tuple[Floats, Floats]:
             mean, variance = gp.predict(X)
             return mean, variance + gp.noise_variance
 
         answers = side_by_side(one, self.processes)
+        means = np.stack([mean for mean, _ in answers], axis=1)
         variances = np.stack([variance for _, variance in answers], axis=1)
-        return np.stack([mean for mean, _ in answers], axis=1), variances[:, :, None] * np.eye(3)
+        return means @ self.axes, np.asarray(np.einsum("nk,kij->nij", variances, self._shares), dtype=np.float64)
 
     @property
     def noise(self) -> Floats:
-        """(3, 3) of each axis its own."""
-        return np.diag([gp.noise_variance for gp in self.processes])
+        """(3, 3) of the processes together."""
+        return np.asarray(np.einsum("k,kij->ij", [gp.noise_variance for gp in self.processes], self._shares))
+
+    @property
+    def _shares(self) -> Floats:
+        return np.stack([np.outer(axis, axis) for axis in self.axes])
 
     def leave_one_out(self) -> tuple[Floats, Floats]:
         """In closed form, hyperparameters kept."""
         pairs = [(gp.y, *gp.leave_one_out()) for gp in self.processes]
         errors = np.stack([y - mean for y, mean, _ in pairs], axis=1)
-        return errors, np.stack([variance for *_, variance in pairs], axis=1)
+        variances = np.stack([variance for *_, variance in pairs], axis=1)
+        return errors @ self.axes, variances @ self.axes**2
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from implicam.errors import NumericalError
-from implicam.gp.fit import MAX_LENGTHSCALE_SDS, Fit
+from implicam.gp.fit import MAX_LENGTHSCALE_SDS, MAX_START_LENGTHSCALE_SDS, Fit
 from implicam.gp.kernels import SHAPES, Floats, Kernel, squared_distances
 from implicam.gp.linalg import cholesky, solve
 from implicam.threads import side_by_side
@@ -114,14 +114,20 @@ def maximise_coregionalised(
         X: (n, d) inputs.
         Y: (n, m) outputs, n greater than m.
         shape: A key of `SHAPES`.
-        starts: Independent fits, one for each output: the search begins from the lengthscales of each.
+        starts: Independent fits, one for each output: the search begins from the lengthscales of each, and their mean.
         shortest: The least lengthscale, in the unit of its input.
 
     Raises:
         NumericalError: No start has a positive definite covariance.
     """
     likelihood = CoregionalisedLikelihood(X, Y, shape)
-    found = side_by_side(lambda start: _search(likelihood, shape, start, shortest), starts)
+    # A lengthscale that is long for one output has next to no gradient, but may be short for another.
+    alive = [np.minimum(start.kernel.lengthscale, MAX_START_LENGTHSCALE_SDS) for start in starts]
+    ratios = [start.noise_variance / start.kernel.signal_variance for start in starts]
+    alive.append(np.exp(np.mean(np.log(alive), axis=0)))
+    ratios.append(float(np.exp(np.mean(np.log(ratios)))))
+    tasks = list(zip(alive, ratios, strict=True))
+    found = side_by_side(lambda task: _search(likelihood, shape, *task, shortest), tasks)
     best = max(found, key=lambda fit: fit.log_marginal_likelihood)
     if best.log_marginal_likelihood <= -_FAILED:
         raise NumericalError(
@@ -130,16 +136,17 @@ def maximise_coregionalised(
     return best
 
 
-def _search(likelihood: CoregionalisedLikelihood, shape: str, start: Fit, shortest: float) -> CoregionalisedFit:
-    """From the lengthscales of an independent fit, with the covariance that is best if signal and noise are alike."""
+def _search(
+    likelihood: CoregionalisedLikelihood, shape: str, lengthscale: Floats, ratio: float, shortest: float
+) -> CoregionalisedFit:
+    """From lengthscales (d,) and a ratio of noise to signal, with the covariance that is best if both are alike."""
     X, Y = likelihood.X, likelihood.Y
     (n, d), m = X.shape, Y.shape[1]
     low = np.concatenate([np.full(d, np.log(shortest)), np.full(m, np.log(MIN_SIGNAL)), np.full(m * m, -np.inf)])
     high = np.concatenate(
         [np.full(d, np.log(MAX_LENGTHSCALE_SDS)), np.full(m, np.log(MAX_SIGNAL)), np.full(m * m, np.inf)]
     )
-    lengths = np.clip(np.log(start.kernel.lengthscale), low[:d], high[:d])
-    ratio = start.noise_variance / start.kernel.signal_variance
+    lengths = np.clip(np.log(lengthscale), low[:d], high[:d])
     A = Kernel(shape, 1.0, np.exp(lengths))(X, X)
     A[np.diag_indices(n)] += ratio
     signal = Y.T @ solve(cholesky(A), Y) / n
