@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from implicam.calibrators import Calibration, calibrator, calibrator_from_name
-from implicam.calibrators.explicit import ExplicitCalibration, rig_of
+from implicam.calibrators import Calibration, calibrator_from_name
+from implicam.calibrators.explicit import Explicit, ExplicitCalibration, rig_of
 from implicam.compare import Split, fit_each, judge
 from implicam.dataset import Dataset
 from implicam.errors import DatasetError, ImplicamError
@@ -191,9 +191,8 @@ def explicit_of(source: Source, cameras: str, method: str, each: int, pairs: int
             f"there are fewer than {each} pictures of each camera or {pairs} of each pair.",
             fix="the lines for smaller budgets are computed where there are enough pictures for them",
         )
-    fitted = calibrator(method, align="icp", boards=boards).fit(source.data(BALL, cameras))
-    assert isinstance(fitted, ExplicitCalibration)
-    return fitted
+    preset = Explicit.variants().get(method.partition(":")[2], {})
+    return Explicit(**preset, align="icp", boards=boards).fit(source.data(BALL, cameras))
 
 
 def _errors(fit: ExplicitCalibration | ImplicamError, data: Dataset) -> Values:
