@@ -63,6 +63,10 @@ CASES = (
     ("stereo", 36, 0.0),
     (WIDE_NAME, 36, 0.0),
     (WIDE_NAME, 36, 0.1),
+    ("2R", 10, 0.0),
+    ("bar6", 10, 0.0),
+    ("bar12 of the study", 36, 0.0),
+    ("dome24 of the study", 36, 0.0),
 )
 """Placement, known points, and the sd of their positions in mm."""
 
@@ -101,13 +105,14 @@ def check(rigs: int) -> None:
     lines = path.read_text().splitlines() if path.exists() else [HEADINGS, "|---" * HEADINGS.count(" | ") + "|---|"]
     print("\n".join(lines), flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        wide = Path(folder) / f"{WIDE_NAME}.toml"
-        wide.write_text(WIDE)
+        drawings = {WIDE_NAME: WIDE, CASES[-2][0]: drawn("bar", 12), CASES[-1][0]: drawn("dome", 24)}
+        for name, text in drawings.items():
+            (Path(folder) / f"{name}.toml").write_text(text)
         for name, points, sd in CASES:
             key = f"| {name} | {points} | {sd:g} | "
             if any(line.startswith(key) for line in lines):
                 continue
-            spec = str(wide) if name == WIDE_NAME else name
+            spec = str(Path(folder) / f"{name}.toml") if name in drawings else name
             count = rigs // 2 if sd else rigs  # their fits take ten times as long
             (design,) = compare_designs([spec], Assumptions(position_sd=sd), points, places=300, check=count)
             lines.append(key + as_line(design))
