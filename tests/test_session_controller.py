@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 from implicam import load_calibration, read_dataset
+from implicam.active import Step
 from implicam.detect import Ball, Detected
 from implicam.errors import FitError, HardwareError, ImplicamError, UsageError
 from implicam.hardware import Person
 from implicam.session import Session
 from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, Equipment, SessionController
-from implicam.session.setup import Setup, changed, open_session
+from implicam.session.setup import Setup, open_session, with_options
 
 SETUP = Setup(rig="stereo", budget=12, speed=1e6)
 
@@ -379,16 +380,16 @@ def test_two_sessions_on_one_folder_are_refused(controller: SessionController) -
 def test_another_rig_is_refused_and_another_budget_is_not(tmp_path: Path) -> None:
     open_session(tmp_path / "s", SETUP).close()
     with pytest.raises(UsageError, match="rig"):
-        open_session(tmp_path / "s", changed(SETUP, rig="bar6"))
+        open_session(tmp_path / "s", with_options(SETUP, rig="bar6"))
     with pytest.raises(UsageError, match="cameras"):
-        open_session(tmp_path / "s", changed(SETUP, cameras=(("a", "0"),)))
+        open_session(tmp_path / "s", with_options(SETUP, cameras=(("a", "0"),)))
     with pytest.raises(UsageError, match="workspace"):
-        open_session(tmp_path / "s", changed(SETUP, workspace="garbage"))
+        open_session(tmp_path / "s", with_options(SETUP, workspace="garbage"))
     open_session(tmp_path / "s", None).close()  # what was refused was not kept
-    with open_session(tmp_path / "s", changed(SETUP, budget=20)):
+    with open_session(tmp_path / "s", with_options(SETUP, budget=20)):
         pass
     with Session.open(tmp_path / "s") as session:
-        assert Setup.from_settings(session.settings) == changed(SETUP, budget=20)
+        assert Setup.from_settings(session.settings) == with_options(SETUP, budget=20)
 
 
 def test_by_itself_until_the_rule_says_stop(tmp_path: Path) -> None:
@@ -492,3 +493,15 @@ def test_setups_that_cannot_be_say_why() -> None:
             Setup(**wrong)  # type: ignore[arg-type]
         assert error.value.fix
     assert Setup.from_settings({**SETUP.as_settings(), "of a newer version": 1}) == SETUP
+
+
+def test_a_session_stops_when_it_has_converged_or_the_time_is_over() -> None:
+    """The rules of the command line, each by its own words."""
+    steady = [Step(8 + i, 2.0, 1.5, 1.0 + 0.001 * i, 3.0, 1.0, 10.0 * i) for i in range(8)]
+    assert Setup(rig="stereo", converged=5).rule.met(steady).startswith("the last 5 points changed it by")
+    assert Setup(rig="stereo", converged=0.1).rule.met(steady) == ""
+    assert Setup(rig="stereo", minutes=1).rule.met(steady) == "70 s have passed"
+    assert Setup(rig="stereo", minutes=2).rule.met(steady) == ""
+    for wrong in ({"minutes": 0}, {"converged": -1.0}):
+        with pytest.raises(UsageError, match="is not possible"):
+            Setup(**wrong)

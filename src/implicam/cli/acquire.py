@@ -159,9 +159,9 @@ def _acquire(
     Without cameras it shows the simulated rig. Every accepted point is on disk; run it again to go on.
     """
     from implicam.session.folder import is_session, make_folder
-    from implicam.session.setup import Setup, changed, open_session
+    from implicam.session.setup import Setup, open_session, with_options
 
-    changed(Setup(), **options)  # what is wrong with the words is said before anything is begun
+    with_options(Setup(), **options)  # what is wrong with the words is said before anything is begun
     opencv()
     if not unattended:
         import_extra("viser", "viewer", "the page of implicam acquire")
@@ -171,7 +171,7 @@ def _acquire(
     try:
         with _ended_by_sigterm(log), log_to_file(log, command_line()):
             before = _stored(folder)
-            setup = changed(before or Setup(), **options)
+            setup = with_options(before or Setup(), **options)
             if unattended and not setup.simulated:
                 raise UsageError(
                     "nothing is moved, and nobody is asked, while nobody looks.",

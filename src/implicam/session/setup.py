@@ -12,7 +12,18 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from implicam.active import Below, Budget, Loop, Rule, Within, Workspace, acquisition_from_name, workspace_from
+from implicam.active import (
+    Below,
+    Budget,
+    Converged,
+    Loop,
+    Rule,
+    Time,
+    Within,
+    Workspace,
+    acquisition_from_name,
+    workspace_from,
+)  # fmt: skip
 from implicam.active.acquisitions import ACQUISITIONS, DEFAULT_ACQUISITION
 from implicam.active.design_model import can_design_experiments, design_error, design_methods
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
@@ -46,8 +57,9 @@ SIMULATED = "simulated"
 SIMULATED_SPEED = 0.4
 """m/s of the simulated robot: fast enough not to wait for, slow enough to see it move."""
 
-PATIENCE = 60.0
-"""Seconds for the next picture of a camera that has none to spare: somebody, or another program, has to take it."""
+PICTURE_TIMEOUT_SECONDS, LIVE_TIMEOUT_SECONDS = 60.0, 10.0
+"""For the next picture: of a camera that has none to spare, because somebody or another program has to take it; and of
+one that is live or triggered."""
 
 # options under the headings of `implicam acquire --help`
 _rig = partial(Option, panel="Without hardware")
@@ -89,7 +101,9 @@ class Setup:
     workspace: Annotated[str, _plan("x0:x1,y0:y1,z0:z1 or a CSV of places: where the ball can be", "WHERE")] = ""
     below: Annotated[float | None, _plan("Stop at this 95 % uncertainty, everywhere", "LENGTH")] = None
     within: Annotated[float, _plan("Or at so many times what pixel noise leaves", "TIMES")] = 1.2
+    converged: Annotated[float | None, _plan("Or when five points changed it by less than so many %", "PERCENT")] = None
     budget: Annotated[int, _plan("Or after N points", "N", 1)] = 60
+    minutes: Annotated[float | None, _plan("Or after so many minutes of this sitting", "MIN")] = None
     acquisition: Annotated[str, _plan(lambda: ", ".join(ACQUISITIONS))] = DEFAULT_ACQUISITION
     reach: Annotated[float | None, _plan("A way that costs as much time as one point: no zigzag", "LENGTH")] = None
     method: Annotated[str, _plan(lambda: ", ".join(design_methods()))] = DEFAULT_METHOD
@@ -108,7 +122,7 @@ class Setup:
             raise design_error(method.calibration.method)
         acquisition_from_name(self.acquisition)
         _ = self.rule
-        for what in ("reach", "speed", "sd", "radius"):
+        for what in ("reach", "speed", "sd", "radius", "converged", "minutes"):
             value = getattr(self, what)
             if value is not None and not 0 < value < np.inf:
                 raise UsageError(f"{what} = {value:g} is not possible.", fix="give a number greater than zero")
@@ -119,7 +133,11 @@ class Setup:
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, Any]) -> Setup:
-        """The inverse of `as_settings`; what this version does not know is left out."""
+        """The inverse of `as_settings`.
+
+        Args:
+            settings: Plain values; what this version does not know is left out.
+        """
         known = {field.name for field in fields(cls)}
         return cls(**{key: value for key, value in settings.items() if key in known})
 
@@ -136,7 +154,11 @@ class Setup:
     def rule(self) -> Rule:
         """When to stop."""
         rule = Within(self.within) | Budget(self.budget)
-        return rule if self.below is None else Below(self.below) | rule
+        if self.below is not None:
+            rule = Below(self.below) | rule
+        if self.converged is not None:
+            rule = rule | Converged(self.converged / 100)
+        return rule if self.minutes is None else rule | Time(60 * self.minutes)
 
     def built(self) -> Rig:
         """The simulated rig."""
@@ -174,10 +196,18 @@ def position_from_text(text: str, option: str) -> Floats:
 def open_session(
     folder: Path, setup: Setup | None, *, auto: bool = False, say: Callable[[str], None] = print
 ) -> SessionController:
-    """The controller of a new session, or of the one in the folder: with its own setup where `setup` is None.
+    """The controller of a new session, or of the one in the folder.
 
-    Opens no camera and no robot yet but to learn the size of the pictures. UsageError where the folder is in use, or
-    holds something else.
+    Opens no camera and no robot yet but to learn the size of the pictures.
+
+    Args:
+        folder: Of the session.
+        setup: What it is begun with; None for its own, or, of a new one, the simulated rig.
+        auto: Whether the robot goes on by itself.
+        say: Told what is waited for.
+
+    Raises:
+        UsageError: The folder is in use, holds something else, or was begun with another rig.
     """
     if is_session(folder):
         session = Session.open(folder)
@@ -230,7 +260,8 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
     radius = setup.radius
     if radius is None and setup.simulated:
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
-    timeout = 10.0 if trigger is not None or all(source.live for source in cameras) else PATIENCE
+    waits = trigger is None and not all(source.live for source in cameras)
+    timeout = PICTURE_TIMEOUT_SECONDS if waits else LIVE_TIMEOUT_SECONDS
     equipment = Equipment(
         cameras, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run, setup.unit
     )
@@ -310,11 +341,17 @@ def _sized(setup: Setup, cameras: list[FrameSource], say: Callable[[str], None])
         for device in needed:
             devices.callback(device.close)
             device.open()
-        frames = take_frames(cameras, trigger, PATIENCE if trigger is None else 10.0, pool)
+        timeout = PICTURE_TIMEOUT_SECONDS if trigger is None else LIVE_TIMEOUT_SECONDS
+        frames = take_frames(cameras, trigger, timeout, pool)
         sizes = [frame.picture.shape for frame in frames]
     return [Camera(source.name, width, height) for source, (height, width) in zip(cameras, sizes, strict=True)]
 
 
-def changed(setup: Setup, **given: Any) -> Setup:
-    """The setup with what was given on the command line: everything that is not None."""
+def with_options(setup: Setup, **given: Any) -> Setup:
+    """The setup with what was given on the command line.
+
+    Args:
+        setup: What was there.
+        given: Options by name; None for those that were not given.
+    """
     return replace(setup, **{key: value for key, value in given.items() if value is not None})
