@@ -91,6 +91,19 @@ def test_the_contract_says_what_does_not_hold(wrong: Any, says: str) -> None:
         check_lens(wrong)
 
 
+@dataclass(frozen=True)
+class Blind(KannalaBrandt):
+    """With strong distortion it sees nothing, which is an answer."""
+
+    @cached_property
+    def _critical_angle(self) -> float:
+        return super()._critical_angle if self.k1 > -0.2 else 0.0
+
+
+def test_a_lens_may_see_nothing_where_its_parameters_are_past_the_usual() -> None:
+    check_lens(Blind(433.0, 431.0, 630.0, 405.0))
+
+
 def test_a_perspective_lens_sees_nothing_behind() -> None:
     points = np.random.default_rng(4).normal(size=(200, 3))
     for lens in EXAMPLES["brown-conrady"].values():

@@ -237,7 +237,8 @@ def _check_one_to_one(lens: Lens, points: Floats, least: float) -> None:
     _must((area > 0).all(), f"the image turns back on itself: {lens}")
     near = valid & (np.abs(uv - [lens.cx, lens.cy]) < 2e3).all(axis=1)
     rays, found = lens.ray_from_pixel(uv[near])
-    _must(not near.any() or found.mean() >= least, f"only {found.mean():.0%} of the pixels seen have a ray: {lens}")
+    share = float(np.mean(found)) if len(found) else 1.0
+    _must(share >= least, f"only {share:.0%} of the pixels seen have a ray: {lens}")
     _close(rays[found], _unit(points[near])[found], f"two points must not share a pixel: {lens}", atol=1e-4)
 
 
