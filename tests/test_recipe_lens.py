@@ -70,7 +70,7 @@ def test_a_file_with_a_lens_that_this_version_does_not_have_is_refused_by_name(
     write_dataset(data(5, 2), tmp_path / "new")
     ran = cli("measure", "toy.implicam", "new")
     assert ran.code == 1
-    assert "lens 'equisolid'" in " ".join(ran.err.split())
+    assert "lens of the family 'equisolid', which is not installed" in " ".join(ran.err.split())
 
 
 def test_every_command_takes_it(cli: Cli, tmp_path: Path, request: pytest.FixtureRequest) -> None:
