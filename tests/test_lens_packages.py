@@ -176,11 +176,21 @@ def test_a_family_that_cannot_be_started_is_told_with_the_reason() -> None:
             raise FitError("a perspective lens cannot look 80° off its axis.")
         return family
 
-    _, choice = choose_lens("auto", make, lambda made: np.ones(4))
+    _, choice = choose_lens("auto", make, lambda made: np.ones(4), 10.0)
     assert choice.lens == "kannala-brandt"
     notes = dropped_notes(["left", "right"], [choice, Choice("kannala-brandt", {})])
     assert notes == ["lens brown-conrady was not tried for left: a perspective lens cannot look 80° off its axis."]
     assert dropped_notes(["left"], [choice])[0].startswith("lens brown-conrady was not tried for any camera: a persp")
+
+
+def test_a_family_that_is_named_and_cannot_be_started_says_what_to_do() -> None:
+    """All cameras refused, it said to look for wrong rows; the cure of each camera stands in its reason."""
+
+    def make(family: str) -> str:
+        raise FitError("no start of narrow sees these points.", fix="use another lens, or auto, for this camera")
+
+    with pytest.raises(FitError, match="sees these points; use another lens, or auto, for this camera"):
+        choose_lens("narrow", make, lambda made: np.ones(4), 10.0)
 
 
 @pytest.mark.parametrize("method", [[], ["--method", "forward-gp"], ["--method", "explicit"]])

@@ -147,7 +147,7 @@ def fit_lens(start: AnyLens | Sequence[AnyLens], points: Floats, uv: Floats) -> 
         raise FitError(
             f"no start of {family} sees these points.",
             why=f"the best of {len(starts)} sees {seen} of {len(points)}; a wider lens of the family may see them all",
-            fix=f"another lens for this camera; or, in {family}, other starts for `nearest`",
+            fix=f"use another lens, or auto, for this camera; or give {family} other starts in its `nearest`",
         )
     best, *others = (_fit_from(one, points, uv) for one in able)
     for other in others:
@@ -156,7 +156,7 @@ def fit_lens(start: AnyLens | Sequence[AnyLens], points: Floats, uv: Floats) -> 
         raise FitError(
             f"the fit of {family} to these points stalled {best.rms:.3g} px (rms) off.",
             why="every step to a nearer lens loses some of the points, or the steps ran out",
-            fix=f"another lens for this camera; or, in {family}, other starts for `nearest`",
+            fix=f"use another lens, or auto, for this camera; or give {family} other starts in its `nearest`",
         )
     if best.cosine > MAX_STALLED_COSINE and best.rms > ROUND_TRIP_PX:
         _LOG.info("the fit of %s stalled %.3g px off, which is near enough to start from", family, best.rms)

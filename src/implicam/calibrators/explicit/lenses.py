@@ -64,7 +64,7 @@ def choose_lens(
         PartError: the lens that is named, of another package, fails.
     """
     if family != AUTO:
-        with _named(family):
+        with _named(family), _cure_in_reason():
             return make(family), Choice(family, {})
     started: dict[str, Made] = {}
     failure: FitError | None = None
@@ -117,6 +117,17 @@ def _named(family: str) -> Iterator[None]:
             why=f"{type(error).__name__}: {' '.join(str(error).split())}",
             fix=f"check it in the tests of {package}: implicam.testing.check_lens",
         ) from error
+
+
+@contextmanager
+def _cure_in_reason() -> Iterator[None]:
+    """What is told of a camera that is not calibrated is one sentence: the cure goes into it."""
+    try:
+        yield
+    except FitError as error:
+        if not error.fix:
+            raise
+        raise type(error)(f"{error.what.rstrip('.')}; {error.fix}.", why=error.why, fix=error.fix) from error
 
 
 def dropped_notes(names: Sequence[str], choices: Sequence[Choice]) -> list[str]:
