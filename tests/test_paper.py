@@ -38,7 +38,7 @@ from implicam.experiments.plan import (
 )
 from implicam.experiments.reproduction import EXPERIMENTS, reproduce
 from implicam.experiments.source import BALL, BOARD, BOARDS, BUDGETS, CHECK, PARTS, RANDOM, Source
-from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate
+from implicam.simulate import ball_grid, build_rig, moving_board, random_positions, simulate, simulate_boards
 
 ROOT = Path(__file__).parents[1]
 TINY = Plan(
@@ -421,6 +421,19 @@ def test_the_case_that_decides_is_shown_and_one_without_numbers_is_not_decided()
     rows = [row for row in rows if row["method"] != NETWORK or row["known"] != 157]
     found = judged(rows, "gp_beats_network", GP)
     assert (found.verdict, "with 157 points" in found.number) == (OPEN, True)
+
+
+def test_lines_for_more_pictures_than_there_are_are_not_begun(tmp_path: Path) -> None:
+    """With 10 + 4 pictures of measured data, eleven cells could only fail."""
+    folder = measured(tmp_path / "mine")
+    rig = build_rig("stereo", seed=1)
+    names = [camera.name for camera in rig.cameras]
+    groups = [(name,) for name in names for _ in range(10)] + [tuple(names)] * 4
+    write_dataset(simulate_boards(rig, groups, seed=2), folder / "boards")
+    cells = ball.cells(Source.of(folder, 0), replace(FULL, subsets=2))
+    budgets = {cell.name.split("/")[3] for cell in cells if cell.name.startswith("ball/explicit")}
+    assert budgets == {"10+4"}
+    assert not [cell for cell in cells if "alignment" in cell.name]
 
 
 def test_boards_are_in_the_order_of_their_numbers() -> None:

@@ -94,6 +94,8 @@ def _tables(summary: Mapping[str, Any]) -> list[Table]:
     tables = [_findings(summary["verdicts"])] if summary["verdicts"] else []
     if summary.get("ball"):
         tables.append(_ball(summary["ball"]))
+    if summary.get("active"):
+        tables.append(_active(summary["active"]))
     if summary.get("published"):
         tables.append(_published(summary["published"]))
     tables.append(_times(summary))
@@ -137,6 +139,17 @@ def _ball(table: Sequence[Mapping[str, Any]]) -> Table:
 def _median(rows: Sequence[Mapping[str, Any]], **wanted: Any) -> str:
     found = [row["rmse"][1] for row in rows if all(row[key] == value for key, value in wanted.items())]
     return decimal_number(found[0]) if found else "-"
+
+
+def _active(table: Sequence[Mapping[str, Any]]) -> Table:
+    """At the start, after some points and at the end: what is stated, and what errors are."""
+    keys = ("mean_sd", "max_sd", "rmse")
+    rows = [
+        [row["set"], row["method"], str(row["known"]), *(decimal_number(row[key][1]) for key in keys)] for row in table
+    ]
+    heads = ["cameras", "method", "points", "mean sd", "largest sd", "rms error"]
+    title = "Active learning: at the positions that are left, median of the starts, mm"
+    return show.text_table(title, heads, rows, left=2)
 
 
 def _published(table: Sequence[Mapping[str, Any]]) -> Table:

@@ -60,6 +60,7 @@ def cells(source: Source, plan: Plan) -> list[Cell]:
 
 
 def _explicit_cells(source: Source, plan: Plan) -> list[Cell]:
+    """The lines of explicit; of measured data those for which there are enough pictures."""
     if BOARDS not in source.parts:
         return []
     return [
@@ -68,6 +69,7 @@ def _explicit_cells(source: Source, plan: Plan) -> list[Cell]:
         for method in LINES
         for cameras in reversed(list(source.sets))
         for each, pairs in BUDGETS
+        if not source.folder or source.boards(cameras, each, pairs, 0) is not None
         for subset in range(1 if (each, pairs) == BUDGETS[0] else plan.subsets)
     ]  # fmt: skip
 
@@ -80,8 +82,8 @@ def _example_cells(source: Source, plan: Plan) -> list[Cell]:
         _cell(example, f"{NAME}/example/{slug(method)}", source, cameras=cameras, method=method, known=known)
         for method in EXAMPLES
     ]
-    if BOARDS in source.parts:
-        pair = ALIGNED_SET if ALIGNED_SET in names else names[0]
+    pair = ALIGNED_SET if ALIGNED_SET in names else names[0]
+    if BOARDS in source.parts and source.boards(pair, *BUDGETS[0], 0) is not None:
         found.append(_cell(alignment, f"{NAME}/alignment", source, cameras=pair))
     return found
 
