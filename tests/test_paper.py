@@ -15,6 +15,7 @@ import pytest
 from scipy import stats
 
 from implicam.calibrators import InverseGP, InverseGPCalibration, calibrator_from_name
+from implicam.calibrators.explicit import Explicit
 from implicam.calibrators.explicit.boards import boards_of
 from implicam.cli import main
 from implicam.dataset import Dataset, write_dataset
@@ -26,6 +27,7 @@ from implicam.experiments.evidence import FAILS, HOLDS, OPEN, Case, interval, ra
 from implicam.experiments.markdown import number, quartiles, table
 from implicam.experiments.plan import (
     EXPLICIT_BUNDLE,
+    EXPLICIT_PAPER,
     FORWARD,
     FULL,
     GP,
@@ -482,6 +484,32 @@ def test_explicit_is_a_line_that_the_most_points_must_cross() -> None:
     assert judged(rows, "learners_beat_poor_explicit", GP).verdict == HOLDS
     assert judged(rows_of_the_ball({GP: 2.0}), "explicit_wins_2R", GP).verdict == HOLDS
     assert judged(rows_of_the_ball({GP: 0.5}), "explicit_wins_2R", GP).verdict == FAILS
+
+
+@pytest.mark.parametrize("method", LINES)
+def test_each_line_is_computed_by_its_own_pipeline(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = list[Explicit]()
+
+    def fit(self: Explicit, data: Dataset) -> None:
+        taken.append(self)
+        raise FitError("enough is known.")
+
+    monkeypatch.setattr(Explicit, "fit", fit)
+    rows = ball.line(Source(0).options, "2R", method, 10, 4, 0)["rows"]
+    assert [(row["judged"], row["method"], row["failure"]) for row in rows] == [
+        (judged, method, "enough is known.") for judged in (BALL, CHECK)
+    ]
+    assert (taken[0].preset, taken[0].align) == (method.partition(":")[2] or "joint", "icp")
+    assert taken[0].boards is not None
+
+
+def test_a_line_of_the_papers_pipeline_has_its_reprojection_error() -> None:
+    for row in ball.line(Source(0).options, "2R", EXPLICIT_PAPER, 10, 4, 0)["rows"]:
+        assert not row["failure"]
+        assert 0.2 < row["rmse"] < 0.8
+        assert 0.25 < row["reprojection"] < 0.4
+        assert 0.8 < row["ellipsoid_95"] <= 1
+        assert row["calibrated"] == 2
 
 
 def test_the_papers_software_is_judged_by_the_papers_pipeline_in_both_variants() -> None:

@@ -15,6 +15,7 @@ from scipy.special import chdtri
 
 from implicam.calibrators import Calibration, calibrator_from_name
 from implicam.calibrators.explicit import Explicit, ExplicitCalibration, rig_of
+from implicam.calibrators.explicit.align import ICP
 from implicam.compare import Split, fit_each, judge
 from implicam.dataset import Dataset
 from implicam.errors import DatasetError, ImplicamError
@@ -194,7 +195,7 @@ def explicit_of(source: Source, cameras: str, method: str, each: int, pairs: int
             fix="the lines for smaller budgets are computed where there are enough pictures for them",
         )
     preset = Explicit.variants().get(method.partition(":")[2], {})
-    return Explicit(**preset, align="icp", boards=boards).fit(source.data(BALL, cameras))
+    return Explicit(**{**preset, "align": ICP, "boards": boards}).fit(source.data(BALL, cameras))
 
 
 def _errors(fit: ExplicitCalibration | ImplicamError, data: Dataset) -> Values:
