@@ -15,8 +15,10 @@ from implicam import registry
 from implicam.calibrators import load_calibration
 from implicam.errors import UsageError
 from implicam.hardware import CAMERAS, ROBOTS, TRIGGERS, camera_from, robot_from, trigger_from
+from implicam.session import Session, is_session
 from implicam.session.controller import CALIBRATION_FILE
 from implicam.session.setup import Setup, open_session
+from test_hardware_robots import HOST
 from toy_robot import AXES, RIG, ToyCamera, ToyRobot, ToyTrigger
 
 CORNERS = RIG.volume.world_from_box.apply((np.mgrid[0:2, 0:2, 0:2].reshape(3, -1).T - 0.5) * RIG.volume.size)
@@ -136,6 +138,44 @@ def test_a_robot_that_goes_on_by_itself_is_not_photographed(tmp_path: Path, monk
         controller.retry()
         controller.go()
         assert controller.state.phase == "shown"
+
+
+def test_a_driver_of_a_package_is_asked_before_those_here(tmp_path: Path) -> None:
+    (tmp_path / "folder.toy").mkdir()
+    assert isinstance(camera_from("left", "1.toy"), ToyCamera)
+    for spec in ("toy", "TOY:1", "Toy"):
+        with pytest.raises(UsageError, match=r"toy:NUMBER") as error:
+            camera_from("left", spec)
+        assert "did you mean 'toy'" in str(error.value) or "is a driver's name" in str(error.value)
+        assert f"{spec!r} names no camera (did you mean {spec!r}" not in str(error.value)
+    with pytest.raises(UsageError, match="did you mean 'toy'"):
+        robot_from("TOY:1", box=BOX)
+
+
+def test_a_robot_that_does_not_answer_is_said_at_once_and_not_kept(cli: Cli, tmp_path: Path) -> None:
+    cameras = ["--no-browser", "--port", "0", "--camera", "cam1=toy:0", "--camera", "cam2=toy:1"]
+    words = ["acquire", "s", *cameras, f"--workspace={WORKSPACE}"]
+    for address, says in ((HOST, "30004"), ("no-such-host.invalid", "30004")):
+        pytest.importorskip("rtde_receive", reason="the extra robot is not installed")
+        ran = cli(*words, "--robot", f"ur:{address}")
+        assert (ran.code, says in ran.err) == (1, True), ran.err
+        assert not is_session(tmp_path / "s")
+    open_session(tmp_path / "s", Setup(cameras=CAMERA_SPECS, robot="toy:1", workspace=WORKSPACE)).close()
+    AXES.silence(True)
+    ran = cli("acquire", "s", "--no-browser", "--port", "0", "--robot", "toy:2")
+    assert (ran.code, "the toy at 2 does not answer" in ran.err) == (1, True), ran.err
+    with Session.open(tmp_path / "s") as session:
+        assert session.settings["robot"] == "toy:1"
+
+
+def test_a_session_whose_driver_is_gone_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    open_session(tmp_path / "s", Setup(cameras=CAMERA_SPECS, robot="toy:1", workspace=WORKSPACE)).close()
+    monkeypatch.setattr(registry, "entry_points", lambda **by: EntryPoints())
+    monkeypatch.setattr(ROBOTS, "_parts", {key: part for key, part in ROBOTS._parts.items() if key != "toy"})
+    with pytest.raises(UsageError, match=r"cannot go on: 'toy:1' names no robot") as error:
+        open_session(tmp_path / "s", None)
+    assert "it was begun with --camera cam1=toy:0 --camera cam2=toy:1 --robot toy:1" in error.value.why
+    assert "install the package again" in error.value.fix
 
 
 def test_the_command_line_knows_it(cli: Cli) -> None:

@@ -97,6 +97,7 @@ class ToyRobot:
     def open(self) -> None:
         if self._link is None:
             self._link = AXES.link
+            self._ask()
 
     def position(self) -> Floats:
         here, moving = self._ask()

@@ -90,8 +90,9 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     Returns:
         `" (did you mean 'cam1'?)"`; empty where no word is close.
     """
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
-    return f" (did you mean {close[0]!r}?)" if close else ""
+    as_written = {one.lower(): one for one in known}
+    close = difflib.get_close_matches(word.lower(), list(as_written), n=1, cutoff=0.6)
+    return f" (did you mean {as_written[close[0]]!r}?)" if close else ""
 
 
 def import_extra(module: str, extra: str, purpose: str) -> ModuleType:

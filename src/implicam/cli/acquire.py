@@ -196,7 +196,7 @@ acquire_command = command("acquire")(OptionsOfParts(_acquire, "folder", _setup_o
 
 @contextmanager
 def _ended_by_sigterm(log: Path) -> Iterator[None]:
-    """SIGTERM is as Ctrl-C while the block runs, and the block ends within `CLOSING_SECONDS` of it."""
+    """SIGTERM, or the end of the terminal, is as Ctrl-C while the block runs, and it ends within `CLOSING_SECONDS`."""
 
     def cut_off() -> None:
         with suppress(OSError), log.open("a", encoding="utf-8") as file:
@@ -204,18 +204,22 @@ def _ended_by_sigterm(log: Path) -> Iterator[None]:
         os._exit(128 + signal.SIGTERM)
 
     def end(number: int, frame: object) -> None:
-        signal.signal(number, signal.SIG_IGN)
+        for again in heard:
+            signal.signal(again, signal.SIG_IGN)
         late.start()
         raise KeyboardInterrupt
 
     late = threading.Timer(CLOSING_SECONDS, cut_off)
     late.daemon = True
-    before = signal.signal(signal.SIGTERM, end)
+    signals = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+    heard = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]  # nohup ignores one
+    before = {number: signal.signal(number, end) for number in heard}
     try:
         yield
     finally:
         late.cancel()
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _stored(folder: Path) -> Any:

@@ -8,6 +8,7 @@ robot.move(xyz); frame = camera.frame()
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 from implicam.errors import UsageError, did_you_mean
@@ -70,7 +71,9 @@ CAMERAS: Registry[type[CameraDriver]] = Registry(
     "implicam.cameras",
     offers(CameraDriver),
 )
-"""Name -> driver; those that take a spec without their name are asked in this order."""
+"""Name -> driver; those that take a spec without their name are asked in this order, the ones `HERE` last."""
+
+HERE = (OpenCVCamera, FolderCamera, GenICamCamera)
 
 ROBOTS: Registry[type[RobotDriver]] = Registry(
     "robot", {"person": Person, "csv": CsvPlayer, "ur": URRobot}, "implicam.robots", offers(RobotDriver)
@@ -109,14 +112,21 @@ def camera_from(name: str, spec: str, *, triggered: bool = False) -> FrameSource
     Raises:
         UsageError: No driver takes it; the error says what the specs look like.
     """
-    driver, colon, rest = spec.partition(":")
+    driver, colon, _ = spec.partition(":")
     if colon and driver in CAMERAS:
-        return CAMERAS[driver].from_spec(name, rest, triggered=triggered)
-    for kind in CAMERAS.values():
+        kind, rest = CAMERAS.find(spec)
+        return kind.from_spec(name, rest, triggered=triggered)
+    for kind in sorted(CAMERAS.importable().values(), key=lambda kind: kind in HERE):  # those of packages first
         if kind.takes(spec):
             return kind.from_spec(name, spec, triggered=triggered)
-    known = (*CAMERAS, "/dev/video0", *STREAM_PREFIXES)
-    raise _unknown_error(CAMERAS, spec, known, why="there is no such file or folder either")
+    if driver in CAMERAS:
+        raise UsageError(
+            f"{spec!r} alone names no camera.", why="it is a driver's name", fix=f"write {CAMERAS[driver].spec}"
+        )
+    why = "there is no such file or folder either"
+    if Path(spec).is_file():
+        why = f"there is such a file, and by its ending it is no film; opencv:{spec} tries to read it as one"
+    raise _unknown_error(CAMERAS, spec, (*CAMERAS, "/dev/video0", *STREAM_PREFIXES), why=why)
 
 
 def robot_from(spec: str, **options: Any) -> GuardedRobot:
@@ -163,10 +173,9 @@ Driver = TypeVar("Driver")
 
 
 def _find_driver(drivers: Registry[Driver], spec: str) -> tuple[Driver, str]:
-    name, _, rest = spec.partition(":")
-    if name not in drivers:
+    if spec.partition(":")[0] not in drivers:
         raise _unknown_error(drivers, spec, tuple(drivers))
-    return drivers[name], rest
+    return drivers.find(spec)
 
 
 def _unknown_error(drivers: Registry[Any], spec: str, known: tuple[str, ...], why: str = "") -> UsageError:

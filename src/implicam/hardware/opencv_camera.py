@@ -21,6 +21,12 @@ from implicam.hardware.protocol import Frame, Grey
 from implicam.images import opencv
 
 STREAM_PREFIXES = ("rtsp://", "rtsps://", "http://", "https://", "udp://")
+FILM_ENDINGS = (
+    ".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".mjpg", ".mjpeg", ".ts", ".mts", ".wmv", ".flv",
+    ".ogv", ".3gp", ".y4m",
+)  # fmt: skip
+"""Of files that are taken for films by their names."""
+
 STALE_DEVICE_PICTURES, STALE_STREAM_PICTURES = 1, 2
 """Pictures after the call that may have been exposed before it: the one on its way, and the one in a stream's decoder,
 which knows that a picture is whole when the next begins."""
@@ -41,12 +47,13 @@ class OpenCVCamera:
 
     @classmethod
     def takes(cls, spec: str) -> bool:
-        """Whether a spec without the driver's name is a device, the address of a stream, or a file.
+        """Whether a spec without the driver's name is a device, the address of a stream, or a file named like a film.
 
         Args:
             spec: The words of the command line.
         """
-        return spec.isdecimal() or spec.startswith(("/dev/", *STREAM_PREFIXES)) or Path(spec).is_file()
+        film = Path(spec).suffix.lower() in FILM_ENDINGS and Path(spec).is_file()
+        return spec.isdecimal() or _is_device(spec) or spec.startswith(STREAM_PREFIXES) or film
 
     @classmethod
     def from_spec(cls, name: str, rest: str, *, triggered: bool = False) -> Self:
@@ -64,7 +71,7 @@ class OpenCVCamera:
         text = str(source)
         self.source: int | str = int(text) if text.isdecimal() else text
         self._source_text = re.sub("//[^/]*@", "//...@", text)  # no password in a message
-        self._device = isinstance(self.source, int) or text.startswith("/dev/")
+        self._device = isinstance(self.source, int) or _is_device(text)
         self._film = not self._device and not text.startswith(STREAM_PREFIXES)
         self.live = not (triggered or self._film)
         self._skip = 0 if triggered else STALE_DEVICE_PICTURES if self._device else STALE_STREAM_PICTURES
@@ -214,6 +221,10 @@ def _silence_opencv(cv2: Any) -> Iterator[None]:
         yield
     finally:
         cv2.utils.logging.setLogLevel(level)
+
+
+def _is_device(text: str) -> bool:
+    return text.startswith("/dev/") and not text.startswith("/dev/shm/")
 
 
 def _to_grey(image: NDArray[np.uint8]) -> Grey:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -193,45 +193,82 @@ def position_from_text(text: str, option: str) -> Floats:
     return position
 
 
+Hardware = tuple[list[FrameSource], Robot, Workspace]
+
+
 def open_session(
     folder: Path, setup: Setup | None, *, auto: bool = False, say: Callable[[str], None] = print
 ) -> SessionController:
     """The controller of a new session, or of the one in the folder.
 
-    Opens no camera and no robot yet but to learn the size of the pictures.
+    The robot is connected, so that a wrong address is said at once, and never kept. The cameras of a new session are
+    opened to learn the size of the pictures.
 
     Args:
         folder: Of the session.
-        setup: What it is begun with; None for its own, or, of a new one, the simulated rig.
-        auto: Whether the robot goes on by itself.
-        say: Told what is waited for.
+        setup: What to begin it with, or what to change; None for what it was begun with.
+        auto: Go on without being asked.
+        say: Shows a line of text.
 
     Raises:
-        UsageError: The folder is in use, holds something else, or was begun with another rig.
+        UsageError: The folder is in use or holds something else, or the setup is not possible.
+        HardwareError: The robot, or in a new session a camera, does not answer.
     """
     if is_session(folder):
         session = Session.open(folder)
         try:
             now = _continued(session, setup)
-            controller = _made(session, now, _hardware(now, say), auto)
-            kept = session.settings
-            for key, value in now.as_settings().items():  # once it is known that it works
-                if key not in kept or kept[key] != value:
-                    session.set(key, value)
-            return controller
+            with _connected(_found_again(session, now, say)) as hardware:
+                controller = _made(session, now, hardware, auto)
+                kept = session.settings
+                for key, value in now.as_settings().items():  # once it is known that it works
+                    if key not in kept or kept[key] != value:
+                        session.set(key, value)
+                return controller
         except BaseException:
             session.close()
             raise
     setup = setup or Setup()
-    hardware = _hardware(setup, say)
-    session = Session.create(
-        folder,
-        name=folder.absolute().name,
-        length_unit=setup.unit,
-        cameras=_sized(setup, hardware[0], say),
-        settings=setup.as_settings(),
-    )
-    return _made(session, setup, hardware, auto)
+    with _connected(_hardware(setup, say)) as hardware:
+        session = Session.create(
+            folder,
+            name=folder.absolute().name,
+            length_unit=setup.unit,
+            cameras=_sized(setup, hardware[0], say),
+            settings=setup.as_settings(),
+        )
+        return _made(session, setup, hardware, auto)
+
+
+@contextmanager
+def _connected(hardware: Hardware) -> Iterator[Hardware]:
+    """With the robot connected; it is let go of after an error."""
+    robot = hardware[1]
+    try:
+        robot.open()
+        yield hardware
+    except BaseException:
+        robot.close()
+        raise
+
+
+def _found_again(session: Session, setup: Setup, say: Callable[[str], None]) -> Hardware:
+    """As `_hardware`; what a session was begun with and is not to be had any more is said to be of the session."""
+    before = Setup.from_settings(session.settings)
+    try:
+        return _hardware(setup, say)
+    except UsageError as error:
+        if (setup.cameras, setup.robot, setup.trigger) != (before.cameras, before.robot, before.trigger):
+            raise
+        words = [f"--camera {name}={spec}" for name, spec in before.cameras]
+        words += [f"--robot {before.robot}"] if before.robot else []
+        words += [f"--trigger {before.trigger}"] if before.trigger else []
+        raise UsageError(
+            f"the session in {session.folder} cannot go on: {error.what}",
+            why=f"it was begun with {' '.join(words)}; what was measured is kept"
+            + (f". {error.why}" if error.why else ""),
+            fix=f"install the package again that brought what is missing, or name another: {error.fix}",
+        ) from error
 
 
 def _continued(session: Session, setup: Setup | None) -> Setup:
@@ -249,9 +286,6 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
     if setup.simulated != before.simulated:
         raise UsageError(f"the session in {session.folder} has other cameras.", fix="begin another in another folder")
     return setup
-
-
-Hardware = tuple[list[FrameSource], Robot, Workspace]
 
 
 def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> SessionController:

@@ -8,7 +8,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
@@ -373,11 +373,9 @@ def serve(
             import webbrowser
 
             webbrowser.open(front.url)
-        while not page.closed.wait(0.5):
-            pass
-    except KeyboardInterrupt:
-        if controller.state.phase == "moving":
-            controller.stop_robot()
+        with suppress(KeyboardInterrupt):
+            while not page.closed.wait(0.5):
+                pass
     finally:
         controller.leave()  # before anything is waited for: the robot may be on its way
         front.close()
