@@ -144,11 +144,14 @@ def test_a_stop_while_a_person_is_asked_is_heard() -> None:
 
 
 def test_a_driver_that_is_not_complete_is_refused_when_it_is_made() -> None:
-    class Half(Careless):
-        stop = None  # type: ignore[assignment]
+    class Half:
+        moves = alone = True
+
+        def move(self, xyz: Floats) -> Floats:
+            return xyz
 
     for half in (Half(), None):
-        with pytest.raises(UsageError, match=r"is not complete: it has no .*stop") as caught:
+        with pytest.raises(UsageError, match=r"the driver of half:1 is not complete: it has no .*stop") as caught:
             guard_robot(half, RobotOptions(), "half:1")  # type: ignore[arg-type]
         says_all(caught.value)
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from implicam.dataset.model import METRES_PER_UNIT
 from implicam.errors import HardwareError, ImplicamError, UsageError
-from implicam.hardware.guard import MEMBERS
 from implicam.hardware.protocol import Floats, Robot, RobotOptions
+from implicam.registry import missing_members
 
 HALT_SECONDS = 0.5
 """From `stop` to a stand."""
@@ -138,8 +138,8 @@ class _Check:
 
     def members_and_options(self) -> None:
         robot = self._make(self._options)
-        for member in MEMBERS:
-            assert hasattr(robot, member), f"it has no {member}"
+        missing = missing_members(robot, Robot)
+        assert not missing, f"it has no {', '.join(missing)}"
         assert robot.moves is True, "check_robot is for robots that move by themselves"
         assert robot.alone is True, "check_robot is for robots that move by themselves"
         robot.close()

@@ -7,7 +7,6 @@ after such a move the robot has no position until it has been seen to stand.
 
 from __future__ import annotations
 
-import inspect
 import threading
 import time
 from contextlib import suppress
@@ -26,15 +25,13 @@ from implicam.hardware.protocol import (
     check_position,
     format_position,
 )
+from implicam.registry import missing_members
 
 OUTSIDE_M = 1e-3
 """Metres that a robot may stand outside of its box: it was sent to the very edge, and is not exact."""
 
 STANDING_M, STANDING_SECONDS = 1e-4, 0.5
 """A robot that has gone no further than this in this time stands; further where its `sd` is larger."""
-
-MEMBERS = ("sd", "moves", "alone", "open", "position", "move", "stop", "reachable", "close")
-"""What `Robot` asks for."""
 
 
 class GuardedRobot:
@@ -188,8 +185,8 @@ def guard_robot(robot: Robot, options: RobotOptions, name: str = "the robot") ->
     Raises:
         UsageError: The driver lacks something that `Robot` asks for, or the box is none.
     """
-    missing = [member for member in MEMBERS if inspect.getattr_static(robot, member, None) is None]
-    if missing and not isinstance(robot, GuardedRobot):
+    missing = missing_members(robot, Robot)
+    if missing:
         raise UsageError(
             f"the driver of {name} is not complete: it has no {', '.join(missing)}.",
             why="a session must be able to move, ask and stop every robot",
