@@ -35,7 +35,14 @@ class NetworkTrigger:
 
     @classmethod
     def from_spec(cls, rest: str) -> Self:
-        """As of `TriggerDriver`."""
+        """A trigger box by its address, not connected yet.
+
+        Args:
+            rest: "//HOST:PORT".
+
+        Raises:
+            UsageError: The address is not complete.
+        """
         return cls(f"{cls.spec.partition(':')[0]}:{rest}")
 
     def __init__(self, address: str, timeout: float = 1.0) -> None:
