@@ -180,3 +180,24 @@ def test_ctrl_c_in_the_thread_that_moves_stops_the_driver(tmp_path: Path, monkey
             guided.go()
         assert stopped == [True]
         assert guided.state.phase == "aim"
+
+
+def test_a_robot_that_moves_while_it_is_photographed_is_trouble(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_session(tmp_path / "s", replace(SLOW, speed=1e6)) as guided:
+        guided.start()
+        camera, driver = guided.equipment.cameras[0], guided.equipment.robot.driver  # type: ignore[attr-defined]
+        plain = camera.frame
+
+        def frame(timeout: float = 5.0) -> object:
+            driver._reported = driver._reported + 1.0
+            return plain(timeout)
+
+        with monkeypatch.context() as pushed:
+            pushed.setattr(camera, "frame", frame)
+            guided.go()
+        assert "the robot moved 1.73 mm while the pictures were taken" in guided.state.message
+        guided.retry()
+        guided.go()
+        assert guided.state.phase == "shown"
