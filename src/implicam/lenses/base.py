@@ -68,10 +68,24 @@ class Lens(Protocol):
         """
 
     def jacobian(self, points: Floats) -> Floats:
-        """(n, 2, 3) derivative of the pixels with respect to the points (n, 3); NaN where there is no pixel."""
+        """The derivative of the pixels with respect to the points.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 2, 3) in pixels per length unit of the points; NaN where there is no pixel.
+        """
 
     def parameter_jacobian(self, points: Floats) -> Floats:
-        """(n, 2, p) derivative of the pixels of points (n, 3) by the p parameters; NaN where there is no pixel."""
+        """The derivative of the pixels with respect to the p parameters.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 2, p), in the order of the fields; NaN where there is no pixel.
+        """
 
     def ray_from_pixel(self, uv: Floats) -> tuple[Floats, Bools]:
         """The rays that pixels look along.
@@ -210,24 +224,56 @@ def _fit(start: AnyLens, points: Floats, uv: Floats) -> _LensFit[AnyLens]:
 
 
 def focal_lengths(lens: Lens) -> tuple[float, float]:
-    """The focal lengths along u and v at the middle of the image, pixels; by contract, the lens's fx and fy."""
+    """The focal lengths at the middle of the image; by contract, the lens's fx and fy.
+
+    Args:
+        lens: Of any family.
+
+    Returns:
+        Along u and along v, pixels.
+    """
     fx, fy = np.diagonal(lens.jacobian(np.array([[0.0, 0.0, 1.0]]))[0]).tolist()
     return fx, fy
 
 
 def pixel_from_plane(lens: Lens, xy: Floats) -> Floats:
-    """(n, 2) pixels of places (n, 2) in the plane at distance 1, distorted already."""
+    """The pixels of places in the plane at distance 1, distorted already.
+
+    Args:
+        lens: Its focal lengths and principal point are used, and nothing else.
+        xy: (n, 2) in the plane.
+
+    Returns:
+        (n, 2) pixels.
+    """
     return xy * [lens.fx, lens.fy] + [lens.cx, lens.cy]
 
 
 def plane_from_pixel(lens: Lens, uv: Floats) -> Floats:
-    """The inverse of `pixel_from_plane`."""
+    """The inverse of `pixel_from_plane`.
+
+    Args:
+        lens: Its focal lengths and principal point are used, and nothing else.
+        uv: (n, 2) pixels.
+
+    Returns:
+        (n, 2) in the plane at distance 1, distorted still.
+    """
     plane: Floats = (uv - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
     return plane
 
 
 def check_rays(lens: Lens, rays: Floats, uv: Floats) -> tuple[Floats, Bools]:
-    """Unit rays, NaN where the lens does not bring them back to their pixel; and (n,) where it does."""
+    """Which rays a lens brings back to their pixels.
+
+    Args:
+        lens: Of any family.
+        rays: (n, 3) directions in the camera frame, of any length.
+        uv: (n, 2) pixels they should look along.
+
+    Returns:
+        Unit rays (n, 3), NaN where they do not come back within `ROUND_TRIP_PX`; and (n,) where they do.
+    """
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     back, valid = lens.pixel_from_camera_point(rays)
     valid &= (np.abs(back - uv) < ROUND_TRIP_PX + 1e-12 * np.abs(uv)).all(axis=1)

@@ -42,12 +42,26 @@ class BrownConrady:
     k3: float = 0.0
 
     def pixel_from_camera_point(self, points: Floats) -> tuple[Floats, Bools]:
-        """Pixels (n, 2) of points (n, 3) in the camera frame, any length unit; and (n,) where they exist, else NaN."""
+        """The pixels of points.
+
+        Args:
+            points: (n, 3) in the camera frame, any length unit.
+
+        Returns:
+            (n, 2) pixels, NaN where there is none, and (n,) whether there is one.
+        """
         xy, valid = self._plane_from_point(points)
         return pixel_from_plane(self, self._distort(xy)), valid
 
     def jacobian(self, points: Floats) -> Floats:
-        """(n, 2, 3) derivative of the pixels with respect to the points; NaN where there is no pixel."""
+        """The derivative of the pixels with respect to the points.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 2, 3) in pixels per length unit of the points; NaN where there is no pixel.
+        """
         xy, valid = self._plane_from_point(points)
         z = np.where(valid, points[:, 2], np.nan)
         plane = np.zeros((len(xy), 2, 3))  # d (x/z, y/z) / d (x, y, z)
@@ -58,7 +72,14 @@ class BrownConrady:
         return jacobian
 
     def parameter_jacobian(self, points: Floats) -> Floats:
-        """(n, 2, 9) derivative of the pixels with respect to fx, fy, cx, cy, k1, k2, p1, p2, k3; NaN for no pixel."""
+        """The derivative of the pixels with respect to fx, fy, cx, cy, k1, k2, p1, p2, k3.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 2, 9); NaN where there is no pixel.
+        """
         xy, _ = self._plane_from_point(points)
         x, y = xy.T
         r2 = x * x + y * y
@@ -74,7 +95,14 @@ class BrownConrady:
         return out
 
     def ray_from_pixel(self, uv: Floats) -> tuple[Floats, Bools]:
-        """Unit rays (n, 3) in the camera frame of pixels (n, 2); and (n,) where they exist, else NaN."""
+        """The rays that pixels look along.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            (n, 3) unit vectors in the camera frame, NaN where there is none, and (n,) whether there is one.
+        """
         distorted = plane_from_pixel(self, uv)
         radius = np.hypot(*distorted.T)
         # Decentring pushes some pixels beyond the radial polynomial's reach: start them just inside its fold.
@@ -86,17 +114,34 @@ class BrownConrady:
         return check_rays(self, np.column_stack([xy, np.ones(len(xy))]), uv)
 
     def distortion_prior(self, widest: float, sds: DistortionSds | None = None) -> tuple[Floats, Floats]:
-        """As of `Lens`: independent, about no distortion."""
+        """The prior of the distortion, as of `Lens`: independent, about no distortion.
+
+        Args:
+            widest: Radians off its axis up to which the lens is used; beyond 1.5 it counts as 1.5.
+            sds: Of k1, k2, k3, and fourth of both p1 and p2; and of what k1, k2, k3 may do at the edge. None for
+                `PRIOR_SD` and `AT_EDGE_PRIOR_SD`.
+
+        Returns:
+            Mean (5,), zero, and precision (5, 5) of k1, k2, p1, p2, k3.
+        """
         own, at_edge = sds or (PRIOR_SD, AT_EDGE_PRIOR_SD)
         k1, k2, k3 = np.minimum(own[:3], at_edge / np.tan(min(widest, 1.5)) ** np.array([2, 4, 6]))
         return np.zeros(5), np.diag(1 / np.array([k1, k2, own[3], own[3], k3]) ** 2)
 
     @classmethod
     def nearest(cls, lens: Lens, points: Floats) -> BrownConrady:
-        """As of `Lens`; linear least squares, with k1 and k2 only: a third term invites folds.
+        """The lens nearest to another, as of `Lens`; by linear least squares, with k1 and k2 only: a third term invites
+        folds.
+
+        Args:
+            lens: Of any family.
+            points: (n, 3) in the camera frame, all seen by that lens.
+
+        Returns:
+            A lens that sees all of them.
 
         Raises:
-            FitError: the points are too far off the axis for a perspective lens.
+            FitError: The points are too far off the axis for a perspective lens, or none was found that sees them.
         """
         cure = "use kannala-brandt, or auto, for this camera"
         widest = float(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max())

@@ -53,20 +53,48 @@ class KannalaBrandt:
     k4: float = 0.0
 
     def pixel_from_camera_point(self, points: Floats) -> tuple[Floats, Bools]:
-        """As `BrownConrady.pixel_from_camera_point`; a lens that bends so far sees points behind the camera."""
+        """The pixels of points; a lens that bends so far sees points behind the camera.
+
+        Args:
+            points: (n, 3) in the camera frame, any length unit.
+
+        Returns:
+            (n, 2) pixels, NaN where there is none, and (n,) whether there is one.
+        """
         at = self._polar(points)
         return pixel_from_plane(self, at.xyz[:, :2] * at.across[:, None]), at.valid
 
     def jacobian(self, points: Floats) -> Floats:
-        """(n, 2, 3) derivative of the pixels with respect to the points; NaN where there is no pixel."""
+        """The derivative of the pixels with respect to the points.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 2, 3) in pixels per length unit of the points; NaN where there is no pixel.
+        """
         return self._by_point(self._polar(points))
 
     def parameter_jacobian(self, points: Floats) -> Floats:
-        """(n, 2, 8) derivative of the pixels with respect to fx, fy, cx, cy, k1 ... k4; NaN where there is no pixel."""
+        """The derivative of the pixels with respect to fx, fy, cx, cy, k1 ... k4.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 2, 8); NaN where there is no pixel.
+        """
         return self._by_parameters(self._polar(points))
 
     def pixel_and_slopes(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """Pixels, `jacobian` and `parameter_jacobian` at once, in half the time."""
+        """Pixels, `jacobian` and `parameter_jacobian` at once, in half the time.
+
+        Args:
+            points: (n, 3) in the camera frame.
+
+        Returns:
+            (n, 2) pixels, (n, 2, 3) and (n, 2, 8) their derivatives; NaN where there is no pixel.
+        """
         at = self._polar(points)
         pixel = pixel_from_plane(self, at.xyz[:, :2] * at.across[:, None])
         return pixel, self._by_point(at), self._by_parameters(at)
@@ -97,7 +125,14 @@ class KannalaBrandt:
         return out
 
     def ray_from_pixel(self, uv: Floats) -> tuple[Floats, Bools]:
-        """Unit rays (n, 3) in the camera frame of pixels (n, 2); and (n,) where they exist, else NaN."""
+        """The rays that pixels look along.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            (n, 3) unit vectors in the camera frame, NaN where there is none, and (n,) whether there is one.
+        """
         bent = plane_from_pixel(self, uv)
         radius = np.hypot(*bent.T)
         theta = invert_odd_polynomial(radius, self._radial, self._critical_angle)
@@ -105,7 +140,16 @@ class KannalaBrandt:
         return check_rays(self, rays, uv)
 
     def distortion_prior(self, widest: float, sds: DistortionSds | None = None) -> tuple[Floats, Floats]:
-        """As of `Lens`: about the line from an equidistant to a perspective lens, eq. (3) of docs/method.md."""
+        """The prior of the distortion, as of `Lens`: about the line from an equidistant to a perspective lens, eq. (3)
+        of docs/method.md.
+
+        Args:
+            widest: Radians off its axis up to which the lens is used.
+            sds: Of k1 ... k4, and of what each may do at the edge. None for `PRIOR_SD` and `AT_EDGE_PRIOR_SD`.
+
+        Returns:
+            Mean (4,) and precision (4, 4) of k1 ... k4.
+        """
         own, at_edge = sds or (PRIOR_SD, AT_EDGE_PRIOR_SD)
         sd = np.minimum(own, at_edge / widest ** np.array([2, 4, 6, 8]))
         covariance = np.diag(sd**2) + 0.25 * np.outer(PERSPECTIVE_K, PERSPECTIVE_K)
@@ -113,7 +157,18 @@ class KannalaBrandt:
 
     @classmethod
     def nearest(cls, lens: Lens, points: Floats) -> KannalaBrandt:
-        """As of `Lens`; one of this family is itself."""
+        """The lens nearest to another, as of `Lens`; one of this family is itself.
+
+        Args:
+            lens: Of any family.
+            points: (n, 3) in the camera frame, all seen by that lens.
+
+        Returns:
+            A lens that sees all of them.
+
+        Raises:
+            FitError: No lens of this family was found that sees these points.
+        """
         if isinstance(lens, cls):
             return lens
         uv = lens.pixel_from_camera_point(points)[0]

@@ -8,12 +8,28 @@ from implicam.lenses.base import Floats
 
 
 def odd_polynomial(t: Floats, k: tuple[float, ...]) -> Floats:
-    """The distortion polynomial t (1 + k1 t² + k2 t⁴ + ...)."""
+    """The distortion polynomial t (1 + k1 t² + k2 t⁴ + ...).
+
+    Args:
+        t: Where; of any shape.
+        k: k1, k2, ...: one or more.
+
+    Returns:
+        Its values, of the same shape.
+    """
     return t * _polynomial([*k[::-1], 1.0], t * t)
 
 
 def odd_polynomial_slope(t: Floats, k: tuple[float, ...]) -> Floats:
-    """Its derivative by t."""
+    """The derivative of `odd_polynomial` by t.
+
+    Args:
+        t: Where; of any shape.
+        k: k1, k2, ...: one or more.
+
+    Returns:
+        The slopes, of the same shape.
+    """
     return _polynomial(_slope_in_square(k), t * t)
 
 
@@ -31,7 +47,14 @@ def _slope_in_square(k: tuple[float, ...]) -> list[float]:
 
 
 def first_turning_point(k: tuple[float, ...]) -> float:
-    """The smallest positive t where the polynomial stops growing; infinite where it never does."""
+    """The smallest positive t where the polynomial stops growing; infinite where it never does.
+
+    Args:
+        k: k1, k2, ...: one or more.
+
+    Returns:
+        This t.
+    """
     if min(k) >= 0:
         return float("inf")
     roots = np.roots(_slope_in_square(k))
@@ -40,7 +63,16 @@ def first_turning_point(k: tuple[float, ...]) -> float:
 
 
 def invert_odd_polynomial(value: Floats, k: tuple[float, ...], upper: float) -> Floats:
-    """The t in [0, upper) where the polynomial is `value` >= 0, or NaN: Newton's method kept inside a bracket."""
+    """The t at which the polynomial has given values: Newton's method kept inside a bracket.
+
+    Args:
+        value: 0 or more; of any shape.
+        k: k1, k2, ...: one or more.
+        upper: Where the polynomial stops growing, as `first_turning_point` says; may be infinite.
+
+    Returns:
+        t in [0, upper), of the same shape; NaN where the polynomial does not come so far.
+    """
     low, high = np.zeros_like(value), np.full_like(value, upper if np.isfinite(upper) else 1.0)
     if not np.isfinite(upper):
         for _ in range(60):  # grows without end, so some power of two is beyond
@@ -57,13 +89,30 @@ def invert_odd_polynomial(value: Floats, k: tuple[float, ...], upper: float) -> 
 
 
 def divide(a: Floats | float, b: Floats, at_zero: Floats | float) -> Floats:
-    """`a / b`, and its limit `at_zero` where b is zero."""
+    """`a / b`, and its limit `at_zero` where b is zero.
+
+    Args:
+        a: The numerator.
+        b: The denominator, of any shape that broadcasts with `a`.
+        at_zero: The value where b is zero.
+
+    Returns:
+        The quotients.
+    """
     zero = b == 0
     return np.where(zero, at_zero, a / np.where(zero, 1.0, b))
 
 
 def solve_2x2(matrices: Floats, vectors: Floats) -> Floats:
-    """Solve (n, 2, 2) x = (n, 2) by Cramer's rule; a singular matrix gives NaN."""
+    """Solve (n, 2, 2) x = (n, 2) by Cramer's rule; a singular matrix gives NaN.
+
+    Args:
+        matrices: (n, 2, 2).
+        vectors: (n, 2) right hand sides.
+
+    Returns:
+        (n, 2) the x; NaN where a matrix is singular.
+    """
     (a, b), (c, d) = matrices[:, 0].T, matrices[:, 1].T
     det = a * d - b * c
     x, y = vectors.T

@@ -92,7 +92,14 @@ class Table:
 
 
 def alarm_of(table: Table) -> str:
-    """Say what is wrong with a measured table as a whole, in one sentence; nothing where all is well."""
+    """Say what is wrong with a measured table as a whole, in one sentence; nothing where all is well.
+
+    Args:
+        table: The measured table, what was left out of it, and what the calibration says of other pixels.
+
+    Returns:
+        The sentence; "" where all is well, or where fewer than `min_alarm_points` points have two views.
+    """
     settings, views = table.settings, table.seen.sum(axis=1)
     many, tested = settings.max_contradicting_share, views >= 2
     n = int(tested.sum())

@@ -58,7 +58,14 @@ class CentralCamera:
         return len(fields(self.lens)) + 6
 
     def view(self, points: Floats) -> View:
-        """Everything at once, of points (n, 3)."""
+        """Everything that a camera sees of points, at once.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            Pixels and log distance of each point, and their derivatives; NaN where the lens has no answer.
+        """
         turned = points @ self.pose.rotation.T
         there = turned + self.pose.translation
         uv, _ = self.lens.pixel_from_camera_point(there)
@@ -77,11 +84,25 @@ class CentralCamera:
         )
 
     def pixel(self, points: Floats) -> Floats:
-        """(n, 2) pixels, NaN where there is none."""
+        """Where the camera sees points.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            (n, 2) pixels, NaN where there is none.
+        """
         return self.lens.pixel_from_camera_point(self.pose.apply(points))[0]
 
     def lines(self, uv: Floats) -> tuple[Floats, Floats]:
-        """The lines of sight of pixels (n, 2): the camera's centre (3,) and unit directions (n, 3), NaN for none."""
+        """The lines of sight of pixels.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            The camera's centre (3,) and unit directions (n, 3) in the working frame, NaN for none.
+        """
         rays, _ = self.lens.ray_from_pixel(uv)
         return self.pose.centre, rays @ self.pose.rotation
 
@@ -96,13 +117,30 @@ class CentralCamera:
         return self.lens.fx > 0 and self.lens.fy > 0
 
     def moved(self, step: Floats) -> CentralCamera:
-        """The camera with its parameters changed by (size,)."""
+        """The camera with its parameters changed.
+
+        Args:
+            step: (size,) of the lens parameters, the rotation vector (radians, applied after the rotation that it has),
+                and the translation in the working frame.
+
+        Returns:
+            The new camera, with a lens of the same family; whether it is `sane` is not checked.
+        """
         lens = type(self.lens)(*(lens_parameters(self.lens) + step[:-6]).tolist())
         turn = rotation_from_vector(step[-6:-3])
         return CentralCamera(lens, Pose(turn @ self.pose.rotation, self.pose.translation + step[-3:]))
 
     def prior(self, image: Image, widest: float, settings: CameraSettings = DEFAULT_SETTINGS) -> Prior:
-        """Eq. (3), for a lens that is used up to `widest` radians off its axis."""
+        """The prior of the lens, eq. (3); of the pose there is none.
+
+        Args:
+            image: Where pixels are measured from; the principal point is expected at its centre.
+            widest: Radians off its axis up to which the lens is used.
+            settings: The prior's standard deviations.
+
+        Returns:
+            Mean (size,) and precision (size, size), zero for what nothing is known of.
+        """
         mean, precision = np.zeros(self.size), np.zeros((self.size, self.size))
         aspect = 1 / (settings.log_aspect_prior_sd * self.lens.fx) ** 2
         precision[:2, :2] = aspect * np.array([[1, -1], [-1, 1]])
@@ -118,7 +156,18 @@ class CentralCamera:
 
     @classmethod
     def from_array(cls, array: Floats, lens: type[Lens]) -> CentralCamera:
-        """The inverse of `as_array`, with a lens of this family; ValueError for what is none."""
+        """The inverse of `as_array`.
+
+        Args:
+            array: (p + 12,) lens parameters, rotation and translation.
+            lens: Its family of lenses.
+
+        Returns:
+            The camera.
+
+        Raises:
+            ValueError: The array does not have this length, or its rotation is none.
+        """
         if len(array) != len(fields(lens)) + 12:
             raise ValueError(f"an array of {len(array)} numbers is no {lens.family} lens with its pose")
         rotation = array[-12:-3].reshape(3, 3)
@@ -128,13 +177,28 @@ class CentralCamera:
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """Cross products (..., 3) of a and b; NumPy's takes several times as long for few."""
+    """Cross products (..., 3) of a and b; NumPy's takes several times as long for few.
+
+    Args:
+        a: (..., 3).
+        b: (..., 3), which broadcasts with a.
+
+    Returns:
+        (..., 3) a x b.
+    """
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     return np.stack([y * b[..., 2] - z * b[..., 1], z * b[..., 0] - x * b[..., 2], x * b[..., 1] - y * b[..., 0]], -1)
 
 
 def lens_parameters(lens: Lens) -> Floats:
-    """The parameters of a lens, in the order of its fields."""
+    """The parameters of a lens, in the order of its fields.
+
+    Args:
+        lens: Of any family.
+
+    Returns:
+        (p,) fx, fy, cx, cy in pixels, then those of the distortion.
+    """
     return np.array([getattr(lens, field.name) for field in fields(lens)])
 
 
@@ -148,7 +212,14 @@ class ProjectiveCamera:
     size: ClassVar[int] = 12
 
     def view(self, points: Floats) -> View:
-        """As of `CentralCamera`; the distance is w, up to a factor."""
+        """Everything that a camera sees of points, as `CentralCamera.view`; the distance is w, up to a factor.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            Pixels and log w of each point, and their derivatives; NaN behind the camera.
+        """
         homogeneous = np.column_stack([points, np.ones(len(points))])
         x, y, w = (homogeneous @ self.P.T).T
         w = np.where(w > 0, w, np.nan)
@@ -161,13 +232,27 @@ class ProjectiveCamera:
         return View(uv, np.log(w), by_parameters, by_point, self.P[2, :3] / w[:, None])
 
     def pixel(self, points: Floats) -> Floats:
-        """(n, 2) pixels, NaN behind the camera."""
+        """Where the camera sees points.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            (n, 2) pixels, NaN behind the camera.
+        """
         x, y, w = (np.column_stack([points, np.ones(len(points))]) @ self.P.T).T
         w = np.where(w > 0, w, np.nan)
         return np.column_stack([x / w, y / w])
 
     def lines(self, uv: Floats) -> tuple[Floats, Floats]:
-        """The lines of sight, as of `CentralCamera`."""
+        """The lines of sight of pixels, as `CentralCamera.lines`.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            The camera's centre (3,) and unit directions (n, 3) in the working frame.
+        """
         directions = np.linalg.solve(self.P[:, :3], np.column_stack([uv, np.ones(len(uv))]).T).T
         return camera_centre(self.P), directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
@@ -182,11 +267,27 @@ class ProjectiveCamera:
         return True
 
     def moved(self, step: Floats) -> ProjectiveCamera:
-        """The camera with its matrix changed by (12,)."""
+        """The camera with its matrix changed.
+
+        Args:
+            step: (12,) added to P, row by row.
+
+        Returns:
+            The new camera.
+        """
         return ProjectiveCamera(self.P + step.reshape(3, 4))
 
     def prior(self, image: Image, widest: float, settings: RigModelSettings = DEFAULT_SETTINGS) -> Prior:
-        """Roughly what the linear resection found; and the scale of P, which no pixel shows, stays what it is."""
+        """Roughly what the linear resection found; and the scale of P, which no pixel shows, stays what it is.
+
+        Args:
+            image: Not used: there is no lens model.
+            widest: Not used either.
+            settings: The relative sd of the entries of P.
+
+        Returns:
+            Mean (12,), which is P itself, and precision (12, 12).
+        """
         scale = np.maximum(np.abs(self.P), 1e-3 * np.abs(self.P).max(axis=1, keepdims=True))
         along = (self.P / scale**2).ravel()
         own = np.diag(1 / (settings.projection_prior_relative_sd * scale.ravel()) ** 2)
@@ -198,5 +299,15 @@ class ProjectiveCamera:
 
     @classmethod
     def from_array(cls, array: Floats) -> ProjectiveCamera:
-        """The inverse of `as_array`."""
+        """The inverse of `as_array`.
+
+        Args:
+            array: (12,) P, row by row.
+
+        Returns:
+            The camera.
+
+        Raises:
+            ValueError: The array does not have 12 numbers.
+        """
         return cls(array.reshape(3, 4))

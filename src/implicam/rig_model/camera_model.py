@@ -47,7 +47,14 @@ class CameraModel:
         return view, view if self.field_camera is self.camera else self.field_camera.view(points)
 
     def coordinates(self, view: View) -> Floats:
-        """(n, 3) where the field is looked up."""
+        """Where the field is looked up.
+
+        Args:
+            view: What the `field_camera` sees of n points.
+
+        Returns:
+            (n, 3) pixel about the image's centre in half sides, and scaled log distance.
+        """
         return field_coordinates(view, self.image, self.depth)
 
     def without_weights(self) -> CameraModel:
@@ -59,7 +66,14 @@ class CameraModel:
         return self.field.coefficients(self.signal * self.weights)
 
     def predict(self, points: Floats) -> tuple[Floats, Floats]:
-        """Mean pixels (n, 2) and their derivative by the point (n, 2, 3); NaN where the lens has no answer."""
+        """Where the camera sees points, its residual field included.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            Mean pixels (n, 2) and their derivative by the point (n, 2, 3); NaN where the lens has no answer.
+        """
         view, measured = self._views(points)
         q = self.coordinates(measured)
         K = self.field.kernel(q, self.field.inducing)
@@ -72,7 +86,14 @@ class CameraModel:
         return view.uv + K @ self._coefficients, by_point
 
     def rows(self, points: Floats) -> Rows:
-        """How the pixels of points (n, 3) depend on the camera's unknowns, about the present mean."""
+        """How the pixels of points depend on the camera's unknowns, about the present mean.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            Mean pixels and their slopes; of these `by_point` is that of the camera without its field.
+        """
         view, measured = self._views(points)
         K = self.field.kernel(self.coordinates(measured), self.field.inducing)
         phi = self.field.features_from(K)
@@ -96,7 +117,16 @@ class Rows(NamedTuple):
 
 
 def apply_covariance_root(rows: Rows, root: Floats) -> Floats:
-    """(n, 2, q) whose products `spread spread^T` are the covariances of mean pixels, from a camera's root (q, P)."""
+    """What a root of a camera's covariance makes of its pixels: the products `spread spread^T` of the result are the
+    covariances of mean pixels.
+
+    Args:
+        rows: How n pixels depend on the camera's P unknowns.
+        root: (q, P), W of the covariance W^T W.
+
+    Returns:
+        (n, 2, q) in pixels.
+    """
     p, m = rows.J.shape[2], rows.phi.shape[1]
     out = rows.J @ root[:, :p].T
     for i in range(2):
@@ -112,17 +142,40 @@ class CameraViews(NamedTuple):
     relative: Floats
 
     def select(self, keep: NDArray[np.bool_]) -> CameraViews:
-        """Some of them."""
+        """Some of the views.
+
+        Args:
+            keep: (n,) which.
+
+        Returns:
+            These, in their order.
+        """
         return CameraViews(self.rows[keep], self.uv[keep], self.relative[keep])
 
 
 def thin_views(seen: CameraViews, most: int) -> CameraViews:
-    """At most so many of them, at random."""
+    """At most so many views, at random; always the same ones.
+
+    Args:
+        seen: What a camera saw.
+        most: How many are kept.
+
+    Returns:
+        The views kept, in their order.
+    """
     return seen if len(seen.rows) <= most else seen.select(random_subset(len(seen.rows), most))
 
 
 def random_subset(n: int, most: int) -> Bools:
-    """At most so many of n, at random."""
+    """At most so many of n, at random; always the same ones.
+
+    Args:
+        n: How many there are.
+        most: How many are kept.
+
+    Returns:
+        (n,) which are kept.
+    """
     keep = np.full(n, n <= most)
     if n > most:
         keep[np.random.default_rng(0).choice(n, most, replace=False)] = True

@@ -22,7 +22,14 @@ class Hyperparameters(NamedTuple):
 
 
 def field_kernel(lengthscale: Floats) -> Kernel:
-    """Of a residual field over (u, v) in half the longer side and the log distance, eq. (8); unit variance."""
+    """The kernel of a residual field over (u, v) in half the longer side and the log distance, eq. (8).
+
+    Args:
+        lengthscale: (2,) across the image, in half its longer side, and in scaled log distance.
+
+    Returns:
+        A squared-exponential kernel of unit variance.
+    """
     return Kernel("squared-exponential", 1.0, lengthscale[[0, 0, 1]])
 
 
@@ -34,7 +41,15 @@ class DepthScale(NamedTuple):
 
     @classmethod
     def of(cls, view: View, typical_sd: float) -> DepthScale:
-        """Of the known points that a camera sees; typical_sd: of their log distance in an ordinary rig."""
+        """The scale for the known points that a camera sees.
+
+        Args:
+            view: What the camera sees of them.
+            typical_sd: Of their log distance in an ordinary rig.
+
+        Returns:
+            Their mean log distance; and as the unit their sd of it over the typical one, between 1e-6 and 1.
+        """
         spread = float(np.std(view.log_distance))
         return cls(float(np.mean(view.log_distance)), min(max(spread / typical_sd, 1e-6), 1.0))
 
@@ -44,10 +59,28 @@ UNSCALED_DEPTH = DepthScale()
 
 
 def field_coordinates(view: View, image: Image, depth: DepthScale) -> Floats:
-    """(n, 3) where a field is looked up: pixel about the centre in half sides, scaled log distance, eq. (8)."""
+    """Where a field is looked up, eq. (8).
+
+    Args:
+        view: What a camera sees of n points.
+        image: Where its pixels are measured from.
+        depth: How log distance becomes a coordinate.
+
+    Returns:
+        (n, 3) pixel about the centre in half sides, scaled log distance.
+    """
     return np.column_stack([(view.uv - image.centre) / image.half, (view.log_distance - depth.mean) / depth.unit])
 
 
 def empty_field(lengthscale: Floats, q: Floats, tolerance: float) -> LowRank:
-    """A field with inducing points chosen among q (n, 3)."""
+    """A field before it has any weights.
+
+    Args:
+        lengthscale: (2,) as of `field_kernel`.
+        q: (n, 3) coordinates among which the inducing points are chosen.
+        tolerance: As of `LowRank.of`.
+
+    Returns:
+        The field, with unit variance.
+    """
     return LowRank.of(field_kernel(lengthscale), q, tolerance)

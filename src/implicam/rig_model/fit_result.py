@@ -43,5 +43,12 @@ class FitResult:
     ordinary_px: tuple[float, ...] = ()
 
     def left_by_ordinary(self, number: int) -> float:
-        """The median error, px, that an ordinary camera would leave in fitted camera `number`; NaN if it is one."""
+        """The median error that an ordinary camera would leave in a fitted camera.
+
+        Args:
+            number: Of the camera, in the order of `posterior.models`.
+
+        Returns:
+            In pixels; NaN where no other camera was tried.
+        """
         return self.ordinary_px[number] if self.ordinary_px else float("nan")

@@ -86,7 +86,14 @@ class GeneralCamera:
         return bool(MIN_FOCAL_PX < self.focal < 1e12 and whole)
 
     def moved(self, step: Floats) -> GeneralCamera:
-        """The camera with its parameters changed by (17,)."""
+        """The camera with its parameters changed; its inverse distance stays `MIN_RHO` at least.
+
+        Args:
+            step: (17,) as `PARAMETERS` names them.
+
+        Returns:
+            The new camera; whether it is `sane` is not checked.
+        """
         x = self.parameters + step
         rho = max(float(x[RHO]), MIN_RHO)
         across = x[12:14]
@@ -104,15 +111,37 @@ class GeneralCamera:
         )
 
     def with_shape(self, shape: Floats, tilt: Floats) -> GeneralCamera:
-        """The camera with other pixels."""
+        """The camera with other pixels.
+
+        Args:
+            shape: (2,) p and q.
+            tilt: (2,) of the image plane.
+
+        Returns:
+            The new camera.
+        """
         return replace(self, shape=shape, tilt=tilt)
 
     def pixel(self, points: Floats) -> Floats:
-        """(n, 2) pixels of points (n, 3), NaN where there is none."""
+        """Where the camera sees points.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            (n, 2) pixels, NaN where there is none.
+        """
         return self._image(self._lens.pixel_from_camera_point(self.pose.apply(points))[0])[0]
 
     def view(self, points: Floats) -> View:
-        """Everything at once, of points (n, 3)."""
+        """Everything that a camera sees of points, at once.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            Pixels and log distance of each point, and their derivatives; NaN where the lens has no answer.
+        """
         n = len(points)
         turned = points @ self.pose.rotation.T
         there = turned + self.pose.translation
@@ -147,7 +176,14 @@ class GeneralCamera:
         )
 
     def lines(self, uv: Floats) -> tuple[Floats, Floats]:
-        """The lines of sight of pixels (n, 2): the camera's centre (3,) and unit directions (n, 3), NaN for none."""
+        """The lines of sight of pixels.
+
+        Args:
+            uv: (n, 2) pixels.
+
+        Returns:
+            The camera's centre (3,) and unit directions (n, 3) in the working frame, NaN for none.
+        """
         y = np.linalg.solve(self.focal * self._pixels[0], (uv - self.centre).T).T
         w = 1 - y @ self.tilt
         m = y / np.where(w > 0, w, np.nan)[:, None]
@@ -174,7 +210,17 @@ class GeneralCamera:
 
     @classmethod
     def from_array(cls, array: Floats) -> GeneralCamera:
-        """The inverse of `as_array`; ValueError for what is none."""
+        """The inverse of `as_array`.
+
+        Args:
+            array: (24,) focal, shape, tilt, centre, k, +1 or -1 if mirrored, rotation, translation.
+
+        Returns:
+            The camera.
+
+        Raises:
+            ValueError: Its rotation, focal length, mirror sign or place is none.
+        """
         rotation = array[12:21].reshape(3, 3)
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
             raise ValueError("a camera's rotation is not one")
@@ -185,8 +231,16 @@ class GeneralCamera:
 
     @classmethod
     def from_central(cls, camera: CentralCamera, *, mirrored_about: float | None = None) -> GeneralCamera:
-        """The same camera as a Kannala-Brandt `CentralCamera`; mirrored_about: the u at which its pictures, which were
-        turned left for right, are turned back."""
+        """The same camera as a Kannala-Brandt `CentralCamera`.
+
+        Args:
+            camera: It; its lens must be of this family.
+            mirrored_about: The u, in pixels, at which its pictures, which were turned left for right, are turned back;
+                None where they were not.
+
+        Returns:
+            The camera, with no tilt and no skew.
+        """
         lens = camera.lens
         assert isinstance(lens, KannalaBrandt)
         p = 0.5 * np.log(lens.fx / lens.fy)

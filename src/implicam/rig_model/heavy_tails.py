@@ -52,7 +52,15 @@ class HeavyTails(NamedTuple):
     weights: tuple[Floats, ...]
 
     def weight_views(self, seen: tuple[CameraViews, ...], *, with_loss: bool) -> tuple[CameraViews, ...]:
-        """The views, noisier where they count less; with_loss: by the loss of information, too."""
+        """The views, noisier where they count less.
+
+        Args:
+            seen: Per camera, the n views that the weights are of.
+            with_loss: Noisier by the loss of information, too.
+
+        Returns:
+            The same views with other relative noise.
+        """
         loss = self.loss if with_loss else 1.0
         return tuple(
             s._replace(relative=s.relative * np.sqrt(loss / w)) for s, w in zip(seen, self.weights, strict=True)
@@ -65,17 +73,40 @@ class HeavyTails(NamedTuple):
 
 
 def information_loss(degrees: float | None) -> float:
-    """Scale matrix over inverse Fisher information of a bivariate t; 1 for normal noise (None)."""
+    """Scale matrix over inverse Fisher information of a bivariate t; 1 for normal noise (None).
+
+    Args:
+        degrees: Degrees of freedom; None for normal noise.
+
+    Returns:
+        The ratio, 1 or more.
+    """
     return 1.0 if degrees is None else (degrees + 4) / (degrees + 2)
 
 
 def outlier_distance(degrees: float, normal: float) -> float:
-    """The squared distance beyond which a view is as rare as beyond `normal` with normal noise."""
+    """The squared distance beyond which a view is as rare as beyond `normal` with normal noise.
+
+    Args:
+        degrees: Degrees of freedom of the noise.
+        normal: A squared distance under normal noise.
+
+    Returns:
+        The squared distance, in the scale matrix of the t.
+    """
     return float(degrees * np.expm1(normal / degrees))
 
 
 def student_t_weights(distance: Floats, degrees: float) -> Floats:
-    """How much views count at these squared distances (in their scale matrix)."""
+    """How much views count, eq. (T3).
+
+    Args:
+        distance: Squared distances, in the scale matrix of each view; of any shape.
+        degrees: Degrees of freedom of the noise.
+
+    Returns:
+        Weights of the same shape: 1 at a squared distance of 2, less beyond.
+    """
     return np.asarray((degrees + 2) / (degrees + distance), dtype=np.float64)
 
 
@@ -125,7 +156,16 @@ def _likelihoods(q: Floats, background: Floats, degrees: Floats) -> Floats:
 
 
 def consistency(distance: Floats, seen: Bools, degrees: float) -> Floats:
-    """(n,) p-value that the views agree, from squared distances (n, C) at the most probable position, eq. (T5)."""
+    """How well the views of points agree, eq. (T5).
+
+    Args:
+        distance: Squared distances (n, C) of the views at the most probable position.
+        seen: (n, C) the views in use.
+        degrees: Degrees of freedom of the noise.
+
+    Returns:
+        (n,) p-values; NaN with fewer than two views, or without a finite distance.
+    """
     views = seen.sum(axis=1)
     total = np.sum(np.where(seen, degrees * np.log1p(distance / degrees), 0), axis=1)
     free = np.maximum(2 * views - 3 * degrees / (degrees + 2), 1)
@@ -133,8 +173,18 @@ def consistency(distance: Floats, seen: Bools, degrees: float) -> Floats:
 
 
 def equivalent_normal_noise(noise: Floats, distance: Floats, seen: Bools, degrees: float) -> Floats:
-    """(n, C) noise of normal views that tell as much as these: by their distances, eq. (T3); of two views,
-    where nothing says which is the worse, the standard deviation."""
+    """The noise of normal views that tell as much as these: by their distances, eq. (T3); of two views, where nothing
+    says which is the worse, the standard deviation.
+
+    Args:
+        noise: (n, C) scale of the t, pixels.
+        distance: (n, C) squared distances, in the scale matrix of each view.
+        seen: (n, C) the views in use.
+        degrees: Degrees of freedom of the noise, more than two.
+
+    Returns:
+        (n, C) standard deviations, pixels.
+    """
     weighted = information_loss(degrees) / student_t_weights(distance, degrees)
     plain = degrees / (degrees - 2)
     few = (seen.sum(axis=1) < 3)[:, None]
@@ -223,18 +273,37 @@ def _starts(A: Floats, b: Floats, few: int) -> list[Floats]:
 
 
 def whiten(linear: LinearisedViews) -> tuple[Floats, Floats]:
-    """Slopes A (n, C, 2, 3) and residuals b (n, C, 2) of single views in the scale of their noise."""
+    """Slopes and residuals of single views in the scale of their noise.
+
+    Args:
+        linear: The views of n points; what ties cameras (`joint`) is left aside.
+
+    Returns:
+        Slopes A (n, C, 2, 3) and residuals b (n, C, 2).
+
+    Raises:
+        numpy.linalg.LinAlgError: The inverse covariance of a view is not positive definite.
+    """
     root = np.linalg.cholesky(linear.each).swapaxes(2, 3)  # each = root^T root
     return np.asarray(root @ linear.D), np.asarray((root @ linear.r[..., None])[..., 0])
 
 
 def degrees_of_agreement(A: Floats, b: Floats, seen: Bools, settings: RigModelSettings) -> float | None:
-    """Degrees of freedom of the noise from what cameras say of the same points, wherever these are: from views (n, C)
-    whitened as above, the position of each point integrated out, eq. (T2). None where the noise is normal.
+    """Degrees of freedom of the noise from what cameras say of the same points, wherever these are: the position of
+    each point is integrated out, eq. (T2).
 
     A known position that is off by itself looks like heavy tails in every single camera; here it does not count. And
-    where cameras agree among themselves much better than with the known positions, the errors are mostly of these:
-    what cameras share is not their noise, and noise is taken for normal.
+    where cameras agree among themselves much better than with the known positions, the errors are mostly of these: what
+    cameras share is not their noise, and noise is taken for normal.
+
+    Args:
+        A: Slopes (n, C, 2, 3) of views, as `whiten` gives them.
+        b: Their residuals (n, C, 2).
+        seen: (n, C) the views in use.
+        settings: The degrees to try, how many points to use, and how clear the finding must be.
+
+    Returns:
+        The degrees; None where the noise is normal, or where there are too few views to tell.
     """
     views = seen.sum(axis=1)
     some = np.flatnonzero(views >= 2)[: settings.max_confirming_points]

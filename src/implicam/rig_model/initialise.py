@@ -202,7 +202,16 @@ def start_rig(
 def require_two_cameras(
     training: TrainingData, started: dict[int, InitialCamera], uncalibrated: list[tuple[int, str]]
 ) -> None:
-    """FitError, which says why, where fewer than two cameras are left."""
+    """Stop where fewer than two cameras are left.
+
+    Args:
+        training: What the fit starts from.
+        started: The cameras that have a start, by their numbers.
+        uncalibrated: (number, why) of the others.
+
+    Raises:
+        FitError: There are fewer than two; it says why of each of the others.
+    """
     if len(started) < 2:
         raise FitError(
             f"{len(started)} of {len(training.names)} cameras can be calibrated; a position takes two.",
@@ -238,7 +247,17 @@ def _advise(training: TrainingData, uncalibrated: list[tuple[int, str]]) -> str:
 
 
 def check_start(started: InitialCamera, points: Floats, uv: Floats, training: TrainingData) -> None:
-    """FitError for a start that too few views agree on, or that leaves too much."""
+    """Stop at a start that too few views agree on, or that leaves too much.
+
+    Args:
+        started: The camera, and which of its views agree.
+        points: (n, 3) known positions in the working frame, which it sees.
+        uv: (n, 2) their pixels.
+        training: What the fit starts from; its settings say what is too much.
+
+    Raises:
+        FitError: Fewer than `MIN_POINTS_PER_CAMERA` views agree, or their median error is too large.
+    """
     settings = training.settings
     error = np.linalg.norm(started.camera.pixel(points) - uv, axis=1)[started.inliers]
     low, high = pixel_extent(uv)
@@ -257,7 +276,16 @@ def check_start(started: InitialCamera, points: Floats, uv: Floats, training: Tr
 
 
 def lens_only_model(started: InitialCamera, image: Image, noise: float = 1.0) -> CameraModel:
-    """A camera model that is nothing but the camera; noise in pixels."""
+    """A camera model that is nothing but the camera.
+
+    Args:
+        started: The camera and its prior.
+        image: Where its pixels are measured from.
+        noise: Pixels.
+
+    Returns:
+        The model, with a field that is zero everywhere.
+    """
     field = empty_field(np.ones(2), np.zeros((1, 3)), 1.0)
     none = np.zeros((1, 2))
     return CameraModel(

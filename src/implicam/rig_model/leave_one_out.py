@@ -22,7 +22,18 @@ MIN_INFORMATION_RATIO = 1e-12
 
 
 def squared_distances(posterior: Posterior, c: int, points: Floats, seen: CameraViews, inliers: Bools) -> Floats:
-    """(n,) how far each view is from what the others predict: closed form for the views used, eq. (18)."""
+    """How far each view of a camera is from what the others predict: closed form for the views used, eq. (18).
+
+    Args:
+        posterior: What is known of the cameras.
+        c: Number of the camera in it.
+        points: Known positions (m, 3) in the working frame.
+        seen: The camera's views, n of them.
+        inliers: (n,) those that the posterior is from.
+
+    Returns:
+        (n,) squared distances in the covariance of the prediction and the noise; infinite where there is none.
+    """
     residual, covariance = left_out_residuals(posterior, c, points, seen, inliers)
     inverse = np.linalg.inv(covariance)
     distance = np.einsum("ni,nij,nj->n", residual, inverse, residual)
@@ -64,7 +75,17 @@ class Residuals(NamedTuple):
 
 
 def posterior_residuals(posterior: Posterior, c: int, points: Floats, seen: CameraViews) -> Residuals:
-    """Of all views of camera c."""
+    """What is left of all views of a camera at the posterior mean.
+
+    Args:
+        posterior: What is known of the cameras.
+        c: Number of the camera in it.
+        points: Known positions (n, 3) in the working frame.
+        seen: What this camera saw of them.
+
+    Returns:
+        Of each view, in pixels; about the position that the posterior gives the point, where it is off.
+    """
     model = posterior.models[c]
     where = points[seen.rows]
     if posterior.displacement is not None:
@@ -75,7 +96,15 @@ def posterior_residuals(posterior: Posterior, c: int, points: Floats, seen: Came
 
 
 def left_out_residuals_from(at: Residuals, inliers: Bools) -> tuple[Floats, Floats]:
-    """As `left_out_residuals`; inliers: the views that the posterior is from."""
+    """As `left_out_residuals`, from what is left at the posterior mean.
+
+    Args:
+        at: Of the n views of a camera.
+        inliers: (n,) the views that the posterior is from.
+
+    Returns:
+        Residuals (n, 2) in pixels, and their covariances (n, 2, 2).
+    """
     smooth = at.reach / (at.sd**2)[:, None, None]
     left = np.where(inliers[:, None, None] & np.isfinite(smooth), np.eye(2) - smooth, np.eye(2))
     values, vectors = np.linalg.eigh(left)  # rounding can make a view that decides alone more than decisive
@@ -112,7 +141,16 @@ def update_inliers(
 
 
 def next_inliers(distance: Floats, inliers: Bools, limit: float) -> Bools:
-    """The views to use next: the far ones go, the worst tenth at a time, those that agree come back."""
+    """The views to use next: the far ones go, the worst tenth at a time, those that agree come back.
+
+    Args:
+        distance: (n,) squared distances from what the others predict.
+        inliers: (n,) the views used until now.
+        limit: Squared distance beyond which a view contradicts the others.
+
+    Returns:
+        (n,) the views to use.
+    """
     worst = np.quantile(distance[inliers], 0.9) if inliers.any() else 0.0
     return np.asarray(np.where(inliers, distance <= max(limit, worst), distance <= limit), dtype=np.bool_)
 
@@ -147,7 +185,17 @@ class LeftOutViews(NamedTuple):
 def left_out_views(
     posterior: Posterior, points: Floats, seen: tuple[CameraViews, ...], inliers: tuple[Bools, ...]
 ) -> list[LeftOutViews]:
-    """Per camera."""
+    """The views of each camera, each predicted without itself.
+
+    Args:
+        posterior: What is known of the cameras.
+        points: Known positions (n, 3) in the working frame.
+        seen: Per camera, what it saw.
+        inliers: Per camera, the views that the posterior is from.
+
+    Returns:
+        Per camera, all of its views.
+    """
     found = []
     where = points if posterior.displacement is None else points + posterior.displacement
     for c, (one, k) in enumerate(zip(seen, inliers, strict=True)):
@@ -162,7 +210,17 @@ def left_out_views(
 
 
 def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Floats]:
-    """What all views say of the position of each of n points, and the largest variance ratio (n,) of these views."""
+    """What all views in use say of the position of each point.
+
+    Args:
+        views: Per camera, predicted without themselves.
+        inliers: Per camera, which of them are in use.
+        n: Number of known points.
+
+    Returns:
+        What they say together of the n points, in the working frame; and the largest variance ratio (n,) of these
+        views, zero for points without one.
+    """
     total = Agreement(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n))
     largest = np.zeros(n)
     for view, k in zip(views, inliers, strict=True):

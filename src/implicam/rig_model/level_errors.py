@@ -66,11 +66,18 @@ class Levels(NamedTuple):
 
 
 def find_levels(points: Floats, settings: RigModelSettings) -> Levels | None:
-    """Of the points (n, 3) of one target; None if it has none.
+    """The levels on which the points of one target stand.
 
     Of the axes along which the points stand on a few planes, that with the fewest, and then the one along which the
     target is thinnest; of all directions where no axis is one, since a target may be turned. (Stairs have slanted
     planes too, through the edges of their steps, and these can be fewer.)
+
+    Args:
+        points: (n, 3) of one target.
+        settings: How many levels it may have, how thin they are, and how many points each has.
+
+    Returns:
+        The level of each point; None if the target has none.
     """
     some = points[np.linspace(0, len(points) - 1, min(MAX_POINTS_LOOKED_AT, len(points))).astype(int)]
     normals = np.concatenate([np.eye(3), _normals(some)])

@@ -21,7 +21,17 @@ POINTS_PER_CHUNK = 4096
 
 
 def stable_cholesky(A: Floats) -> Floats:
-    """Of matrices (..., p, p) with unit diagonals; where rounding made one indefinite, of the nearest that is not."""
+    """Cholesky factors; where rounding made a matrix indefinite, of the nearest that is not.
+
+    Args:
+        A: (..., p, p) with unit diagonals.
+
+    Returns:
+        (..., p, p) lower factors.
+
+    Raises:
+        numpy.linalg.LinAlgError: Not even the largest of `JITTERS` on the diagonal helps.
+    """
     for jitter in JITTERS:
         try:
             return np.asarray(np.linalg.cholesky(A + jitter * np.eye(A.shape[-1]) if jitter else A), dtype=np.float64)
@@ -31,7 +41,14 @@ def stable_cholesky(A: Floats) -> Floats:
 
 
 def invert_stack(A: Floats) -> Floats:
-    """Inverses of symmetric matrices (n, k, k), NaN where there is none."""
+    """Inverses of symmetric matrices (n, k, k), NaN where there is none.
+
+    Args:
+        A: (n, k, k) symmetric.
+
+    Returns:
+        (n, k, k), symmetric; NaN where a matrix is singular or not finite.
+    """
     good = np.asarray(np.isfinite(A).all(axis=(1, 2)))
     out = np.full(A.shape, np.nan)
     try:
@@ -46,7 +63,16 @@ def invert_stack(A: Floats) -> Floats:
 def camera_normals(
     models: tuple[CameraModel, ...], points: Floats, camera_views: tuple[CameraViews, ...]
 ) -> list[NormalEquations]:
-    """The normal equations of each camera, eq. (13)."""
+    """The normal equations of each camera, eq. (13).
+
+    Args:
+        models: The cameras where they are linearised, with their priors.
+        points: Known positions (n, 3) in the working frame.
+        camera_views: Per camera, what it saw.
+
+    Returns:
+        Per camera, as if the positions were exact.
+    """
     return side_by_side(lambda pair: _normal(pair[0], points, pair[1]), list(zip(models, camera_views, strict=True)))
 
 
@@ -60,7 +86,14 @@ class CameraFailedError(np.linalg.LinAlgError):
 
 @contextmanager
 def name_failing_camera(number: int) -> Iterator[None]:
-    """Say which camera it was whose equations have no solution."""
+    """Say which camera it was whose equations have no solution.
+
+    Args:
+        number: Of the camera, among those being fitted.
+
+    Raises:
+        CameraFailedError: For a `numpy.linalg.LinAlgError` within; one that names its camera already stays.
+    """
     try:
         yield
     except CameraFailedError:
@@ -106,7 +139,17 @@ def _normal(model: CameraModel, points: Floats, seen: CameraViews) -> NormalEqua
 def whitened_rows(
     model: CameraModel, points: Floats, seen: CameraViews
 ) -> Iterator[tuple[Floats, Floats, Floats, Floats, Floats]]:
-    """In parts: the noise (n,), and in units of it the residuals, their slopes by lens, field and point."""
+    """The views of a camera in units of their noise, some at a time.
+
+    Args:
+        model: The camera where it is linearised; the weights of its field count as zero.
+        points: Known positions (n, 3) in the working frame.
+        seen: What the camera saw of them.
+
+    Yields:
+        Of m views in the order of `seen`: the noise (m,) in pixels; and in units of it the residuals (m, 2), and their
+        slopes by the camera (m, 2, p), by the field (m, features), and by the point (m, 2, 3).
+    """
     bare = model.without_weights()
     for part in slices(len(seen.rows)):
         sd = model.noise * seen.relative[part]
@@ -121,8 +164,18 @@ def whitened_rows(
 
 
 def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
-    """Root of the covariance, mean and log determinant; scaled first, since lens parameters differ by many orders of
-    magnitude."""
+    """Solve normal equations, scaled first, since lens parameters differ by many orders of magnitude.
+
+    Args:
+        A: (P, P).
+        b: (P,).
+
+    Returns:
+        Root W (P, P) of the covariance W^T W = A^-1, the mean (P,), and the log determinant of A.
+
+    Raises:
+        numpy.linalg.LinAlgError: A is not finite, or the views do not fix the camera.
+    """
     if not np.isfinite(A).all():
         raise np.linalg.LinAlgError("a camera has turned its back on points that it saw")
     scale = 1 / np.sqrt(np.diag(A))
@@ -132,6 +185,14 @@ def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
 
 
 def slices(n: int, size: int = POINTS_PER_CHUNK) -> Iterator[slice]:
-    """Of n rows, so many at a time."""
+    """Slices of rows, so many at a time.
+
+    Args:
+        n: Number of rows.
+        size: Rows in each slice; the last may have fewer.
+
+    Yields:
+        The slices, in order.
+    """
     for start in range(0, n, size):
         yield slice(start, min(start + size, n))

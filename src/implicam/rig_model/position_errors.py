@@ -44,7 +44,14 @@ class Agreement(NamedTuple):
     coordinates: Floats
 
     def select(self, rows: NDArray[np.int64]) -> Agreement:
-        """Of some points."""
+        """What is said of some of the points.
+
+        Args:
+            rows: Their numbers.
+
+        Returns:
+            The same of these.
+        """
         return Agreement(*(column[rows] for column in self))
 
 
@@ -79,7 +86,14 @@ class PositionErrors:
         return np.asarray(vectors * np.sqrt(values), dtype=np.float64)
 
     def weights(self, agreement: Agreement) -> Floats:
-        """(n,) by how much each point's own scale is larger than the usual one; EM's: one over the mean precision."""
+        """By how much each point's own scale is larger than the usual one; EM's: one over the mean precision.
+
+        Args:
+            agreement: What the views of n points say of their positions, each predicted without the point.
+
+        Returns:
+            (n,) ratios of variances; 1 where the errors are normal.
+        """
         found = _Scales.of(agreement, self.scale).likelihood(np.log(self.noise), self.freedom)
         return np.asarray(1 / np.sum(found.share / _nodes(self.freedom)[0][:, None], axis=0), dtype=np.float64)
 

@@ -54,8 +54,17 @@ class Posterior:
         return self.joint is not None or self.ties is not None
 
     def root(self, c: int) -> Floats:
-        """(., P) root of the covariance of camera c's unknowns, everything included. Where cameras are tied, the roots
-        of all have the same rows, and their products are the covariances between cameras."""
+        """A root of the covariance of a camera's unknowns, everything included.
+
+        Where cameras are tied, the roots of all have the same rows, and their products are the covariances between
+        cameras.
+
+        Args:
+            c: Number of the camera in `models`.
+
+        Returns:
+            (rows, P), W of the covariance W^T W.
+        """
         start, end = self.offsets[c : c + 2]
         if self.ties is not None:
             own = np.zeros((self.offsets[-1] + len(self.ties), end - start))
@@ -64,7 +73,14 @@ class Posterior:
         return self.alone[c] if self.joint is None else self.joint[:, start:end]
 
     def shared_root(self, c: int) -> Floats:
-        """(q, P) the part of the root by which camera c is tied to the others."""
+        """The part of the root by which a camera is tied to the others; there must be ties.
+
+        Args:
+            c: Number of the camera in `models`.
+
+        Returns:
+            (q, P).
+        """
         start, end = self.offsets[c : c + 2]
         both = self.joint if self.ties is None else self.ties
         assert both is not None
@@ -153,7 +169,15 @@ def _condition_tied(
 
 
 def move_to_mean(models: tuple[CameraModel, ...], means: list[Floats]) -> tuple[CameraModel, ...]:
-    """Each camera at its posterior mean, the weights of its field too."""
+    """Each camera at its posterior mean, the weights of its field too.
+
+    Args:
+        models: The cameras where they are linearised.
+        means: Per camera (P,), the step of its lens and pose, then the weights of its field.
+
+    Returns:
+        The cameras moved.
+    """
     return tuple(
         replace(
             model,

@@ -78,7 +78,18 @@ class FittedRig:
         return all(model.family in LENS_KINDS for model in self.posterior.models)
 
     def measure(self, observations: Observations) -> Measurement:
-        """Measure each point with the views it has, two or more."""
+        """Measure each point with the views it has, two or more.
+
+        Args:
+            observations: What the cameras saw, by their names.
+
+        Returns:
+            Positions in the world with error bars, and of each point without one the reason; and the alarm, if there is
+            one.
+
+        Raises:
+            DatasetError: None of the cameras is one of the calibration, or one has images of another size.
+        """
         known = [name for name in self.trained.camera_names if name in observations.camera_names]
         trained = self.trained.with_cameras(known) if known else self.trained
         observations = match_cameras(trained, observations)
@@ -125,7 +136,14 @@ class FittedRig:
         return np.stack([model.predict(points)[0] for model in self.posterior.models], axis=1)
 
     def views(self, observations: Observations) -> tuple[Floats, Floats]:
-        """Pixels (n, C, 2) of the calibrated cameras, NaN where not seen, and the noise (n, C) of each view, pixels."""
+        """Pixels and noise of the C calibrated cameras.
+
+        Args:
+            observations: What the cameras saw, by their names; those it does not have saw nothing.
+
+        Returns:
+            Pixels (n, C, 2), NaN where not seen, and the noise (n, C) of each view, pixels.
+        """
         n, C = len(observations), len(self.camera_names)
         uv, noise = np.full((n, C, 2), np.nan), np.ones((n, C))
         for c, name in enumerate(self.camera_names):
@@ -136,7 +154,14 @@ class FittedRig:
         return uv, noise
 
     def predict(self, xyz: Floats) -> Floats:
-        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
+        """Where all cameras see positions, in pixels without noise.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            (n, cameras, 2); NaN where a camera does not see a position, or is not calibrated.
+        """
         points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
         uv = np.full((len(points), len(self.trained.cameras), 2), np.nan)
         finite = np.isfinite(points).all(axis=1)
@@ -148,8 +173,15 @@ class FittedRig:
         return uv
 
     def sensitivities(self, xyz: Floats) -> list[Sensitivity]:
-        """For positions (n, 3): one for each camera; a single one of all cameras where errors of the known positions
-        tie them together. NaN where a lens has no answer."""
+        """How what cameras see of positions depends on these, and on what is unknown of the cameras.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            One for each calibrated camera; a single one of all cameras where errors of the known positions tie them
+            together. NaN where a lens has no answer.
+        """
         points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
         parts = []
         for number, (c, model) in enumerate(zip(self.cameras, self.posterior.models, strict=True)):
@@ -164,15 +196,32 @@ class FittedRig:
         return [Sensitivity(self.cameras, *together)]
 
     def slopes(self, xyz: Floats) -> Iterator[tuple[Floats, float, int]]:
-        """For positions (n, 3), per calibrated camera: the derivative of its pixels (n, 2, 3) per length unit, its
-        noise in pixels, and its number in the dataset."""
+        """How the pixels of each calibrated camera depend on positions.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Yields:
+            The derivative of its pixels (n, 2, 3) per length unit, its noise in pixels, and its number in the dataset.
+        """
         points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
         loss = float(np.sqrt(information_loss(self.degrees)))
         for c, model in zip(self.cameras, self.posterior.models, strict=True):
             yield model.predict(points)[1] / self.frame.scale, model.noise * loss, c
 
     def lines_of_sight(self, camera: str, uv: Floats) -> tuple[Floats, Floats]:
-        """Centre (3,) and directions (n, 3), in the world, of what a calibrated camera sees at pixels (n, 2)."""
+        """What a calibrated camera sees at pixels.
+
+        Args:
+            camera: Its name.
+            uv: (n, 2) pixels.
+
+        Returns:
+            Centre (3,) and unit directions (n, 3), in the world; NaN for none.
+
+        Raises:
+            ValueError: The camera is not calibrated.
+        """
         centre, rays = self.posterior.models[self.camera_names.index(camera)].camera.lines(uv)
         return self.frame.to_world(centre), rays
 

@@ -29,7 +29,15 @@ class Unknowns(NamedTuple):
 def views_by_shots(
     camera_views: tuple[CameraViews, ...], errors: ShotErrors
 ) -> Iterator[tuple[tuple[CameraViews, ...], slice]]:
-    """The views of some shots at a time, so that memory does not grow with their number."""
+    """The views of some shots at a time, so that memory does not grow with their number.
+
+    Args:
+        camera_views: Per camera, what it saw.
+        errors: Which point belongs to which shot.
+
+    Yields:
+        The views of the points of some shots, per camera; and which shots these are.
+    """
     for part in slices(errors.count, 512):
         inside = (errors.shot >= part.start) & (errors.shot < part.stop)
         yield tuple(seen.select(inside[seen.rows]) for seen in camera_views), part
@@ -51,7 +59,18 @@ class ShotSchurBlock(NamedTuple):
         errors: ShotErrors,
         part: slice,
     ) -> ShotSchurBlock:
-        """From the views of these shots."""
+        """From the views of these shots.
+
+        Args:
+            models: The C cameras where they are linearised, of P unknowns each.
+            points: Known positions (n, 3) in the working frame.
+            camera_views: Per camera, what it saw of these shots.
+            errors: How whole shots may be off.
+            part: The S shots.
+
+        Returns:
+            What their views say, the prior of the shots' errors included.
+        """
         S, k = part.stop - part.start, errors.basis.shape[2]
         found = side_by_side(
             lambda pair: _accumulate(pair[0], points, pair[1], errors, part),
@@ -67,7 +86,14 @@ class ShotSchurBlock(NamedTuple):
         return np.concatenate([self.G, self.g[..., None]], axis=2)
 
     def unknowns(self, mean: Floats) -> Floats:
-        """(S, k) posterior mean, from that of the cameras."""
+        """The posterior mean of the shots' errors, in their sds.
+
+        Args:
+            mean: (sum P,) that of the cameras.
+
+        Returns:
+            (S, k).
+        """
         found = np.linalg.solve(self.H, (self.g - self.G @ mean)[..., None])[..., 0]
         return np.asarray(found, dtype=np.float64)
 

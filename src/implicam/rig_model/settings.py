@@ -68,7 +68,15 @@ class CameraSettings(Settings):
     """Points of a table that count as independent at most: all share what is not known of the cameras."""
 
     def distortion_sds(self, family: str) -> DistortionSds | None:
-        """What these settings say of the distortion of a family of lenses; None where its own numbers hold."""
+        """What these settings say of the distortion of a family of lenses; None where its own numbers hold.
+
+        Args:
+            family: The name of the family.
+
+        Returns:
+            The sds of its parameters, and of what each term may do at the edge of the image; None for another family
+            than Kannala-Brandt.
+        """
         known = family == KannalaBrandt.family
         return (self.distortion_prior_sd, self.distortion_at_edge_prior_sd) if known else None
 

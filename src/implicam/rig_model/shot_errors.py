@@ -81,7 +81,14 @@ class Shots:
         return cls(shot.astype(np.int64), centre, axes, extent, radius, along, pattern, settings)
 
     def errors(self, points: Floats) -> ShotErrors:
-        """All shots as one: shift along, across (2), and three tilts, each with every pattern."""
+        """All shots as one: shift along, across (2), and three tilts, each with every pattern.
+
+        Args:
+            points: (n, 3) those that the shots are of, in the working frame.
+
+        Returns:
+            The errors with one shot and k = 6 x patterns components, in the working frame.
+        """
         own = self._rigid(points, self.shot)  # (n, 3, 6)
         basis = own[:, :, :, None] * self.pattern[self.shot][:, None, None, :]
         group = np.repeat([0, 1, 1, 2, 2, 2], self.pattern.shape[1])
@@ -121,15 +128,30 @@ class Shots:
         return nearest, holds, 1 - holds**2
 
     def label_slope(self, points: Floats, sd: Floats) -> Floats:
-        """(n, 3, K) how far a label near each point is off, by each of the unknowns in their sds (K,); eq. (22)."""
+        """How far a label near each point is off, by each of the unknowns in their sds, eq. (22).
+
+        Args:
+            points: (n, 3) anywhere in the working frame.
+            sd: (K,) of the unknowns.
+
+        Returns:
+            (n, 3, K) in the working frame.
+        """
         nearest, holds, _ = self._nearest(points)
         rigid = self._rigid(points, nearest)
         known = holds[:, None, None, None] * rigid[:, :, :, None] * self.pattern[nearest][:, None, None, :]
         return np.asarray(known.reshape(len(points), 3, len(sd)) * sd, dtype=np.float64)
 
     def unresolved_covariance(self, points: Floats, sd: Floats) -> Floats:
-        """(n, 3, 3) of the error of a label near each point, as far as the shots do not tell it: nothing at a shot. sd:
-        (6,) of a shot's error."""
+        """The error of a label near each point, as far as the shots do not tell it: nothing at a shot.
+
+        Args:
+            points: (n, 3) anywhere in the working frame.
+            sd: (6,) of a shot's error: shift along, across (2), and three tilts.
+
+        Returns:
+            (n, 3, 3) covariances in the working frame.
+        """
         nearest, _, open_part = self._nearest(points)
         lengths = np.linalg.norm(points - self.centre[nearest], axis=1) / self.radius[nearest]
         within = np.minimum(1, self.settings.max_tilt_radii / np.maximum(lengths, 1e-12))
@@ -138,8 +160,15 @@ class Shots:
         return np.asarray(open_part[:, None, None] * (lever @ lever.swapaxes(1, 2)), dtype=np.float64)
 
     def world_variance_ratio(self, points: Floats) -> Floats:
-        """(n,) variance of the world at each point over that of a shot's error, eq. (28): the world is the parabola
-        through the shots by definition, or the line through two."""
+        """The variance of the world at each point over that of a shot's error, eq. (28): the world is the parabola
+        through the shots by definition, or the line through two.
+
+        Args:
+            points: (n, 3) anywhere in the working frame.
+
+        Returns:
+            (n,), at most `max_world_variance_ratio`.
+        """
         t = (self.centre - (middle := self.centre.mean(axis=0))) @ self.along[0]
         half = np.abs(t).max()
         terms = min(WORLD_POLYNOMIAL_TERMS, len(t))

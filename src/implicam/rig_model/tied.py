@@ -45,8 +45,21 @@ def condition_scattered(
     errors: ShotErrors | None,
     scatter: Scatter,
 ) -> Posterior:
-    """As `posterior.condition`, where each known point has an error of its own. errors: those of shots besides, all
-    as one "shot"; or None."""
+    """As `posterior.condition`, where each known point has an error of its own.
+
+    Args:
+        models: The cameras where they are linearised, with their priors.
+        points: Known positions (n, 3) in the working frame.
+        camera_views: Per camera, what it saw.
+        errors: Those of shots besides, all as one "shot"; or None.
+        scatter: How single known positions are off.
+
+    Returns:
+        The posterior, whose models have moved to its mean; its cameras are tied by `ties`.
+
+    Raises:
+        numpy.linalg.LinAlgError: The views of a camera do not fix it.
+    """
     normals = camera_normals(models, points, camera_views)
     alone = [solve_normal(normal.A, normal.b) for normal in normals]
     rig = _Rig(models, points, camera_views, errors, scatter, tuple(root for root, _, _ in alone))

@@ -29,7 +29,18 @@ class Frame:
 
     @classmethod
     def of(cls, data: Dataset, method: str) -> Frame:
-        """FitError, which names the method, where the points do not fill a volume."""
+        """The working frame of a dataset.
+
+        Args:
+            data: The known points; those that some camera sees count.
+            method: The name of the method, for the error.
+
+        Returns:
+            The frame about these points.
+
+        Raises:
+            FitError: They are too few, or do not fill a volume.
+        """
         seen = data.observations.seen.any(axis=1)
         _ = data.positions  # a clear error where there are none
         counts = data.observations.seen.sum(axis=0)
@@ -45,7 +56,17 @@ class Frame:
 
     @classmethod
     def from_array(cls, array: Floats) -> Frame:
-        """The inverse of `as_array`; ValueError for what is none."""
+        """The inverse of `as_array`.
+
+        Args:
+            array: (4,) offset and scale.
+
+        Returns:
+            The frame.
+
+        Raises:
+            ValueError: The scale is not positive.
+        """
         if array[3] <= 0:
             raise ValueError("the scale of the frame must be positive")
         return cls(array[:3], float(array[3]))
@@ -55,23 +76,53 @@ class Frame:
         return np.append(self.offset, self.scale)
 
     def to_working(self, xyz: Floats) -> Floats:
-        """World to working frame."""
+        """Positions in the working frame.
+
+        Args:
+            xyz: (..., 3) in the world.
+
+        Returns:
+            (..., 3) in the working frame.
+        """
         return (xyz - self.offset) / self.scale
 
     def to_world(self, points: Floats) -> Floats:
-        """Working frame to world."""
+        """Positions in the world.
+
+        Args:
+            points: (..., 3) in the working frame.
+
+        Returns:
+            (..., 3) in the world.
+        """
         return points * self.scale + self.offset
 
 
 def camera_views_of(observations: Observations, stated: Floats) -> tuple[CameraViews, ...]:
-    """What each camera saw, all of it."""
+    """What each camera saw, all of it.
+
+    Args:
+        observations: Of C cameras.
+        stated: (C,) their usual stated noise, as `stated_noise` gives it.
+
+    Returns:
+        Per camera, its views.
+    """
     relative = relative_noise(observations, stated)
     seen = (np.flatnonzero(column) for column in observations.seen.T)
     return tuple(CameraViews(rows, observations.uv[rows, c], relative[rows, c]) for c, rows in enumerate(seen))
 
 
 def image_of(observations: Observations, c: int) -> Image:
-    """Where the pixels of camera number c are measured from."""
+    """Where the pixels of a camera are measured from.
+
+    Args:
+        observations: What the cameras saw.
+        c: Number of the camera.
+
+    Returns:
+        The middle of its image and half the longer side; where its size is not told, of what it saw.
+    """
     camera = observations.cameras[c]
     if camera.width is not None and camera.height is not None:
         return Image(np.array([camera.width - 1, camera.height - 1]) / 2, max(camera.width, camera.height) / 2)
@@ -83,20 +134,42 @@ def image_of(observations: Observations, c: int) -> Image:
 
 
 def stated_noise(observations: Observations) -> Floats:
-    """(C,) the usual stated noise of each camera in pixels, NaN where none is stated."""
+    """The usual stated noise of each camera.
+
+    Args:
+        observations: Of C cameras.
+
+    Returns:
+        (C,) medians in pixels, NaN where none is stated.
+    """
     size = view_noise(observations)
     known = np.isfinite(size) & observations.seen
     return np.array([np.median(size[known[:, c], c]) if known[:, c].any() else np.nan for c in range(size.shape[1])])
 
 
 def relative_noise(observations: Observations, stated: Floats) -> Floats:
-    """(n, C) the stated noise of each view over the camera's usual one; 1 where it is not stated."""
+    """The stated noise of each view over the camera's usual one.
+
+    Args:
+        observations: n points and C cameras.
+        stated: (C,) the usual one, pixels.
+
+    Returns:
+        (n, C) ratios; 1 where no noise is stated.
+    """
     relative = view_noise(observations) / stated
     return np.where(np.isfinite(relative) & (relative > 0), relative, 1.0)
 
 
 def view_noise(observations: Observations) -> Floats:
-    """(n, C) the stated noise of u and v together, in pixels; NaN where none is stated."""
+    """The stated noise of u and v together.
+
+    Args:
+        observations: n points and C cameras.
+
+    Returns:
+        (n, C) in pixels; NaN where none is stated.
+    """
     return np.asarray(np.sqrt(np.mean(observations.sd**2, axis=2)), dtype=np.float64)
 
 
@@ -117,7 +190,14 @@ def _declared(data: Dataset, frame: Frame) -> ShotErrors | None:
 
 
 def pixel_extent(uv: Floats) -> tuple[Floats, Floats]:
-    """The lowest and highest (2,) of pixels (n, 2), wild ones aside."""
+    """The lowest and highest of pixels, wild ones aside.
+
+    Args:
+        uv: (n, 2) pixels, one or more.
+
+    Returns:
+        The lowest (2,) and the highest (2,).
+    """
     away = np.linalg.norm(uv - np.median(uv, axis=0), axis=1)
     inside = uv[away <= MAX_PIXEL_DISTANCE_RATIO * np.quantile(away, 0.75)]
     return inside.min(axis=0), inside.max(axis=0)
@@ -176,7 +256,14 @@ class TrainingData:
         return cls(points, observations.camera_names, camera_views, images, stated, errors, lens, settings)
 
     def of_cameras(self, cameras: Sequence[int]) -> Self:
-        """The same of some cameras, by their numbers."""
+        """The same of some cameras.
+
+        Args:
+            cameras: Their numbers.
+
+        Returns:
+            Their names, views, images and noise in this order; points and errors are the same.
+        """
         return replace(
             self,
             names=tuple(self.names[c] for c in cameras),

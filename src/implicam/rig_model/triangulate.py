@@ -55,17 +55,38 @@ class Labels(NamedTuple):
     bars: Floats
 
     def off(self, x: Floats) -> Floats:
-        """(n, 3) how far a label near each of x (n, 3) is off, as far as it is known."""
+        """How far a label near each point is off, as far as it is known.
+
+        Args:
+            x: (n, 3) in the working frame.
+
+        Returns:
+            (n, 3) in the working frame; zero where nothing is known of the errors.
+        """
         if self.unknowns is None:
             return np.zeros_like(x)
         return np.asarray(self.shots.label_slope(x, self.sd) @ self.unknowns.mean, dtype=np.float64)
 
     def own(self, x: Floats) -> Floats:
-        """(n, 3, 3) covariance of the error that a known position near each of x (n, 3) may have besides."""
+        """The error that a known position near each point may have besides.
+
+        Args:
+            x: (n, 3) in the working frame.
+
+        Returns:
+            (n, 3, 3) covariances in the working frame.
+        """
         return np.nan_to_num(self.shots.unresolved_covariance(x, self.bars))
 
     def world(self, x: Floats) -> Floats:
-        """(n, 3, 3) how well the shots say what the world is there, which is made of their labels, eq. (28)."""
+        """How well the shots say what the world is there, which is made of their labels, eq. (28).
+
+        Args:
+            x: (n, 3) in the working frame.
+
+        Returns:
+            (n, 3, 3) covariances in the working frame.
+        """
         return self.own(x) * np.nan_to_num(self.shots.world_variance_ratio(x))[:, None, None]
 
 

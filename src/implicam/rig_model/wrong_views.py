@@ -65,14 +65,38 @@ class Points(Protocol):
         """Degrees of freedom of the noise, None where it is normal."""
 
     def lines(self, rows: Ints) -> tuple[Floats, Floats]:
-        """Centres (C, 3) of the cameras and directions (n, C, 3) of the lines of sight, NaN for none."""
+        """The lines of sight of some points.
+
+        Args:
+            rows: Numbers (n,) of the points.
+
+        Returns:
+            Centres (C, 3) of the cameras and directions (n, C, 3) in the working frame, NaN for none.
+        """
 
     def linearise(self, rows: Ints, x: Floats, seen: Bools, before: LinearisedViews | None = None) -> LinearisedViews:
-        """The views `seen` (n, C) about x (n, 3); NaN where a camera has no answer. The covariances are those of
-        `before`, if it is given: of a place nearby."""
+        """Views of points about places.
+
+        Args:
+            rows: Numbers (n,) of the points.
+            x: (n, 3) the places, in the working frame.
+            seen: (n, C) the views to use.
+            before: Of a place nearby, whose covariances are taken; None to find them.
+
+        Returns:
+            The views; NaN where a camera has no answer.
+        """
 
     def solve(self, rows: Ints, seen: Bools) -> tuple[Floats, Floats, Floats]:
-        """Positions (n, 3), covariances and p-values (n,) from the views `seen` alone; NaN for none."""
+        """Where points are, from some of their views alone.
+
+        Args:
+            rows: Numbers (n,) of the points.
+            seen: (n, C) the views to use.
+
+        Returns:
+            Positions (n, 3) and covariances (n, 3, 3) in the working frame, and p-values (n,); NaN for none.
+        """
 
 
 class BetterChoice(NamedTuple):
@@ -86,7 +110,14 @@ class BetterChoice(NamedTuple):
 
 
 def max_wrong_views(views: Ints) -> Ints:
-    """How many views of a point may be left out: the others must be able to contradict, and be more."""
+    """How many views of a point may be left out: the others must be able to contradict, and be more.
+
+    Args:
+        views: (n,) how many views each point has.
+
+    Returns:
+        (n,) none of one or two, one of three or four, two of five to seven, of more (views - 2) // 2.
+    """
     views = np.asarray(views)
     few = np.clip((views - 1) // 2, 0, 2)
     return np.asarray(np.where(views >= 8, (views - 2) // 2, few), dtype=np.int64)
@@ -457,7 +488,15 @@ def _least_squares(N: Floats, g: Floats) -> Floats:
 
 
 def apply_weights(linear: LinearisedViews, what: Floats) -> Floats:
-    """W times what (n, C, 2, k)."""
+    """The inverse covariance of the views of each point, times columns.
+
+    Args:
+        linear: The views of n points.
+        what: (n, C, 2, k).
+
+    Returns:
+        (n, C, 2, k); across cameras where these are tied.
+    """
     if linear.joint is None:
         return np.asarray(linear.each @ what, dtype=np.float64)
     n, C, _, k = what.shape
