@@ -150,7 +150,18 @@ class Settings:
 
 
 def unit_of(name: str, default: Any) -> str:
-    """The unit of a setting in words; KeyError for a name that does not end in one of `UNITS`."""
+    """The unit of a setting in words.
+
+    Args:
+        name: Of the setting; its ending says the unit.
+        default: Its default value; a whole number is a count.
+
+    Returns:
+        The unit.
+
+    Raises:
+        KeyError: The name of a setting that is no whole number does not end in one of `UNITS`.
+    """
     if isinstance(default, int):
         return COUNT
     bare = name.removesuffix(WITHOUT)

@@ -137,7 +137,14 @@ def _rms(values: Floats) -> Floats:
 
 
 def as_rows(found: Realised) -> list[tuple[str, float, float, float]]:
-    """Axis, predicted, rms error and stated standard deviation, for x, y, z and all axes together."""
+    """Axis, predicted, rms error and stated standard deviation, for x, y, z and all axes together.
+
+    Args:
+        found: What was predicted, measured and stated.
+
+    Returns:
+        Four rows, in the length unit of `found`.
+    """
     columns = [found.predicted_rms, found.error_rms, found.stated_rms]
     whole = [float(np.linalg.norm(column)) for column in columns]
     each = [(axis, *(float(column[i]) for column in columns)) for i, axis in enumerate("xyz")]

@@ -41,7 +41,14 @@ class UncertaintyScale:
     unit: str
 
     def bar(self, **more: Any) -> dict[str, Any]:
-        """Plotly's colour bar."""
+        """Plotly's colour bar.
+
+        Args:
+            **more: Of Plotly's options, which win over those here.
+
+        Returns:
+            The options of a colour bar.
+        """
         title = {"text": f"95 % uncertainty<br>({plain(self.unit)})", "side": "top"}
         quiet = {"thickness": 14, "outlinewidth": 0, "ticks": "outside", "tickformat": ".3~g"}
         return {"title": title, **quiet, **more}

@@ -183,7 +183,18 @@ def _tool(tool: str | Sequence[float]) -> Tool:
 
 
 def position_from_text(text: str, option: str) -> Floats:
-    """(3,) the position that "120,-40,300" means; UsageError, which names the option, where it is none."""
+    """The position that "120,-40,300" means.
+
+    Args:
+        text: Three numbers with commas between them.
+        option: Of the command line, which the error names.
+
+    Returns:
+        (3,) as given.
+
+    Raises:
+        UsageError: It is no position.
+    """
     try:
         position = np.array([float(number) for number in text.split(",")], dtype=np.float64)
         if position.shape != (3,) or not np.isfinite(position).all():
