@@ -173,6 +173,7 @@ def json_commands(made: Path) -> dict[str, list[str]]:
         "export": ["export", file, "--to", "colmap", "-o", "model"],
         "import": ["import", str(made / "cameras.toml"), "-o", "cameras.implicam"],
         "suggest": ["suggest", file, "-n", "3"],
+        "design": ["design", "stereo", "--points", "20"],
         "acquire": ["acquire", "session", "--rig", "stereo", "--budget", "9", "--speed", "1000", "--unattended"],
         "info": ["info", file],
     }
