@@ -91,17 +91,29 @@ def align(
             pose, Q, G, W, residual = _weighted(pose, measured, cov, xyz, sd, used, there)
             break
         used = good
-    B = (Q @ G.swapaxes(1, 2) @ W)[used]
-    own = _own_noise(B, point[used], pose, sd[used], known.shots[pairs][used])
-    K = np.einsum("nai,nip->ap", B, M[used])
-    follows = (M[used] - G[used] @ K) @ root.T
-    left = point[used] + follows @ follows.swapaxes(1, 2) + G[used] @ own @ G[used].swapaxes(1, 2)
-    left = left + pose.rotation @ (sd[used][:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
-    errors, sds = left_out(pose, Q, G[used], W[used], residual[used], left)
-    found = Alignment(pose, used, K, own, errors, sds, extent_ratio(measured[used], xyz[used]))
+    usual = float(np.mean(np.trace(cov[used], axis1=1, axis2=2)) / 3)
+    alike = np.broadcast_to(usual * np.eye(3), cov.shape)
+    motions = [(pose, Q, G, W, residual), _weighted(pose, measured, alike, xyz, sd, used, there)]
+
+    def alignment(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats) -> Alignment:
+        B = (Q @ G.swapaxes(1, 2) @ W)[used]
+        own = _own_noise(B, point[used], pose, sd[used], known.shots[pairs][used])
+        K = np.einsum("nai,nip->ap", B, M[used])
+        follows = (M[used] - G[used] @ K) @ root.T
+        left = point[used] + follows @ follows.swapaxes(1, 2) + G[used] @ own @ G[used].swapaxes(1, 2)
+        left = left + pose.rotation @ (sd[used][:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
+        errors, sds = left_out(pose, Q, G[used], W[used], residual[used], left)
+        return Alignment(pose, used, K, own, errors, sds, extent_ratio(measured[used], xyz[used]))
+
+    def loss(one: Alignment) -> float:
+        return float(np.sum(one.errors**2 / (usual + sd[used] ** 2)))
+
+    both = [alignment(*motion) for motion in motions]
+    best = int(np.argmin([loss(one) for one in both])) if used.sum() > 3 else 0
+    left = motions[best][4][there]
     extent = float(np.sqrt(np.sum(known.xyz.var(axis=0))))
-    check_alignment(found, residual[there], xyz[there], measured[there], extent, settings)
-    return found
+    check_alignment(both[best], left, xyz[there], measured[there], extent, settings)
+    return both[best]
 
 
 def _by_pixels(
