@@ -23,7 +23,7 @@ from implicam.errors import CalibrationFileError, DatasetError, FitError, UsageE
 from implicam.evaluation import evaluate
 from implicam.exchange import UNKNOWN_UNIT, ExplicitCamera
 from implicam.exchange import Rig as ExchangeRig
-from implicam.geometry import Pose, rotation_from_vector
+from implicam.geometry import Pose, register, rotation_from_vector
 from implicam.lenses import BrownConrady
 from implicam.simulate import (
     Rig,
@@ -181,6 +181,18 @@ def from_boards() -> ExplicitCalibration:
 @cache
 def from_boards_alone() -> ExplicitCalibration:
     return Explicit().fit(fisheyes()[1])
+
+
+def test_errors_that_neighbouring_points_share_do_not_turn_the_rig() -> None:
+    """As a lens does that no model holds. Weights would give the exact points, which are near, the say."""
+    known = points(pair()[0], 60, 5)
+    distance = np.linalg.norm(known.xyz - pair()[0].cameras[0].camera_from_world.centre, axis=1)
+    near = distance < np.quantile(distance, 0.3)
+    sight = (known.xyz - pair()[0].cameras[0].camera_from_world.centre) / distance[:, None]
+    bent = replace(known.positions, xyz=known.xyz + 0.4 * near[:, None] * sight)
+    measured = on_boards().fit(replace(known, known=bent)).measure(known.observations).xyz
+    left = np.sqrt(np.mean(np.sum((measured - bent.xyz) ** 2, axis=1)))
+    assert left < 1.01 * register(measured, bent.xyz)[1]
 
 
 def test_from_boards_it_measures_close_to_the_limit_with_true_error_bars() -> None:
