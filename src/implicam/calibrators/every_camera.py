@@ -42,17 +42,43 @@ class Scaling:
 
     @classmethod
     def of(cls, values: Floats) -> Scaling:
-        """The scaling that gives each column of (n, d) mean 0 and standard deviation 1."""
+        """The scaling that gives each column mean 0 and standard deviation 1.
+
+        Args:
+            values: (n, d).
+
+        Returns:
+            The scaling; a column of equal values is not scaled.
+        """
         scale = values.std(axis=0)
         return cls(values.mean(axis=0), np.where(scale > 0, scale, 1.0))
 
     def apply(self, values: Floats) -> Floats:
-        """Standardise (n, d)."""
+        """Standardise values.
+
+        Args:
+            values: (n, d), columns as of the offset.
+
+        Returns:
+            (n, d).
+        """
         return (values - self.offset) / self.scale
 
 
 def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]]:
-    """The points with every view, each once, and why the others are not used; FitError where they are too few."""
+    """The points with every view, each once, and why the others are not used.
+
+    Args:
+        data: Known points and what the cameras saw of them.
+        method: The name of the method, for reasons and errors.
+
+    Returns:
+        The data of the points used, without cameras that are there twice; and the reason of each point that is not.
+
+    Raises:
+        DatasetError: The data have no known positions.
+        FitError: The points are too few, or all their positions share a coordinate.
+    """
     copied = list_copied_points(data)
     data = remove_copies(data, cameras_too=True)
     seen = data.observations.seen
@@ -71,12 +97,27 @@ def seen_by_all(data: Dataset, method: str) -> tuple[Dataset, tuple[Unused, ...]
 
 
 def pixels_of(data: Dataset) -> Floats:
-    """(n, 2 cameras) the concatenated pixels u1, v1, u2, v2, ..."""
+    """The concatenated pixels u1, v1, u2, v2, ...
+
+    Args:
+        data: n points.
+
+    Returns:
+        (n, 2 cameras) pixels, NaN where not seen.
+    """
     return data.observations.uv.reshape(len(data), -1)
 
 
 def scaling_arrays(pixels: Scaling, positions: Scaling) -> dict[str, NDArray[Any]]:
-    """The two scalings as arrays of a calibration file."""
+    """The two scalings as arrays of a calibration file.
+
+    Args:
+        pixels: Of the 2 C pixel coordinates.
+        positions: Of x, y, z.
+
+    Returns:
+        Name -> array.
+    """
     return {
         "pixel_offset": pixels.offset,
         "pixel_scale": pixels.scale,
@@ -86,7 +127,19 @@ def scaling_arrays(pixels: Scaling, positions: Scaling) -> dict[str, NDArray[Any
 
 
 def scalings(arrays: Arrays, data: Dataset) -> tuple[Scaling, Scaling]:
-    """The inverse of `scaling_arrays`: of pixels, of positions; ValueError where they do not fit the data."""
+    """The inverse of `scaling_arrays`.
+
+    Args:
+        arrays: Of the file.
+        data: That the file's calibration was fitted to; the number of its cameras counts.
+
+    Returns:
+        The scalings of pixels and of positions.
+
+    Raises:
+        KeyError: An array is missing.
+        ValueError: One does not fit the data, or is not finite, or a scale is not positive.
+    """
     pixels, positions = (
         Scaling(
             finite_column(arrays, f"{what}_offset", (d,)), finite_column(arrays, f"{what}_scale", (d,), positive=True)
@@ -97,19 +150,44 @@ def scalings(arrays: Arrays, data: Dataset) -> tuple[Scaling, Scaling]:
 
 
 def why_not_all_seen(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> str:
-    """The reason for a point that not every camera saw."""
+    """The reason for a point that not every camera saw.
+
+    Args:
+        seen: (cameras,) which saw the point.
+        names: Of the cameras.
+        method: The name of the method.
+
+    Returns:
+        The reason, which names the cameras that did not see it.
+    """
     blind = [name for name, ok in zip(names, seen, strict=True) if not ok]
     return f"{method} needs every camera; not seen by {', '.join(blind)}"
 
 
 def missing_view_reasons(seen: NDArray[np.bool_], names: tuple[str, ...], method: str) -> Names:
-    """(n,) why a point was not measured, from seen (n, cameras); empty where every camera saw it."""
+    """Why points were not measured.
+
+    Args:
+        seen: (n, cameras) which camera saw which point.
+        names: Of the cameras.
+        method: The name of the method.
+
+    Returns:
+        (n,) reasons; empty where every camera saw the point.
+    """
     reasons = ["" if row.all() else why_not_all_seen(row, names, method) for row in seen]
     return np.array(reasons, dtype=np.str_)
 
 
 def flat_note(data: Dataset) -> list[str]:
-    """A note on known points in one plane, whichever way it lies."""
+    """A note on known points in one plane, whichever way it lies.
+
+    Args:
+        data: With its known positions.
+
+    Returns:
+        The note; no note where they fill a volume.
+    """
     extents = np.linalg.svd(data.xyz - data.xyz.mean(axis=0), compute_uv=False)
     if extents[-1] > MAX_RELATIVE_THICKNESS * extents[0]:
         return []
@@ -120,7 +198,16 @@ def flat_note(data: Dataset) -> list[str]:
 
 
 def lattice_note(data: Dataset, method: str, settings: EveryCameraSettings = USUAL) -> list[str]:
-    """A note on known positions that share their coordinates, which a map from pixels to positions can learn."""
+    """A note on known positions that share their coordinates, which a map from pixels to positions can learn.
+
+    Args:
+        data: With its known positions.
+        method: The name of the method.
+        settings: How many points share a value on a lattice.
+
+    Returns:
+        The note; no note where there is no lattice.
+    """
     lattice = [
         f"{axis} has {len(np.unique(values))} values"
         for axis, values in zip("xyz", data.xyz.T, strict=True)

@@ -135,7 +135,19 @@ class InverseGP(CalibratorBase):
         return ("gpytorch", "paper") if self.preset == "paper" else None
 
     def fit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
-        """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
+        """Fit to the points that every camera saw; the others are listed in `unused`, with the reason.
+
+        Args:
+            data: Known points and what the cameras saw of them.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            FitError: There are too few points that every camera saw.
+            MissingExtraError: The preset is `paper`, and its software is not installed.
+        """
         if self.preset == "smooth":
             return self._fitted_smooth(data, progress)
         if self.preset == "paper":
@@ -253,8 +265,16 @@ class InverseGPCalibration(CalibrationBase):
         return PixelCloud.of(pixels_of(self._usable), self.calibrator.settings)
 
     def farness(self, uv: Floats) -> Floats:
-        """(k,) the factor by which error bars at pixels (k, d) grow away from those learned from: 1 among them; what
-        is beyond `farthest` is not measured. The paper's presets know nothing of it."""
+        """The factor by which error bars grow away from the pixels learned from; what is beyond `farthest` is not
+        measured.
+
+        Args:
+            uv: (k, d) concatenated pixels.
+
+        Returns:
+            (k,) 1 among the pixels learned from, and everywhere for the presets `plain` and `paper`, which know nothing
+            of it.
+        """
         if self.smoothness is None:
             return np.ones(len(uv))
         return np.maximum(self.cloud.farness(uv), 1.0)
@@ -270,8 +290,17 @@ class InverseGPCalibration(CalibrationBase):
         return self.pixels.apply(pixels_of(usable)), self.positions.apply(usable.xyz)
 
     def measure(self, observations: Observations) -> Measurement:
-        """Measure the points that every camera saw, and whose pixels are like those learned from (`smooth`); the
-        others keep their row, with a reason."""
+        """Measure the points that every camera saw, and whose pixels are like those learned from (`smooth`).
+
+        Args:
+            observations: What the cameras saw, by their names.
+
+        Returns:
+            Positions in the world with their covariances; other points keep their row, with a reason.
+
+        Raises:
+            DatasetError: A camera of the calibration is missing, or has images of another size.
+        """
         observations = match_cameras(self.used.observations, observations)
         seen = observations.seen
         reason = missing_view_reasons(seen, observations.camera_names, self.method).astype(object)
@@ -300,8 +329,15 @@ class InverseGPCalibration(CalibrationBase):
         )
 
     def position_processes(self, uv: Floats) -> PositionProcesses:
-        """What the processes say of n places together, at their pixels uv (n, cameras, 2); for a place that a camera
-        does not see, what they would say at the middle of the data."""
+        """What the processes say of places together; for one that a camera does not see, what they would say at the
+        middle of the data.
+
+        Args:
+            uv: (n, cameras, 2) the pixels of the places, NaN where not seen.
+
+        Returns:
+            The processes at these places, in squared length units of the world.
+        """
         pixels = self.pixels.apply(uv.reshape(len(uv), -1))
         pixels = np.where(np.isfinite(pixels), pixels, 0.0)
         square = np.outer(self.positions.scale, self.positions.scale)
@@ -318,12 +354,31 @@ class InverseGPCalibration(CalibrationBase):
         return PositionProcesses(processes, self.map.uncertain(pixels) * square, widened)
 
     def condition_on(self, data: Dataset) -> InverseGPCalibration:
-        """The same hyperparameters, with these known points."""
+        """The same hyperparameters, with these known points.
+
+        Args:
+            data: All known points from now on, of the same cameras.
+
+        Returns:
+            The calibration, with the same scaling of pixels and positions.
+        """
         return replace(self, data=data)
 
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> InverseGPCalibration:
-        """As `refit`, starting from what is known, for some points more; with `anew` from no guess as well, and the
-        more probable of both counts. The paper's preset always starts from its defaults."""
+        """As `refit`, starting from what is known, for some points more. The paper's preset always starts from its
+        defaults.
+
+        Args:
+            data: All known points from now on.
+            progress: Is told how far the fit is.
+            anew: Start from no guess as well; the more probable of both counts.
+
+        Returns:
+            The new calibration.
+
+        Raises:
+            FitError: There are too few points that every camera saw.
+        """
         if self.calibrator.preset == "paper":
             return self.calibrator.fit(data, progress)
         if self.smoothness is not None and self.basis is not None:
@@ -436,7 +491,19 @@ class InverseGPCalibration(CalibrationBase):
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> InverseGPCalibration:
-        """Restore a calibration; the factors are computed again, which takes less time than reading them would."""
+        """Restore a calibration; the factors are computed again, which takes less time than reading them would.
+
+        Args:
+            data: That it was fitted to.
+            table: Of `state`.
+            arrays: Of `state`.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            KeyError, ValueError, TypeError: Something is missing or does not fit.
+        """
         calibrator = InverseGP.from_table(table)
         _, unused = seen_by_all(data, cls.method)
         used = remove_copies(data, cameras_too=True)
@@ -470,7 +537,14 @@ class InverseGPCalibration(CalibrationBase):
 
 
 def unlike_reason(far: float) -> str:
-    """Why pixels so far from all known points are not measured."""
+    """Why pixels so far from all known points are not measured.
+
+    Args:
+        far: Times as far as the farthest of the known points from the others.
+
+    Returns:
+        The reason in words.
+    """
     return (
         f"pixels unlike any it has learned: {far:.0f} times as far from the known points' as the farthest of these "
         "(a wrong match, or a place away from where known points are)"

@@ -42,16 +42,45 @@ class Map(Protocol):
         """Its Gaussian processes."""
 
     def inputs(self, X: Floats) -> Floats:
-        """(k, d) what the processes take, from standardised pixels (k, d)."""
+        """What the processes take.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            (k, d).
+        """
 
     def drift(self, X: Floats, explained: Sequence[Floats]) -> list[Floats]:
-        """Of each part (p, k): what is uncertain of its mean."""
+        """What is uncertain of the mean of each part.
+
+        Args:
+            X: (k, d) standardised pixels.
+            explained: Of each part (n, k) what its known points explain: L^-1 K(known, X).
+
+        Returns:
+            Of each part (p, k).
+        """
 
     def uncertain(self, X: Floats) -> Floats:
-        """(k, 3, 3) what is in the covariance beside the parts, from standardised pixels."""
+        """What is in the covariance beside the parts.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            (k, 3, 3) in standardised units.
+        """
 
     def predict(self, X: Floats) -> tuple[Floats, Floats]:
-        """Mean (k, 3) and covariance (k, 3, 3) of a new noisy position, from standardised pixels (k, d)."""
+        """Predict new noisy positions.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            Mean (k, 3) and covariance (k, 3, 3), in standardised units.
+        """
 
     @property
     def noise(self) -> Floats:
@@ -80,19 +109,48 @@ class ThreeMaps:
         return tuple(Part(gp, np.outer(axis, axis), 1) for gp, axis in zip(self.processes, self.axes, strict=True))
 
     def inputs(self, X: Floats) -> Floats:
-        """The pixels themselves."""
+        """The pixels themselves.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            X itself.
+        """
         return X
 
     def drift(self, X: Floats, explained: Sequence[Floats]) -> list[Floats]:
-        """Nothing: their mean is known."""
+        """Nothing: their mean is known.
+
+        Args:
+            X: (k, d) standardised pixels.
+            explained: As of `Map`; only their number counts.
+
+        Returns:
+            Of each part (0, k).
+        """
         return [np.zeros((0, len(X))) for _ in explained]
 
     def uncertain(self, X: Floats) -> Floats:
-        """Nothing: hyperparameters are taken as known."""
+        """Nothing: hyperparameters are taken as known.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            (k, 3, 3) zeros.
+        """
         return np.zeros((len(X), 3, 3))
 
     def predict(self, X: Floats) -> tuple[Floats, Floats]:
-        """The processes side by side; with one an axis the covariance is diagonal."""
+        """The processes side by side; with one an axis the covariance is diagonal.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            Mean (k, 3) and covariance (k, 3, 3) of new noisy positions, in standardised units.
+        """
 
         def one(gp: GaussianProcess) -> tuple[Floats, Floats]:
             mean, variance = gp.predict(X)
@@ -139,7 +197,19 @@ class SmoothMap:
         Y: Floats,
         settings: InverseGPSettings = DEFAULT_SETTINGS,
     ) -> SmoothMap:
-        """On known points: standardised pixels X (n, d), whose standard deviations in pixels are spread (d,)."""
+        """Condition on known points.
+
+        Args:
+            smoothness: Lengthscales and noise, in the coordinates of the basis.
+            basis: (d, d) the process takes `pixels @ basis`.
+            spread: (d,) standard deviations of the pixels.
+            X: (n, d) standardised pixels.
+            Y: (n, 3) standardised positions.
+            settings: How many residuals the linear mean must leave.
+
+        Returns:
+            The map.
+        """
         axes = _mean_axes(X, spread, settings)
         with few_threads(len(X)):
             return cls(Kriging.condition(smoothness, X @ basis, Y, _with_one(X @ axes)), basis, axes)
@@ -150,19 +220,48 @@ class SmoothMap:
         return (Part(self.kriging, self.kriging.sigma, 3),)
 
     def inputs(self, X: Floats) -> Floats:
-        """In the basis that was chosen."""
+        """Standardised pixels in the basis that was chosen.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            (k, d).
+        """
         return X @ self.basis
 
     def drift(self, X: Floats, explained: Sequence[Floats]) -> list[Floats]:
-        """Of the linear mean."""
+        """What is uncertain of the linear mean.
+
+        Args:
+            X: (k, d) standardised pixels.
+            explained: Of its one part (n, k) what the known points explain.
+
+        Returns:
+            Of its one part (q + 1, k), q being the directions in which the mean is linear.
+        """
         return [self.kriging.drift(_with_one(X @ self.axes), explained[0])]
 
     def uncertain(self, X: Floats) -> Floats:
-        """What is not known of the lengthscales."""
+        """What is not known of the lengthscales.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            (k, 3, 3) in standardised units.
+        """
         return self._at(X)[2]
 
     def predict(self, X: Floats) -> tuple[Floats, Floats]:
-        """With the covariance of all three coordinates."""
+        """Predict new noisy positions, with the covariance of all three coordinates.
+
+        Args:
+            X: (k, d) standardised pixels.
+
+        Returns:
+            Mean (k, 3) and covariance (k, 3, 3), in standardised units.
+        """
         mean, factor, moved = self._at(X)
         return mean, self.kriging.sigma * (factor + self.kriging.noise_variance)[:, None, None] + moved
 
@@ -241,9 +340,21 @@ def learn_smooth(
     start: tuple[Smoothness, bool] | None = None,
     anew: bool = True,
 ) -> tuple[Smoothness, Floats]:
-    """The more probable of the bases (d, d) and its smoothness, for standardised X (n, d) and Y (n, 3).
+    """Learn how smooth the map is, in the more probable of the bases.
 
-    start: an earlier smoothness, and whether it was along principal axes; without `anew` only that is gone on from.
+    Args:
+        X: (n, d) standardised pixels.
+        Y: (n, 3) standardised positions.
+        spread: (d,) standard deviations of the pixels.
+        shape: Name of the kernel.
+        shortest: Bound of every lengthscale.
+        seed: Of the random starts.
+        settings: The priors.
+        start: An earlier smoothness, and whether it was along principal axes.
+        anew: Start from no guess as well; without, only from `start`, if it is given.
+
+    Returns:
+        The smoothness, and the basis (d, d) that it is in.
     """
     bases = _bases(X, spread, shortest, settings)
     H = _with_one(X @ _mean_axes(X, spread, settings))
@@ -262,10 +373,24 @@ def learn_smooth(
 
 
 def few_threads(points: int) -> AbstractContextManager[None]:
-    """One BLAS thread for matrices of so few points, on which several only wait for each other (threads.py)."""
+    """One BLAS thread for matrices of so few points, on which several only wait for each other (threads.py).
+
+    Args:
+        points: How many known points there are.
+
+    Returns:
+        A context in which BLAS has this many threads.
+    """
     return blas_threads(1 if points <= MAX_POINTS_ON_ONE_THREAD else cores())
 
 
 def is_principal(basis: Floats) -> bool:
-    """Whether a basis is that of principal axes, not that of the pixels."""
+    """Whether a basis is that of principal axes, not that of the pixels.
+
+    Args:
+        basis: (d, d), one that `learn_smooth` has chosen.
+
+    Returns:
+        Whether it is anything but unity.
+    """
     return not np.array_equal(basis, np.eye(len(basis)))

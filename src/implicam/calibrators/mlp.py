@@ -81,7 +81,19 @@ class MLP(CalibratorBase):
         return "torch", "mlp"
 
     def fit(self, data: Dataset, progress: Progress = silent) -> MLPCalibration:
-        """Fit to the points that every camera saw; the others are listed in `unused`, with the reason."""
+        """Fit to the points that every camera saw; the others are listed in `unused`, with the reason.
+
+        Args:
+            data: Known points and what the cameras saw of them.
+            progress: Is told how far the training is.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            FitError: There are too few points that every camera saw.
+            MissingExtraError: PyTorch is not installed.
+        """
         (found,) = self.fit_many([data], progress)
         if isinstance(found, FitError):
             raise found
@@ -90,7 +102,15 @@ class MLP(CalibratorBase):
     def fit_many(self, datasets: Sequence[Dataset], progress: Progress = silent) -> list[MLPCalibration | FitError]:
         """Fit to each dataset, number i with seed + i, as `fit` would; those with equally many points as one batch.
 
-        A dataset that cannot be used has its FitError in the list.
+        Args:
+            datasets: Known points and what the cameras saw of them.
+            progress: Is told how far the training is.
+
+        Returns:
+            The calibrations in this order; in the place of one that cannot be made, its FitError.
+
+        Raises:
+            MissingExtraError: PyTorch is not installed.
         """
         prepared = [_prepare(replace(self, seed=self.seed + i), data) for i, data in enumerate(datasets)]
         examples = [ready.examples for ready in prepared if isinstance(ready, _Prepared)]
@@ -154,7 +174,17 @@ class MLPCalibration(CalibrationBase):
         return remove_copies(self.data, cameras_too=True)
 
     def measure(self, observations: Observations) -> Measurement:
-        """Measure the points that every camera saw; the others keep their row, with a reason."""
+        """Measure the points that every camera saw.
+
+        Args:
+            observations: What the cameras saw, by their names.
+
+        Returns:
+            Positions in the world with their covariances; other points keep their row, with a reason.
+
+        Raises:
+            DatasetError: A camera of the calibration is missing, or has images of another size.
+        """
         observations = match_cameras(self.used.observations, observations)
         seen = observations.seen
         complete = seen.all(axis=1)
@@ -253,7 +283,19 @@ class MLPCalibration(CalibrationBase):
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> MLPCalibration:
-        """Restore a calibration; PyTorch is not needed."""
+        """Restore a calibration; PyTorch is not needed.
+
+        Args:
+            data: That it was fitted to.
+            table: Of `state`.
+            arrays: Of `state`.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            KeyError, ValueError, TypeError: Something is missing or does not fit.
+        """
         calibrator = MLP.from_table(table)
         usable, unused = seen_by_all(data, cls.method)
         held_out = arrays["held_out"]

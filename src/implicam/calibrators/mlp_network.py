@@ -18,7 +18,14 @@ HIDDEN = (128, 128, 64)
 
 
 def layer_shapes(inputs: int) -> list[tuple[int, int]]:
-    """(inputs, outputs) of each layer of weights."""
+    """(inputs, outputs) of each layer of weights.
+
+    Args:
+        inputs: Of the network: two a camera.
+
+    Returns:
+        One pair for each of the four layers.
+    """
     return list(pairwise((inputs, *HIDDEN, 3)))
 
 
@@ -32,14 +39,28 @@ class Network:
     slope: float = DEFAULT_SETTINGS.leaky_relu_slope_ratio
 
     def predict(self, X: Floats) -> Floats:
-        """(n, 3) outputs of inputs (n, d), with every unit at work."""
+        """Outputs with every unit at work.
+
+        Args:
+            X: (n, d) standardised inputs.
+
+        Returns:
+            (n, 3) standardised outputs.
+        """
         return self._above_first(self._first(X), [np.ones(width) for width in HIDDEN])
 
     def spread(self, X: Floats, masks: Floats) -> Floats:
-        """(n, 3, 3) sample covariance of the outputs over passes with dropout; masks (passes, units) as `draw_masks`.
+        """The sample covariance of the outputs over passes with dropout.
 
         Monte-Carlo dropout: Gal and Ghahramani, "Dropout as a Bayesian Approximation", ICML 2016. Each pass uses one
         mask for all points, so that a point's answer does not depend on its company.
+
+        Args:
+            X: (n, d) standardised inputs.
+            masks: (passes, units) as `draw_masks`, of two passes or more.
+
+        Returns:
+            (n, 3, 3) in standardised units.
         """
         first, centre = self._first(X), self.predict(X)
         total, squares = np.zeros((len(X), 3)), np.zeros((len(X), 3, 3))
@@ -61,7 +82,16 @@ class Network:
 
 
 def draw_masks(rng: np.random.Generator, passes: int, dropout: float) -> Floats:
-    """(passes, hidden units) zero where a unit is switched off, with probability `dropout`; else 1 / (1 - dropout)."""
+    """Draw which hidden units are switched off.
+
+    Args:
+        rng: The source of chance.
+        passes: How many masks.
+        dropout: Probability that a unit is switched off.
+
+    Returns:
+        (passes, hidden units) zero where a unit is switched off, else 1 / (1 - dropout).
+    """
     return (rng.random((passes, sum(HIDDEN))) >= dropout) / (1 - dropout)
 
 

@@ -62,6 +62,18 @@ def train(
 
     Filling up small ones with zeros instead would make large batches of unequal networks, and round differently from a
     run of its own: without dropout that was seen to end in another optimum.
+
+    Args:
+        runs: What each network learns from.
+        dropout: Probability that a hidden unit is switched off.
+        progress: Is told how many epochs are done.
+        settings: Learning rate, epochs and patience.
+
+    Returns:
+        The networks, in the order of the runs.
+
+    Raises:
+        MissingExtraError: PyTorch is not installed.
     """
     sizes, epochs = sorted({run.size for run in runs}), settings.max_epochs
     found: dict[int, Trained] = {}
@@ -89,7 +101,15 @@ def _one_thread() -> Iterator[Any]:
 
 
 def initial_weights(inputs: int, rng: np.random.Generator) -> list[Floats]:
-    """Weight, bias, weight, ...: uniform within 1 / sqrt(inputs of the layer), as `torch.nn.Linear` starts."""
+    """Weight, bias, weight, ...: uniform within 1 / sqrt(inputs of the layer), as `torch.nn.Linear` starts.
+
+    Args:
+        inputs: Of the network.
+        rng: The source of chance.
+
+    Returns:
+        Weights (inputs of the layer, outputs) and biases (1, outputs), in turn.
+    """
     return [
         rng.uniform(-1, 1, shape) / np.sqrt(fan_in)
         for fan_in, fan_out in layer_shapes(inputs)
@@ -148,8 +168,19 @@ def gradients(
     masks: Sequence[Any] = (),
     slope: float = DEFAULT_SETTINGS.leaky_relu_slope_ratio,
 ) -> tuple[Any, ...]:
-    """Gradients of every network's mean squared error, shaped as `parameters`; Y is (networks, n, 3), the rest as in
-    `forward`."""
+    """The gradients of every network's mean squared error.
+
+    Args:
+        torch: The module.
+        parameters: As of `forward`.
+        X: Standardised inputs (networks, n, d).
+        Y: Standardised outputs (networks, n, 3).
+        masks: As of `forward`.
+        slope: Of the leaky ReLU below zero.
+
+    Returns:
+        Shaped as `parameters`.
+    """
     predicted = forward(torch, parameters, X, masks, slope)
     # a network's weights are in no loss but its own
     loss = torch.nn.functional.mse_loss(predicted, Y, reduction="sum") / Y[0].numel()

@@ -25,10 +25,22 @@ if TYPE_CHECKING:
 
 
 def train(method: InverseGP, X: Floats, Y: Floats, progress: Progress) -> tuple[Hyperparameters, ...]:
-    """Hyperparameters of x, y and z after GPyTorch's training; X (n, d) standardised pixels, Y (n, 3) in metres.
+    """Hyperparameters of x, y and z after GPyTorch's training.
 
     The three are one batch of independent GPs: the sum of their losses has the gradients of each, and Adam works
     element by element, so each takes the steps that it would take alone.
+
+    Args:
+        method: Its settings have the learning rate and the number of steps.
+        X: (n, d) standardised pixels.
+        Y: (n, 3) in metres.
+        progress: Is told how many steps are done.
+
+    Returns:
+        One for each of x, y, z; variances are in squared metres.
+
+    Raises:
+        MissingExtraError: PyTorch or GPyTorch is not installed.
     """
     torch = import_extra("torch", "paper", "the paper preset")
     import_extra("gpytorch", "paper", "the paper preset")
@@ -84,7 +96,13 @@ def _train(
 def exact_gp(inputs: Any, outputs: Any, likelihood: Any) -> Any:
     """GPyTorch's tutorial model: constant mean, scaled ARD squared-exponential kernel.
 
-    inputs (n, d) and outputs (n,), or a batch of both.
+    Args:
+        inputs: (n, d), or a batch of such.
+        outputs: (n,), or a batch of such.
+        likelihood: GPyTorch's, of as large a batch.
+
+    Returns:
+        The model, in float64.
     """
     import gpytorch
 

@@ -37,7 +37,15 @@ class PixelCloud:
 
     @classmethod
     def of(cls, X: Floats, settings: InverseGPSettings = DEFAULT_SETTINGS) -> PixelCloud:
-        """Of pixels (n, d) of the known points."""
+        """The cloud of the known points.
+
+        Args:
+            X: (n, d) their pixels.
+            settings: From how many points on the sheet may be curved.
+
+        Returns:
+            Where their sheet lies, and how far they scatter about it.
+        """
         n, d = X.shape
         offset = X.mean(axis=0)
         spread = np.sqrt(np.mean(X.var(axis=0)))
@@ -57,7 +65,14 @@ class PixelCloud:
         return cls(offset, directions, q, degree, coefficients, inverse, whiten, float(left_out.max()))
 
     def farness(self, X: Floats) -> Floats:
-        """(k,) how far pixels (k, d) are off, in that of the farthest known point from all others."""
+        """How far pixels are off the known points' sheet.
+
+        Args:
+            X: (k, d) pixels.
+
+        Returns:
+            (k,) in the distance of the farthest known point from all others.
+        """
         Z = (X - self.offset) @ self.directions
         B = _terms(Z[:, : self.leading], self.degree)
         variance_ratio = 1.0 + np.einsum("ij,jk,ik->i", B, self.inverse, B)

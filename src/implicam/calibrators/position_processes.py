@@ -37,7 +37,15 @@ class PositionProcess:
     drift: Floats
 
     def covariance(self, a: Index, b: Index) -> Floats:
-        """Between places a and b, of the function without noise."""
+        """The covariance between places, of the function without noise.
+
+        Args:
+            a: Some of the places.
+            b: Others.
+
+        Returns:
+            (a, b).
+        """
         V, W = self.known, self.drift
         return np.asarray(self.kernel(self.X[a], self.X[b]) + W[:, a].T @ W[:, b] - V[:, a].T @ V[:, b])
 
@@ -49,7 +57,14 @@ class PositionProcess:
         return np.asarray(np.maximum(self.kernel.signal_variance + drift - explained, 0.0))
 
     def with_known(self, i: int) -> PositionProcess:
-        """The same when place i is a known point too: V gets one more row."""
+        """The same when place i is a known point too: V gets one more row.
+
+        Args:
+            i: Number of the place.
+
+        Returns:
+            The process at the same places.
+        """
         row = self.covariance(slice(i, i + 1), slice(None)) / np.sqrt(self.variances[i] + self.noise_variance)
         return replace(self, known=np.concatenate([self.known, row]))
 
@@ -82,5 +97,12 @@ class PositionProcesses:
         return np.asarray(np.einsum("k,kij->ij", noise, np.stack([one.share for one in self.processes])))
 
     def with_known(self, i: int) -> PositionProcesses:
-        """The same when place i is a known point too."""
+        """The same when place i is a known point too.
+
+        Args:
+            i: Number of the place.
+
+        Returns:
+            The processes at the same places.
+        """
         return replace(self, processes=tuple(one.with_known(i) for one in self.processes))

@@ -75,7 +75,14 @@ class FitSummary:
 
 
 def per_axis(values: ArrayLike) -> dict[str, float]:
-    """Numbers (3,) by the names of their axes."""
+    """Numbers (3,) by the names of their axes.
+
+    Args:
+        values: (3,).
+
+    Returns:
+        "x", "y", "z" -> number.
+    """
     return dict(zip("xyz", np.asarray(values, dtype=np.float64).tolist(), strict=True))
 
 
@@ -111,20 +118,54 @@ class Calibration(Protocol):
         """The views that the fit does not use because they contradict the others, the farthest first."""
 
     def measure(self, observations: Observations) -> Measurement:
-        """Measure each point; one that cannot be measured keeps its row, with a reason."""
+        """Measure each point; one that cannot be measured keeps its row, with a reason.
+
+        Args:
+            observations: What the cameras saw, by their names.
+
+        Returns:
+            Positions in the world, with covariances where they are stated.
+        """
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """What a calibration file must carry beside the data: a readable table, and arrays."""
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> Self:
-        """The inverse of `state`; KeyError, ValueError or TypeError for anything that does not fit."""
+        """The inverse of `state`.
+
+        Args:
+            data: That it was fitted from.
+            table: Of `state`.
+            arrays: Of `state`.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            KeyError, ValueError, TypeError: Something does not fit.
+        """
 
     def refit(self, data: Dataset, progress: Progress = silent) -> Self:
-        """The same method with the same options on other data: cross-validation, or one point more."""
+        """The same method with the same options on other data: cross-validation, or one point more.
+
+        Args:
+            data: Known points of the same cameras.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The new calibration.
+
+        Raises:
+            FitError: It cannot be done, and why.
+        """
 
     def save(self, path: str | Path) -> None:
-        """Write a `.implicam` file."""
+        """Write a `.implicam` file.
+
+        Args:
+            path: Of the file.
+        """
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
@@ -167,7 +208,14 @@ class PredictsPixels(Calibration, Protocol):
         """
 
     def sensitivities(self, xyz: Floats) -> list[Sensitivity]:
-        """How pixels depend on the position and on what is unknown of the cameras, at positions (n, 3)."""
+        """How pixels depend on the position and on what is unknown of the cameras.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            One for each calibrated camera, or a single one of all where they are not independent.
+        """
 
     def lines_of_sight(self, camera: str, uv: Floats) -> tuple[Floats, Floats]:
         """The lines that a calibrated camera sees as points.
@@ -187,7 +235,14 @@ class HasPositionProcesses(Calibration, Protocol):
     """A calibration that is Gaussian processes from pixels to a position, so that it says what one more would add."""
 
     def position_processes(self, uv: Floats) -> PositionProcesses:
-        """What the processes say of n places together, at their pixels uv (n, cameras, 2)."""
+        """What the processes say of places together.
+
+        Args:
+            uv: (n, cameras, 2) pixels of the places.
+
+        Returns:
+            The processes at these places.
+        """
 
 
 @runtime_checkable
@@ -195,7 +250,19 @@ class Updatable(Calibration, Protocol):
     """A calibration that can be fitted again from where it is, when there are a few known points more."""
 
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> Calibration:
-        """As `refit`, starting from what is known; with `anew` from no guess as well."""
+        """As `refit`, starting from what is known; with `anew` from no guess as well.
+
+        Args:
+            data: All known points from now on.
+            progress: Is told how far the fit is.
+            anew: Start from no guess as well.
+
+        Returns:
+            The new calibration.
+
+        Raises:
+            FitError: It cannot be done, and why.
+        """
 
 
 @runtime_checkable
@@ -203,7 +270,14 @@ class TakesPoints(Calibration, Protocol):
     """A calibration that takes known points at once, with all that was learned of the optics kept."""
 
     def condition_on(self, data: Dataset) -> Calibration:
-        """The same hyperparameters, with these known points."""
+        """The same hyperparameters, with these known points.
+
+        Args:
+            data: All known points from now on, of the same cameras.
+
+        Returns:
+            The new calibration.
+        """
 
 
 def option(help: str, metavar: str = "NAME", *, is_dataset: bool = False) -> dict[str, Any]:  # noqa: A002
@@ -233,7 +307,18 @@ class Calibrator(Protocol):
         """The optional library that a fit needs, and the extra that brings it."""
 
     def fit(self, data: Dataset, progress: Progress = silent) -> Calibration:
-        """Fit to known points; FitError says why it cannot be done."""
+        """Fit to known points.
+
+        Args:
+            data: Known points and what the cameras saw of them.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            FitError: It cannot be done, and why.
+        """
 
 
 class CalibratorBase:
@@ -276,8 +361,15 @@ class CalibratorBase:
 
         A file from before a method had settings, or one of them, has the defaults: what it was made with.
 
+        Args:
+            table: Of `as_table`.
+            **datasets: The options that are datasets, by name.
+
+        Returns:
+            The calibrator.
+
         Raises:
-            KeyError, ValueError, TypeError, UsageError: an option is missing, or makes no sense.
+            KeyError, ValueError, TypeError, UsageError: An option is missing, or makes no sense.
         """
         options: dict[str, Any] = {}
         for one in fields(cls):  # type: ignore[arg-type]
@@ -293,7 +385,14 @@ SETTINGS = "settings"
 
 
 def settings_type(calibrator: type[Any]) -> type[Settings] | None:
-    """What the settings of a method are; None for a method that has none."""
+    """What the settings of a method are; None for a method that has none.
+
+    Args:
+        calibrator: The class of the method.
+
+    Returns:
+        The type of its field `settings`, or None.
+    """
     usual = {field.name: field.default for field in fields(calibrator)}.get(SETTINGS)
     return type(usual) if isinstance(usual, Settings) else None
 
@@ -323,7 +422,18 @@ class CalibrationBase:
         return None
 
     def refit(self, data: Dataset, progress: Progress = silent) -> Any:
-        """The same method with the same options on other data."""
+        """The same method with the same options on other data.
+
+        Args:
+            data: Known points of the same cameras.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The new calibration.
+
+        Raises:
+            FitError: It cannot be done, and why.
+        """
         return self.calibrator.fit(data, progress)
 
     def notes(self) -> list[str]:
@@ -335,7 +445,11 @@ class CalibrationBase:
         return self.summary().as_table()  # type: ignore[attr-defined,no-any-return]
 
     def save(self, path: str | Path) -> None:
-        """Write a `.implicam` file that carries everything, the known points included."""
+        """Write a `.implicam` file that carries everything, the known points included.
+
+        Args:
+            path: Of the file.
+        """
         calibration_file.save(self, path)  # type: ignore[arg-type]
 
 
@@ -368,19 +482,54 @@ class RigCalibration(CalibrationBase):
         return self.map.follows_lenses_only
 
     def measure(self, observations: Observations) -> Measurement:
-        """Measure each point with the views it has, two or more."""
+        """Measure each point with the views it has, two or more.
+
+        Args:
+            observations: What the cameras saw, by their names.
+
+        Returns:
+            Positions in the world with error bars, and of each point without one the reason.
+
+        Raises:
+            DatasetError: None of the cameras is one of the calibration, or one has images of another size.
+        """
         return self.map.measure(observations)
 
     def predict(self, xyz: Floats) -> Floats:
-        """(n, cameras, 2) where the cameras see positions (n, 3), in pixels without noise; NaN where they do not."""
+        """Where the cameras see positions, in pixels without noise.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            (n, cameras, 2), of all cameras of the dataset; NaN where a camera does not see one.
+        """
         return self.map.predict(xyz)
 
     def sensitivities(self, xyz: Floats) -> list[Sensitivity]:
-        """How pixels depend on the position and on what is unknown of the cameras, at positions (n, 3)."""
+        """How pixels depend on the position and on what is unknown of the cameras.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            One for each calibrated camera; a single one of all where errors of the known positions tie them together.
+        """
         return self.map.sensitivities(xyz)
 
     def lines_of_sight(self, camera: str, uv: Floats) -> tuple[Floats, Floats]:
-        """Centre (3,) and directions (n, 3), in the world, of what a camera sees at pixels (n, 2)."""
+        """The lines that a calibrated camera sees as points.
+
+        Args:
+            camera: Its name.
+            uv: (n, 2) pixels.
+
+        Returns:
+            Centre (3,) of the camera and unit directions (n, 3), in the world; NaN for a pixel without a line.
+
+        Raises:
+            ValueError: The camera is not calibrated.
+        """
         return self.map.lines_of_sight(camera, uv)
 
     def centres(self) -> dict[str, Floats]:
@@ -403,7 +552,21 @@ def solvable() -> Iterator[None]:
 
 
 def finite_column(arrays: Arrays, name: str, shape: tuple[int, ...], *, positive: bool = False) -> NDArray[np.float64]:
-    """An array of a calibration file; ValueError where it is not finite float64 of this shape."""
+    """An array of a calibration file, checked.
+
+    Args:
+        arrays: Of the file.
+        name: Of the array.
+        shape: That it must have.
+        positive: Every number must be greater than zero.
+
+    Returns:
+        The array.
+
+    Raises:
+        KeyError: There is none.
+        ValueError: It is not finite float64 of this shape, or not positive.
+    """
     array = arrays[name]
     if array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite float64 of shape {shape}, and is {array.dtype} {array.shape}")

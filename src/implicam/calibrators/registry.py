@@ -93,9 +93,15 @@ def calibrator(name: str, **options: Any) -> Calibrator:
 def calibrator_from_name(name: str) -> Calibrator:
     """The calibrator of `method` or `method:variant`, as tables and sweeps name them, everything else at its default.
 
+    Args:
+        name: Of the method, with a variant or without.
+
+    Returns:
+        The calibrator; the library that it needs is imported.
+
     Raises:
-        UsageError: the method or the variant is not known.
-        MissingExtraError: the library that it needs to be fitted is not installed.
+        UsageError: The method or the variant is not known.
+        MissingExtraError: The library that it needs to be fitted is not installed.
     """
     made = calibrator(name)
     if made.library is not None:
@@ -104,7 +110,17 @@ def calibrator_from_name(name: str) -> Calibrator:
 
 
 def library_of(name: str) -> tuple[str, str] | None:
-    """The library that a method or variant needs to be fitted, and the extra that brings it."""
+    """The library that a method or variant needs to be fitted, and the extra that brings it.
+
+    Args:
+        name: `method` or `method:variant`.
+
+    Returns:
+        The two names; None where nothing more is needed.
+
+    Raises:
+        UsageError: The method or the variant is not known.
+    """
     return calibrator(name).library
 
 
@@ -123,7 +139,14 @@ NEEDED = {name: library for name in _NEEDY if (library := library_of(name))}
 
 
 def options_of(method: str) -> dict[str, Field[Any]]:
-    """The options that a method has on the command line: its calibrator's fields with an `option`, by name."""
+    """The options that a method has on the command line: its calibrator's fields with an `option`, by name.
+
+    Args:
+        method: Its name.
+
+    Returns:
+        Name -> field.
+    """
     return {field.name: field for field in fields(CALIBRATORS[method].calibrator) if "help" in field.metadata}
 
 
@@ -140,6 +163,12 @@ def method_for(**options: Any) -> str:
     """The method that is meant where only options are given: the first that takes them all, the default one before.
 
     Where none takes them, the first that has options of these names, whose error says the most.
+
+    Args:
+        **options: Name -> value; those that are None are not given.
+
+    Returns:
+        The name of the method.
     """
     given = {key: value for key, value in options.items() if value is not None}
     methods = dict.fromkeys([DEFAULT_METHOD, *CALIBRATORS])
@@ -156,7 +185,17 @@ def method_for(**options: Any) -> str:
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read a `.implicam` file; CalibrationFileError says what is wrong with one that cannot be used."""
+    """Read a `.implicam` file.
+
+    Args:
+        path: Of the file.
+
+    Returns:
+        The calibration.
+
+    Raises:
+        CalibrationFileError: It cannot be used, and what is wrong with it.
+    """
     contents = calibration_file.read(path)
     if contents.method not in CALIBRATORS:
         raise CalibrationFileError(

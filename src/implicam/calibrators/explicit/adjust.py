@@ -48,11 +48,25 @@ class Placed(NamedTuple):
 
     @classmethod
     def of(cls, poses: Sequence[Pose]) -> Placed:
-        """From single poses."""
+        """From single poses.
+
+        Args:
+            poses: rig_from_board of each board.
+
+        Returns:
+            The same, stacked.
+        """
         return cls(np.array([p.rotation for p in poses]), np.array([p.translation for p in poses]))
 
     def pose(self, k: int) -> Pose:
-        """That of board number k."""
+        """The pose of one board.
+
+        Args:
+            k: Its number.
+
+        Returns:
+            rig_from_board.
+        """
         return Pose(self.rotation[k], self.translation[k])
 
 
@@ -68,7 +82,14 @@ class Stack(NamedTuple):
 
     @classmethod
     def of(cls, views: Sequence[BoardView]) -> Stack:
-        """From the views of one camera."""
+        """From the views of one camera.
+
+        Args:
+            views: Its views, one for each board that it saw; there may be none.
+
+        Returns:
+            The stack, in the order of the views.
+        """
         ends = np.cumsum([0, *(len(view.rows) for view in views)]).tolist()
         sections = tuple((view.board, slice(a, b)) for view, a, b in zip(views, ends[:-1], ends[1:], strict=True))
         xyz = np.concatenate([np.zeros((0, 3)), *(view.xyz for view in views)])
@@ -91,7 +112,14 @@ class Views:
         return tuple(Stack.of([view for view in self.each if view.camera == c]) for c in range(self.count))
 
     def select(self, keep: Sequence[Bools]) -> Views:
-        """Per camera, some of its corners: masks as its stack. Views of which none is left are left out."""
+        """Some of the corners; views of which none is left are left out.
+
+        Args:
+            keep: Per camera (n,) which, in the order of its stack.
+
+        Returns:
+            The views with these alone.
+        """
         some = (view.select(keep[c][rows]) for c, view, rows in self.in_stacks())
         return Views(tuple(view for view in some if len(view.rows)), self.count)
 
@@ -135,22 +163,52 @@ class Bundle:
         return free
 
     def corners(self, c: int) -> Floats:
-        """(n, 3) in the rig's frame, of the boards that camera number c saw."""
+        """Where the corners are that a camera saw.
+
+        Args:
+            c: Number of the camera.
+
+        Returns:
+            (n, 3) in the rig's frame, in the order of its stack.
+        """
         stack = self.views.stacks[c]
         turned = np.einsum("nij,nj->ni", self.boards.rotation[stack.board], stack.xyz)
         return np.asarray(turned + self.boards.translation[stack.board], dtype=np.float64)
 
     def residuals(self, c: int) -> Floats:
-        """(n, 2) pixels of camera number c, seen minus predicted; NaN where the lens has none."""
+        """What a camera saw minus what is predicted.
+
+        Args:
+            c: Number of the camera.
+
+        Returns:
+            (n, 2) pixels; NaN where the lens has none.
+        """
         return self.views.stacks[c].uv - self.cameras[c].pixel(self.corners(c))
 
     def lengths(self, c: int) -> Floats:
-        """(n,) of the residuals of camera number c, in its usual pixels; infinite where the lens has none."""
+        """How far off the corners of a camera are.
+
+        Args:
+            c: Number of the camera.
+
+        Returns:
+            (n,) lengths of the residuals in its usual pixels, over their relative noise; infinite where the lens has
+            none.
+        """
         error = np.linalg.norm(self.residuals(c), axis=1) / self.views.stacks[c].relative
         return np.where(np.isfinite(error), error, np.inf)
 
     def moved(self, step: Floats, boards: Floats) -> Bundle:
-        """With cameras changed by (P,) and boards by (boards, 6)."""
+        """The bundle with cameras and boards changed.
+
+        Args:
+            step: (P,) of the cameras; nothing changes where they are held.
+            boards: (boards, 6) rotation vectors, radians, and translations in the rig's frame.
+
+        Returns:
+            The new bundle.
+        """
         parts = np.split(step, self.starts[1:-1])
         cameras = self.cameras
         if not self.held:
@@ -170,7 +228,20 @@ class Adjusted(NamedTuple):
 def adjust(
     bundle: Bundle, *, robust: bool = True, progress: Progress = silent, iterations: int = MAX_ITERATIONS
 ) -> Adjusted:
-    """The bundle with the least robust (or plain) sum of squares, from where it starts."""
+    """The bundle with the least robust (or plain) sum of squares, from where it starts.
+
+    Args:
+        bundle: Where it starts.
+        robust: Take Cauchy's cost, and not the plain sum of squares.
+        progress: Is told how many steps are done.
+        iterations: Steps at most.
+
+    Returns:
+        Where it ends, with the covariance of the cameras there.
+
+    Raises:
+        numpy.linalg.LinAlgError: The views do not fix the cameras.
+    """
     cost, damping, converged = _cost(bundle, robust), 1e-3, False
     normal = _Normal.of(bundle, robust)
     for number in range(iterations):
@@ -323,7 +394,14 @@ def _slacks(bundle: Bundle, c: int, by_board: Floats) -> Iterator[tuple[Floats, 
 
 
 def log_marginal_with_slack(bundle: Bundle) -> float:
-    """Log marginal likelihood of the views for the bundle's slack, cameras and boards integrated out (Laplace)."""
+    """Log marginal likelihood of the views for the bundle's slack, cameras and boards integrated out (Laplace).
+
+    Args:
+        bundle: Adjusted by plain least squares.
+
+    Returns:
+        In nats, up to a constant.
+    """
     normal = _Normal.of(bundle, robust=False)
     _, _, cameras = solve_normal(*_definite(*normal.reduced(normal.A, normal.D)))
     total = _cost(bundle, robust=False) + np.sum(np.linalg.slogdet(normal.D)[1]) + cameras
@@ -335,8 +413,16 @@ def log_marginal_with_slack(bundle: Bundle) -> float:
 
 
 def root_with_slack(bundle: Bundle, root: Floats) -> Floats:
-    """(q, P) root of the covariance where there was slack, of cameras that were adjusted without, with root^T root: to
-    each view's own error comes what the slack of its board moved the cameras by."""
+    """A root of the covariance where there was slack, of cameras that were adjusted without: to each view's own error
+    comes what the slack of its board moved the cameras by.
+
+    Args:
+        bundle: With its slack.
+        root: (q, P) of the covariance without.
+
+    Returns:
+        (P, P), or fewer rows where there are fewer in all.
+    """
     plain = replace(bundle, slack=0.0)
     normal, starts, pulls = _Normal.of(plain, robust=False), bundle.starts, []
     back = np.linalg.solve(normal.D, normal.B.swapaxes(1, 2))  # (b, 6, P): how boards follow the cameras
@@ -352,7 +438,15 @@ def root_with_slack(bundle: Bundle, root: Floats) -> Floats:
 
 
 def unexplained(bundle: Bundle, c: int) -> Floats:
-    """(n,) lengths of the residuals of a camera that its slack does not explain either, in its usual pixels."""
+    """What the slack of a camera's boards does not explain of its residuals either.
+
+    Args:
+        bundle: With its slack.
+        c: Number of the camera.
+
+    Returns:
+        (n,) lengths in its usual pixels; infinite where the lens has none.
+    """
     r, _, K = _whitened(replace(bundle, slack=0.0), c, robust=False)
     r = r.copy()
     for (_, rows), (Q, size) in zip(bundle.views.stacks[c].sections, _slacks(bundle, c, K), strict=True):
@@ -364,7 +458,14 @@ def unexplained(bundle: Bundle, c: int) -> Floats:
 
 def log_marginal(bundle: Bundle) -> float:
     """Log of the integral of exp(-cost / 2) over all unknowns, by Laplace's method where the bundle is: cameras and
-    boards; robust cost."""
+    boards; robust cost.
+
+    Args:
+        bundle: Adjusted with the robust cost.
+
+    Returns:
+        In nats, up to a constant.
+    """
     normal = _Normal.of(bundle, robust=True)
     boards = np.linalg.slogdet(normal.D)[1]
     _, _, cameras = solve_normal(*_definite(*normal.reduced(normal.A, normal.D)))
@@ -372,14 +473,31 @@ def log_marginal(bundle: Bundle) -> float:
 
 
 def spreads(bundle: Bundle) -> Floats:
-    """(C,) the usual residual of each camera in pixels per coordinate, whatever a few wrong corners say."""
+    """The usual residual of each camera, whatever a few wrong corners say.
+
+    Args:
+        bundle: As it is.
+
+    Returns:
+        (C,) pixels per coordinate.
+    """
     return np.array([np.median(bundle.lengths(c)) / RAYLEIGH_MEDIAN for c in range(len(bundle.cameras))])
 
 
 def adjust_in_steps(bundle: Bundle, half: Floats, *, one_noise: bool = False, progress: Progress = silent) -> Adjusted:
     """Adjusted with the residuals' own size as the noise, which shrinks: far from the answer nothing is an outlier.
 
-    half: (C,) half the longer side of each image, pixels. one_noise: the same for all cameras.
+    Args:
+        bundle: Where it starts.
+        half: (C,) half the longer side of each image, pixels.
+        one_noise: The noise is the same for all cameras.
+        progress: Is told how many steps are done.
+
+    Returns:
+        Where it ends.
+
+    Raises:
+        numpy.linalg.LinAlgError: The views do not fix the cameras.
     """
 
     def noise_of(bundle: Bundle) -> Floats:

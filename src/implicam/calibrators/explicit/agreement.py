@@ -56,8 +56,17 @@ class Agreement(NamedTuple):
 
 
 def agreements(bundle: Bundle, half: Floats, alone: Mapping[tuple[int, int], Floats]) -> list[Agreement]:
-    """For all pairs that share boards. half (C,); alone: (camera, board) -> lengths (k,) of the residuals of its
-    corners when the camera is fitted alone, in its usual pixels."""
+    """What is left of each camera alone and of both together, for all pairs that share boards.
+
+    Args:
+        bundle: All cameras, adjusted together.
+        half: (C,) half the longer side of each image, pixels.
+        alone: (camera, board) -> lengths (k,) of the residuals of its corners when the camera is fitted alone, in its
+            usual pixels.
+
+    Returns:
+        One for each pair.
+    """
     together: dict[tuple[int, int], Floats] = {}
     lengths = [bundle.lengths(c) for c in range(len(bundle.cameras))]
     for c, view, rows in bundle.views.in_stacks():
@@ -83,11 +92,17 @@ def _usual(a: Sequence[Floats], b: Sequence[Floats]) -> float:
 
 def with_slack(bundle: Bundle, progress: Progress = silent) -> tuple[Adjusted, list[tuple[int, int, float]]]:
     """The bundle of cameras that contradict each other, adjusted as if every board had moved a little between the
-    pictures of it, and the corners that are wrong even so (row, camera in the bundle, pixels off).
+    pictures of it.
 
-    bundle: with the noise of each camera alone. How far boards moved is found by marginal likelihood. So no camera is
-    believed more than another, the lenses stay as good as each camera alone finds them, and what the rig does not
-    know for it is in its covariance.
+    How far boards moved is found by marginal likelihood. So no camera is believed more than another, the lenses stay as
+    good as each camera alone finds them, and what the rig does not know for it is in its covariance.
+
+    Args:
+        bundle: With the noise of each camera alone.
+        progress: Is told how far it is.
+
+    Returns:
+        Where it ends, and the corners that are wrong even so: (row, camera in the bundle, pixels off).
     """
     everything, wrong = bundle.views, [np.zeros(len(stack.uv), dtype=np.bool_) for stack in bundle.views.stacks]
     alone, settings = bundle.noise, bundle.settings
@@ -110,9 +125,18 @@ def with_slack(bundle: Bundle, progress: Progress = silent) -> tuple[Adjusted, l
 
 
 def loosened(found: Adjusted, progress: Progress = silent) -> Adjusted:
-    """The same with the covariance that it has if boards moved a little between the pictures of them, where the views
-    clearly say so. Errors that all corners of a view share, those of a lens that its model does not hold, too, are not
-    errors of single corners, which would cancel; the cameras stay as they are, since it is not known which it was."""
+    """The same cameras with the covariance that they have if boards moved a little between the pictures of them.
+
+    Errors that all corners of a view share, those of a lens that its model does not hold, too, are not errors of single
+    corners, which would cancel; the cameras stay as they are, since it is not known which it was.
+
+    Args:
+        found: An adjustment by plain least squares.
+        progress: Is told how far it is.
+
+    Returns:
+        The adjustment; as it was where the views do not clearly say so.
+    """
     bundle, settings = found.bundle, found.bundle.settings
     seen = np.zeros(len(bundle.boards.translation), dtype=np.int64)
     for view in bundle.views.each:
@@ -149,11 +173,20 @@ def _most_probable(bundle: Bundle, progress: Progress) -> Bundle:
 def mirrored(
     camera: CentralCamera, seen: Mapping[int, BoardView], placed: Mapping[int, Pose], other: Mapping[int, Pose]
 ) -> float:
-    """The usual error in pixels of a camera on the boards (numbers) that another saw as well, if the pictures of one of
-    the two are mirrored. placed, other: camera_from_board of each camera alone.
+    """The usual error of a camera on the boards that another saw as well, if the pictures of one of the two are
+    mirrored.
 
     A mirrored picture of a board fits as well as a right one, from behind; or from the front, where a detector has
     counted the corners anew, along the mirrored rows or columns.
+
+    Args:
+        camera: At the origin of its own frame.
+        seen: Number of the board -> what it saw of it.
+        placed: Number of the board -> camera_from_board of this camera alone.
+        other: The same of the other camera; it shares a board or more.
+
+    Returns:
+        Pixels.
     """
     common = sorted(placed.keys() & other.keys())
     flip, best = np.diag([-1.0, 1.0, 1.0]), np.inf
@@ -173,6 +206,15 @@ def mirrored(
 
 
 def lengths_alone(camera: CentralCamera, view: BoardView, pose: Pose) -> Floats:
-    """(k,) of the residuals of a view by a camera at the origin, pixels over the relative noise."""
+    """How far off the corners of a view are for a camera at the origin.
+
+    Args:
+        camera: The camera.
+        view: What it saw of a board.
+        pose: camera_from_board.
+
+    Returns:
+        (k,) pixels over the relative noise; infinite where the lens has no pixel.
+    """
     off = np.linalg.norm(camera.pixel(pose.apply(view.xyz)) - view.uv, axis=1) / view.relative
     return np.where(np.isfinite(off), off, np.inf)

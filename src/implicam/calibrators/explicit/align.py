@@ -63,9 +63,25 @@ def align(
     how: str,
     settings: ExplicitSettings,
 ) -> Alignment:
-    """models: cameras in the rig's frame; root (q, P) of their covariance. uv (n, C, 2) and noise (n, C): their views
-    of the known points, NaN where not used; start (n, 3): where they are in the rig's frame, roughly, NaN where not
-    measured. FitError where they do not fix a motion, or contradict the boards."""
+    """The motion that brings the rig onto the known points, weighted by what each is worth, without those that
+    contradict.
+
+    Args:
+        models: Cameras in the rig's frame.
+        root: (q, P) of their covariance.
+        uv: (n, C, 2) their views of the known points, NaN where not used.
+        noise: (n, C) of the views, pixels.
+        start: (n, 3) where the points are in the rig's frame, roughly, NaN where not measured.
+        known: Where they are in the world.
+        how: `points` or `icp`.
+        settings: What contradicts.
+
+    Returns:
+        The motion, with its uncertainty and what is left.
+
+    Raises:
+        FitError: The known points do not fix a motion, or contradict the boards.
+    """
     there = np.asarray(np.isfinite(start).all(axis=1))
     if there.sum() < 3:
         raise FitError(
@@ -143,7 +159,21 @@ def _by_pixels(
 def matched(
     measured: Floats, xyz: Floats, used: Bools, how: str, settings: ExplicitSettings
 ) -> tuple[Pose, NDArray[np.int64]]:
-    """rig_from_world in closed form, and the number of each measured point's known one: its own, or the closest."""
+    """The motion in closed form, and which known point each measured one is.
+
+    Args:
+        measured: (n, 3) in the rig's frame.
+        xyz: (n, 3) the known points of the same names, in the world.
+        used: (n,) which of the pairs the motion is from.
+        how: `points`, by their names, or `icp`, by the closest.
+        settings: When two ways to match are told apart.
+
+    Returns:
+        rig_from_world, and (n,) the number of each measured point's known one.
+
+    Raises:
+        FitError: The points lie on one line, or can be matched in several ways.
+    """
     if how == POINTS:
         return register(xyz[used], measured[used])[0], np.arange(len(xyz))
     named = register(xyz[used], measured[used])[0]
@@ -153,10 +183,21 @@ def matched(
 
 
 def closest_points(known: Floats, measured: Floats, named: Pose, min_ratio: float) -> Pose:
-    """measured_from_known by iterative closest point, from the principal axes in all 24 ways, whatever the names.
+    """The motion by iterative closest point, from the principal axes in all 24 ways, whatever the names.
 
-    Where a symmetric target fits in several ways, that which the names lead to (`named`) is taken if it is one of them;
-    else FitError. min_ratio: two ways are told apart where one leaves so many times what the other leaves.
+    Where a symmetric target fits in several ways, that which the names lead to is taken if it is one of them.
+
+    Args:
+        known: (n, 3) in the world.
+        measured: (m, 3) in the rig's frame.
+        named: measured_from_known by the names.
+        min_ratio: Two ways are told apart where one leaves so many times what the other leaves.
+
+    Returns:
+        measured_from_known.
+
+    Raises:
+        FitError: The points can be matched in more than one way, and the names lead to none of these.
     """
     starts = [named, *_by_axes(known, measured)]
     found = sorted(((icp(known, measured, start), i) for i, start in enumerate(starts)), key=lambda one: one[0][1])
@@ -188,8 +229,17 @@ def _by_axes(known: Floats, measured: Floats) -> list[Pose]:
 
 
 def icp(known: Floats, measured: Floats, start: Pose) -> tuple[Pose, float]:
-    """measured_from_known by iterative closest point (Besl & McKay 1992), and the rms distance left: each measured
-    point (m, 3) is matched with the known point (n, 3) closest to it."""
+    """The motion by iterative closest point (Besl & McKay 1992): each measured point is matched with the known point
+    closest to it.
+
+    Args:
+        known: (n, 3) in the world.
+        measured: (m, 3) in the rig's frame.
+        start: measured_from_known to begin with.
+
+    Returns:
+        measured_from_known, and the rms distance left; infinite for a start that leads nowhere.
+    """
     tree, pose = cKDTree(known), start
     pairs = np.full(len(measured), -1)
     for _ in range(MAX_ROUNDS):
@@ -238,7 +288,19 @@ def _own_noise(B: Floats, point: Floats, pose: Pose, sd: Floats, shots: Names) -
 
 
 def left_out(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats, cov: Floats) -> tuple[Floats, Floats]:
-    """Errors and sds (m, 3) in the world of the used points, each as if the motion came from the others."""
+    """Errors and standard deviations of the used points, each as if the motion came from the others.
+
+    Args:
+        pose: rig_from_world.
+        Q: (6, 6) inverse of the normal matrix.
+        G: (m, 3, 6) how the points follow the motion.
+        W: (m, 3, 3) their weights.
+        residual: (m, 3) in the rig's frame.
+        cov: (m, 3, 3) covariances of the errors, in the rig's frame.
+
+    Returns:
+        Errors and sds (m, 3) in the world; of three points the errors are the residuals.
+    """
     error = residual
     if len(residual) > 3:  # with three, two would be left: nothing to align with
         inside = np.eye(3) - G @ Q @ (G.swapaxes(1, 2) @ W)
@@ -248,7 +310,15 @@ def left_out(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats, cov:
 
 
 def extent_ratio(measured: Floats, xyz: Floats) -> float:
-    """World over rig, the ratio of the extents: 1 where the board's square is right."""
+    """World over rig, the ratio of the extents: 1 where the board's square is right.
+
+    Args:
+        measured: (m, 3) in the rig's frame.
+        xyz: (m, 3) the same points in the world.
+
+    Returns:
+        The ratio.
+    """
     a, b = measured - measured.mean(axis=0), xyz - xyz.mean(axis=0)
     return float(np.sqrt(np.sum(b**2) / np.sum(a**2)))
 
@@ -256,7 +326,19 @@ def extent_ratio(measured: Floats, xyz: Floats) -> float:
 def check_alignment(
     found: Alignment, residual: Floats, xyz: Floats, measured: Floats, extent: float, settings: ExplicitSettings
 ) -> None:
-    """FitError where boards and known points are not of one rig, or not of one unit."""
+    """Stop where boards and known points are not of one rig, or not of one unit.
+
+    Args:
+        found: The motion.
+        residual: (m, 3) of the points measured, in the rig's frame.
+        xyz: (m, 3) where they are in the world.
+        measured: (m, 3) where they are in the rig's frame.
+        extent: Of the known points.
+        settings: What is too much.
+
+    Raises:
+        FitError: Too much is left, or the scale is wrong; it says so if a mirror explains it.
+    """
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
     most = settings.max_alignment_error_extents
     if rms < most * extent and abs(found.scale - 1) < most:
@@ -281,7 +363,16 @@ def check_alignment(
 def in_world(
     cameras: tuple[CentralCamera, ...], root: Floats, alignment: Alignment
 ) -> tuple[tuple[CentralCamera, ...], Floats]:
-    """Cameras (camera_from_rig) and the root (q, P) of their covariance, seen from the world."""
+    """Cameras and the root of their covariance, seen from the world.
+
+    Args:
+        cameras: With their poses camera_from_rig.
+        root: (q, P) of their covariance.
+        alignment: The motion and its uncertainty.
+
+    Returns:
+        The cameras with poses camera_from_world, and the root (q + 6, P).
+    """
     rig_from_world = alignment.rig_from_world
     moved, blocks, levers = [], [], []
     for camera in cameras:
@@ -303,7 +394,17 @@ def in_world(
 def in_frame(
     cameras: tuple[CentralCamera, ...], root: Floats, offset: Floats, scale: float
 ) -> tuple[tuple[CentralCamera, ...], Floats]:
-    """Cameras and the root of their covariance, for points of which `offset` is taken, then divided by `scale`."""
+    """Cameras and the root of their covariance, in a frame that is shifted and scaled.
+
+    Args:
+        cameras: With their poses camera_from_world.
+        root: (q, P) of their covariance.
+        offset: (3,) that is taken from points.
+        scale: Which they are then divided by.
+
+    Returns:
+        The cameras, and the root (q, P).
+    """
     moved, blocks = [], []
     for camera in cameras:
         turned = camera.pose.rotation @ offset
@@ -316,7 +417,14 @@ def in_frame(
 
 
 def block_diagonal(blocks: list[Floats]) -> Floats:
-    """One matrix with the blocks along its diagonal."""
+    """One matrix with the blocks along its diagonal.
+
+    Args:
+        blocks: Matrices of any sizes.
+
+    Returns:
+        The matrix, zero elsewhere.
+    """
     return np.asarray(block_diag(*blocks), dtype=np.float64)
 
 

@@ -38,7 +38,14 @@ class BoardView:
     rows: NDArray[np.int64]
 
     def select(self, keep: NDArray[np.bool_]) -> BoardView:
-        """Some of the corners."""
+        """Some of the corners.
+
+        Args:
+            keep: (k,) which.
+
+        Returns:
+            The view with these alone.
+        """
         return replace(self, xyz=self.xyz[keep], uv=self.uv[keep], relative=self.relative[keep], rows=self.rows[keep])
 
 
@@ -60,15 +67,30 @@ class Boards:
         return tuple(camera.name for camera in self.cameras)
 
     def of_camera(self, c: int) -> tuple[BoardView, ...]:
-        """The views of camera number c."""
+        """The views of one camera.
+
+        Args:
+            c: Its number.
+
+        Returns:
+            Its views, in the order of the boards.
+        """
         return tuple(view for view in self.views if view.camera == c)
 
 
 def boards_of(data: Dataset, scale: float = 1.0, settings: ExplicitSettings = DEFAULT_SETTINGS) -> Boards:
-    """The boards of a dataset: corners as [target] in dataset.toml lays them out, or as its known positions do; lengths
-    times `scale`.
+    """The boards of a dataset: corners as [target] in dataset.toml lays them out, or as its known positions do.
 
-    FitError where neither says where the corners are on the board.
+    Args:
+        data: Corners and what the cameras saw of them.
+        scale: What lengths are multiplied by.
+        settings: How many corners a view takes.
+
+    Returns:
+        The boards; views of too few corners, or of corners on a line, are left out.
+
+    Raises:
+        FitError: Neither says where the corners are on the board.
     """
     shots, flat = _laid_out(data, settings.min_corners)
     flat = flat * scale
@@ -88,7 +110,14 @@ def boards_of(data: Dataset, scale: float = 1.0, settings: ExplicitSettings = DE
 
 
 def has_boards(data: Dataset) -> bool:
-    """Whether a dataset says that it shows a board whose corners can be laid out."""
+    """Whether a dataset says that it shows a board whose corners can be laid out.
+
+    Args:
+        data: The dataset; its [target] counts.
+
+    Returns:
+        Whether that is of the kind `board` or `charuco`.
+    """
     target = data.extra.get("target")
     return isinstance(target, Mapping) and target.get("kind") in ("board", "charuco")
 
@@ -157,7 +186,14 @@ def _spread(flat: Floats) -> bool:
 
 
 def usable_cameras(boards: Boards) -> tuple[list[int], list[tuple[int, str]]]:
-    """Numbers of the cameras that saw enough boards; number and reason of the others."""
+    """Which cameras saw enough boards.
+
+    Args:
+        boards: All views.
+
+    Returns:
+        Numbers of those that did; number and reason of the others.
+    """
     counts = [len(boards.of_camera(c)) for c in range(len(boards.cameras))]
     good = [c for c, count in enumerate(counts) if count >= MIN_BOARDS]
     why = f"of the {MIN_BOARDS} boards that it takes, each with {boards.settings.min_corners} corners or more"
@@ -166,6 +202,13 @@ def usable_cameras(boards: Boards) -> tuple[list[int], list[tuple[int, str]]]:
 
 
 def renumbered(views: Sequence[BoardView]) -> tuple[tuple[BoardView, ...], list[int]]:
-    """The views with boards counted from 0, and which boards these are."""
+    """The views with boards counted from 0.
+
+    Args:
+        views: With any numbers of boards.
+
+    Returns:
+        The views, and the former number of each board.
+    """
     boards = sorted({view.board for view in views})
     return tuple(replace(view, board=boards.index(view.board)) for view in views), boards

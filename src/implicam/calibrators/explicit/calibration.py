@@ -118,6 +118,18 @@ class Explicit(CalibratorBase):
 
         A dataset of boards at places nobody knows is calibrated in the frame of its first camera; its boards then have
         the positions that the adjustment gives them.
+
+        Args:
+            data: Known points, or corners of boards, and what the cameras saw of them.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            FitError: Fewer than two cameras can be calibrated, or boards and known points contradict each other.
+            UsageError: The options ask for boards or known points that are not there.
+            MissingExtraError: The preset is one of the paper's, and OpenCV is not installed.
         """
         with explain_fit_error(data), solvable(), blas_threads(1):
             if self.preset != JOINT:
@@ -203,7 +215,17 @@ class ExplicitCalibration(RigCalibration):
 
     def measure(self, observations: Observations) -> Measurement:
         """Measure each point with the views it has, two or more: by maximum likelihood; with the paper's presets by
-        linear triangulation."""
+        linear triangulation.
+
+        Args:
+            observations: What the cameras saw, by their names.
+
+        Returns:
+            Positions in the world with error bars, and of each point without one the reason.
+
+        Raises:
+            DatasetError: None of the cameras is one of the calibration, or one has images of another size.
+        """
         if self.fitted.inflation is None:
             return self.map.measure(observations)
         return measure_linearly(self.fitted, self.map, observations)
@@ -221,7 +243,16 @@ class ExplicitCalibration(RigCalibration):
     def refit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
         """The same method with the same options, and the same boards, on other known points.
 
-        UsageError for a calibration that has no known points of its own: nothing can be held out of it.
+        Args:
+            data: Known points of the same cameras.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The new calibration.
+
+        Raises:
+            UsageError: The calibration has no known points of its own: nothing can be held out of it.
+            FitError: Fewer than two cameras can be calibrated, or boards and known points contradict each other.
         """
         if self.fitted.alone:
             raise UsageError(
@@ -255,7 +286,20 @@ class ExplicitCalibration(RigCalibration):
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ExplicitCalibration:
-        """Restore a calibration; nothing is computed again."""
+        """Restore a calibration; nothing is computed again.
+
+        Args:
+            data: That it was fitted to.
+            table: Of `state`.
+            arrays: Of `state`.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            KeyError, ValueError, TypeError: Something is missing or does not fit.
+            PartError: A lens of another package is not installed, or cannot be used.
+        """
         fitted, boards = saved.restored(data, table, arrays)
         calibrator = Explicit.from_table({"preset": JOINT, **table}, boards=boards)  # files had none before
         if (calibrator.preset == JOINT) != (fitted.inflation is None):

@@ -67,14 +67,38 @@ class CameraGroups:
 
 
 def calibrate_groups(boards: Boards, family: str, progress: Progress = silent) -> CameraGroups:
-    """Every camera that saw enough boards, in the groups that shared boards join; a group may be one camera."""
+    """Every camera that saw enough boards, in the groups that shared boards join; a group may be one camera.
+
+    Args:
+        boards: All views.
+        family: Name of the lens of all cameras, or `auto`.
+        progress: Is told how far it is.
+
+    Returns:
+        The groups, each in the frame of its first camera.
+
+    Raises:
+        FitError: Cameras of a group contradict each other, and by too much.
+    """
     singles, choices, uncalibrated = _singles(boards, family, progress)
     groups = [_adjust_group(boards, singles, choices, poses, progress) for poses in _joined(boards, singles)]
     return CameraGroups(tuple(groups), tuple(sorted(uncalibrated)))
 
 
 def calibrate_largest_group(boards: Boards, family: str, progress: Progress = silent) -> CameraGroup:
-    """The largest group of cameras that shared boards join. FitError where it is fewer than two cameras."""
+    """The largest group of cameras that shared boards join.
+
+    Args:
+        boards: All views.
+        family: Name of the lens of all cameras, or `auto`.
+        progress: Is told how far it is.
+
+    Returns:
+        The group, in the frame of its first camera.
+
+    Raises:
+        FitError: It is fewer than two cameras, or they contradict each other, and by too much.
+    """
     singles, choices, uncalibrated = _singles(boards, family, progress)
     groups = _joined(boards, singles)
     poses = groups[0] if groups and len(groups[0]) > 1 else {}

@@ -23,8 +23,18 @@ from implicam.rig_model import (
 
 
 def rig_of(calibration: Calibration) -> tuple[Rig, list[str]]:
-    """The cameras of a calibration, and what is lost: forward-gp's lenses are fitted to all that it predicts, without
-    its field. UsageError for a method that has no cameras."""
+    """The cameras of a calibration for other programs.
+
+    Args:
+        calibration: Of any method.
+
+    Returns:
+        The cameras, and notes on what is lost: forward-gp's lenses are fitted to all that it predicts, without its
+        field.
+
+    Raises:
+        UsageError: The method has no cameras, or one of them has no lens that a file could hold.
+    """
     if not isinstance(calibration, RigCalibration):
         raise UsageError(
             f"{calibration.method} has no cameras that could be exported.",
@@ -45,10 +55,20 @@ def rig_of(calibration: Calibration) -> tuple[Rig, list[str]]:
 
 
 def calibration_of(rig: Rig, name: str, noise: float) -> ExplicitCalibration:
-    """A calibration that measures with the cameras of another program; noise: of views that do not state theirs, px.
+    """A calibration that measures with the cameras of another program.
 
     Nothing is known of how well they are calibrated: the error bars are those of the pixels alone, and a note says so.
-    UsageError where there is one camera, or the length unit is not known.
+
+    Args:
+        rig: The cameras.
+        name: Of the calibration's dataset.
+        noise: Of views that do not state theirs, pixels.
+
+    Returns:
+        The calibration, without known points.
+
+    Raises:
+        UsageError: There is one camera, or the length unit is not known.
     """
     if len(rig.cameras) < 2:
         raise UsageError("there is one camera; a position takes two.", fix="give the file of the whole rig")

@@ -64,7 +64,20 @@ class Fitted:
 
 
 def fit_to_points(data: Dataset, family: str, settings: ExplicitSettings, progress: Progress) -> Fitted:
-    """Every camera from the known points; FitError where fewer than two can be calibrated."""
+    """Every camera from the known points.
+
+    Args:
+        data: Known points and what the cameras saw of them.
+        family: Name of the lens of all cameras, or `auto`.
+        settings: Priors and thresholds.
+        progress: Is told how far the fit is.
+
+    Returns:
+        The cameras that could be calibrated.
+
+    Raises:
+        FitError: The points do not fill a volume, or fewer than two cameras can be calibrated.
+    """
     used = remove_copies(data)
     frame = Frame.of(used, METHOD)
     training = TrainingData.of("central", used, frame, settings.rig_model, shots_off=False)
@@ -100,7 +113,20 @@ def _pixel_notes(data: Dataset, fitted: FitResult, choices: Mapping[int, Choice]
 def fit_to_boards_alone(
     data: Dataset, family: str, settings: ExplicitSettings, progress: Progress
 ) -> tuple[Dataset, Fitted]:
-    """Cameras in the frame of the first; and the data with the positions that the boards have there."""
+    """Cameras in the frame of the first, from boards at places nobody knows.
+
+    Args:
+        data: Corners of boards, and what the cameras saw of them.
+        family: Name of the lens of all cameras, or `auto`.
+        settings: Priors and thresholds.
+        progress: Is told how far the fit is.
+
+    Returns:
+        The data of the corners placed, with the positions that they have there; and the cameras.
+
+    Raises:
+        FitError: Fewer than two cameras can be calibrated together, or nothing says where corners are on the board.
+    """
     group = calibrate_largest_group(boards_of(data, settings=settings), family, progress)
     placed = _placed(data, group)
     posterior = group_posterior(group, group.bundle.cameras, group.root)
@@ -139,7 +165,19 @@ WORLD_FRAME = Frame(np.zeros(3), 1.0)
 
 
 def by_cameras_of(data: Dataset, boards: Dataset) -> Observations:
-    """The boards' observations by the cameras of the data; an error where sizes differ, or no two are the same."""
+    """What the cameras of some data saw of the boards.
+
+    Args:
+        data: Known points.
+        boards: Corners of boards.
+
+    Returns:
+        The boards' observations by the cameras that both have.
+
+    Raises:
+        FitError: They share fewer than two cameras.
+        DatasetError: A camera has images of another size in the one than in the other.
+    """
     names = [name for name in data.observations.camera_names if name in boards.observations.camera_names]
     if len(names) < 2:
         raise FitError(
@@ -164,7 +202,16 @@ def _placed(data: Dataset, group: CameraGroup) -> Dataset:
 
 
 def group_posterior(group: CameraGroup, cameras: Sequence[CentralCamera], root: Floats) -> Posterior:
-    """Cameras of a group, wherever they have been moved to, with the root of their covariance."""
+    """Cameras of a group as a posterior.
+
+    Args:
+        group: The group, for priors, images and noise.
+        cameras: Its cameras, wherever they have been moved to.
+        root: (q, P) of their covariance there.
+
+    Returns:
+        The posterior, in the frame of these cameras.
+    """
     none = [np.ones(camera.size, dtype=np.bool_) for camera in cameras]  # only a fit asks which views started it
     models = tuple(
         lens_only_model(InitialCamera(camera, prior, inliers), image, float(noise))
@@ -176,7 +223,15 @@ def group_posterior(group: CameraGroup, cameras: Sequence[CentralCamera], root: 
 
 
 def posterior_of(models: tuple[CameraModel, ...], root: Floats) -> Posterior:
-    """From the root (q, P) of the covariance of the cameras' unknowns; their fields, which are none, have no spread."""
+    """The posterior of cameras whose fields, which are none, have no spread.
+
+    Args:
+        models: The cameras.
+        root: (q, P) of the covariance of their lenses and poses.
+
+    Returns:
+        The posterior, with all cameras tied.
+    """
     parts, start = [], 0
     for model in models:
         own = root[:, start : start + model.camera.size]
@@ -186,14 +241,31 @@ def posterior_of(models: tuple[CameraModel, ...], root: Floats) -> Posterior:
 
 
 def wrong_corners(group: CameraGroup, boards: Dataset) -> tuple[Rejected, ...]:
-    """The corners of boards that are not used, the farthest first."""
+    """The corners of boards that are not used, the farthest first.
+
+    Args:
+        group: The group.
+        boards: The dataset that its boards are from.
+
+    Returns:
+        Names of the corner and camera, and how far off it is, pixels.
+    """
     names, points = boards.observations.camera_names, boards.points
     found = [Rejected(str(points[row]), names[c], off) for row, c, off in group.wrong]
     return tuple(sorted(found, key=lambda view: -np.nan_to_num(view.residual, nan=np.inf)))
 
 
 def group_notes(group: CameraGroup, trained: Observations, boards: Dataset) -> list[str]:
-    """What is to be said of the boards: cameras that contradict each other, wrong corners, lenses hardly fixed."""
+    """What is to be said of the boards: cameras that contradict each other, wrong corners, lenses hardly fixed.
+
+    Args:
+        group: The group.
+        trained: What its cameras saw of the boards.
+        boards: The dataset that its boards are from.
+
+    Returns:
+        The notes.
+    """
     names = trained.camera_names
     notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in group.uncalibrated]
     moved = np.sqrt(6) * group.bundle.slack  # along three axes, in either picture

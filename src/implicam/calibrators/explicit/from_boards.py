@@ -50,7 +50,21 @@ class Part(NamedTuple):
 
 
 def fit_to_boards(data: Dataset, groups: CameraGroups, boards: Dataset, how: str, progress: Progress) -> Fitted:
-    """FitError where fewer than two cameras get a place in the world."""
+    """Cameras that boards have calibrated, brought into the world by known points.
+
+    Args:
+        data: Known points and what the cameras saw of them.
+        groups: Of cameras, from the boards.
+        boards: The dataset that the boards are from.
+        how: `points` or `icp`: how measured and known points are matched.
+        progress: Is told how far the fit is.
+
+    Returns:
+        The cameras that got a place in the world.
+
+    Raises:
+        FitError: They are fewer than two.
+    """
     copied, copies_told = list_copied_points(data), describe_point_copies(data)
     data = remove_copies(data)
     trained = by_cameras_of(data, boards)

@@ -46,7 +46,20 @@ MAX_MISFIT_RATIO = 2.0
 def fit_points(
     training: TrainingData, family: str, settings: ExplicitSettings, progress: Progress
 ) -> tuple[FitResult, dict[int, Choice]]:
-    """Fit every camera that can be fitted; and the lens model that each got, by its number."""
+    """Fit every camera that can be fitted.
+
+    Args:
+        training: What the fit starts from.
+        family: Name of the lens of all cameras, or `auto`.
+        settings: Priors and thresholds.
+        progress: Is told how far the fit is.
+
+    Returns:
+        The fit; and the lens model that each camera got, by its number.
+
+    Raises:
+        FitError: Fewer than two cameras can be started.
+    """
     progress("fitting", 0, 3)
     choices: dict[int, Choice] = {}
 
@@ -66,7 +79,21 @@ def refined(
     settings: ExplicitSettings,
     progress: Progress,
 ) -> FitResult:
-    """Cameras from where they start, with the noise that the residuals show and without the views that contradict."""
+    """Cameras from where they start, with the noise that the residuals show and without the views that contradict.
+
+    Args:
+        training: What the fit starts from.
+        started: The start of each camera that has one, by its number.
+        uncalibrated: (number, why) of the others.
+        settings: Priors and thresholds.
+        progress: Is told how far the fit is.
+
+    Returns:
+        The fit, in the working frame.
+
+    Raises:
+        numpy.linalg.LinAlgError: The views of a camera do not fix it.
+    """
     cameras = tuple(started)
     progress("fitting", 1, 3)
     seen = tuple(training.camera_views[c] for c in cameras)
@@ -161,7 +188,15 @@ def _settled(
 
 
 def with_noise(models: Sequence[CameraModel], noise: Floats) -> tuple[CameraModel, ...]:
-    """The cameras with noise (C,) in pixels."""
+    """The cameras with other noise.
+
+    Args:
+        models: C cameras.
+        noise: (C,) pixels.
+
+    Returns:
+        The cameras.
+    """
     return tuple(replace(m, noise=float(sd)) for m, sd in zip(models, noise, strict=True))
 
 

@@ -34,14 +34,33 @@ class Choice(NamedTuple):
 
 
 def angles(camera: CentralCamera, points: Floats) -> Floats:
-    """(n,) off the camera's axis, radians."""
+    """How far off a camera's axis points are.
+
+    Args:
+        camera: The camera.
+        points: (n, 3) in the frame that its pose is from.
+
+    Returns:
+        (n,) radians.
+    """
     there = camera.pose.apply(points)
     return np.asarray(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]), dtype=np.float64)
 
 
 def with_lens(camera: CentralCamera, family: str, points: Floats) -> CentralCamera:
-    """The same camera with the lens of another family that sees points (n, 3) nearest to where it sees them; FitError
-    where there is none."""
+    """The same camera with the nearest lens of another family.
+
+    Args:
+        camera: The camera.
+        family: Name of the lens.
+        points: (n, 3) in the frame that its pose is from, where the new lens is to be near to the old one.
+
+    Returns:
+        The camera in the same place.
+
+    Raises:
+        FitError: There is no such lens.
+    """
     return CentralCamera(LENSES[family].nearest(camera.lens, camera.pose.apply(points)), camera.pose)
 
 
@@ -51,17 +70,26 @@ Made = TypeVar("Made")
 def choose_lens(
     family: str, make: Callable[[str], Made], held_out: Callable[[Made], Floats], max_medians: float
 ) -> tuple[Made, Choice]:
-    """The named family, or of all that can be started the one with the least squared errors (n,) at held-out views.
+    """The named family, or of all that can be started the one with the least squared errors at held-out views.
 
-    A view that one of them keeps and another does not (NaN) counts as far off for that one, as `clipped` has it with
-    max_medians. A
+    A view that one of them keeps and another does not (NaN) counts as far off for that one, as `clipped` has it. A
     later family must be better than the first by more than the standard error of the difference: where there is little
     to tell them apart, the first, `START_FAMILY`, is the safer one. One that cannot be started, or whose package fails,
     is left out, with the reason in the choice.
 
+    Args:
+        family: Name of the lens, or `auto`.
+        make: Makes a camera with a family of lenses, or raises FitError.
+        held_out: Squared errors (n,) of such a camera at held-out views, pixels squared, NaN for those it does not
+            keep.
+        max_medians: A far-off view counts as the median of the squared errors times the square of this.
+
+    Returns:
+        What was made, and which family it is.
+
     Raises:
-        FitError: no family, or not the one that is named, can be started.
-        PartError: the lens that is named, of another package, fails.
+        FitError: No family, or not the one that is named, can be started.
+        PartError: The lens that is named, of another package, fails.
     """
     if family != AUTO:
         with _named(family), _cure_in_reason():
@@ -132,7 +160,15 @@ def _cure_in_reason() -> Iterator[None]:
 
 def dropped_notes(names: Sequence[str], choices: Sequence[Choice]) -> list[str]:
     """A note for each family of lenses that could not be tried, with its cameras and the reason of the first; and for
-    each package that brings one under a name that is taken."""
+    each package that brings one under a name that is taken.
+
+    Args:
+        names: Of the calibrated cameras.
+        choices: Of these, in the same order.
+
+    Returns:
+        The notes.
+    """
     reasons: dict[str, dict[str, str]] = {}
     for name, choice in zip(names, choices, strict=True):
         for family, reason in choice.dropped.items():
@@ -150,6 +186,14 @@ def _with_far(squares: Floats, max_medians: float) -> Floats:
 
 
 def clipped(errors: Floats, max_medians: float) -> Floats:
-    """Errors, none of them so many medians off that it decides alone."""
+    """Errors, none of them so many medians off that it decides alone.
+
+    Args:
+        errors: (n,) lengths; what is not finite counts as far off.
+        max_medians: How many medians an error may be.
+
+    Returns:
+        (n,).
+    """
     errors = np.where(np.isfinite(errors), errors, np.inf)
     return np.minimum(errors, max_medians * float(np.median(errors)))

@@ -35,12 +35,28 @@ class Pixels(NamedTuple):
 
 
 def square(settings: ExplicitSettings, widening: float = 1.0) -> Pixels:
-    """Square pixels and a lens over the middle of the picture: the usual. widening: of the prior of the middle."""
+    """Square pixels and a lens over the middle of the picture: the usual.
+
+    Args:
+        settings: The prior's standard deviations.
+        widening: Of the prior of the middle.
+
+    Returns:
+        The prior.
+    """
     return Pixels(USUAL_PIXELS, settings.log_aspect_prior_sd, widening * settings.centre_prior_sd_sides, 1.0)
 
 
 def kinds(usual: Pixels, settings: ExplicitSettings) -> tuple[Pixels, ...]:
-    """The usual and what else there is; the last allows all."""
+    """The usual and what else there is; the last allows all.
+
+    Args:
+        usual: As of `square`.
+        settings: The priors and odds of the others.
+
+    Returns:
+        Four priors.
+    """
     aspect, centre = settings.stretched_log_aspect_prior_sd, settings.cropped_centre_prior_sd_sides
     return (
         usual,
@@ -51,7 +67,18 @@ def kinds(usual: Pixels, settings: ExplicitSettings) -> tuple[Pixels, ...]:
 
 
 def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels, settings: ExplicitSettings) -> Prior:
-    """The prior of a camera's lens (eq. (3) of docs/method.md) with this one of its pixels."""
+    """The prior of a camera's lens (eq. (3) of docs/method.md) with this one of its pixels.
+
+    Args:
+        camera: Its focal lengths are where log(fy / fx) is made linear.
+        image: Where its pixels are measured from.
+        widest: Radians off its axis up to which it is used.
+        pixels: The prior of its pixels.
+        settings: The prior of its distortion.
+
+    Returns:
+        Mean and precision, zero for what nothing is known of.
+    """
     usual = camera.prior(image, widest, settings)
     mean, precision = usual.mean.copy(), usual.precision.copy()
     lens = camera.lens
@@ -63,7 +90,17 @@ def prior_of(camera: CentralCamera, image: Image, widest: float, pixels: Pixels,
 
 
 def told(name: str, camera: CentralCamera, image: Image, pixels: str) -> list[str]:
-    """A note on a camera whose pixels are not the usual ones."""
+    """A note on a camera whose pixels are not the usual ones.
+
+    Args:
+        name: Of the camera.
+        camera: As it was fitted.
+        image: Where its pixels are measured from.
+        pixels: Name of the prior that won.
+
+    Returns:
+        The note; no note for the usual ones.
+    """
     lens, notes = camera.lens, []
     if pixels in ("stretched", "any"):
         notes.append(f"its pixels are not square, fy / fx = {lens.fy / lens.fx:.4g}")
@@ -74,13 +111,32 @@ def told(name: str, camera: CentralCamera, image: Image, pixels: str) -> list[st
 
 
 def log_density_at_peak(prior: Prior, camera: CentralCamera, image: Image, pixels: Pixels) -> float:
-    """Log of the proper part of the prior where it is highest, up to what is the same for all pixels; and its odds."""
+    """Log of the proper part of the prior where it is highest, up to what is the same for all pixels; and its odds.
+
+    Args:
+        prior: As of `prior_of`.
+        camera: As it was fitted.
+        image: Where its pixels are measured from.
+        pixels: The prior of its pixels.
+
+    Returns:
+        In nats.
+    """
     own = -np.log(pixels.aspect) - 2 * np.log(pixels.centre) - np.log(camera.lens.fx / image.half)
     distortion = np.linalg.slogdet(prior.precision[4:-6, 4:-6])[1]
     return float(own + 0.5 * distortion - np.log(pixels.odds))
 
 
 def noise_prior(sd: float, image: Image, settings: ExplicitSettings) -> float:
-    """Log prior of a noise in pixels."""
+    """The log prior of a noise.
+
+    Args:
+        sd: The noise, pixels.
+        image: Half its longer side is the unit.
+        settings: Median and sd of the log.
+
+    Returns:
+        In nats, up to a constant.
+    """
     median = settings.noise_prior_median_half_sides * image.half
     return float(-0.5 * (np.log(sd / median) / settings.noise_prior_log_sd) ** 2)

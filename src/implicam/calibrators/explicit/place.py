@@ -39,7 +39,17 @@ RANDOM_SUBSETS = 30
 def place(
     training: TrainingData, groups: Mapping[int, CameraGroup], settings: ExplicitSettings, progress: Progress
 ) -> FitResult:
-    """The cameras of groups of one camera, by number, placed by the training data; there may be none."""
+    """The cameras of groups of one camera, placed by known points; there may be none.
+
+    Args:
+        training: What all cameras saw of the known points.
+        groups: The groups of one camera, by its number.
+        settings: Priors and thresholds.
+        progress: Is told how far it is.
+
+    Returns:
+        The fit of those that could be placed, in the working frame; and why the others could not.
+    """
     stated = training.stated.copy()
     started: dict[int, InitialCamera] = {}
     uncalibrated: list[tuple[int, str]] = []

@@ -41,7 +41,15 @@ PACKAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,99}")
 
 def state(fitted: Fitted, boards: Dataset | None) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """A readable table, and arrays: per camera lens and pose in the working frame, the roots of their covariance, and
-    the boards they come from."""
+    the boards they come from.
+
+    Args:
+        fitted: The fit.
+        boards: That it comes from; None for a fit to known points alone.
+
+    Returns:
+        Both, without the options.
+    """
     posterior, names = fitted.posterior, fitted.trained.camera_names
     table = {
         "calibrated": [names[c] for c in fitted.cameras],
@@ -96,7 +104,20 @@ def _paper_from(table: Mapping[str, Any], cameras: int) -> tuple[int, float | No
 
 
 def restored(data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> tuple[Fitted, Dataset | None]:
-    """The inverse of `state`; KeyError, ValueError or TypeError for anything that does not fit."""
+    """The inverse of `state`.
+
+    Args:
+        data: That the calibration was fitted to.
+        table: Of `state`.
+        arrays: Of `state`.
+
+    Returns:
+        The fit, and the boards it comes from, if any.
+
+    Raises:
+        KeyError, ValueError, TypeError: Something is missing or does not fit.
+        PartError: A lens of another package is not installed, or cannot be used.
+    """
     own = {name.removeprefix(BOARDS): array for name, array in arrays.items() if name.startswith(BOARDS)}
     boards = dataset_from_arrays(own, Path("boards")) if own else None
     trained = _trained(data, boards)

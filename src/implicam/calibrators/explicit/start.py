@@ -59,15 +59,36 @@ class Scene(NamedTuple):
     settings: ExplicitSettings
 
     def select(self, some: Bools) -> Scene:
-        """Some of the points."""
+        """Some of the points.
+
+        Args:
+            some: (n,) which.
+
+        Returns:
+            The scene with these alone.
+        """
         return self._replace(points=self.points[some], uv=self.uv[some])
 
 
 def start_with_lens(
     points: Floats, uv: Floats, image: Image, family: str, settings: ExplicitSettings
 ) -> tuple[InitialCamera, Choice]:
-    """A camera from known points (n, 3), all seen at uv (n, 2), its lens model and pixels; FitError where they do not
-    fix one, MirroredError where a mirrored camera would see them so."""
+    """A camera from known points, from no guess, with its lens model and pixels.
+
+    Args:
+        points: (n, 3) known positions in the working frame.
+        uv: (n, 2) pixels at which all of them are seen.
+        image: Where pixels are measured from.
+        family: Name of the lens, or `auto`.
+        settings: Priors and thresholds.
+
+    Returns:
+        The start of the camera, and which lens it got.
+
+    Raises:
+        FitError: The points are too few, or do not fix a camera.
+        MirroredError: A mirrored camera would see them so.
+    """
     if len(points) < MIN_POINTS_PER_CAMERA:
         raise FitError(f"{len(points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
     scene = Scene(points, uv, image, settings)
@@ -200,8 +221,16 @@ def _check_mirror(found: _Candidate, scene: Scene) -> None:
 
 
 def median_pixel_error(camera: CentralCamera, points: Floats, uv: Floats) -> float:
-    """Median distance in px of points (n, 3), where a camera sees them, from uv (n, 2); a point it cannot see is
-    infinitely far."""
+    """The median distance of points, where a camera sees them, from their pixels.
+
+    Args:
+        camera: The camera.
+        points: (n, 3) in the frame that its pose is from.
+        uv: (n, 2) pixels.
+
+    Returns:
+        Pixels; a point that the camera cannot see is infinitely far.
+    """
     error = np.linalg.norm(camera.pixel(points) - uv, axis=1)
     return float(np.median(np.where(np.isfinite(error), error, np.inf)))
 

@@ -66,7 +66,20 @@ class _Candidate(NamedTuple):
 def calibrate_camera(
     views: Sequence[BoardView], image: Image, family: str, settings: ExplicitSettings = DEFAULT_SETTINGS
 ) -> tuple[OneCamera, Choice]:
-    """From the views of one camera, and the lens model it got. FitError where the boards do not fix a lens."""
+    """A camera from its views of boards, and the lens model it got.
+
+    Args:
+        views: Of this camera alone.
+        image: Where its pixels are measured from.
+        family: Name of the lens, or `auto`.
+        settings: Priors and thresholds.
+
+    Returns:
+        The camera at the origin of its own frame, with boards counted from 0; and which lens it got.
+
+    Raises:
+        FitError: The boards do not fix a lens.
+    """
     own, _ = renumbered([replace(view, camera=0) for view in views])
     first = _with_pixels(_starts(own, image, settings), Views(own, 1), image, settings)
     left = float(spreads(first.bundle)[0])
@@ -119,8 +132,16 @@ def _with_pixels(
 
 
 def log_evidence(bundle: Bundle, image: Image, pixels: Pixels) -> float:
-    """Log marginal likelihood of the views of one camera, lens and boards integrated out (Laplace), at their noise; up
-    to what is the same for all pixels."""
+    """The log marginal likelihood of the views of one camera, lens and boards integrated out (Laplace), at their noise.
+
+    Args:
+        bundle: Of one camera, adjusted.
+        image: Where its pixels are measured from.
+        pixels: The prior of its pixels.
+
+    Returns:
+        In nats, up to what is the same for all pixels.
+    """
     noise = max(float(spreads(bundle)[0]), 1e-5 * image.half)
     corners = len(bundle.views.stacks[0].uv)
     likelihood = -2 * corners * np.log(noise) + log_marginal(replace(bundle, noise=np.array([noise])))
@@ -166,8 +187,16 @@ def _start(
 
 
 def planar_poses(flat: Floats, rays: Floats, focal: Floats) -> tuple[list[Pose], Floats]:
-    """camera_from_board for each of k lenses, from points (n, 2) on the board and their unit rays (k, n, 3); and errors
-    (k, n) in pixels of focal lengths (k,). The homography board -> ray, made rigid (Zhang 2000, appendix C)."""
+    """The pose of a board for each of several lenses: the homography board -> ray, made rigid (Zhang 2000, appendix C).
+
+    Args:
+        flat: (n, 2) points on the board.
+        rays: (k, n, 3) their unit rays by each lens.
+        focal: (k,) focal lengths, pixels.
+
+    Returns:
+        camera_from_board for each lens, and errors (k, n) in pixels of these focal lengths.
+    """
     middle = flat.mean(axis=0)
     scale = float(np.sqrt(np.mean((flat - middle) ** 2)))
     points = np.column_stack([(flat - middle) / scale, np.ones(len(flat))])
@@ -206,8 +235,15 @@ def _trimmed_pose(flat: Floats, rays: Floats, focal: float, least: int) -> Pose:
 
 
 def placed_again(bundle: Bundle) -> Bundle | None:
-    """The bundle of one camera with boards placed anew that are stuck in a wrong pose: wrong corners led them there, or
-    it is the mirrored pose that a small board has as well. None where there is none."""
+    """The bundle with boards placed anew that are stuck in a wrong pose: wrong corners led them there, or it is the
+    mirrored pose that a small board has as well.
+
+    Args:
+        bundle: Of one camera.
+
+    Returns:
+        The new bundle, not adjusted; None where no board is stuck.
+    """
     lengths, usual = bundle.lengths(0), float(spreads(bundle)[0])
     rotation, translation, changed = bundle.boards.rotation.copy(), bundle.boards.translation.copy(), False
     for (k, rows), view in zip(bundle.views.stacks[0].sections, bundle.views.each, strict=True):
@@ -232,7 +268,16 @@ def _best_pose(bundle: Bundle, view: BoardView, now: Pose) -> tuple[Pose, float]
 
 
 def median_error(camera: CentralCamera, view: BoardView, pose: Pose) -> float:
-    """Of the corners of a board at a pose, in pixels; infinite where the camera does not see most of them."""
+    """How far off the corners of a board at a pose are.
+
+    Args:
+        camera: The camera.
+        view: What it saw of the board.
+        pose: Of the board, in the frame that the camera's pose is from.
+
+    Returns:
+        The median in pixels; infinite where the camera does not see most of them.
+    """
     off = np.linalg.norm(camera.pixel(pose.apply(view.xyz)) - view.uv, axis=1)
     return float(np.median(np.nan_to_num(off, nan=np.inf)))
 
@@ -240,7 +285,18 @@ def median_error(camera: CentralCamera, view: BoardView, pose: Pose) -> float:
 def pose_and_mirror(
     camera: CentralCamera, view: BoardView, now: Pose, noise: float, settings: ExplicitSettings
 ) -> list[Pose]:
-    """The best pose from random corners (RANSAC) or the present one, and that with the tilt the other way; refined."""
+    """The best pose from random corners (RANSAC) or the present one, and that with the tilt the other way; refined.
+
+    Args:
+        camera: At the origin of its own frame.
+        view: What it saw of a board.
+        now: The present camera_from_board.
+        noise: Pixels.
+        settings: The robust cost.
+
+    Returns:
+        Both poses camera_from_board.
+    """
     rng = np.random.default_rng(0)
     rays, valid = camera.lens.ray_from_pixel(view.uv)
     good = np.flatnonzero(valid)

@@ -82,7 +82,18 @@ class ForwardGP(CalibratorBase):
         return {lens: {"lens": lens} for lens in LENS_OPTIONS}
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
-        """Fit to all known points that any camera saw."""
+        """Fit to all known points that any camera saw.
+
+        Args:
+            data: Known points and what the cameras saw of them.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            FitError: Fewer than two cameras can be calibrated, or the points do not fill a volume.
+        """
         with explain_fit_error(data):
             return self._fit(data, progress)
 
@@ -167,6 +178,17 @@ class ForwardGPCalibration(RigCalibration):
         """As `refit`, starting from what is known: for a few points more, in half of the time.
 
         What is found is the nearest optimum and not the best of many, so begin `anew` where the points have grown much.
+
+        Args:
+            data: All known points from now on.
+            progress: Is told how far the fit is.
+            anew: Start from no guess, as `refit`.
+
+        Returns:
+            The new calibration.
+
+        Raises:
+            FitError: Fewer than two cameras can be calibrated.
         """
         if anew:
             return self.calibrator.fit(data, progress)
@@ -223,7 +245,14 @@ class ForwardGPCalibration(RigCalibration):
         ]
 
     def known_position_covariance(self, xyz: Floats) -> Floats:
-        """(n, 3, 3) of the error of a known position near each of xyz (n, 3), as estimated; zero if none seems off."""
+        """The error of a known position near places, as estimated.
+
+        Args:
+            xyz: (n, 3) in the world.
+
+        Returns:
+            (n, 3, 3) in squared length units; zero if none seems off.
+        """
         out = np.zeros((len(xyz), 3, 3))
         if self.fitted.position_errors is not None:
             out += self.fitted.position_errors.covariance
@@ -251,7 +280,19 @@ class ForwardGPCalibration(RigCalibration):
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ForwardGPCalibration:
-        """Restore a calibration; nothing is computed again."""
+        """Restore a calibration; nothing is computed again.
+
+        Args:
+            data: That it was fitted to.
+            table: Of `state`.
+            arrays: Of `state`.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            KeyError, ValueError, TypeError: Something is missing or does not fit.
+        """
         calibrator = ForwardGP.from_table(table)
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = remove_copies(data)

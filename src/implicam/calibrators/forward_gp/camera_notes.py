@@ -12,7 +12,15 @@ from implicam.rig_model.general_camera import GeneralCamera
 
 
 def kind_notes(fitted: FitResult, names: Sequence[str]) -> list[str]:
-    """names: of the fitted cameras."""
+    """Notes on the cameras that are not ordinary.
+
+    Args:
+        fitted: The fitted cameras.
+        names: Of these, in the same order.
+
+    Returns:
+        One for each such camera, and one before them where all are mirrored.
+    """
     models = fitted.posterior.models
     mirrored = [isinstance(model.camera, GeneralCamera) and model.camera.mirrored for model in models]
     notes = []

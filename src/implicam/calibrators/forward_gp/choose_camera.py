@@ -78,7 +78,17 @@ class Start(NamedTuple):
 
 
 def candidates(whole: Scene) -> list[Candidate]:
-    """The kinds of camera that explain the views; one where it is ordinary. FitError where there is none."""
+    """The kinds of camera that explain the views; one where it is ordinary.
+
+    Args:
+        whole: What the camera saw.
+
+    Returns:
+        The kinds, each refined.
+
+    Raises:
+        FitError: There are too few points, or no camera sees them so.
+    """
     if len(whole.points) < MIN_POINTS_PER_CAMERA:
         raise FitError(f"{len(whole.points)} known points are seen; a camera needs at least {MIN_POINTS_PER_CAMERA}.")
     ladder = _ladder(whole, mirrored=False, subsets=False)
@@ -99,7 +109,15 @@ def candidates(whole: Scene) -> list[Candidate]:
 
 
 def choose(rig: Sequence[list[Candidate]], settings: ForwardGPSettings) -> list[Candidate]:
-    """One candidate of each camera: evidence, prior odds, and what the rig's other cameras are."""
+    """One candidate of each camera: evidence, prior odds, and what the rig's other cameras are.
+
+    Args:
+        rig: Of each camera its candidates, one or more.
+        settings: The prior odds.
+
+    Returns:
+        One of each camera, in the same order.
+    """
     chosen = [max(some, key=lambda one: one.evidence + np.log(_weight(one, [], settings))) for some in rig]
     for _ in range(ROUNDS_OF_CHOICE):
         before = [one.kind for one in chosen]
@@ -112,7 +130,16 @@ def choose(rig: Sequence[list[Candidate]], settings: ForwardGPSettings) -> list[
 
 
 def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate | None:
-    """A camera that fitted most of these points a moment ago, refined; None where it no longer does."""
+    """A camera that fitted most of these points a moment ago, refined.
+
+    Args:
+        whole: What the camera saw.
+        camera: As it was fitted.
+        family: Its kind.
+
+    Returns:
+        The only candidate; None where the camera no longer fits, or is of no kind that is chosen among.
+    """
     if not isinstance(camera, GeneralCamera) or family not in KINDS:
         return None
     error = whole.error(camera)
@@ -124,7 +151,16 @@ def candidate_again(whole: Scene, camera: AnyCamera, family: str) -> Candidate |
 
 
 def as_started(one: Candidate, whole: Scene, some: Sequence[Candidate]) -> InitialCamera:
-    """What the fit starts from; some: all candidates of the camera."""
+    """What the fit starts from.
+
+    Args:
+        one: The candidate that was chosen.
+        whole: What the camera saw.
+        some: All candidates of the camera.
+
+    Returns:
+        The camera with its prior, the views it explains, and what an ordinary camera would leave, in pixels.
+    """
     settings, widest = whole.settings, _widest(one.camera, whole.points[one.inliers])
     prior = family_prior(one.camera, one.family, whole.image, widest, settings)
     left = float(np.median(whole.error(one.camera)[one.inliers]))

@@ -67,7 +67,15 @@ class CameraEvidence:
     relative: Floats
 
     def spectrum(self, lengthscale: Floats, tolerance: float) -> Spectrum:
-        """The data seen from the field's eigenvectors."""
+        """The data seen from the field's eigenvectors.
+
+        Args:
+            lengthscale: (2,) as of `field_kernel`.
+            tolerance: Variance of the field that may be left out.
+
+        Returns:
+            What `objective` needs.
+        """
         p = self.X.shape[2]
         _, phi = pivoted_cholesky(field_kernel(lengthscale)(self.q, self.q), tolerance)
         phi /= self.relative[:, None]
@@ -86,7 +94,16 @@ class CameraEvidence:
         )
 
     def objective(self, spectrum: Spectrum, signal: float, noise: float) -> tuple[float, float, float]:
-        """Minus the log marginal likelihood, eq. (11), and its derivatives by log signal and log noise."""
+        """Minus the log marginal likelihood, eq. (11).
+
+        Args:
+            spectrum: Of this camera.
+            signal: Sd of the field, pixels.
+            noise: Sd of the noise, pixels.
+
+        Returns:
+            Its value in nats, and its derivatives by log signal and log noise.
+        """
         value, by_signal, by_noise = BatchedEvidence.of([self], [spectrum]).objective(
             np.array([signal]), np.array([noise])
         )
@@ -111,7 +128,15 @@ class BatchedEvidence(NamedTuple):
 
     @classmethod
     def of(cls, cameras: list[CameraEvidence], spectra: list[Spectrum]) -> BatchedEvidence:
-        """Of several cameras, padded with zeros to the largest."""
+        """Several cameras, padded with zeros to the largest.
+
+        Args:
+            cameras: Which have as many parameters each.
+            spectra: Of these.
+
+        Returns:
+            The stacks.
+        """
         m, p = max(len(s.e) for s in spectra), cameras[0].X.shape[2]
         e, y, X = np.zeros((len(spectra), m)), np.zeros((len(spectra), m, 2)), np.zeros((len(spectra), m, 2, p))
         for c, s in enumerate(spectra):
@@ -129,7 +154,15 @@ class BatchedEvidence(NamedTuple):
         )
 
     def objective(self, signal: Floats, noise: Floats) -> tuple[Floats, Floats, Floats]:
-        """(C,) each of `CameraEvidence.objective`, for signal and noise (C,)."""
+        """That of `CameraEvidence`, for every camera.
+
+        Args:
+            signal: (C,) pixels.
+            noise: (C,) pixels.
+
+        Returns:
+            (C,) each: the values, and the derivatives by log signal and by log noise.
+        """
         signal2, noise2 = signal**2, noise**2
         v = signal2[:, None] * self.e + noise2[:, None]
         v2 = v.repeat(2, axis=1)
@@ -249,7 +282,15 @@ class RigEvidence:
         return np.array([np.mean(np.log(found / median)) for found, median in pairs])
 
     def penalty(self, signal: Floats, noise: Floats) -> float:
-        """Minus the log prior of sizes (C,) in pixels, as far as the rig shares them."""
+        """Minus the log prior of sizes, as far as the rig shares them.
+
+        Args:
+            signal: (C,) pixels.
+            noise: (C,) pixels.
+
+        Returns:
+            In nats, up to a constant.
+        """
         return 0.5 * float(np.sum((self._mean_deviations(signal, noise) / self._shared_sds()) ** 2))
 
     def _shared_sds(self) -> Floats:

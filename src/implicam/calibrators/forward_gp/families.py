@@ -39,18 +39,40 @@ class Scene(NamedTuple):
     settings: ForwardGPSettings
 
     def error(self, camera: GeneralCamera) -> Floats:
-        """(n,) px, infinite where the camera sees nothing."""
+        """How far a camera is off the pixels.
+
+        Args:
+            camera: In the working frame.
+
+        Returns:
+            (n,) px, infinite where the camera sees nothing.
+        """
         away = np.linalg.norm(camera.pixel(self.points) - self.uv, axis=1)
         return np.asarray(np.where(np.isnan(away), np.inf, away), dtype=np.float64)
 
     def near(self, error: Floats, inliers: Bools) -> Bools:
         """The views that a camera explains, judged by the median of those kept; of few views, which a camera of
-        seventeen numbers may nearly go through, by the noise."""
+        seventeen numbers may nearly go through, by the noise.
+
+        Args:
+            error: (n,) px.
+            inliers: (n,) the views kept until now.
+
+        Returns:
+            (n,) the views explained.
+        """
         by_error = self.settings.max_start_error_medians * float(np.median(error[inliers]))
         return np.asarray(error <= max(by_error, self.settings.min_tolerated_noises * self.noise), dtype=np.bool_)
 
     def select(self, rows: NDArray[np.int64] | Bools) -> Scene:
-        """Some of the views."""
+        """Some of the views.
+
+        Args:
+            rows: Their numbers, or (n,) which.
+
+        Returns:
+            The scene with these alone.
+        """
         return self._replace(points=self.points[rows], uv=self.uv[rows], relative=self.relative[rows])
 
     @property
@@ -61,7 +83,18 @@ class Scene(NamedTuple):
 
 
 def family_prior(camera: GeneralCamera, family: str, image: Image, widest: float, settings: ForwardGPSettings) -> Prior:
-    """Eq. (3) of a camera that is used up to `widest` radians off its axis."""
+    """The prior of a kind of camera, eq. (3).
+
+    Args:
+        camera: Its inverse distance is the unit of distortion.
+        family: The kind.
+        image: Where its pixels are measured from.
+        widest: Radians off its axis up to which it is used.
+        settings: The prior's standard deviations.
+
+    Returns:
+        Mean (17,) and precision (17, 17), zero for what nothing is known of.
+    """
     kind = settings.kinds[family]
     mean, precision = np.zeros(camera.size), np.zeros((camera.size, camera.size))
     mean[CENTRE] = image.centre
@@ -79,7 +112,17 @@ def family_prior(camera: GeneralCamera, family: str, image: Image, widest: float
 
 
 def near_prior(camera: GeneralCamera, prior: Prior, image: Image, settings: ForwardGPSettings) -> Prior:
-    """The prior of a free camera about where it was found."""
+    """The prior of a free camera about where it was found.
+
+    Args:
+        camera: As it was found.
+        prior: Of its kind.
+        image: Where its pixels are measured from.
+        settings: The sds about it.
+
+    Returns:
+        The prior, with shape, tilt, principal point and inverse distance about those of the camera.
+    """
     mean, precision = prior.mean.copy(), prior.precision.copy()
     at = camera.parameters
     p, q, tilt, centre = settings.near_prior_sd
@@ -91,14 +134,31 @@ def near_prior(camera: GeneralCamera, prior: Prior, image: Image, settings: Forw
 
 
 def widest_angle(camera: GeneralCamera, points: Floats) -> float:
-    """Radians off the axis of the farthest of points (n, 3)."""
+    """The angle off the axis of the farthest of points.
+
+    Args:
+        camera: In the working frame.
+        points: (n, 3) in the working frame, one or more.
+
+    Returns:
+        Radians.
+    """
     there = camera.pose.apply(points)
     return float(np.arctan2(np.hypot(there[:, 0], there[:, 1]), there[:, 2]).max())
 
 
 def log_evidences(camera: GeneralCamera, priors: Sequence[Prior], views: Scene) -> list[float]:
     """Log marginal likelihood of the views with each prior, in nats: lens and pose integrated out, linear about this
-    camera, sizes at their most probable."""
+    camera, sizes at their most probable.
+
+    Args:
+        camera: About which all is linear.
+        priors: The kinds to compare.
+        views: What it saw.
+
+    Returns:
+        One for each prior; minus infinity where the camera does not see all points, or the equations have no solution.
+    """
     view, settings = camera.view(views.points), views.settings
     if not np.isfinite(view.by_parameters).all():
         return [-np.inf for _ in priors]

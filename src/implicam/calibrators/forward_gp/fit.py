@@ -122,7 +122,18 @@ def _start_cameras(
 def choose_cameras(
     training: Training, guess: Mapping[int, CameraModel]
 ) -> tuple[dict[int, InitialCamera], list[tuple[int, str]]]:
-    """The kind of each camera, and where it starts; guess: cameras that fitted most of the points a moment ago."""
+    """The kind of each camera, and where it starts.
+
+    Args:
+        training: What the fit starts from.
+        guess: Cameras that fitted most of the points a moment ago, by their numbers.
+
+    Returns:
+        The start of each camera that has one, by its number; and (number, why) of the others.
+
+    Raises:
+        FitError: Fewer than two cameras can be started.
+    """
 
     def scene(c: int) -> Scene:
         seen = training.camera_views[c]

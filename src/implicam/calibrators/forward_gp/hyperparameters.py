@@ -91,7 +91,17 @@ def _evidence(training: Training, model: CameraModel, seen: CameraViews, moved: 
 def size_fields(
     training: Training, models: tuple[CameraModel, ...], used: tuple[CameraViews, ...], hyper: Hyperparameters
 ) -> tuple[CameraModel, ...]:
-    """The cameras with fields laid out anew."""
+    """The cameras with fields laid out anew.
+
+    Args:
+        training: What the fit starts from.
+        models: The cameras.
+        used: Per camera, the views to use.
+        hyper: Lengthscales, signal and noise of these cameras.
+
+    Returns:
+        The cameras, whose fields have no weights yet.
+    """
 
     def one(c: int) -> CameraModel:
         model = models[c]

@@ -13,7 +13,16 @@ from implicam.rig_model.leave_one_out import LeftOutViews, left_out_positions, l
 
 
 def start_without_lens(training: Training, c: int, before: InitialCamera) -> InitialCamera | None:
-    """Camera c, started with a lens before, as a linear projection; None where it saw too little for its field."""
+    """A camera, started with a lens before, as a linear projection.
+
+    Args:
+        training: What the fit starts from.
+        c: Number of the camera.
+        before: Its start with a lens.
+
+    Returns:
+        Its start; None where it saw too little for its field, or no linear projection sees the points so.
+    """
     seen = training.camera_views[c]
     if len(seen.rows) < training.settings.min_views_without_lens:
         return None
@@ -36,7 +45,14 @@ class Comparison:
         self.errors = [left_out_positions(views, f.inliers, n)[0] for views, f in zip(self.views, fits, strict=True)]
 
     def predicts_better(self, number: int) -> bool:
-        """Whether the left-out views of a camera are clearly more probable in the one fit than in the other."""
+        """Whether the left-out views of a camera are clearly more probable in the one fit than in the other.
+
+        Args:
+            number: Of the camera, in the order of the fits.
+
+        Returns:
+            Whether the first fit is the better one.
+        """
         one, other = (self._log_densities(views[number]) for views in self.views)
         return _clearly_positive(one - other, self.settings.min_gain_without_lens_nats)
 

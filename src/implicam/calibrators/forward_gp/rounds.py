@@ -37,7 +37,15 @@ class Round(NamedTuple):
     tails: HeavyTails | None = None
 
     def used(self, seen: tuple[CameraViews, ...], *, with_loss: bool) -> tuple[CameraViews, ...]:
-        """The views to use, with their weights as noise; with_loss: for what is known of the cameras."""
+        """The views to use, with their weights as noise.
+
+        Args:
+            seen: Per camera, what it saw.
+            with_loss: Noisier by the loss of information too: for what is known of the cameras.
+
+        Returns:
+            Per camera, its inliers.
+        """
         weighted = seen if self.tails is None else self.tails.weight_views(seen, with_loss=with_loss)
         return tuple(views.select(k) for views, k in zip(weighted, self.inliers, strict=True))
 
@@ -81,7 +89,15 @@ def next_round(training: Training, last: Round, *, search: bool, keep_sizes: boo
 
 
 def check_fitted(training: Training, state: Round) -> None:
-    """A camera that ends far off its own known points is no camera, whatever its covariance says."""
+    """Stop at a camera that ends far off its own known points: it is no camera, whatever its covariance says.
+
+    Args:
+        training: What the cameras of the round saw, and no others.
+        state: Of the fit.
+
+    Raises:
+        CameraFailedError: A camera's median error is too large, or it has too few views.
+    """
     points, posterior = training.points, state.posterior
     if posterior.displacement is not None:
         points = points + posterior.displacement

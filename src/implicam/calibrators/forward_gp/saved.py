@@ -28,7 +28,15 @@ from implicam.rig_model.shot_errors import ShotErrors, Shots
 
 
 def state(fitted: FitResult, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """A readable table, and arrays: per camera lens, field, weights, root of the covariance, in the working frame."""
+    """A readable table, and arrays: per camera lens, field, weights, root of the covariance, in the working frame.
+
+    Args:
+        fitted: The fit.
+        names: Of all cameras of the dataset.
+
+    Returns:
+        Both, without the options and the frame.
+    """
     posterior = fitted.posterior
     table = {
         "calibrated": [names[c] for c in fitted.cameras],
@@ -92,9 +100,20 @@ def _described(fitted: FitResult, number: int, name: str) -> dict[str, Any]:
 def restored(
     data: Dataset, points: Floats, table: Mapping[str, Any], arrays: Arrays, settings: ForwardGPSettings
 ) -> FitResult:
-    """The inverse of `state`; points: (n, 3) the known positions in the working frame.
+    """The inverse of `state`.
 
-    KeyError, ValueError or TypeError for anything that does not fit.
+    Args:
+        data: That it was fitted to, without what is there twice.
+        points: (n, 3) the known positions in the working frame.
+        table: Of `state`.
+        arrays: Of `state`.
+        settings: With which it was fitted.
+
+    Returns:
+        The fit.
+
+    Raises:
+        KeyError, ValueError, TypeError: Something is missing or does not fit.
     """
     names = data.observations.camera_names
     cameras = tuple(names.index(str(name)) for name in table["calibrated"])

@@ -158,7 +158,14 @@ class ForwardGPSettings(RigModelSettings):
         return {name: CameraKind(*getattr(self, f"{name}_kind")) for name in KINDS}
 
     def log_signal_prior(self, *, lens: bool) -> tuple[float, float]:
-        """Mean and sd of the log of the field's sd in half sides; lens: beside a lens model."""
+        """The prior of the log of the field's sd.
+
+        Args:
+            lens: The field is beside a lens model, and not beside a linear projection.
+
+        Returns:
+            Mean and sd, of a sd in half sides.
+        """
         if lens:
             return math.log(self.signal_prior_median_half_sides), self.signal_prior_log_sd
         return math.log(self.signal_prior_median_half_sides_without_lens), self.signal_prior_log_sd_without_lens
