@@ -147,6 +147,7 @@ class InverseGP(CalibratorBase):
         Raises:
             FitError: There are too few points that every camera saw.
             MissingExtraError: The preset is `paper`, and its software is not installed.
+            NumericalError: No search for the hyperparameters succeeded.
         """
         if self.preset == "smooth":
             return self._fitted_smooth(data, progress)

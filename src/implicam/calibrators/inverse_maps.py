@@ -348,13 +348,16 @@ def learn_smooth(
         spread: (d,) standard deviations of the pixels.
         shape: Name of the kernel.
         shortest: Bound of every lengthscale.
-        seed: Of the random starts.
+        seed: Of the part of many points that a search begins on.
         settings: The priors.
         start: An earlier smoothness, and whether it was along principal axes.
-        anew: Start from no guess as well; without, only from `start`, if it is given.
+        anew: Search from no guess as well, in both bases; without `start` that is always done.
 
     Returns:
         The smoothness, and the basis (d, d) that it is in.
+
+    Raises:
+        NumericalError: No search succeeded.
     """
     bases = _bases(X, spread, shortest, settings)
     H = _with_one(X @ _mean_axes(X, spread, settings))
