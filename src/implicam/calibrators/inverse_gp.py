@@ -505,7 +505,7 @@ class InverseGPCalibration(CalibrationBase):
         Raises:
             KeyError, ValueError, TypeError: Something is missing or does not fit.
         """
-        calibrator = InverseGP.from_table(table)
+        calibrator = InverseGP.from_table({"outputs": INDEPENDENT, **table})  # files had none before
         _, unused = seen_by_all(data, cls.method)
         used = remove_copies(data, cameras_too=True)
         d = 2 * len(used.cameras)
