@@ -431,8 +431,8 @@ def test_options_win_over_the_variant_and_those_that_are_none_are_left_at_their_
 
 def test_the_options_of_the_command_line_are_fields_with_a_help_text() -> None:
     offered = {method: set(options_of(method)) for method in METHODS}
-    assert offered["explicit"] == {"lens", "align", "boards"}
-    assert offered["inverse-gp"] == {"kernel", "preset"}
+    assert offered["explicit"] == {"lens", "preset", "align", "boards"}
+    assert offered["inverse-gp"] == {"kernel", "preset", "outputs"}
     assert set(every_option()["lens"]) == {"forward-gp", "explicit"}
     for fields in every_option().values():
         for field in fields.values():

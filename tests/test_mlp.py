@@ -523,7 +523,7 @@ def test_a_missing_array_or_option_is_refused() -> None:
     for name in arrays:
         with pytest.raises(KeyError):
             MLPCalibration.from_state(data, table, {key: a for key, a in arrays.items() if key != name})
-    for name in table:
+    for name in set(table) - {"settings"}:  # files from before there were settings have none
         with pytest.raises(KeyError):
             MLPCalibration.from_state(data, {key: v for key, v in table.items() if key != name}, arrays)
     with pytest.raises(UsageError):

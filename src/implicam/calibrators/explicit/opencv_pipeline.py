@@ -11,6 +11,7 @@ OpenCV's own guess of the focal length is started from others, and pictures that
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -184,6 +185,13 @@ def _fisheye(views: Sequence[BoardView], size: tuple[int, int], half: float) -> 
     return found
 
 
+def _opencv_reason(error: Exception) -> str:
+    """What OpenCV says of an error. `error.err` may be that of another one: OpenCV keeps it on the class."""
+    text = " ".join(str(error).split())
+    found = re.search(r"error: \([^)]*\) (.*?)(?: in function|$)", text)
+    return found[1] if found else text
+
+
 def _fisheye_of_all(views: Sequence[BoardView], size: tuple[int, int], half: float) -> tuple[_Single, Floats]:
     """The first start that leaves little, else the best, and the error of each picture; FitError where all fail."""
     cv2 = opencv()
@@ -200,7 +208,7 @@ def _fisheye_of_all(views: Sequence[BoardView], size: tuple[int, int], half: flo
         try:
             _, K, D, *_ = cv2.fisheye.calibrate(*_points(views, np.float64), size, K, D, flags=start, criteria=criteria)
         except cv2.error as error:
-            why = " ".join(str(error.err or error).split())
+            why = _opencv_reason(error)
             continue
         if not (np.isfinite(K).all() and np.isfinite(D).all() and K[0, 0] > 0 and K[1, 1] > 0):
             continue
