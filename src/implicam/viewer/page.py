@@ -368,12 +368,12 @@ def serve(
     try:
         front.start()
         page.start()
-        say(f"The session is at {front.url}   (Ctrl-C ends it; nothing is lost)")
-        if open_browser:
-            import webbrowser
-
-            webbrowser.open(front.url)
         with suppress(KeyboardInterrupt):
+            say(f"The session is at {front.url}   (Ctrl-C ends it; nothing is lost)")
+            if open_browser:
+                import webbrowser
+
+                webbrowser.open(front.url)
             while not page.closed.wait(0.5):
                 pass
     finally:
