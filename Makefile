@@ -4,7 +4,7 @@
 # make methods   all methods side by side, the first table of docs/choose.md
 # make odd       300 rigs of all kinds: how many are right, refused, silently wrong
 # make active   the tables and the figure of docs/active.md
-# make paper  the paper's experiments, 21 minutes; docs/reproduce.md
+# make paper  the paper's experiments on five rigs, hours; docs/reproduce.md
 # make clean  start over
 PYTHON ?= python3
 VENV := .venv

@@ -55,7 +55,7 @@ class Measurement:
     def __post_init__(self) -> None:
         """A covariance is symmetric to the last bit, whatever order a method or a processor summed it in."""
         object.__setattr__(self, "cov", 0.5 * (self.cov + self.cov.swapaxes(1, 2)))
-        if len(self.share_calibration) != len(self.points):
+        if not len(self.share_calibration):  # not given: the method cannot tell
             object.__setattr__(self, "share_calibration", np.full(len(self.points), np.nan))
 
     def __len__(self) -> int:
