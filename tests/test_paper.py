@@ -639,7 +639,15 @@ def test_one_experiment_keeps_the_others_in_the_account(done: tuple[Path, Source
 def test_other_plans_have_results_of_their_own(done: tuple[Path, Source, Any]) -> None:
     out, source, _ = done
     assert {path.name for path in (out / "cells").iterdir()} == {f"tiny-{source.name}"}
-    assert len({QUICK.name, FULL.name, FULL.with_runs(3).name, FULL.with_runs(4).name}) == 4
+    assert len({QUICK.name, FULL.name, FULL.with_runs(3).name, FULL.with_runs(4).name, FULL.shared_by(5).name}) == 5
+
+
+def test_rigs_share_the_runs_but_each_keeps_a_few() -> None:
+    assert FULL.shared_by(1) is FULL
+    for rigs in (2, 5, 20):
+        of_each = FULL.shared_by(rigs).runs
+        assert of_each[NETWORK] == of_each[GP] == max(5, 50 // rigs)
+        assert of_each[PAPER] == FULL.runs[PAPER] and of_each[FORWARD] == FULL.runs[FORWARD]
 
 
 def test_an_experiment_without_data_is_named(tmp_path: Path) -> None:

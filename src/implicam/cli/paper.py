@@ -37,7 +37,7 @@ def paper_command(
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A taste in a few minutes.")] = False,
     runs: Annotated[
-        int | None, typer.Option("--runs", min=2, metavar="N", help="So many runs of every method.")
+        int | None, typer.Option("--runs", min=2, metavar="N", help="So many runs of every method on each rig.")
     ] = None,
     rigs: Annotated[
         int | None,
@@ -63,15 +63,14 @@ def paper_command(
             f"{data} is not a folder.", fix="give the folder of the measured data, as docs/paper.md describes it"
         )
     plan = QUICK if quick else FULL
-    if runs is not None:
-        plan = plan.with_runs(runs)
     chosen = EXPERIMENTS if experiment is Experiment.all else (experiment.value,)
     if data is not None and rigs is not None:
         raise UsageError("measured data are of one rig.", fix="leave out --rigs, or --data")
     count = rigs or (1 if quick or data is not None else RIGS)
     sources = [Source.of(data, seed + i) for i in range(count)]
+    plan = plan.with_runs(runs) if runs is not None else plan.shared_by(count)
     if count > 1 and not json:
-        show.say(f"{count} rigs; each takes about as long as the first. --rigs 1 computes that alone.")
+        show.say(f"{count} rigs, one after another, each about as long. --rigs 1 gives the first alone all runs.")
     try:
         with log_to_file(output / LOG, command_line()), show.progress(json) as progress:
             made = reproduce(chosen, output, sources, plan, jobs=jobs, scheduler=scheduler, progress=progress)

@@ -19,6 +19,9 @@ adjustment, since it does not say which it ran; ours."""
 RIGS = 5
 """Simulated rigs, unless told otherwise: what holds for one may be an accident of its lenses."""
 
+LEAST_RUNS_OF_A_RIG = 5
+"""As many runs of each method as every rig keeps, where the rigs share the paper's 50."""
+
 DRAWN_METHODS = (PAPER, NETWORK, FORWARD)
 """Whose boards are drawn."""
 
@@ -81,6 +84,17 @@ class Plan:
         """
         each = dict.fromkeys(METHODS, runs)
         return replace(self, name=f"{self.name}-{runs}-runs", runs=each, random_runs=each, repeats=each)
+
+    def shared_by(self, rigs: int) -> Plan:
+        """The plan for each of several rigs, which share the runs: two runs on one rig are alike, two rigs are not.
+
+        Args:
+            rigs: How many.
+        """
+        if rigs == 1:
+            return self
+        runs = {method: max(min(LEAST_RUNS_OF_A_RIG, count), count // rigs) for method, count in self.runs.items()}
+        return replace(self, name=f"{self.name}-of-{rigs}-rigs", runs=runs)
 
 
 FULL = Plan()
