@@ -1,15 +1,19 @@
 """Examples in docstrings and Markdown write their files into a folder of their own; the browser of the page tests; how
-long a test may take."""
+much work tests take."""
 
 import os
 import shutil
+from collections import Counter
 from typing import Any
 
 import pytest
 
-MOST_CPU_SECONDS = 40.0
-"""Work of one test that is not slow, its child processes with it: twice what the longest takes. It is there to find
-what hangs or has become quadratic; so it counts work, not time, and a machine that is busy does not fail it."""
+CPU_SECONDS_OF_A_TEST = 20.0
+CPU_SECONDS_OF_A_FILE = 40.0
+"""Work of one test and of one file that are not slow, child processes with it. What takes more is named at the end of
+a run; it fails nothing, because another processor takes twice as long for the same work."""
+
+_CPU_SECONDS = "cpu_seconds"
 
 
 def cpu_seconds() -> float:
@@ -18,15 +22,39 @@ def cpu_seconds() -> float:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item):
-    before = cpu_seconds()
-    result = yield
-    taken = cpu_seconds() - before
-    if taken > MOST_CPU_SECONDS and not any(item.get_closest_marker(name) for name in ("slow", "browser")):
-        pytest.fail(
-            f"{taken:.0f} CPU s, and at most {MOST_CPU_SECONDS:.0f} are allowed: make it cheaper, or mark it slow"
+def pytest_runtest_protocol(item):
+    item.stash[_started] = cpu_seconds()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    if call.when == "teardown":  # the fixtures that a file's first test makes are work of that file, too
+        item.user_properties.append((_CPU_SECONDS, cpu_seconds() - item.stash[_started]))
+    return (yield)
+
+
+_started = pytest.StashKey[float]()
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Name the tests and files that take more work than they should."""
+    tests, files = Counter[str](), Counter[str]()
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if getattr(report, "when", "") == "teardown" and "slow" not in report.keywords:
+                taken = dict(report.user_properties)[_CPU_SECONDS]
+                tests[report.nodeid] += taken
+                files[report.nodeid.partition("::")[0]] += taken
+    heavy = [(name, taken) for name, taken in files.most_common() if taken > CPU_SECONDS_OF_A_FILE]
+    heavy += [(name, taken) for name, taken in tests.most_common() if taken > CPU_SECONDS_OF_A_TEST]
+    if heavy:
+        terminalreporter.section(
+            f"more than {CPU_SECONDS_OF_A_FILE:.0f} CPU s a file or {CPU_SECONDS_OF_A_TEST:.0f} a test"
         )
-    return result
+        for name, taken in heavy:
+            terminalreporter.write_line(f"{taken:6.0f} s  {name}")
+        terminalreporter.write_line(f"{files.total():6.0f} s  all")
 
 
 @pytest.fixture(autouse=True)

@@ -13,13 +13,13 @@ import pytest
 
 from implicam.calibrators import (
     METHODS,
-    NEEDED,
     Calibration,
     InverseGP,
     InverseGPCalibration,
     calibrator,
     calibrator_from_name,
     every_option,
+    library_of,
     load_calibration,
     method_for,
     options_of,
@@ -410,14 +410,15 @@ def test_options_are_checked_by_name() -> None:
 def test_a_name_is_a_method_with_one_option(
     name: str, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if name in NEEDED:
-        pytest.importorskip(NEEDED[name][0])
+    needed = library_of(name)
+    if needed:
+        pytest.importorskip(needed[0])
     assert calibrator_from_name(name) == calibrator(name.partition(":")[0], **options)
     for wrong in (f"no-{name}", f"{name}-no"):
         with pytest.raises(UsageError):
             calibrator_from_name(wrong)
-    if name in NEEDED:  # told when it is named, not in the middle of a sweep
-        library, extra = NEEDED[name]
+    if needed:  # told when it is named, not in the middle of a sweep
+        library, extra = needed
         monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(MissingExtraError, match=f"{name} needs the library '{library}'") as caught:
             calibrator_from_name(name)

@@ -133,11 +133,6 @@ def compared_names() -> list[str]:
     ]
 
 
-_NEEDY = ("inverse-gp:paper", "explicit:paper", "explicit:paper-bundle", "mlp", "mlp:no-dropout")
-NEEDED = {name: library for name in _NEEDY if (library := library_of(name))}
-"""`library_of` the methods and variants here that need one."""
-
-
 def options_of(method: str) -> dict[str, Field[Any]]:
     """The options that a method has on the command line: its calibrator's fields with an `option`, by name.
 
