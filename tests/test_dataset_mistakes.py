@@ -604,21 +604,6 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
             '  fix: write x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ... as its first line'
         ),
     ),
-    'a word for a view that is missing': (
-        WIDE.replace("10,20", "n/a,n/a"),
-        (
-            "{at}/w.csv, line 2: u_cam1 = 'n/a' is not a number.\n"
-            '  fix: leave the cell empty where there is no value'
-        ),
-    ),
-    'a comma at the end': (
-        WIDE.replace("\n", ",\n"),
-        (
-            '{at}/w.csv, line 1: a column has no name.\n'
-            '  why: a comma at the end of a line, or an empty column of a spreadsheet, makes one more column\n'
-            '  fix: remove the comma or the column from every line, or give it a name'
-        ),
-    ),
     'half a camera': (
         "x,y,z,u_a,v_b\n1,2,3,4,5\n",
         (
@@ -631,7 +616,8 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
         "x,y,u_a,v_a\n1,2,3,4\n",
         (
             '{at}/w.csv, line 1: x, y and z must all be there, or none.\n'
-            '  fix: add the missing column'
+            "  why: found are 'x', 'y', and no 'z'\n"
+            '  fix: add the missing column, or correct its heading'
         ),
     ),
     'half view': (
@@ -697,9 +683,9 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
     'comma': (
         WIDE.replace("4,5,6", '4,"5,5",6'),
         (
-            "{at}/w.csv, line 3: y = '5,5' is not a number.\n"
-            '  why: it has a decimal comma\n'
-            '  fix: write it with a decimal point'
+            "{at}/w.csv, lines 3 and 2: one number has a comma and one has a point: '5,5' and '.1'.\n"
+            '  why: it cannot be told which is the decimal mark, and whether the other separates thousands\n'
+            '  fix: write all numbers with decimal points, and without marks between thousands'
         ),
     ),
     'header only': (
@@ -714,14 +700,6 @@ WIDE_MISTAKES: dict[str, tuple[str, str]] = {
         (
             '{at}/w.csv is empty.\n'
             '  fix: its first line must be x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ..., then one row per entry'
-        ),
-    ),
-    'semicolons': (
-        WIDE.replace(",", ";"),
-        (
-            "{at}/w.csv, line 1: the columns are separated by semicolons: 'point;x;y;z;sd_x;u_cam1;v_cam1;sd_u_cam1'.\n"
-            '  why: implicam reads comma-separated tables with decimal points, so that 1,5 is never mistaken\n'
-            "  fix: save as CSV with commas and decimal points (Excel: set the region to English, or pandas: read_csv(..., sep=';', decimal=',').to_csv(..., index=False))"
         ),
     ),
     'camera twice': (

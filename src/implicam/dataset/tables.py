@@ -37,10 +37,12 @@ Row = tuple[int, list[str]]
 
 
 class NumberColumn(NamedTuple):
-    """The cure where a number is missing, and the texts (small letters) that say that none is meant to be there."""
+    """The cure where a number is missing, the texts (small letters) that say that none is meant to be there, and the
+    decimal mark."""
 
     cure_nan: str
     missing: tuple[str, ...] = ()
+    decimal: str = "."
 
 
 @dataclass(frozen=True)
@@ -83,22 +85,28 @@ class Columns:
 
 
 def read_columns(
-    path: Path, header: Sequence[str], rows: Iterable[Row], names: Sequence[str], numbers: Mapping[str, NumberColumn]
+    path: Path | str,
+    header: Sequence[str],
+    rows: Iterable[Row],
+    names: Sequence[str],
+    numbers: Mapping[str, NumberColumn],
+    unit: str = "line",
 ) -> Columns:
     """Read the rows of a table into columns.
 
     Args:
-        path: The file, for errors.
+        path: The file, for errors; or the file and what in it.
         header: The names of all columns.
         rows: Line number and cells of each row, as `read_table` gives them.
         names: Columns whose texts lose the spaces around them; all other text stays as it is.
         numbers: Columns of numbers, and what may be missing in them.
+        unit: What an error calls a row: "line", or "row".
 
     Raises:
         DatasetError: A cell is no number; names the line.
     """
     columns: dict[str, list[Any]] = {column: [] for column in header}
-    lines, in_file = list[int](), f"{path}, line "  # formatted once: a table may have a million rows
+    lines, in_file = list[int](), f"{path}, {unit} "  # formatted once: a table may have a million rows
     for line, row in rows:
         lines.append(line)
         for column, text in zip(header, row, strict=True):
@@ -128,13 +136,13 @@ def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[
     """
     example = example or ",".join(required)
     require_file(path, f"put a comma-separated table with the columns {example} there")
-    rows = _read_rows(path)
+    rows = split_lines(path)
     _, header = next(rows, (1, []))
     if not header:
         raise DatasetError(f"{path} is empty.", fix=f"its first line must be {example}, then one row per entry")
     header = [name.strip() for name in header]
     _check_header(path, header, required)
-    return header, _check_width(path, len(header), rows)
+    return header, check_width(f"{path}, line", len(header), rows)
 
 
 def require_file(path: Path, fix: str) -> None:
@@ -171,8 +179,17 @@ def naming(place: Path | str) -> Iterator[None]:
         raise DatasetError(f"{place}: {error.what}", why=error.why, fix=error.fix) from None
 
 
-def _read_rows(path: Path) -> Iterator[Row]:
-    reader = csv.reader(_read_lines(path), strict=True)
+def split_lines(path: Path, separator: str = ",") -> Iterator[Row]:
+    """The rows of a table of text with the numbers of their lines; blank lines are skipped.
+
+    Args:
+        path: The file.
+        separator: What is between two cells.
+
+    Raises:
+        DatasetError: A row is not well-formed, or the file is no text; names the line.
+    """
+    reader = csv.reader(read_lines(path), strict=True, delimiter=separator)
     first = 1  # the line on which the row begins; a quoted cell may go on over several
     try:
         for row in reader:
@@ -183,12 +200,20 @@ def _read_rows(path: Path) -> Iterator[Row]:
         raise DatasetError(
             f"{path}, line {first}: not a well-formed CSV row.",
             why=str(error),
-            fix='write a cell that contains a comma or a quote as "...", with inner quotes doubled',
+            fix=f'write a cell that contains a {"comma" if separator == "," else "separator"} or a quote as "...", '
+            "with inner quotes doubled",
         ) from error
 
 
-def _read_lines(path: Path) -> Iterator[str]:
-    """Lines as text, read one at a time, so that a gigabyte of something else costs one line of memory."""
+def read_lines(path: Path) -> Iterator[str]:
+    """Lines as text, read one at a time, so that a gigabyte of something else costs one line of memory.
+
+    Args:
+        path: The file.
+
+    Raises:
+        DatasetError: A line is no text, or too long.
+    """
     with path.open("rb") as file:
         for number in range(1, 1 << 62):
             line = file.readline(MAX_LINE_BYTES + 1)
@@ -245,34 +270,57 @@ def _check_header(path: Path, header: list[str], required: Sequence[str]) -> Non
                 why=_hint_misspelling(name, header),
                 fix=f"the first line must name at least the columns {','.join(required)}",
             )
+    check_headings(f"{path}, line 1", header)
+
+
+def check_headings(place: str, header: Sequence[str]) -> None:
+    """Refuse a column that has no name, one that no dataset could have, or the name of another.
+
+    Args:
+        place: File and line, for errors.
+        header: The headings.
+
+    Raises:
+        DatasetError: For the first such column.
+    """
     for name, times in Counter(header).items():
         if times > 1:
             raise DatasetError(
-                f"{path}, line 1: the column {name[:60]!r} is there {times} times.",
+                f"{place}: the column {name[:60]!r} is there {times} times.",
                 why="cells beyond the last name may be empty" if name == "" else "",
                 fix="give every column a name of its own",
             )
         if name == "":
             raise DatasetError(
-                f"{path}, line 1: a column has no name.",
+                f"{place}: a column has no name.",
                 why="a comma at the end of a line, or an empty column of a spreadsheet, makes one more column",
                 fix="remove the comma or the column from every line, or give it a name",
             )
-        with naming(f"{path}, line 1"):
+        with naming(place):
             check_name(name, "column name")
 
 
-def _check_width(path: Path, width: int, rows: Iterator[Row]) -> Iterator[Row]:
+def check_width(place: str, width: int, rows: Iterable[Row]) -> Iterator[Row]:
+    """The same rows, each checked.
+
+    Args:
+        place: What stands before the number of a line in an error: "rig.csv, line".
+        width: Cells that a row has.
+        rows: Line number and cells.
+
+    Raises:
+        DatasetError: A row has more cells, or fewer, or a cell is too long.
+    """
     for line, row in rows:
         if len(row) != width:
             raise DatasetError(
-                f"{path}, line {line}: {len(row)} cells, but the header names {width}: {','.join(row)[:80]!r}.",
+                f"{place} {line}: {len(row)} cells, but the header names {width}: {','.join(row)[:80]!r}.",
                 why="a decimal comma splits a number in two" if len(row) > width else "the row may be cut off",
                 fix="give every column one cell; use decimal points",
             )
         if max(map(len, row)) > MAX_CELL_CHARACTERS:
             raise DatasetError(
-                f"{path}, line {line}: a cell has {max(map(len, row))} characters: {max(row, key=len)[:40]!r}...",
+                f"{place} {line}: a cell has {max(map(len, row))} characters: {max(row, key=len)[:40]!r}...",
                 why="a quote may be missing" if any("\n" in cell for cell in row) else "",
                 fix=f"shorten it to {MAX_CELL_CHARACTERS} characters",
             )
@@ -299,7 +347,9 @@ NO_VALUE_WORDS = ("", "-", "--", "n/a", "na", "#n/a", "none", "null", "missing")
 """What people and spreadsheets write where there is no value; refused, with the cure that belongs to it."""
 
 
-def read_number(text: str, place: str, column: str, *, cure_nan: str, missing: Sequence[str] = ()) -> float:
+def read_number(
+    text: str, place: str, column: str, *, cure_nan: str, missing: Sequence[str] = (), decimal: str = "."
+) -> float:
     """Read a finite number.
 
     Args:
@@ -308,6 +358,7 @@ def read_number(text: str, place: str, column: str, *, cure_nan: str, missing: S
         column: Its column, for the error.
         cure_nan: What to do where the number is missing or not finite.
         missing: Texts (small letters) that are read as NaN.
+        decimal: The decimal mark.
 
     Raises:
         DatasetError: If the text is no finite number; names the place, the value and the cure.
@@ -318,9 +369,9 @@ def read_number(text: str, place: str, column: str, *, cure_nan: str, missing: S
     try:
         if "_" in text or not text.isascii():
             raise ValueError
-        value = float(text)
+        value = float(text if decimal == "." else text.replace(decimal, "."))
     except ValueError:
-        comma = "," in text
+        comma = "," in text and decimal == "."
         raise DatasetError(
             f"{place}: {column} = {text[:60]!r} is not a number.",
             why="it has a decimal comma" if comma else "the cell is empty" if text == "" else "",

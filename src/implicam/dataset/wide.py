@@ -1,15 +1,15 @@
 """A dataset as one table: x,y,z,u_cam1,v_cam1,... in CSV or Parquet, or as the arrays of an NPZ.
 
 The table has one row per point; an empty cell is a missing view. What dataset.toml says (name, unit, image sizes)
-travels in `<file>.csv.toml` beside a CSV, in the schema of a Parquet file, in the array `dataset` of an NPZ. A CSV
-without it still reads: name from the file, cameras from the columns, image sizes unknown, unit from `unit`.
+travels in `<file>.csv.toml` beside a CSV, in the schema of a Parquet file, in the array `dataset` of an NPZ. A table
+without it is one that people bring: sheet.py reads it.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from implicam.dataset.model import (
     check_unique,
     check_views,
 )
+from implicam.dataset.sheet import EXAMPLE_HEADER, Sheet, read_sheet, sheet_of_text
 from implicam.dataset.tables import (
     Columns,
     NumberColumn,
@@ -43,8 +44,6 @@ from implicam.dataset.tables import (
 )
 from implicam.errors import DatasetError, ImplicamError, did_you_mean, import_extra
 from implicam.files import npz_bytes, read_npz, replacing, toml_text, write_text
-
-_EXAMPLE_HEADER = "x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ..."
 
 
 @dataclass(frozen=True)
@@ -67,41 +66,20 @@ def _description_path(path: Path) -> Path:
     return path.with_name(path.name + ".toml")  # not rig.toml, which may be anything
 
 
-def _read_layout(header: list[str], description: dict[str, Any] | None, path: Path, unit: str | None) -> _Layout:
-    if not _cameras_named(header) and any(map(_is_number, header)):
-        raise DatasetError(
-            f"{path}, line 1: the first line holds numbers, and no names of columns.",
-            fix="write x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ... as its first line",
-        )
-    extra: dict[str, Any] = {}
-    view_extra: tuple[str, ...] = ()
-    if description is None:
-        if unit is None:
+def _described_layout(header: list[str], description: dict[str, Any], path: Path) -> _Layout:
+    """The layout of a table with a description, which leaves nothing to be guessed."""
+    meta = description.get(WIDE_TABLE, {})
+    listed = meta.get("view_columns", ()) if isinstance(meta, dict) else ()
+    view_extra = tuple(map(str, listed)) if isinstance(listed, list) else ()
+    name, unit, cameras, extra = description_from_toml(description, path)
+    known = [camera.name for camera in cameras]
+    for camera in _cameras_named(header):
+        if camera not in known:
             raise DatasetError(
-                f"{path}: the length unit of x, y, z is not stated.",
-                why=f"a wide CSV carries it in {_description_path(path).name} beside it, which is not there",
-                fix='add --unit mm, or unit="mm" in read_dataset(...)',
+                f"{path}, line 1: the columns u_{camera} and v_{camera} belong to no camera of the description"
+                f"{did_you_mean(camera, known)}.",
+                fix=f"the cameras are {', '.join(known)}; rename the columns, or add a [[cameras]] table",
             )
-        _refuse_unpaired(header, path)
-        cameras = tuple(Camera(name) for name in _cameras_named(header))
-        name = path.stem
-    else:
-        meta = description.get(WIDE_TABLE, {})
-        listed = meta.get("view_columns", ()) if isinstance(meta, dict) else ()
-        view_extra = tuple(map(str, listed)) if isinstance(listed, list) else ()
-        name, unit, cameras, extra = description_from_toml(description, path)
-        known = [camera.name for camera in cameras]
-        for camera in _cameras_named(header):
-            if camera not in known:
-                raise DatasetError(
-                    f"{path}, line 1: the columns u_{camera} and v_{camera} belong to no camera of the description"
-                    f"{did_you_mean(camera, known)}.",
-                    fix=f"the cameras are {', '.join(known)}; rename the columns, or add a [[cameras]] table",
-                )
-    if not cameras:
-        raise DatasetError(
-            f"{path}, line 1: there are no camera columns.", fix="name them u_cam1,v_cam1,u_cam2,v_cam2, ..."
-        )
     columns = set(header)
     if len(columns & set("xyz")) not in (0, 3):
         raise DatasetError(f"{path}, line 1: x, y and z must all be there, or none.", fix="add the missing column")
@@ -114,32 +92,35 @@ def _read_layout(header: list[str], description: dict[str, Any] | None, path: Pa
     return _Layout(cameras, view_extra, point_extra, name, unit, extra)
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+def read_brought(sheet: Sheet, path: Path, unit: str | None) -> Dataset:
+    """The dataset of a table that has no description; its name is that of the file.
 
+    Args:
+        sheet: The table.
+        path: The file.
+        unit: The length unit; None where the headings state it.
 
-def _refuse_unpaired(header: list[str], path: Path) -> None:
-    """A column u_ without its v_, or the reverse: a typing error must not remove a camera."""
-    columns = set(header)
-    partner = {
-        column: ("v_" if column[0] == "u" else "u_") + column[2:] for column in header if column[:2] in _PREFIXES
-    }
-    lonely = [column for column, other in partner.items() if other not in columns]
-    for column in lonely[:1]:
-        likely = [other for other in lonely if other[0] != column[0]] or [c for c in header if c not in partner]
+    Raises:
+        DatasetError: The unit is not stated, there are two ways to read the table, or it has a mistake.
+    """
+    brought = read_sheet(sheet)
+    if unit is None and not brought.unit:
         raise DatasetError(
-            f"{path}, line 1: there is a column {column!r} but no {partner[column]!r}"
-            f"{did_you_mean(partner[column], likely)}.",
-            why="the pixels of a camera are a pair of columns, u_NAME and v_NAME",
-            fix="correct the heading, add the other column, or give a column that is no pixel another name",
+            f"{path}: the length unit of x, y, z is not stated.",
+            why=f"a table carries it in {_description_path(path).name} beside it, which is not there",
+            fix='add --unit mm, or unit="mm" in read_dataset(...)',
         )
-
-
-_PREFIXES = ("u_", "v_")
+    if unit is not None and brought.unit not in ("", unit):
+        raise DatasetError(
+            f"{path} is in {brought.unit!r}, not in {unit!r}.",
+            why="the headings of x, y and z say so",
+            fix="leave out --unit, or correct the headings",
+        )
+    with naming(path):
+        cameras = tuple(Camera(name) for name in brought.cameras)
+        stated = unit or brought.unit
+        layout = _Layout(cameras, brought.views, brought.further, path.stem, stated, {})
+        return replace(_assemble(brought.columns, layout), notes=brought.notes)
 
 
 def _cameras_named(header: Iterable[str]) -> list[str]:
@@ -182,6 +163,8 @@ def _assemble(table: Columns, layout: _Layout) -> Dataset:
 def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
     """Read `x,y,z,u_cam1,v_cam1,...`, with or without point, shot, sd_x, sd_u_cam1 and further columns.
 
+    A table without a description may be written as people write it, see `read_sheet`.
+
     Args:
         path: The file; its description is read from `<name>.csv.toml` beside it, where that is there.
         unit: The length unit where there is no description; else it is not used.
@@ -189,9 +172,11 @@ def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
     Raises:
         DatasetError: The unit is not stated, or there is a mistake; names file, line, value and cure.
     """
-    header, rows = read_table(path, (), _EXAMPLE_HEADER)
     sidecar = _description_path(path)
-    layout = _read_layout(header, read_toml(sidecar) if sidecar.exists() else None, path, unit)
+    if not sidecar.exists():
+        return read_brought(sheet_of_text(path), path, unit)
+    header, rows = read_table(path, (), EXAMPLE_HEADER)
+    layout = _described_layout(header, read_toml(sidecar), path)
     numbers = dict.fromkeys(layout.numbers(), NumberColumn("leave the cell empty where there is no value", ("", "nan")))
     table = read_columns(path, header, rows, ("point", "shot"), numbers)
     if not table.n:
@@ -299,7 +284,7 @@ def read_parquet(path: Path) -> Dataset:
     for column, times in Counter(table.column_names).items():
         if times > 1:
             raise DatasetError(f"{path}: the column {column[:60]!r} is there {times} times.", fix="leave one out")
-    layout = _read_layout(table.column_names, description, path, None)
+    layout = _described_layout(table.column_names, description, path)
     numeric = set(layout.numbers())
     numbers = {c: _read_numbers(v, c, path) for c, v in columns.items() if c in numeric}
     texts = {c: _read_texts(v, c, path) for c, v in columns.items() if c not in numeric}

@@ -1,0 +1,329 @@
+"""Tables as people write them: read right, or refused with the cure; never wrong in silence."""
+
+from __future__ import annotations
+
+import csv
+import io
+import random
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
+from implicam.dataset.headings import is_camera_name, read_headings, take_apart
+from implicam.errors import DatasetError
+
+SPREADSHEETS = 30
+
+
+def truth() -> Dataset:
+    """Eight known points before three cameras; a few views are missing."""
+    rng = np.random.default_rng(3)
+    uv = np.round(rng.uniform(20.0, 1900.0, (8, 3, 2)), 2) + 0.001  # three decimals, never a whole number
+    uv[[1, 4, 4], [0, 1, 2]] = np.nan
+    xyz = np.round(rng.uniform(-0.9, 2.9, (8, 3)), 3)
+    xyz[0] = -0.125, 0.5, 1.75
+    points = np.array([f"Marker {i + 1:02d}" for i in range(8)])
+    cameras = tuple(Camera(f"cam{k + 1}") for k in range(3))
+    known = KnownPositions(points, xyz, np.full((8, 3), np.nan))
+    return Dataset("t", "m", Observations(points, cameras, uv, np.full(uv.shape, np.nan)), known)
+
+
+STYLES: list[dict[str, Any]] = [
+    {"point": "point", "xyz": "xyz", "uv": ("u_cam{}", "v_cam{}")},
+    {"point": "name", "xyz": "XYZ", "uv": ("cam{}_x", "cam{}_y")},
+    {"point": "Marker", "xyz": ("X [m]", "Y [m]", "Z [m]"), "uv": ("Kamera {} x", "Kamera {} y")},
+    {"point": "Punkt", "xyz": ("x_m", "y_m", "z_m"), "uv": ("Kamera {} x [px]", "Kamera {} y [px]")},
+    {"point": "ID", "xyz": ("X (m)", "Y (m)", "Z (m)"), "uv": ("u{}", "v{}")},
+    {"point": "label", "xyz": ("World X", "World Y", "World Z"), "uv": ("Cam {} - u", "Cam {} - v")},
+    {"point": "Point name", "xyz": ("pos_x", "pos_y", "pos_z"), "uv": ("camera{}.x", "camera{}.y")},
+    {"point": "#", "xyz": "XYZ", "uv": ("cam{}x", "cam{}y")},
+    {"point": "target", "xyz": ("x in m", "y in m", "z in m"), "uv": ("cam{}_col", "cam{}_row")},
+    {"point": "marker id", "xyz": "xyz", "uv": ("x (cam{})", "y (cam{})")},
+    {"point": "nr", "xyz": ("x_ref", "y_ref", "z_ref"), "uv": ("View {} U", "View {} V")},
+    {"point": "Name", "xyz": "XYZ", "uv": ("x{}", "y{}")},
+]
+MARKS = [
+    ("", ""),
+    ("-1", "-1"),
+    ("NaN", "NaN"),
+    ("0", "0"),
+    ("n/a", "n/a"),
+    ("-", "-"),
+    ("nan", "nan"),
+    ("#N/A", "#N/A"),
+]
+
+
+def spreadsheet(data: Dataset, seed: int) -> tuple[list[list[str]], dict[str, Any]]:
+    """Header and rows of a table as somebody may write it, and how the cells are to be put into a file."""
+    rng = random.Random(seed)
+    style = STYLES[seed % len(STYLES)]
+    decimal = rng.choice(".,")
+    separator = rng.choice(";\t" if decimal == "," else ",;\t")
+    mark = rng.choice(MARKS)
+    columns: list[tuple[str, list[str]]] = [(style["point"], data.points.tolist())]
+
+    def number(value: float) -> str:
+        return repr(float(value)).replace(".", decimal)
+
+    columns += [(h, [number(x) for x in data.xyz[:, i]]) for i, h in enumerate(style["xyz"])]
+    for k in range(len(data.cameras)):
+        for q, heading in enumerate(style["uv"]):
+            cells = data.observations.uv[:, k, q].tolist()
+            columns.append((heading.format(k + 1), [mark[q] if c != c else number(c) for c in cells]))
+    if rng.random() < 0.5:
+        columns.append((rng.choice(["remark", "frame", "Bemerkung"]), [str(i) for i in range(len(data))]))
+    if rng.random() < 0.6:
+        rng.shuffle(columns)
+    if rng.random() < 0.3:
+        columns += [("", [""] * len(data))] * 2  # columns of a spreadsheet in which nothing stands
+    rows = [[h for h, _ in columns], *map(list, zip(*(cells for _, cells in columns), strict=True))]
+    how = {"delimiter": separator, "quoting": rng.choice([csv.QUOTE_MINIMAL, csv.QUOTE_ALL])}
+    return rows, {"how": how, "encoding": rng.choice(["utf-8", "utf-8-sig"]), "end": rng.choice(["\n", "\r\n"])}
+
+
+def write(path: Path, rows: list[list[str]], how: dict[str, Any]) -> Path:
+    text = io.StringIO()
+    csv.writer(text, lineterminator=how["end"], **how["how"]).writerows(rows)
+    path.write_bytes(text.getvalue().encode(how["encoding"]))
+    return path
+
+
+def assert_right(read: Dataset, data: Dataset) -> None:
+    """The same numbers and the same missing views; each camera is there, in any order, under its own number."""
+    order = [
+        next(k for k, name in enumerate(read.observations.camera_names) if name[-1] == c.name[-1]) for c in data.cameras
+    ]
+    assert len(read.cameras) == len(data.cameras)
+    np.testing.assert_array_equal(read.observations.uv[:, order], data.observations.uv)
+    np.testing.assert_array_equal(read.xyz, data.xyz)
+    assert read.length_unit == "m"
+
+
+@pytest.mark.parametrize("seed", range(SPREADSHEETS))
+def test_spreadsheets_are_read_right(seed: int, tmp_path: Path) -> None:
+    data = truth()
+    rows, how = spreadsheet(data, seed)
+    read = read_dataset(write(tmp_path / "s.csv", rows, how), unit="m")
+    assert_right(read, data)
+    assert read.points.tolist() == data.points.tolist()
+    marks = {cell for row in rows[1:] for cell in row} & {"-1", "NaN", "0", "n/a", "-", "nan", "#N/A"} - {""}
+    frames = {"remark", "frame", "Bemerkung"} & set(rows[0])
+    for mark in marks - ({"0"} if frames else set()):
+        assert any(mark in note and "missing" in note for note in read.notes), (mark, read.notes)
+
+
+@pytest.mark.parametrize("seed", range(SPREADSHEETS))
+def test_a_typing_error_in_a_heading_is_refused_or_changes_nothing(seed: int, tmp_path: Path) -> None:
+    data, rng = truth(), random.Random(1000 + seed)
+    rows, how = spreadsheet(data, seed)
+    refused = 0
+    for i, heading in enumerate(rows[0]):
+        if not heading:
+            continue
+        at = rng.randrange(len(heading))
+        for typo in (heading[:at] + heading[at + 1 :], heading[:at] + rng.choice("aexz1q_") + heading[at:]):
+            spoilt = [[*rows[0][:i], typo, *rows[0][i + 1 :]], *rows[1:]]
+            try:
+                read = read_dataset(write(tmp_path / "s.csv", spoilt, how), unit="m")
+            except DatasetError as error:
+                refused += len(error.fix) > 0
+            else:
+                assert_right(read, data)
+    assert refused
+
+
+def sheet(tmp_path: Path, text: str, unit: str | None = "mm") -> Dataset:
+    path = tmp_path / "w.csv"
+    path.write_text(text, encoding="utf-8")
+    return read_dataset(path, unit=unit)
+
+
+REFUSED = {
+    "points that may be cameras": (
+        "nose_x,nose_y,tail_x,tail_y\n1,2,3,4\n",
+        "'nose_x', 'nose_y' are a pair, and it cannot be told whether 'nose' is a camera",
+        "name the pixels u_NAME and v_NAME",
+    ),
+    "DLTdv": (
+        "pt1_cam1_X,pt1_cam1_Y,pt1_cam2_X,pt1_cam2_Y\n1,2,3,4\n",
+        "it cannot be told whether 'pt1_cam1'",
+        "u_NAME",
+    ),
+    "numbers without known positions": (
+        "x1,y1,x2,y2\n1,2,3,4\n",
+        "it cannot be told whether '1' is a camera",
+        "u_NAME",
+    ),
+    "one camera": ("x,y,z,u,v\n1,2,3,4,5\n", "there are no camera columns", "u_cam1"),
+    "half of a position": ("X,Y,cam1_x,cam1_y\n1,2,3,4\n", "x, y and z must all be there", "add the missing column"),
+    "a camera misspelt twice": (
+        "u_cam1,v_cam1,um_cam2,vm_cam2\n1,2,3,4\n",
+        "the column 'um_cam2' names 'cam2', which has no columns of pixels",
+        "correct the heading",
+    ),
+    "one half misspelt": (
+        "cam1_x,cam1_y,cam2_xx,cam2_y\n1,2,3,4\n",
+        "there is a column 'cam2_y' but no 'cam2_x' (did you mean 'cam2_xx'?)",
+        "correct the heading",
+    ),
+    "two pairs": (
+        "u_cam1,v_cam1,cam1_x,cam1_y,u_cam2,v_cam2\n1,2,3,4,5,6\n",
+        "camera 'cam1' has two pairs of columns: 'u_cam1', 'v_cam1' and 'cam1_x', 'cam1_y'",
+        "u_NAME",
+    ),
+    "two names": (
+        "id,name,u_a,v_a\n1,a,2,3\n",
+        "'id', 'name' may all name the points",
+        "call the one that does 'point'",
+    ),
+    "two positions": (
+        "x,y,z,x_ref,y_ref,z_ref,u_a,v_a\n1,2,3,4,5,6,7,8\n",
+        "may all be known positions",
+        "call the known positions x, y and z",
+    ),
+    "two units": ("x [m],y [mm],z [m],u_a,v_a\n1,2,3,4,5\n", "have several units", "convert the columns"),
+    "another unit": ("x [m],y [m],z [m],u_a,v_a\n1,2,3,4,5\n", "is in 'm', not in 'mm'", "leave out --unit"),
+    "thousands": (
+        "x;y;z;u_a;v_a\n1,234;2,345;3,456;10;20\n",
+        "line 2: '1,234' may be a number with a decimal comma, or with a comma between thousands",
+        "decimal points",
+    ),
+    "commas and points": (
+        "x;y;z;u_a;v_a\n0,234;2.345;3,456;10;20\n",
+        "lines 2 and 2",
+        "all numbers with decimal points",
+    ),
+    "thousands and decimals": (
+        'x,y,z,u_a,v_a\n1,2,3,"1,098.61",20\n',
+        "one number has a comma and one has a point",
+        "points",
+    ),
+    "a comma splits a number": (
+        "x,y,z,u_a,v_a\n1,5,2,3,4,5\n",
+        "line 2: 6 cells, but the header names 5",
+        "decimal points",
+    ),
+    "two separators": ("x;y,z;u\n1;2,3;4\n", "semicolons or commas may separate", "leave it out of the headings"),
+    "the index of pandas": (",x,y,z,u_a,v_a\n0,1,2,3,4,5\n", "a column has no name", "give it a name"),
+    "a view twice": ("point,camera,u,v\np,a,1,2\np,a,3,4\n", "point 'p' is seen twice by camera 'a'", "keep one"),
+    "two places": (
+        "point,camera,u,v,x,y,z\np,a,1,2,0,0,0\np,b,3,4,0,1,0\n",
+        "y = 1, but 0 in the row of another",
+        "one",
+    ),
+    "views of nothing": ("camera,u,v\na,1,2\n", "no column names the points", "add a column point"),
+    "half a view": ("x;y;z;u_a;v_a\n1;2;3;4;n/a\n", "u = 4, v = nan", "leave both u and v empty"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_can_be_read_in_two_ways_is_refused(case: str, tmp_path: Path) -> None:
+    text, said, cure = REFUSED[case]
+    with pytest.raises(DatasetError) as caught:
+        sheet(tmp_path, text)
+    assert said in caught.value.what.replace("commas or semicolons", "semicolons or commas")
+    assert cure in caught.value.fix
+    assert str(tmp_path / "w.csv") in caught.value.what
+
+
+def test_one_line_says_how_the_headings_were_read(tmp_path: Path) -> None:
+    read = sheet(tmp_path, "Marker;X [m];Y [m];Z [m];Kamera 1 x;Kamera 1 y;Wetter\nM;0,5;1,5;2;10,25;20;gut\n", None)
+    assert read.notes == (
+        "The table was read so: separated by semicolons; decimal commas; 'Marker' names the points; 'X [m]', 'Y [m]', "
+        "'Z [m]' are x, y, z in m; u and v of Kamera 1 ('Kamera 1 x', 'Kamera 1 y'); kept as they are: 'Wetter'.",
+    )
+    assert read.observations.uv.tolist() == [[[10.25, 20.0]]]
+    assert sheet(tmp_path, "point,x,y,z,u_a,v_a\np,1,2,3,4,5\n").notes == ()
+
+
+def test_words_for_missing_views_are_counted(tmp_path: Path) -> None:
+    read = sheet(tmp_path, "u_a,v_a,u_b,v_b\nn/a,n/a,1,2\n-,-,3,4\nNaN,NaN,5,6\n-1,-1,7,8\n,,9,9.5\n0,0,1,1\n")
+    assert read.observations.seen[:, 0].tolist() == [False] * 6
+    assert [note.partition(":")[0] for note in read.notes] == [
+        "2 cells of pixels say 'n/a'", "2 cells of pixels say '-'", "2 cells of pixels say 'NaN'",
+        "The pixel (-1, -1) occurs 1 times (a)", "The pixel (0, 0) occurs 1 times (a)",
+    ]  # fmt: skip
+
+
+def test_a_row_for_each_view(tmp_path: Path) -> None:
+    read = sheet(tmp_path, "Point;Camera;x;y;weight\np2;a;1,5;2;w\np1;a;3;4;v\np2;b;5;6,25;w\n")
+    assert read.points.tolist() == ["p2", "p1"]
+    assert read.observations.camera_names == ("a", "b")
+    np.testing.assert_array_equal(read.observations.uv, [[[1.5, 2], [5, 6.25]], [[3, 4], [np.nan, np.nan]]])
+    known = sheet(tmp_path, "point,camera,u,v,x,y,z\np,a,1,2,0,0,0\np,b,3,4,0,0,0\nq,b,5,6,1,1,1\n")
+    np.testing.assert_array_equal(known.xyz, [[0, 0, 0], [1, 1, 1]])
+
+
+def test_markers_seen_again_in_each_frame_are_named_by_both(tmp_path: Path) -> None:
+    text = "frame,marker,cam1_x,cam1_y,cam2_x,cam2_y\n1,A,1,2,3,4\n1,B,2,3,4,5\n2,A,3,4,5,6\n"
+    read = sheet(tmp_path, text)
+    assert read.points.tolist() == ["1 A", "1 B", "2 A"]
+    assert "a point is named by 'frame' and 'marker', as '1 A'" in read.notes[0]
+    long = sheet(tmp_path, "frame,marker,camera,u,v\n1,A,a,1,2\n1,A,b,2,3\n2,A,a,3,4\n")
+    assert long.points.tolist() == ["1 A", "2 A"]
+
+
+def test_columns_of_views_go_to_their_cameras(tmp_path: Path) -> None:
+    read = sheet(tmp_path, "u_a,v_a,u_b,v_b,likelihood_a,b_likelihood,sd_u_a,sd_v_a\n1,2,3,4,.9,.8,.25,.5\n")
+    assert read.observations.extra["likelihood"].tolist() == [[".9", ".8"]]
+    assert read.observations.sd[0, 0].tolist() == [0.25, 0.5]
+
+
+@pytest.mark.parametrize("first", ["sep=;\n", "sep=;\r\n", '"sep=;"\n'])
+def test_the_line_that_tells_excel_the_separator(first: str, tmp_path: Path) -> None:
+    assert sheet(tmp_path, first + "x;y;z;u_a;v_a\n1;2;3;4;5\n").xyz.tolist() == [[1, 2, 3]]
+
+
+def test_rows_of_separators_and_empty_columns_are_nothing(tmp_path: Path) -> None:
+    read = sheet(tmp_path, "x;y;z;u_a;v_a;;\n1;2;3;4;5;;\n;;;;;;\n6;7;8;9;10;;\n;;;;;;\n")
+    assert read.xyz.tolist() == [[1, 2, 3], [6, 7, 8]]
+    with pytest.raises(DatasetError, match="line 3: 4 cells"):
+        sheet(tmp_path, "x;y;z;u_a;v_a;\n1;2;3;4;5;\n1;2;3;4\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "label", "axis", "unit"),
+    [
+        ("u_cam 1 [left]", "cam 1 [left]", "u", ""),  # as in docs/formats.md: the name may be anything
+        ("U_cam1", "cam1", "u", ""),
+        ("Kamera 1 x", "Kamera 1", "x", ""),
+        ("x [px] ", "", "x", "px"),
+        ("cam1_x_px", "cam1", "x", "px"),
+        ("X (mm)", "", "x", "mm"),
+        ("x in µm", "", "x", "µm"),
+        ("px1", "", "", ""),
+        ("likelihood", "", "", ""),
+        ("x_left_y", "", "", ""),
+        ("max", "", "", ""),
+        ("box", "", "", ""),
+    ],
+)
+def test_a_heading_is_taken_apart(text: str, label: str, axis: str, unit: str) -> None:
+    heading = take_apart(text.strip())
+    assert (heading.label, heading.axis, heading.unit) == (label, axis, unit)
+
+
+def test_names_that_only_cameras_have() -> None:
+    assert all(is_camera_name(name, False) for name in ("cam1", "Kamera 2", "left", "top view", "GoPro 3", "camera_A"))
+    assert not any(is_camera_name(name, False) for name in ("1", "A", "nose", "pt1_cam1", "marker1", "c1", "left eye"))
+    assert is_camera_name("1", True)
+    assert is_camera_name("c1", True)
+
+
+def test_a_header_of_many_columns_takes_linear_time(tmp_path: Path) -> None:
+    """60 s once for 30,000 columns of points.csv; now half a second."""
+    many = [f"c{i}" for i in range(30_000)]
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    (folder / "dataset.toml").write_text('name = "a"\nlength_unit = "mm"\n[[cameras]]\nname = "a"\n')
+    (folder / "points.csv").write_text(f"point,shot,x,y,z,{','.join(many)}\np,p,1,2,3{',7' * len(many)}\n")
+    (folder / "observations.csv").write_text("point,camera,u,v\np,a,1,2\n")
+    began = time.process_time()
+    assert len(read_dataset(folder).positions.extra) == 30_000
+    assert len(read_headings(["u_a", "v_a", *many], "w.csv").further) == 30_000
+    assert time.process_time() - began < 20.0  # a slow machine; quadratic took minutes
