@@ -241,6 +241,12 @@ def test_one_line_says_how_the_headings_were_read(tmp_path: Path) -> None:
     assert sheet(tmp_path, "point,x,y,z,u_a,v_a\np,1,2,3,4,5\n").notes == ()
 
 
+def test_shots_stay_shots(tmp_path: Path) -> None:
+    assert sheet(tmp_path, "point,shot,x,y,z,u_a,v_a\np,s,1,2,3,4,5\n").shots.tolist() == ["s"]
+    long = sheet(tmp_path, "point,shot,camera,x,y,z,u,v\np,s,a,1,2,3,4,5\np,s,b,1,2,3,4,5\n")
+    assert long.shots.tolist() == ["s"]
+
+
 def test_words_for_missing_views_are_counted(tmp_path: Path) -> None:
     read = sheet(tmp_path, "u_a,v_a,u_b,v_b\nn/a,n/a,1,2\n-,-,3,4\nNaN,NaN,5,6\n-1,-1,7,8\n,,9,9.5\n0,0,1,1\n")
     assert read.observations.seen[:, 0].tolist() == [False] * 6

@@ -147,7 +147,8 @@ def read_headings(header: Sequence[str], place: str) -> Headings:
         camera, pixels = "", _find_pixels(rest, bool(positions), place)
     taken = {*positions, camera, *(column for pair in pixels.values() for column in pair)}
     point = _find_point([text for text in header if text not in taken], place)
-    other = [text for text in header if text not in taken and text not in (point, *SD_POINT)]
+    known = ("shot", *SD_POINT) if positions else SD_POINT
+    other = [text for text in header if text not in taken and text not in (point, *known)]
     times = [text for text in other if _squeezed(text) in _TIME_WORDS]
     views, further = _find_view_columns(other, list(pixels), place)
     return Headings(

@@ -72,9 +72,9 @@ def pivot(table: Columns, headings: Headings, points: Sequence[str]) -> Brought:
         numbers |= {f"{name}_{camera}": values[:, j] for camera, j in camera_of.items()}
     texts: dict[str, list[str]] = {"point": list(row_of)}
     of_views = list[str]()
-    for column in (column for column in headings.further if column in table.texts):
+    for column in (column for column in table.texts if column in (*headings.further, "shot")):
         cells = np.array(table.texts[column], dtype=np.str_)
-        if (cells == cells[first][k]).all():
+        if (cells == cells[first][k]).all() or column == "shot":
             texts[column] = cells[first].tolist()
             continue
         of_views.append(column)
@@ -82,7 +82,7 @@ def pivot(table: Columns, headings: Headings, points: Sequence[str]) -> Brought:
         spread[k, c] = cells
         texts |= {f"{column}_{camera}": spread[:, j].tolist() for camera, j in camera_of.items()}
     columns = Columns(texts, numbers, len(row_of), lambda i: table.place(int(first[i])))
-    further = tuple(column for column in texts if column in headings.further and column != "shot")
+    further = tuple(column for column in texts if column in headings.further)
     return Brought(columns, tuple(camera_of), tuple(of_views), further)
 
 
