@@ -107,6 +107,7 @@ TEARDOWN_SECONDS = 3.0
 """What a busy machine may take to end a process whose session is closed."""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can answer")
 def test_sigterm_closes_the_page_as_ctrl_c_does(tmp_path: Path) -> None:
     pytest.importorskip("viser")
@@ -119,6 +120,7 @@ def test_sigterm_closes_the_page_as_ctrl_c_does(tmp_path: Path) -> None:
     Session.open(tmp_path / "s").close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can answer")
 def test_sigterm_ends_a_session_that_goes_by_itself(tmp_path: Path) -> None:
     words = "acquire s --rig stereo --unattended --speed 1000 -v"
@@ -135,6 +137,7 @@ def test_sigterm_ends_a_session_that_goes_by_itself(tmp_path: Path) -> None:
         assert len(session.data) == len(read_dataset(tmp_path / "s")) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can answer")
 def test_sigterm_cuts_off_what_waits_for_a_camera(tmp_path: Path) -> None:
     pytest.importorskip("viser")

@@ -101,6 +101,7 @@ ODD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unusual", ODD.values(), ids=ODD.keys())
 def test_odd_cameras_measure_as_well_as_ordinary_ones(unusual: Unusual) -> None:
     known, new = odd_rig(unusual)

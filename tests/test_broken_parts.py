@@ -41,6 +41,7 @@ def broken(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return kind
 
 
+@pytest.mark.slow
 @each_kind
 def test_what_needs_its_kind_is_stopped_and_says_which_part(broken: str, cli: Cli, made: Path) -> None:
     ran = cli(*NEEDS[broken].format(rig=made / "rig").split())
@@ -51,6 +52,7 @@ def test_what_needs_its_kind_is_stopped_and_says_which_part(broken: str, cli: Cl
     assert "fix: mend or update" in told
 
 
+@pytest.mark.slow
 @each_kind
 def test_what_does_not_need_its_kind_goes_on(broken: str, cli: Cli, made: Path) -> None:
     rig = made / "rig"
@@ -71,6 +73,7 @@ def test_the_other_drivers_work(broken: str, cli: Cli, tmp_path: Path) -> None:
     assert "csv:FILE" in told
 
 
+@pytest.mark.slow
 def test_a_package_that_is_really_installed(tmp_path: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a process of its own, with the folder that pip leaves."""
     about = tmp_path / "vendor_parts-1.0.dist-info"

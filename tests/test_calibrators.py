@@ -269,6 +269,7 @@ def test_the_same_seed_gives_the_same_bits(case: Case) -> None:
     np.testing.assert_array_equal(again.cov, expected.cov)
 
 
+@pytest.mark.slow
 @every_case
 def test_refit_keeps_method_and_options(case: Case, tmp_path: Path) -> None:
     data, held_out = sets()

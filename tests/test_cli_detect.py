@@ -87,6 +87,7 @@ def test_without_a_radius_the_outline_is_what_is_given_and_it_says_so(photos: Pa
     assert "outline_u" not in read_dataset(photos).observations.extra
 
 
+@pytest.mark.slow
 def test_json_and_going_on_where_it_stopped(photos: Path, cli: Cli) -> None:
     first = json.loads(cli("detect", photos, "--json", "--no-overlays")[1])
     again = json.loads(cli("detect", photos, "--json", "--no-overlays")[1])
@@ -96,6 +97,7 @@ def test_json_and_going_on_where_it_stopped(photos: Path, cli: Cli) -> None:
     assert once_more["resumed"] == 0
 
 
+@pytest.mark.slow
 def test_one_click_teaches_what_the_ball_looks_like(photos: Path, cli: Cli) -> None:
     data = read_dataset(photos)
     u, v = (float(x) for x in np.rint(data.observations.uv[3, 0]))

@@ -139,6 +139,7 @@ def check_kill(folder: Path, victim: Victim, old: Any, new: Any, sources: dict[s
     return outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("victim", VICTIMS, ids=str)
 def test_killed_before_any_of_its_changes_the_old_or_the_new_is_there(
     victim: Victim, template: Path, tmp_path: Path

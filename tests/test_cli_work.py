@@ -152,6 +152,7 @@ def four_cameras(cli: Cli) -> None:
     shutil.move("rig/check", "check")
 
 
+@pytest.mark.slow
 def test_calibrate_says_which_views_it_rejected(cli: Cli) -> None:
     four_cameras(cli)
     wrong = displaced(Path("rig"), {3: "cam3", 17: "cam5"})
@@ -298,6 +299,7 @@ def test_the_unit_of_what_is_measured_does_not_matter_and_that_of_known_points_d
     assert "is in m, and the calibration is in mm" in ran.err
 
 
+@pytest.mark.slow
 def test_cameras_and_without(cli: Cli) -> None:
     cli("simulate", "rig", "--positions", "random", "--points", "60", "--check", "20")
     assert cli("calibrate", "rig", "-o", "a.implicam", "--cameras", "cam2, cam3").code == 0
@@ -401,6 +403,7 @@ def test_the_same_command_writes_the_same_bytes(made: Path, cli: Cli) -> None:
     assert files(Path("again")) == files(made / "rig")
 
 
+@pytest.mark.slow
 def test_the_classical_way_on_the_command_line(made: Path, cli: Cli) -> None:
     assert cli("simulate", "boards", "--target", "boards", "--cameras", "2R", "--seed", "1", "--pairs", "6").code == 0
     ran = cli("calibrate", made / "rig", "--boards", "boards", "-o", "b.implicam")  # nobody means another method

@@ -124,6 +124,7 @@ def mutated(content: bytes, rng: random.Random) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_fuzz(form: str, tmp_path: Path) -> None:
     """Whatever is done to the bytes: a valid dataset, or an error that names the file. Never anything else."""

@@ -270,6 +270,7 @@ def test_what_does_not_count_is_computed_again_and_noted(tmp_path: Path) -> None
     assert any("2 results" in note and "other options" in note for note in results.notes)
 
 
+@pytest.mark.slow
 def test_bad_cells_are_reported_and_the_others_go_on(tmp_path: Path) -> None:
     journal, folder = tmp_path / "journal", tmp_path / "out"
     kinds = ("error", "ours", "exit", "kill", "odd")
@@ -318,6 +319,7 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert [path.name for path in folder.rglob("*") if "partial" in path.name] == []
 
 
+@pytest.mark.slow
 def test_two_runs_on_one_folder_do_no_harm(tmp_path: Path) -> None:
     journal, folder = tmp_path / "journal", tmp_path / "out"
     cells = squares(10, journal, seconds=0.1)

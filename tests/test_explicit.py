@@ -195,6 +195,7 @@ def test_errors_that_neighbouring_points_share_do_not_turn_the_rig() -> None:
     assert left < 1.01 * register(measured, bent.xyz)[1]
 
 
+@pytest.mark.slow
 def test_from_boards_it_measures_close_to_the_limit_with_true_error_bars() -> None:
     """Four rigs, 200 points each: 800 ellipsoids, of which the 95 % should hold 95 ± 3 with the rigs' own scatter."""
     errors, covariances, limits, rigs = [], [], [], []
@@ -458,6 +459,7 @@ def test_wrong_views_are_rejected() -> None:
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.5
 
 
+@pytest.mark.slow
 def test_precise_boards_do_not_spoil_the_noise_of_other_views() -> None:
     """Boards found to 0.01 px with lens errors of 0.3 px say nothing about the 0.2 px of a ball: variances add."""
     rig = build_rig("bar6", seed=2, frame="random", lens_error=0.3, noise=0.01, cameras="2R")
@@ -598,6 +600,7 @@ def test_nothing_in_common_is_a_clear_error_without_known_points() -> None:
 # for and from other programs
 
 
+@pytest.mark.slow
 def test_exported_cameras_see_what_the_calibration_predicts() -> None:
     rig, _ = pair()
     xyz = points(rig, 50, 6).truth.xyz

@@ -251,6 +251,7 @@ def views_of(rig: Rig, camera: str, count: int, seed: int, **options: Any) -> tu
     return boards.views, boards.images[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("camera", "focal_sd"), [("cam2", 4.0), ("cam1", 2.0), ("cam6", 2.0)])
 def test_zhang_finds_the_lens_of_any_camera(camera: str, focal_sd: float) -> None:
     for seed in range(2):

@@ -114,6 +114,7 @@ def test_pixels_of_any_shape_cost_nothing(ratio: float) -> None:
     assert rms_held_out(stretched(ratio)) == pytest.approx(with_square_pixels(), rel=0.05)
 
 
+@pytest.mark.slow
 def test_pixels_that_are_not_square_are_told_and_exported(tmp_path: Path) -> None:
     calibration = Explicit().fit(stretched(1.333))
     assert [choice.pixels for choice in calibration.fitted.choices] == ["stretched"] * 3
@@ -192,6 +193,7 @@ def test_a_resection_finds_the_shape_of_pixels() -> None:
 # pictures that are not of the same instants
 
 
+@pytest.mark.slow
 def test_neither_camera_is_to_blame() -> None:
     """Truth: f 900, centre (639.5, 359.5), baseline 120: webcams without trigger, the board moved by N(0, 3 mm)."""
     data = read_dataset(CASES / "two-camera-noise")

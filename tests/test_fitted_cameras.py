@@ -46,6 +46,7 @@ def test_a_camera_has_its_lens_and_its_pose_in_the_world(made: RigCalibration, d
     assert bool(camera.note) == (made.method == "forward-gp")  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_info_prints_them(made: RigCalibration, cli: Cli, tmp_path: Path) -> None:
     made.save(tmp_path / "rig.implicam")
     told = cli("info", "rig.implicam", "--json").json["fitted_cameras"]

@@ -114,6 +114,7 @@ def test_a_point_takes_two_views() -> None:
     np.testing.assert_allclose(measured.xyz[4:], whole.xyz[4:], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", range(4))
 def test_one_grossly_wrong_view_is_left_out_and_named(bad: int) -> None:
     data, name = others().select(np.arange(15)), rig().cameras[bad].name
@@ -234,6 +235,7 @@ def test_a_fifth_of_wrong_detections_does_not_break_a_fit_without_a_lens() -> No
         assert np.nanmedian(np.abs(error)) < 2
 
 
+@pytest.mark.slow
 def test_nothing_but_wrong_detections_is_refused_with_a_reason() -> None:
     for seed in range(2):
         target = random_positions(rig(), 60, np.random.default_rng(seed))
@@ -426,6 +428,7 @@ def test_an_answer_turns_with_the_world() -> None:
     assert (np.abs(back - a.cov) / scale).max() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras", [["cam2", "cam3"], ["cam2", "cam3", "cam4", "cam5"]])
 def test_any_match_gives_a_sound_number_or_a_reason(cameras: list[str]) -> None:
     """Random pixels, parallel and diverging lines of sight, and the corners of the images."""

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ class Controller:
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == "ready\n"
 
-    def tell(self, line: str = "state") -> dict[str, object]:
+    def tell(self, line: str = "state") -> dict[str, Any]:
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write(line + "\n")
@@ -135,15 +136,24 @@ def test_the_arm_moves_in_metres_with_its_tool_and_orientation(controller: Contr
 
 
 def test_stop_stops_the_arm_on_its_way(controller: Controller, arm: URRobot) -> None:
+    def way() -> float:
+        x, y = controller.tell()["pose"][:2]  # m
+        return float(np.hypot(1e3 * x - 300, 1e3 * y - 200) / np.hypot(200, 300))
+
+    def stop_on_the_way() -> None:
+        while way() < 0.1:
+            time.sleep(0.02)
+        arm.stop()
+
     arm.open()
-    timer = threading.Timer(0.3, arm.stop)
-    timer.start()
+    stopper = threading.Thread(target=stop_on_the_way)
+    stopper.start()
     with pytest.raises(HardwareError, match="was stopped at") as caught:
         arm.move(np.array([500.0, 500.0, 400.0]))
-    timer.join()
+    stopper.join()
     says_all(caught.value)
     here = arm.position()
-    assert 0.1 < np.linalg.norm(here - [300, 200, 400]) / np.linalg.norm([200, 300]) < 0.9
+    assert 0.1 < np.linalg.norm(here - [300, 200, 400]) / np.hypot(200, 300) < 0.9
     time.sleep(0.1)
     assert np.array_equal(arm.position(), here)
     assert np.allclose(arm.move(np.array([300.0, 200.0, 400.0])), [300, 200, 400], atol=0.5)

@@ -109,6 +109,7 @@ def linear_views(n: int, C: int, degrees: float, seed: int) -> LinearisedViews:
     return LinearisedViews(r, D, np.broadcast_to(np.eye(2), (n, C, 2, 2)).copy(), None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("C", [2, 3, 6])
 def test_error_bars_are_those_of_the_t(C: int) -> None:
     views = linear_views(3000, C, 3.0, C)
@@ -207,6 +208,7 @@ def test_wrong_detections_anywhere_are_no_tails() -> None:
 # the whole method
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "specs", "better"), [(120, ("bar6", "dome8"), 0.94), (40, ("bar6", "dome8"), 0.95)])
 def test_heavy_tails_are_found_and_measured_with(
     n: int, specs: tuple[str, ...], better: float, monkeypatch: pytest.MonkeyPatch
@@ -255,6 +257,7 @@ def test_known_positions_that_are_off_are_no_heavy_tails() -> None:
         assert ForwardGP().fit(off).fitted.tails is None
 
 
+@pytest.mark.slow
 def test_a_gross_error_is_still_found() -> None:
     calibration, data = heavy("bar6", 120), with_noise(others("bar6"), 60)
     some = data.select(np.flatnonzero(data.observations.seen.all(axis=1))[:20])

@@ -304,6 +304,7 @@ def test_noise_is_told_from_errors_of_known_positions() -> None:
     assert noise[1] == pytest.approx(noise[0], rel=0.25)
 
 
+@pytest.mark.slow
 def test_what_is_declared_is_not_estimated() -> None:
     calibration = ForwardGP().fit(moved(known(), DOTS, 5, declared=DOTS))
     assert calibration.fitted.position_errors is None
@@ -355,6 +356,7 @@ def test_known_positions_left_out_in_closed_form_are_left_out() -> None:
         np.testing.assert_allclose(spread[row] / np.outer(sd, sd), expected / np.outer(sd, sd), atol=0.03)
 
 
+@pytest.mark.slow
 def test_cross_validation_judges_by_what_each_fold_has_found() -> None:
     data = moved(known(), DOTS, 5)
     judged = cross_validate(ForwardGP().fit, data, 3)

@@ -14,6 +14,7 @@ from implicam.logs import log_to_file
 SIMULATE = ["simulate", "rig", "--cameras", "2R", "--positions", "random", "--points", "20", "--seed", "1"]
 
 
+@pytest.mark.slow
 def test_verbose_tells_what_a_fit_does_and_without_it_nothing_is_told(cli: Cli) -> None:
     cli(*SIMULATE)
     quiet = cli("calibrate", "rig", "-o", "a.implicam", "--json")
@@ -28,6 +29,7 @@ def test_verbose_tells_what_a_fit_does_and_without_it_nothing_is_told(cli: Cli) 
     assert not logging.getLogger("implicam").handlers
 
 
+@pytest.mark.slow
 def test_detect_and_a_session_keep_a_log(cli: Cli, tmp_path: Path) -> None:
     cli("simulate", "photos", "--images", "--cameras", "2R", "--positions", "random", "--points", "1")
     assert cli("detect", "photos", "--target", "ball", "--radius", "8").code == 0

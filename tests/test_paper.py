@@ -94,6 +94,7 @@ def test_random_positions_for_the_boards_lie_where_the_boards_were() -> None:
     assert (np.ptp(inside, axis=0) > 0.9 * np.ptp(boards, axis=0)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras", ["2R", "2R2W"])
 def test_a_budget_is_so_many_pictures_of_each_camera_and_of_every_pair(cameras: str) -> None:
     source = Source(0)
@@ -629,6 +630,7 @@ def test_run_again_nothing_is_computed_twice(done: tuple[Path, Source, Any]) -> 
     assert again.summary["verdicts"] == made.summary["verdicts"]
 
 
+@pytest.mark.slow
 def test_one_experiment_keeps_the_others_in_the_account(done: tuple[Path, Source, Any]) -> None:
     out, source, made = done
     again = reproduce(["board"], out, source, TINY)

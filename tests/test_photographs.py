@@ -47,6 +47,7 @@ def test_same_seed_same_bits():
     assert abs(difference.mean()) < 1e-3  # other noise before the same background
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "bits"), [(0.01, 16), (0.05, 16), (0.02, 8)])
 def test_noise_has_the_stated_size(noise, bits):
     clean = balls(optics=STILL)

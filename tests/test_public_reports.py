@@ -111,6 +111,7 @@ def test_points_behind_a_camera_drawn_as_if_before(method: type[ic.ForwardGP] | 
     assert judged.level(0.95).ellipsoid.value > 0.85  # 60 points, of which a camera sees 35
 
 
+@pytest.mark.slow
 def test_lens_models_that_keep_different_views() -> None:
     """A fisheye that sees beyond 180 degrees: one lens model keeps 26 views, the other 24; it was a ValueError."""
 
@@ -165,6 +166,7 @@ def test_places_that_were_measured_again_are_held_out_together() -> None:
     assert any("27 known points at 9 different positions are few" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -182,6 +184,7 @@ def test_a_camera_that_is_a_picture_late_is_named(change: Callable[[Floats], Flo
     assert verdict.word != "usable"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [trajectory(120), lattice(), random_points(40)], ids=["moving", "lattice", "random"])
 @pytest.mark.parametrize("wild", [0.0, 0.1])
 def test_nothing_is_said_of_rows_that_are_right(where: Floats, wild: float) -> None:
@@ -195,6 +198,7 @@ def test_nothing_is_said_of_rows_that_are_right(where: Floats, wild: float) -> N
             assert describe_row_mistake(where, uv[:, c]) == ""
 
 
+@pytest.mark.slow
 def test_pictures_of_two_sizes() -> None:
     """Half of the recording at half the size: refused, for the reason that it is."""
     xyz = random_points(40)
@@ -250,6 +254,7 @@ def test_a_camera_of_half_the_frame_rate() -> None:
     assert describe_row_mistake(xyz, uv[:, 1]) == ""
 
 
+@pytest.mark.slow
 def test_positions_from_a_tape_measure() -> None:
     """8 mm of error in each coordinate that nobody declared: found, said, and no reason to doubt the error bars."""
     xyz = random_points(30)

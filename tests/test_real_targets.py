@@ -21,6 +21,7 @@ def two_sided_tank() -> Dataset:
     return read_dataset(REAL / "two-sided-tank")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("z", [-16.0, -8.0, 0.0])
 def test_error_bars_hold_away_from_the_planes_of_few_dots(z: float) -> None:
     data = two_sided_tank()
@@ -30,6 +31,7 @@ def test_error_bars_hold_away_from_the_planes_of_few_dots(z: float) -> None:
     assert 0.5 < found.nees.value < 5
 
 
+@pytest.mark.slow
 def test_dots_that_are_off_are_not_taken_for_heavy_tails_of_the_pixels() -> None:
     train, _ = two_sided_tank().split(45, seed=1)  # tails would gain 32 nats, the dots 10
     fitted = ForwardGP().fit(train).fitted

@@ -74,6 +74,7 @@ def test_suggest_works_with_it(made: object, cli: Cli) -> None:
     assert min(highest) >= max(target["xyz"][2] for target in usual)
 
 
+@pytest.mark.slow
 def test_acquire_works_with_it(cli: Cli, request: pytest.FixtureRequest) -> None:
     if "entry point" in request.node.name:
         pytest.skip("run for the other way")

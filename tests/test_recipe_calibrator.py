@@ -377,6 +377,7 @@ def test_one_that_predicts_pixels_says_where_to_measure_next(rig: None, cli: Cli
     assert "made by affine-cameras" not in ran.err
 
 
+@pytest.mark.slow
 def test_one_that_predicts_pixels_guides_a_session(cli: Cli, request: pytest.FixtureRequest) -> None:
     needs_one_way(request)
     ran = run(cli, "acquire s --unattended --cameras 2R --method affine-cameras --budget 12 --json")

@@ -73,6 +73,7 @@ def test_a_file_with_a_lens_that_this_version_does_not_have_is_refused_by_name(
     assert "lens of the family 'equisolid', which is not installed" in " ".join(ran.err.split())
 
 
+@pytest.mark.slow
 def test_every_command_takes_it(cli: Cli, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     if "entry point" in request.node.name:
         pytest.skip("run for the other way")

@@ -81,6 +81,7 @@ def test_what_it_cannot_heed_is_refused_and_the_rest_is_heeded() -> None:
         robot_from("toy:1", box=((0, 0, 0), (1, 1)))
 
 
+@pytest.mark.slow
 def test_a_session_is_run_with_it_and_goes_on(tmp_path: Path) -> None:
     setup = Setup(cameras=CAMERA_SPECS, robot="toy:1", trigger="toy:3", workspace=WORKSPACE, budget=9, radius=8.0)
     with open_session(tmp_path / "s", setup, say=lambda text: None) as controller:
@@ -113,6 +114,7 @@ def test_nothing_moves_in_a_dry_run(tmp_path: Path) -> None:
     assert any(text.startswith("dry run, toy:1: from (") for text in said)
 
 
+@pytest.mark.slow
 def test_a_robot_that_goes_on_by_itself_is_not_photographed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its link falls silent on the way, and comes back before it has arrived."""
     setup = Setup(cameras=CAMERA_SPECS, robot="toy:1", workspace=WORKSPACE, radius=8.0, speed=0.1)
@@ -152,6 +154,7 @@ def test_a_driver_of_a_package_is_asked_before_those_here(tmp_path: Path) -> Non
         robot_from("TOY:1", box=BOX)
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_answer_is_said_at_once_and_not_kept(cli: Cli, tmp_path: Path) -> None:
     cameras = ["--no-browser", "--port", "0", "--camera", "cam1=toy:0", "--camera", "cam2=toy:1"]
     words = ["acquire", "s", *cameras, f"--workspace={WORKSPACE}"]
@@ -168,6 +171,7 @@ def test_a_robot_that_does_not_answer_is_said_at_once_and_not_kept(cli: Cli, tmp
         assert session.settings["robot"] == "toy:1"
 
 
+@pytest.mark.slow
 def test_a_session_whose_driver_is_gone_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     open_session(tmp_path / "s", Setup(cameras=CAMERA_SPECS, robot="toy:1", workspace=WORKSPACE)).close()
     monkeypatch.setattr(registry, "entry_points", lambda **by: EntryPoints())

@@ -272,6 +272,7 @@ def test_error_against_sd_leaves_out_what_a_log_axis_cannot_show():
 # ------------------------------------------------------------------------------------------------ in a real browser
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_page_draws_in_a_browser(tmp_path: Path, chromium: dict[str, Any]):
     sync_api = pytest.importorskip("playwright.sync_api")

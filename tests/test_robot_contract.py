@@ -36,6 +36,7 @@ def test_the_toy_keeps_the_contract_in_any_unit() -> None:
     check_robot(lambda options: ToyRobot.from_spec("1", options), (BOX[0] / 1e3, BOX[1] / 1e3), metres, unit="m")
 
 
+@pytest.mark.slow
 def test_the_arm_keeps_the_contract(controller: Controller) -> None:
     def place() -> Floats:
         return 1e3 * np.array(controller.tell()["pose"][:3])
@@ -227,6 +228,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driver", BAD, ids=lambda driver: driver.__name__)
 def test_a_driver_that_breaks_it_is_found_out(driver: type[ToyRobot], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("implicam.hardware.contract.ANSWER_SECONDS", 2.0)

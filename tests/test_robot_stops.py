@@ -70,6 +70,7 @@ def waited(true: Callable[[], bool], seconds: float) -> float:
     return time.monotonic() - start
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
 @pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_the_arm_halts_when_the_session_is_ended(
@@ -91,6 +92,7 @@ def test_the_arm_halts_when_the_session_is_ended(
     assert process.returncode in (0, 130, 128 + signal.SIGTERM), out + err  # the last: cut off while it closed
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
 def test_a_robot_of_a_package_halts_at_ctrl_c(tmp_path: Path) -> None:
     pytest.importorskip("viser")

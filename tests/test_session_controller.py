@@ -83,6 +83,7 @@ def test_a_session_from_start_to_report(controller: SessionController) -> None:
     assert pictures == [f"p{i:03d}.png" for i in range(1, 13)]
 
 
+@pytest.mark.slow
 def test_the_reticle_is_where_the_ball_will_be(after_ten: SessionController) -> None:
     after_ten.go()
     assert len(after_ten.state.looks) == 2
@@ -168,6 +169,7 @@ def test_a_library_that_fails_in_its_own_way_does_not_end_the_session(controller
     assert controller.loop.points == 1
 
 
+@pytest.mark.slow
 def test_undo_takes_back_the_last_point_only(controller: SessionController) -> None:
     measured(controller, 9)
     assert controller.state.calibration is not None
@@ -183,6 +185,7 @@ def test_undo_takes_back_the_last_point_only(controller: SessionController) -> N
     assert controller.state.phase == "aim"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["camera", "robot"])
 def test_trouble_is_shown_and_the_session_waits(controller: SessionController, part: str) -> None:
     measured(controller, 3)
@@ -356,6 +359,7 @@ def test_triggered_cameras_are_asked_only_when_the_trigger_fires(controller: Ses
     assert triggered.state.cameras_with_ball == ["cam1", "cam2"]
 
 
+@pytest.mark.slow
 def test_a_session_goes_on_where_it_was(tmp_path: Path) -> None:
     with open_session(tmp_path / "s", SETUP) as controller:
         controller.start()
@@ -392,6 +396,7 @@ def test_another_rig_is_refused_and_another_budget_is_not(tmp_path: Path) -> Non
         assert Setup.from_settings(session.settings) == with_options(SETUP, budget=20)
 
 
+@pytest.mark.slow
 def test_by_itself_until_the_rule_says_stop(tmp_path: Path) -> None:
     with open_session(tmp_path / "s", replace(SETUP, below=1.0, budget=30)) as controller:
         controller.equipment.cameras[0].cover(1)  # type: ignore[attr-defined]
@@ -411,6 +416,7 @@ def test_finishing_too_early_says_how_many_are_missing(controller: SessionContro
     assert controller.state.phase == "aim"
 
 
+@pytest.mark.slow
 def test_a_fit_that_fails_at_the_end_is_trouble(controller: SessionController, monkeypatch: pytest.MonkeyPatch) -> None:
     measured(controller, 8)
 

@@ -407,6 +407,7 @@ print(at, sorted(seen))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("start", "sizes", "fewest"), [("accept", [2, 3], 40), ("undo", [1, 2], 25), ("create", [], 20)]
 )

@@ -54,6 +54,7 @@ def test_known_positions_that_are_slightly_off_are_no_doubt_where_the_fit_has_fo
     assert 0.1 < verdict.held_out.rms < 1.5 * verdict.held_out.stated
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ic.ForwardGP, ic.Explicit])
 def test_known_positions_stated_far_too_good_are_doubtful(method: type[ic.ForwardGP] | type[ic.Explicit]) -> None:
     """Off by 1 mm, stated as 0.01 mm: half of the points lay in their ellipsoids, and it was usable."""
@@ -63,6 +64,7 @@ def test_known_positions_stated_far_too_good_are_doubtful(method: type[ic.Forwar
     assert " ".join(verdict.reasons).count("The stated sds of the known positions seem too small") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sd", [0.1, 1.0])
 def test_known_positions_stated_right_are_usable(sd: float) -> None:
     data = rig(50, noise_of_positions=sd)
@@ -97,6 +99,7 @@ def test_rows_copied_are_doubtful_and_the_error_is_that_of_new_points(
     assert "found doubtful when it was made" in capsys.readouterr().err.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_one_camera_late_is_said_once() -> None:
     data = rig(40)
     uv = data.observations.uv.copy()
@@ -106,6 +109,7 @@ def test_one_camera_late_is_said_once() -> None:
     assert not any("cam2 misses" in reason or "like another camera" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 def test_a_camera_that_moved_halfway_is_named() -> None:
     """As people report who bump a tripod while they calibrate."""
     built = build_rig("bar3", seed=3)
@@ -135,6 +139,7 @@ def test_residuals_with_two_means_are_a_move_and_a_few_wrong_views_are_none() ->
     assert _moved_at(np.zeros((11, 2))) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("off", "said"),
     [
@@ -164,6 +169,7 @@ def test_two_pictures_of_one_camera_are_not_usable_though_the_error_bars_are_hon
     assert "different directions" in " ".join(verdict.reasons) or "no measurement" in " ".join(verdict.reasons)
 
 
+@pytest.mark.slow
 def test_marks_that_came_by_the_api_are_said() -> None:
     data = rig(25)
     uv = data.observations.uv.copy()

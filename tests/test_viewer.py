@@ -516,6 +516,7 @@ def by_hand(visitor: Visitor, hand: Path) -> None:
     visitor.reads("2 points · 1 skipped")
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_whole_session_in_a_browser(tmp_path: Path, chromium: dict[str, Any]) -> None:
     pytest.importorskip("viser")

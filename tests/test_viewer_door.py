@@ -52,6 +52,7 @@ def test_viser_talks_through_the_door(viser_page):
             assert refused.value.response.status_code == expected
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_a_browser_shows_the_page_but_not_in_a_foreign_frame_nor_for_a_foreign_server(viser_page, chromium, tmp_path):
     sync_api = pytest.importorskip("playwright.sync_api")

@@ -53,6 +53,7 @@ CASES = [(spec, count, size) for spec, count in (("bar3", 1), ("bar4", 1), ("bar
 CASES += [("bar6", 1, 10), ("bar6", 1, 300), ("dome8", 1, 10), ("dome8", 1, 300), ("dome8", 2, 3), ("dome8", 2, 300)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spec", "count", "size"), CASES)
 def test_the_same_views_are_left_out_as_by_trying_all(spec: str, count: int, size: float) -> None:
     posterior = fitted(spec).posterior
@@ -68,6 +69,7 @@ def test_the_same_views_are_left_out_as_by_trying_all(spec: str, count: int, siz
     assert (left_out[decided] == wrong[decided]).all(axis=1).mean() > 0.95
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [3, 50])
 def test_tied_cameras_too(size: float) -> None:
     calibration = fitted("bar6", 0.2)
@@ -80,6 +82,7 @@ def test_tied_cameras_too(size: float) -> None:
     assert left_out.any(axis=1).mean() > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spec", "count"), [("dome8", 3), ("dome16", 4), ("dome16", 6)])
 def test_more_than_two_wrong_views_among_many(spec: str, count: int) -> None:
     for size in (5, 300):
