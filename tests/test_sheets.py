@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import random
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
+from dataset_files import assert_same
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset, write_dataset
 from implicam.dataset.headings import is_camera_name, read_headings, take_apart
-from implicam.errors import DatasetError
+from implicam.errors import DatasetError, ImplicamError, UsageError
+from implicam.measurement import Measurement
 
 SPREADSHEETS = 30
 
@@ -283,6 +286,82 @@ def test_columns_of_views_go_to_their_cameras(tmp_path: Path) -> None:
 @pytest.mark.parametrize("first", ["sep=;\n", "sep=;\r\n", '"sep=;"\n'])
 def test_the_line_that_tells_excel_the_separator(first: str, tmp_path: Path) -> None:
     assert sheet(tmp_path, first + "x;y;z;u_a;v_a\n1;2;3;4;5\n").xyz.tolist() == [[1, 2, 3]]
+
+
+def test_pixels_from_one_and_from_below(tmp_path: Path) -> None:
+    path = tmp_path / "w.csv"
+    path.write_text("u_a,v_a,u_b,v_b\n1,1,640,480\n0,0,-1,-1\n")
+    read = read_dataset(path, unit="mm", first_pixel=1, v_up=True, size="640x480")
+    np.testing.assert_array_equal(read.observations.uv[0], [[0, 479], [639, 0]])
+    assert not read.observations.seen[1].any()  # marks are marks as the file has them
+    assert [(camera.width, camera.height) for camera in read.cameras] == [(640, 480)] * 2
+    assert any("counted from 1" in note for note in read.notes)
+    assert any("bottom row" in note for note in read.notes)
+    sizes = read_dataset(path, unit="mm", size={"a": (640, 480), "b": (1280, 800)})
+    assert sizes.cameras[1].width == 1280
+    assert sizes.observations.uv[0, 0].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"first_pixel": 2}, "the first pixel cannot have the number 2"),
+        ({"v_up": True}, "the picture's height of camera 'a' is not known"),
+        ({"v_up": True, "size": "b=640x480"}, "the picture's height of camera 'a' is not known"),
+        ({"size": "640*480"}, "'640*480' is no size of pictures"),
+        ({"size": "c=640x480"}, "--size names a camera 'c', which is not there"),
+        ({"size": "64x48"}, "far outside the 64 x 48 image"),
+    ],
+)
+def test_options_that_do_not_fit_the_table(options: dict[str, Any], said: str, tmp_path: Path) -> None:
+    path = tmp_path / "w.csv"
+    path.write_text("u_a,v_a,u_b,v_b\n1,1,640,480\n")
+    with pytest.raises(ImplicamError) as caught:
+        read_dataset(path, unit="mm", **options)
+    assert said in caught.value.what
+    assert caught.value.fix
+
+
+def test_a_size_that_contradicts_the_data(tmp_path: Path) -> None:
+    path = tmp_path / "w.csv"
+    path.write_text("u_a,v_a\n1,1\n")
+    write_dataset(read_dataset(path, unit="mm", size="640x480"), tmp_path / "rig.npz")
+    assert read_dataset(tmp_path / "rig.npz", size="640x480").cameras[0].width == 640
+    with pytest.raises(UsageError, match=r"pictures of 640 x 480 pixels, and --size says 480 x 640"):
+        read_dataset(tmp_path / "rig.npz", size=(480, 640))
+
+
+FORMULAS = ["=1+1", "+M1", "@SUM(A1)", "-M 1", "'=1", "''=1", "'", "'name", "-1.5e3", "+7", "-", "=", "a=1", "'-5"]
+
+
+@pytest.mark.parametrize("form", ["rig", "rig.csv"])
+def test_no_name_is_a_formula_and_all_come_back(form: str, tmp_path: Path) -> None:
+    points = np.array(FORMULAS)
+    uv = np.arange(4.0 * len(points)).reshape(-1, 2, 2) + 1
+    known = KnownPositions(points, np.full((len(points), 3), -1.5), np.full((len(points), 3), np.nan), {"=c": points})
+    observations = Observations(
+        points, (Camera("=a"), Camera("b")), uv, np.full(uv.shape, np.nan), {"n": np.stack([points] * 2, 1)}
+    )
+    data = Dataset("n", "mm", observations, known)
+    write_dataset(data, tmp_path / form)
+    files = [tmp_path / form] if (tmp_path / form).is_file() else sorted((tmp_path / form).glob("*.csv"))
+    for file in files:
+        for row in csv.reader(file.read_text().splitlines()):
+            for cell in row:
+                assert cell[:1] not in tuple("=+@-") or re.fullmatch(r"[-+][\d.e]+", cell)
+    assert_same(read_dataset(tmp_path / form), data)
+
+
+def test_names_in_measured_csv_are_no_formulas(tmp_path: Path) -> None:
+    nothing = np.full((2, 3), np.nan)
+    measured = Measurement(
+        np.array(["=1+1", "b"]), nothing, np.full((2, 3, 3), np.nan), np.zeros(2, int), nothing[:, 0],
+        np.array(["-seen by none", ""]), "mm",
+    )  # fmt: skip
+    measured.write_csv(tmp_path / "m.csv")
+    rows = list(csv.reader((tmp_path / "m.csv").read_text().splitlines()))
+    assert rows[1][0] == "'=1+1"
+    assert rows[1][12] == "'-seen by none"
 
 
 def test_rows_of_separators_and_empty_columns_are_nothing(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats, Names
+from implicam.dataset.folder import csv_text
 from implicam.files import write_text
 
 MEASURED_COLUMNS = (
@@ -98,16 +97,14 @@ class Measurement:
         Raises:
             ImplicamError: It cannot be written.
         """
-        buffer = io.StringIO(newline="")
-        writer = csv.writer(buffer, lineterminator="\n")
-        writer.writerow(MEASURED_COLUMNS)
         off_diagonal = self.cov[:, [0, 0, 1], [1, 2, 2]]
         numbers = np.concatenate([self.xyz, self.sd, off_diagonal], axis=1)
+        rows = []
         for i, name in enumerate(self.points):
             row = ["" if np.isnan(x) else repr(float(x)) for x in numbers[i]]
             p = self.consistency[i]
             share = self.share_calibration[i]
             tail = [str(int(self.views[i])), "" if np.isnan(p) else repr(float(p)), str(self.reason[i])]
             tail.append("" if np.isnan(share) else repr(float(share)))
-            writer.writerow([str(name), *row, *tail])
-        write_text(Path(path), buffer.getvalue())
+            rows.append([str(name), *row, *tail])
+        write_text(Path(path), csv_text(MEASURED_COLUMNS, rows))

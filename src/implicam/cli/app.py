@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -12,7 +13,7 @@ import typer
 
 from implicam.calibration_file import package_version
 from implicam.calibrators import DEFAULT_METHOD
-from implicam.dataset import Dataset, read_dataset
+from implicam.dataset import Dataset, TableOptions, read_dataset
 from implicam.errors import UsageError, import_extra
 from implicam.files import refuse_folder
 
@@ -67,9 +68,6 @@ def command(name: str) -> Callable[[Function], Function]:
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="The same seed gives the same numbers.")]
-Unit = Annotated[
-    str | None, typer.Option("--unit", metavar="UNIT", help="Length unit of a wide CSV that does not state it.")
-]
 Method = Annotated[
     str | None, typer.Option("--method", metavar="NAME", help=f"Calibration method (default {DEFAULT_METHOD}).")
 ]
@@ -85,9 +83,9 @@ LeaveOut = Annotated[
 Report = Annotated[Path | None, typer.Option("--report", help="Also write a one-page HTML report with a 3D view.")]
 
 
-def read(path: Path, unit: str | None, cameras: str | None = None, without: str | None = None) -> Dataset:
+def read(path: Path, table: TableOptions, cameras: str | None = None, without: str | None = None) -> Dataset:
     """The dataset, with the cameras that were asked for."""
-    return chosen(read_dataset(path, unit=unit), cameras, without)
+    return chosen(read_dataset(path, **asdict(table)), cameras, without)
 
 
 def chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,7 +36,6 @@ from implicam.cli.app import (
     Method,
     Report,
     Seed,
-    Unit,
     Without,
     app,
     chosen,
@@ -48,7 +47,7 @@ from implicam.cli.app import (
     need_plotly,
     read,
 )
-from implicam.cli.options import OptionsOfParts, calibrator_from_options, options_of_calibrators
+from implicam.cli.options import OptionsOfParts, calibrator_from_options, options_of_calibrators, with_table_options
 from implicam.cli.settings import (
     SettingsFile,
     ShowSettings,
@@ -57,7 +56,9 @@ from implicam.cli.settings import (
     settings_text,
     with_settings,
 )
-from implicam.dataset import Dataset, read_dataset, write_dataset
+from implicam.dataset import Dataset, TableOptions, write_dataset
+from implicam.dataset.table_options import DOCUMENTED
+from implicam.dataset.wide import is_unit_missing
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import refuse_folder, toml_text
@@ -105,7 +106,7 @@ def _calibrate(
     points: Annotated[int | None, typer.Option(min=1, metavar="N", help="Use so many points, drawn at random.")] = None,
     cameras: Cameras = None,
     without: Without = None,
-    unit: Unit = None,
+    table: TableOptions = DOCUMENTED,
     settings: SettingsFile = None,
     seed: Seed = 0,
     force: Annotated[bool, typer.Option("--force", help="Write the file even if it is not usable.")] = False,
@@ -114,7 +115,7 @@ def _calibrate(
 ) -> None:
     """Learn the rig from known points; points kept back with --points are there for `implicam evaluate`."""
     must_be_calibration(output)
-    data = read(dataset, unit, cameras, without)
+    data = read(dataset, table, cameras, without)
     if points is not None and points != len(data):
         data, _ = data.split(points, seed=seed)
     if data.known is None and has_boards(data) and not _any_given(method, options):
@@ -131,7 +132,9 @@ def _calibrate(
         raise typer.Exit(1)
 
 
-calibrate_command = command("calibrate")(OptionsOfParts(_calibrate, "method", options_of_calibrators))
+calibrate_command = command("calibrate")(
+    OptionsOfParts(with_table_options(_calibrate), "method", options_of_calibrators)
+)
 
 
 def _any_given(method: str | None, options: Mapping[str, Any]) -> bool:
@@ -162,11 +165,12 @@ def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path |
 
 
 @command("measure")
+@with_table_options
 def measure_command(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     dataset: Annotated[Path, typer.Argument(help="What the cameras saw.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The table to write.")] = Path("measured.csv"),
-    unit: Unit = None,
+    table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
@@ -174,7 +178,7 @@ def measure_command(
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
-    data = _read_to_measure(dataset, unit, fitted.data.length_unit)
+    data = _read_to_measure(dataset, table, fitted.data.length_unit)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
         measured = fitted.measure(data.observations)
@@ -208,14 +212,14 @@ def measure_command(
     raise typer.Exit(int(bool(measured.alarm)))
 
 
-def _read_to_measure(path: Path, unit: str | None, likely: str) -> Dataset:
-    """The unit of data to be measured does not matter; a wide CSV that states none is read as in the `likely` one."""
+def _read_to_measure(path: Path, table: TableOptions, likely: str) -> Dataset:
+    """The unit of data to be measured does not matter; a table that states none is read as in the `likely` one."""
     try:
-        return read_dataset(path, unit=unit)
-    except DatasetError:
-        if unit is not None or path.suffix.lower() != ".csv":
+        return read(path, table)
+    except DatasetError as error:
+        if table.unit is not None or not is_unit_missing(error):
             raise
-        return read_dataset(path, unit=likely)
+        return read(path, replace(table, unit=likely))
 
 
 def _typical(sd: Any) -> list[float]:
@@ -234,7 +238,7 @@ def _evaluate(
     method: Method = None,
     cameras: Cameras = None,
     without: Without = None,
-    unit: Unit = None,
+    table: TableOptions = DOCUMENTED,
     seed: Seed = 0,
     json: Json = False,
     **options: Any,
@@ -248,10 +252,10 @@ def _evaluate(
         must_not_replace(report, file, dataset)
     with show.progress(json) as progress:
         if dataset is not None:
-            evaluation = evaluate(load_calibration(file), read(dataset, unit, cameras, without))
+            evaluation = evaluate(load_calibration(file), read(dataset, table, cameras, without))
         else:
             make = partial(calibrator_from_options, method, seed, options)
-            fit, data = _fit_and_data(file, make, cameras, without, unit, given)
+            fit, data = _fit_and_data(file, make, cameras, without, table, given)
             if cv is not None:
                 evaluation = cross_validate(fit, data, cv, seed=seed, progress=progress)
             else:
@@ -277,18 +281,23 @@ def _check_evaluate(dataset: Path | None, cv: int | None, leave_out: str | None,
         raise _own_options()
 
 
-evaluate_command = command("evaluate")(OptionsOfParts(_evaluate, "method", options_of_calibrators))
+evaluate_command = command("evaluate")(OptionsOfParts(with_table_options(_evaluate), "method", options_of_calibrators))
 
 
 def _fit_and_data(
-    path: Path, make: Callable[[], Calibrator], cameras: str | None, without: str | None, unit: str | None, given: bool
+    path: Path,
+    make: Callable[[], Calibrator],
+    cameras: str | None,
+    without: str | None,
+    table: TableOptions,
+    given: bool,
 ) -> tuple[Any, Dataset]:
     if path.suffix.lower() == CALIBRATION_SUFFIX:
         if given:
             raise _own_options()
         fitted = load_calibration(path)
         return fitted.refit, chosen(fitted.data, cameras, without)
-    return make().fit, read(path, unit, cameras, without)
+    return make().fit, read(path, table, cameras, without)
 
 
 def _own_options() -> UsageError:
@@ -326,11 +335,12 @@ def _write_report(evaluation: Evaluation, path: Path) -> None:
 
 
 @command("report")
+@with_table_options
 def report_command(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     dataset: Annotated[Path | None, typer.Argument(help="Known points; without, its own by 10-fold.")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="The page to write.")] = Path("report.html"),
-    unit: Unit = None,
+    table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
     """Write a one-page HTML report with an interactive 3D view."""
@@ -342,7 +352,7 @@ def report_command(
         if dataset is None:
             evaluation = cross_validate(fitted.refit, fitted.data, min(10, len(fitted.data)), progress=progress)
         else:
-            evaluation = evaluate(fitted, read(dataset, unit))
+            evaluation = evaluate(fitted, read(dataset, table))
     _write_report(evaluation, output)
     if json:
         show.emit_json({"report": str(output), "how": evaluation.how})
@@ -351,17 +361,18 @@ def report_command(
 
 
 @command("convert")
+@with_table_options
 def convert_command(
     dataset: Annotated[Path, typer.Argument(help="A folder, .csv, .parquet or .npz.")],
     out: Annotated[Path, typer.Argument(help="The same, in another form: the ending chooses.")],
-    unit: Unit = None,
+    table: TableOptions = DOCUMENTED,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is a folder that exists.")] = False,
     json: Json = False,
 ) -> None:
     """Write a dataset in another form: folder, wide CSV, Parquet, NPZ; nothing is lost."""
     if out.exists() and out.resolve() == dataset.resolve():
         raise UsageError(f"{dataset} would be replaced by itself.", fix="give another name to write to")
-    data = read_dataset(dataset, unit=unit)
+    data = read(dataset, table)
     write_dataset(data, out, overwrite=overwrite)
     if json:
         show.emit_json({"dataset": str(out), "points": len(data), "notes": list(data.notes)})

@@ -12,15 +12,18 @@ import typer
 
 from implicam.calibrators import calibrator_from_name, compared_names, library_of
 from implicam.cli import show
-from implicam.cli.app import Cameras, Json, LeaveOut, Unit, Without, check_figure, command, must_be_shot, read
+from implicam.cli.app import Cameras, Json, LeaveOut, Without, check_figure, command, must_be_shot, read
 from implicam.cli.compare_table import compare_failures, compare_table
+from implicam.cli.options import with_table_options
 from implicam.compare import Split, Trial, as_json, compare_on, plane_splits, random_splits, shot_splits, summarise
-from implicam.dataset import Dataset
+from implicam.dataset import Dataset, TableOptions
+from implicam.dataset.table_options import DOCUMENTED
 from implicam.errors import UsageError
 from implicam.files import replacing
 
 
 @command("compare")
+@with_table_options
 def compare_command(
     dataset: Annotated[Path, typer.Argument(help="Known points.")],
     methods: Annotated[
@@ -44,14 +47,14 @@ def compare_command(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf or .svg).")] = None,
     cameras: Cameras = None,
     without: Without = None,
-    unit: Unit = None,
+    table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
     """All methods on the same splits: one table, one figure, error bars over the splits."""
     if output is not None:
         check_figure(output)
-    data = read(dataset, unit, cameras, without)
-    check_data = None if check is None else read(check, unit, cameras, without)
+    data = read(dataset, table, cameras, without)
+    check_data = None if check is None else read(check, table, cameras, without)
     splits = _splits(data, train, seeds, check_data, leave_out, lattice)
     names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
     chosen = {name: calibrator_from_name(name) for name in names}

@@ -6,15 +6,17 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import typer
 
 from implicam.calibrators import CALIBRATORS, Calibrator, calibrator, every_option, method_for, options_of
-from implicam.dataset import read_dataset
+from implicam.dataset import TableOptions, read_dataset
 from implicam.registry import Option
 
 Options = Mapping[str, Mapping[str, inspect.Parameter]]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class OptionsOfParts:
@@ -86,6 +88,27 @@ def options_of_fields(made: type, *names: str) -> dict[str, inspect.Parameter]:
         described: Any = Annotated[(option.kind or kind) | None, option]
         found[name] = fields[name].replace(default=None, annotation=described)
     return found
+
+
+def with_table_options(function: Function) -> Function:
+    """A command whose parameter `table` is made of the options that tables without a description need.
+
+    Args:
+        function: with a keyword parameter `table`, a `TableOptions`.
+    """
+    own = list(inspect.signature(function, eval_str=True).parameters.values())
+    place = [parameter.name for parameter in own].index("table")
+    options = _merged({"": options_of_fields(TableOptions)})
+
+    @functools.wraps(function)
+    def run(**given: Any) -> Any:
+        stated = {option.name: given.pop(option.name, None) for option in options}
+        table = TableOptions(**{name: value for name, value in stated.items() if value is not None})
+        return function(table=table, **given)
+
+    signature = inspect.Signature([*own[:place], *options, *own[place + 1 :]])
+    run.__signature__ = signature  # type: ignore[attr-defined]
+    return cast(Function, run)
 
 
 def calibrator_from_options(method: str | None, seed: int, options: Mapping[str, Any]) -> Calibrator:

@@ -20,6 +20,7 @@ from implicam.dataset.model import (
     covariance_from_columns,
     join,
 )
+from implicam.dataset.table_options import TableOptions, size_text
 from implicam.dataset.wide import (
     arrays_from_dataset,
     dataset_from_arrays,
@@ -41,6 +42,7 @@ __all__ = [
     "KnownPositions",
     "Names",
     "Observations",
+    "TableOptions",
     "Truth",
     "arrays_from_dataset",
     "covariance_from_columns",
@@ -55,20 +57,32 @@ __all__ = [
 ]
 
 
-def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
-    """Read a dataset from a folder, a wide .csv, a .parquet or an .npz.
+def read_dataset(
+    path: str | Path,
+    *,
+    unit: str | None = None,
+    first_pixel: int = 0,
+    v_up: bool = False,
+    size: str | tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
+) -> Dataset:
+    """Read a dataset from a folder, a .csv, a .parquet or an .npz.
 
     Args:
         path: The folder or file.
-        unit: The length unit of a wide CSV without a description beside it; None to use the unit that the data state.
+        unit: The length unit of a table without a description; None to use the unit that the data state.
+        first_pixel: How the file counts the centre of the first pixel, 0 or 1.
+        v_up: Whether it counts v from the bottom row upwards.
+        size: Width and height of the pictures, for all cameras or for each by name; None to use what the data state.
 
     Returns:
-        The dataset, with marks for missing views read as missing.
+        The dataset, with marks for missing views read as missing, and pixels counted as docs/conventions.md says.
 
     Raises:
         DatasetError: If something is wrong, or the data state another unit; names file, line, value and cure.
+        UsageError: If the options contradict the data.
     """
     path = Path(path)
+    options = TableOptions(unit, first_pixel, v_up, size_text(size))
     try:
         data = _read(path, unit)
     except OSError as error:  # permissions, a broken disk, a name too long
@@ -81,7 +95,7 @@ def read_dataset(path: str | Path, *, unit: str | None = None) -> Dataset:
             why="its own description states the length unit",
             fix="leave out --unit, or correct the description",
         )
-    return remove_marks(data)
+    return options.apply(remove_marks(data))  # a mark is one as the file has it
 
 
 def _read(path: Path, unit: str | None) -> Dataset:

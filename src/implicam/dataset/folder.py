@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from implicam.dataset.cells import guard_cell
 from implicam.dataset.model import (
     POINT_COLUMNS,
     SD_POINT,
@@ -341,7 +342,7 @@ class _Lines(list[str]):
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """The text of a comma-separated table.
+    """The text of a comma-separated table, in which no spreadsheet finds a formula.
 
     Args:
         header: The names of the columns.
@@ -349,6 +350,6 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """
     lines = _Lines()
     writer = csv.writer(lines, lineterminator=_Lines.ENDING)
-    writer.writerow(header)
-    writer.writerows(rows)
+    writer.writerow(map(guard_cell, header))
+    writer.writerows([guard_cell(cell) for cell in row] for row in rows)
     return "\n".join([*lines, ""])

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from implicam.dataset.cells import unguard_cell
 from implicam.dataset.model import (
     MAX_CELL_CHARACTERS,
     SD_POINT,
@@ -194,7 +195,7 @@ def split_lines(path: Path, separator: str = ",") -> Iterator[Row]:
     try:
         for row in reader:
             if len(row) > 1 or (row and row[0].strip()):
-                yield first, row
+                yield first, [unguard_cell(cell) for cell in row] if _may_be_guarded(row) else row
             first = reader.line_num + 1
     except csv.Error as error:
         raise DatasetError(
@@ -203,6 +204,10 @@ def split_lines(path: Path, separator: str = ",") -> Iterator[Row]:
             fix=f'write a cell that contains a {"comma" if separator == "," else "separator"} or a quote as "...", '
             "with inner quotes doubled",
         ) from error
+
+
+def _may_be_guarded(row: list[str]) -> bool:
+    return any(cell[:1] == "'" for cell in row)
 
 
 def read_lines(path: Path) -> Iterator[str]:

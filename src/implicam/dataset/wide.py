@@ -106,7 +106,7 @@ def read_brought(sheet: Sheet, path: Path, unit: str | None) -> Dataset:
     brought = read_sheet(sheet)
     if unit is None and not brought.unit:
         raise DatasetError(
-            f"{path}: the length unit of x, y, z is not stated.",
+            f"{path}: {_UNIT_MISSING}",
             why=f"a table carries it in {_description_path(path).name} beside it, which is not there",
             fix='add --unit mm, or unit="mm" in read_dataset(...)',
         )
@@ -121,6 +121,18 @@ def read_brought(sheet: Sheet, path: Path, unit: str | None) -> Dataset:
         stated = unit or brought.unit
         layout = _Layout(cameras, brought.views, brought.further, path.stem, stated, {})
         return replace(_assemble(brought.columns, layout), notes=brought.notes)
+
+
+_UNIT_MISSING = "the length unit of x, y, z is not stated."
+
+
+def is_unit_missing(error: DatasetError) -> bool:
+    """Whether a table could not be read only because it does not state its length unit.
+
+    Args:
+        error: Of reading it.
+    """
+    return error.what.endswith(_UNIT_MISSING)
 
 
 def _cameras_named(header: Iterable[str]) -> list[str]:
