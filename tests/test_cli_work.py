@@ -428,6 +428,9 @@ def test_the_classical_way_on_the_command_line(made: Path, cli: Cli) -> None:
     for name, more in (("b.yaml", []), ("camchain.yaml", []), ("model", ["--unit", "mm"]), ("b.csv", [])):
         assert cli("import", name, "-o", "i.implicam", *more).code == 0
         assert cli("measure", "i.implicam", made / "rig" / "check").code == 0
+    assert cli("export", "b.implicam", "--to", "ros", "-o", "infos").code == 0
+    pair = cli("import", "infos/cam2.yaml", "infos/cam3.yaml", "-o", "i.implicam", "--unit", "mm")
+    assert pair.out == "i.implicam: 2 cameras, lengths in mm\n"
     assert cli("import", "b.yaml", "-o", "i.implicam", "--unit", "mm").code == 0  # written in metres, as OpenCV has it
     same = cli("evaluate", "i.implicam", made / "rig" / "check", "--json").json
     assert same["rows"][0]["rmse"] == pytest.approx(told["rows"][0]["rmse"], rel=0.05)

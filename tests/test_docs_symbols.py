@@ -40,7 +40,7 @@ CONSTANTS = "## Constants"
 SUFFIXES = {
     "log",
     "avi", "cti", "csv", "db", "html", "implicam", "jpg", "json", "jsonl", "md", "npz", "parquet", "png", "tif", "toml",
-    "txt", "yaml",
+    "txt", "xml", "yaml", "yml",
 }  # fmt: skip
 """What files end in that the documentation names."""
 

@@ -34,10 +34,13 @@ def export_command(
 
 @command("import")
 def import_command(
-    cameras: Annotated[Path, typer.Argument(help="Cameras that another program calibrated.")],
+    cameras: Annotated[
+        list[Path], typer.Argument(help="Cameras that another program calibrated: its file, folder, or files.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="The calibration file to write (*.implicam).")],
     kind: Annotated[
-        str | None, typer.Option("--from", metavar="NAME", help="The format, where its content does not tell.")
+        str | None,
+        typer.Option("--from", metavar="NAME", help=f"One of {', '.join(FORMATS)}; where the content does not tell."),
     ] = None,
     noise: Annotated[
         float, typer.Option("--noise", min=1e-6, metavar="PX", help="Noise of views that do not state theirs.")
@@ -49,10 +52,11 @@ def import_command(
 ) -> None:
     """Make a calibration of another program's cameras, to measure with them and to check them."""
     must_be_calibration(output)
-    must_not_replace(output, cameras)
+    for file in cameras:
+        must_not_replace(output, file)
     rig = import_cameras(cameras, kind)
     rig = rig.in_unit(unit) if unit and rig.length_unit != UNKNOWN_UNIT else import_cameras(cameras, kind, unit=unit)
-    calibration = calibration_of(rig, cameras.stem, noise)
+    calibration = calibration_of(rig, cameras[0].stem, noise)
     calibration.save(output)
     if json:
         show.emit_json({"calibration": str(output), "cameras": len(rig.cameras), "notes": calibration.notes()})

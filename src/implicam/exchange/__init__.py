@@ -1,48 +1,86 @@
 """Explicit cameras in other programs' files: what each format is, how it is written and how it is read.
 
-To add a format: write a file with `write(rig, path) -> notes` and `read(path) -> Rig`, its conventions in its head; add
-it to `FORMATS`, to `_find_kind` if its content tells what it is, to the table of docs/exchange.md, and to the tests.
+To add a format: write a file with `write(rig, path) -> notes`, `read(paths) -> Rig` and `knows(source) -> bool`, its
+conventions in its head; add it to `FORMATS`, to the table of docs/exchange.md, and to the tests.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from implicam.errors import DatasetError, UsageError, did_you_mean
-from implicam.exchange import anipose, colmap, dlt, fits, kalibr, opencv
-from implicam.exchange.checks import read_text
+from implicam.exchange import anipose, caliscope, colmap, dlt, easymocap, fits, kalibr, opencv, opencv_stereo, ros
 from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.source import Source
 from implicam.lenses import BrownConrady, KannalaBrandt
 
 __all__ = ["FORMATS", "UNKNOWN_UNIT", "ExplicitCamera", "Format", "Rig", "export_cameras", "import_cameras"]
 
 
+Write = Callable[[Rig, Path], list[str]]
+Read = Callable[[Sequence[Path]], Rig]
+
+
 @dataclass(frozen=True)
 class Format:
-    """How a format is written, how it is read, and what it is in a few words.
+    """How a format is written, how it is read, how it is recognised, and what it is in a few words.
 
     write: gives notes, each a sentence on what the format lost or cost; none where it holds everything.
+    read: takes the files or folders that belong together.
+    knows: whether what is given is of this format, by its content.
     """
 
-    write: Callable[[Rig, Path], list[str]]
-    read: Callable[[Path], Rig]
+    write: Write
+    read: Read
+    knows: Callable[[Source], bool]
     what: str
     fits_lenses: bool = False
     """Whether it fits its own camera to any lens; the others hold the two families of OpenCV as they are."""
 
 
+def _one_file(read: Callable[[Path], Rig]) -> Read:
+    """The reader of a format whose rigs are one file or folder."""
+
+    def read_one(paths: Sequence[Path]) -> Rig:
+        if len(paths) > 1:
+            raise UsageError(
+                f"{len(paths)} files are given, and this format keeps a whole rig in one.",
+                fix="give the file of the whole rig; opencv and ros take a file for each camera",
+            )
+        return read(paths[0])
+
+    return read_one
+
+
 FORMATS = {
-    "opencv": Format(opencv.write, opencv.read, "OpenCV FileStorage, one YAML file"),
-    "kalibr": Format(kalibr.write, kalibr.read, "Kalibr's camchain.yaml"),
-    "colmap": Format(colmap.write, colmap.read, "COLMAP's text model, a folder"),
-    "aniposelib": Format(anipose.write_aniposelib, anipose.read_aniposelib, "aniposelib's calibration.toml"),
-    "pose2sim": Format(anipose.write_pose2sim, anipose.read_pose2sim, "Pose2Sim's Calib.toml", True),
-    "dlt": Format(dlt.write, dlt.read, "DLT coefficients as a CSV of DLTdv or easyWand", True),
+    "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml"),
+    "colmap": Format(colmap.write, _one_file(colmap.read), colmap.knows, "COLMAP's model, a folder"),
+    "caliscope": Format(caliscope.write, _one_file(caliscope.read), caliscope.knows, "caliscope's camera_array.toml"),
+    "pose2sim": Format(
+        anipose.write_pose2sim,
+        _one_file(anipose.read_pose2sim),
+        anipose.knows_pose2sim,
+        "Pose2Sim's Calib.toml",
+        True,
+    ),
+    "aniposelib": Format(
+        anipose.write_aniposelib,
+        _one_file(anipose.read_aniposelib),
+        anipose.knows_aniposelib,
+        "aniposelib's calibration.toml",
+    ),
+    "easymocap": Format(easymocap.write, easymocap.read, easymocap.knows, "EasyMocap's intri.yml and extri.yml", True),
+    "ros": Format(ros.write, ros.read, ros.knows, "ROS's camera_info, a file a camera"),
+    "opencv-stereo": Format(
+        opencv_stereo.write, opencv_stereo.read, opencv_stereo.knows, "K1, D1, K2, D2, R, T of cv2.stereoCalibrate"
+    ),
+    "opencv": Format(opencv.write, opencv.read, opencv.knows, "OpenCV FileStorage, YAML, XML or JSON"),
+    "dlt": Format(dlt.write, _one_file(dlt.read), dlt.knows, "DLT coefficients as a CSV of DLTdv or easyWand", True),
 }
+"""In the order in which they are tried on a file."""
 
 
 def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
@@ -83,11 +121,11 @@ def _imitating(rig: Rig) -> list[str]:
     return [f"or export to {' or '.join(near)}, which comes within {fits.MAX_LENS_DIFFERENCE_PX:g} px"] if near else []
 
 
-def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | None = None) -> Rig:
-    """Read cameras from another program's file or folder.
+def import_cameras(path: str | Path | Sequence[str | Path], kind: str | None = None, *, unit: str | None = None) -> Rig:
+    """Read cameras from another program's files or folder.
 
     Args:
-        path: The file or folder.
+        path: The file or folder; or several files that belong together.
         kind: A name of `FORMATS`; None to recognise the format by the content.
         unit: The length unit, for a file that does not say it.
 
@@ -95,15 +133,18 @@ def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | Non
         The cameras; the rig's notes say what its reader should know.
 
     Raises:
-        UsageError: There is no such format.
-        DatasetError: The file cannot be read, is not recognised, has a mistake, or states another unit.
+        UsageError: There is no such format, or it takes one file and several are given.
+        DatasetError: A file cannot be read, is not recognised, has a mistake, or states another unit.
     """
-    path = Path(path)
+    paths = tuple(Path(one) for one in ([path] if isinstance(path, str | Path) else path))
+    if not paths:
+        raise UsageError("no file is given.", fix="give the file with the cameras")
     try:
-        rig = _find_format(kind or _find_kind(path)).read(path)
+        form = _find_format(kind) if kind else _recognise(Source(paths))
+        rig = form.read(paths)
     except OSError as error:
         raise DatasetError(
-            f"{path} cannot be read.", why=str(error), fix="check the name and the permissions"
+            f"{paths[0]} cannot be read.", why=str(error), fix="check the name and the permissions"
         ) from error
     if unit is None and rig.length_unit == UNKNOWN_UNIT:
         return replace(rig, notes=(*rig.notes, "The file does not say its length unit: state it before you measure."))
@@ -111,7 +152,7 @@ def import_cameras(path: str | Path, kind: str | None = None, *, unit: str | Non
         return rig
     if rig.length_unit != UNKNOWN_UNIT:
         raise DatasetError(
-            f"{path} is in {rig.length_unit!r}, not in {unit!r}.",
+            f"{paths[0]} is in {rig.length_unit!r}, not in {unit!r}.",
             why="the file, or its format, states the unit",
             fix="leave out the unit, and convert the rig afterwards",
         )
@@ -126,29 +167,13 @@ def _find_format(name: str) -> Format:
     return FORMATS[name]
 
 
-def _find_kind(path: Path) -> str:
-    """The format of a file or folder, by what is in it."""
-    if path.is_dir() or path.name in (colmap.CAMERAS_FILE, colmap.IMAGES_FILE):
-        return "colmap"
-    text = read_text(path)
-    if text.startswith("%YAML") or "opencv-matrix" in text:
-        return "opencv"
-    if re.search(r"^cam0\s*:", text, re.MULTILINE):
-        return "kalibr"
-    if re.search(r"^\s*\[[^\]\n]+\]\s*$", text, re.MULTILINE):
-        return _find_kind_of_toml(path)
-    if re.fullmatch(r"[-+0-9.,eE\s]+", text):
-        return "dlt"
-    raise DatasetError(
-        f"{path}: the format of these cameras is not recognised.",
-        why=f"read are {'; '.join(f'{name} ({entry.what})' for name, entry in FORMATS.items())}",
-        fix="name the format, or export the cameras in one of these",
-    )
-
-
-def _find_kind_of_toml(path: Path) -> str:
-    """Pose2Sim writes four coefficients and never a fisheye; aniposelib five, or a fisheye."""
-    cameras = anipose.camera_tables(anipose.read_toml(path)).values()
-    lengths = [len(c["distortions"]) for c in cameras if isinstance(c.get("distortions"), list)]
-    fisheye = any(c.get("fisheye") is True for c in cameras)
-    return "pose2sim" if lengths and set(lengths) == {4} and not fisheye else "aniposelib"
+def _recognise(source: Source) -> Format:
+    """The first format that knows what is given."""
+    found = next((form for form in FORMATS.values() if form.knows(source)), None)
+    if found is None:
+        raise DatasetError(
+            f"{source.path}: the format of these cameras is not recognised: {source.described()}.",
+            why=f"read are {'; '.join(f'{name} ({entry.what})' for name, entry in FORMATS.items())}",
+            fix="name the format, or export the cameras in one of these",
+        )
+    return found

@@ -14,11 +14,12 @@ Rotation and translation are camera_from_world; pixels are OpenCV's. Pose2Sim re
 
 from __future__ import annotations
 
+import re
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
-from implicam.dataset.tables import naming, parse_toml
+from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
 from implicam.exchange.checks import (
     MAX_CAMERAS,
@@ -28,11 +29,12 @@ from implicam.exchange.checks import (
     lens_from_matrix,
     read_image_size,
     read_numbers,
-    read_text,
     shorten,
 )
 from implicam.exchange.fits import fit_four_coefficients
 from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.refits import make_camera
+from implicam.exchange.source import Source, read_toml
 from implicam.files import toml_text, write_text
 from implicam.geometry import Pose, rotation_from_vector, vector_from_rotation
 from implicam.lenses import KannalaBrandt, Lens
@@ -131,21 +133,32 @@ def read_pose2sim(path: Path) -> Rig:
     return _read_rig(read_toml(path), path, "m")
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file as a dict.
+def knows_pose2sim(source: Source) -> bool:
+    """Whether a TOML file has tables of cameras with four coefficients and no fisheye, as Pose2Sim writes them.
 
     Args:
-        path: The file.
-
-    Raises:
-        DatasetError: There is no such file, or it is no TOML.
+        source: What is given.
     """
-    try:
-        return parse_toml(read_text(path))
-    except ValueError as error:
-        raise DatasetError(
-            f"{path}: not valid TOML: {str(error)[:200]}.", fix="the file may be cut off: export it again"
-        ) from None
+    cameras = _cameras_of(source)
+    lengths = {len(c["distortions"]) for c in cameras if isinstance(c.get("distortions"), list)}
+    return lengths == {4} and not any(c.get("fisheye") is True for c in cameras)
+
+
+def knows_aniposelib(source: Source) -> bool:
+    """Whether a TOML file has tables of cameras.
+
+    Args:
+        source: What is given.
+    """
+    return bool(_cameras_of(source))
+
+
+def _cameras_of(source: Source) -> list[dict[str, Any]]:
+    """The tables of a TOML file that look like a camera."""
+    if not re.search(r"^\s*\[[^\]\n]+\]\s*$", source.text, re.MULTILINE):
+        return []
+    cameras = camera_tables(read_toml(source.path)).values()
+    return [camera for camera in cameras if {"matrix", "distortions", "rotation", "translation"} & set(camera)]
 
 
 def camera_tables(table: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -165,10 +178,11 @@ def _read_rig(table: dict[str, Any], path: Path, unit: str) -> Rig:
     if not 0 < len(cameras) <= MAX_CAMERAS:
         raise DatasetError(f"{path}: it has {len(cameras)} tables of cameras.", fix="each camera is a table, [cam_0]")
     with naming(str(path)):
-        return Rig(tuple(_read_camera(key, value, f"{path}: [{key}]") for key, value in cameras.items()), unit)
+        read = [_read_camera(key, value, f"{path}: [{key}]") for key, value in cameras.items()]
+        return Rig(tuple(camera for camera, _ in read), unit, tuple(note for _, notes in read for note in notes))
 
 
-def _read_camera(key: str, table: dict[str, Any], place: str) -> ExplicitCamera:
+def _read_camera(key: str, table: dict[str, Any], place: str) -> tuple[ExplicitCamera, list[str]]:
     def array(name: str, *shape: int) -> Any:
         return read_numbers(get_entry(table, name, place), shape, f"{place} {name}")
 
@@ -177,6 +191,6 @@ def _read_camera(key: str, table: dict[str, Any], place: str) -> ExplicitCamera:
         raise DatasetError(f"{place}: fisheye = {shorten(fisheye)} must be true or false.", fix="correct the value")
     matrix = array("matrix", 3, 3)
     lens = lens_from_matrix(matrix, array("distortions", -1).tolist(), fisheye=fisheye, place=place)
-    width, height = read_image_size(get_entry(table, "size", place), f"{place} size")
+    size = read_image_size(get_entry(table, "size", place), f"{place} size")
     pose = Pose(rotation_from_vector(array("rotation", 3)), array("translation", 3))
-    return ExplicitCamera(check_text(table.get("name", key), f"{place} name"), width, height, lens, pose)
+    return make_camera(check_text(table.get("name", key), f"{place} name"), size, lens, pose, place)

@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from implicam.errors import DatasetError, did_you_mean, import_extra
+from implicam.errors import DatasetError, did_you_mean
+from implicam.exchange.other_lenses import OtherLens, rational_lens, with_skew
 from implicam.geometry import Pose
 from implicam.lenses import BrownConrady, Floats, KannalaBrandt, Lens
 
 MAX_BYTES = 1 << 18  # YAML takes seconds for more
 MAX_COEFFICIENTS = 14  # of OpenCV's largest lens model
 MAX_CAMERAS = 1000
+MAX_NAMES_SHOWN = 12  # in an error message
 MAX_EXACT_INTEGER = 1 << 53  # every smaller float that is whole is exact
 
 ROTATION_ROUNDING, MAX_ROTATION_ERROR = 1e-9, 1e-3
@@ -53,36 +55,6 @@ def read_text(path: Path, most: int = MAX_BYTES) -> str:
     if "\0" in text:
         raise DatasetError(f"{path} holds zero bytes: it is not a text file.", fix="give the text form of the file")
     return text
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML file as a dict, in which every value is text, a list or a dict; OpenCV's matrices are dicts.
-
-    Tags, merges and types are not looked at: nothing in the file is run, and a few hundred bytes cannot unfold.
-
-    Args:
-        path: The file.
-
-    Raises:
-        DatasetError: There is no such file, or it is no YAML with a table at its top.
-        MissingExtraError: PyYAML is not installed.
-    """
-    text = read_text(path)
-    yaml = import_extra("yaml", "exchange", "reading YAML")
-    if text.lstrip().startswith("<"):
-        raise DatasetError(f"{path} is XML, which is not read.", fix="let OpenCV write it with the ending .yml")
-    first, _, rest = text.partition("\n")
-    if first.startswith("%YAML"):  # OpenCV 4 writes "%YAML:1.0", which is no YAML directive
-        text = "\n" + rest
-    try:
-        table = yaml.load(text, Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DatasetError(
-            f"{path}: not valid YAML.",
-            why=str(error).replace("\n", " ")[:300] or type(error).__name__,
-            fix="the file may be cut off: export it again",
-        ) from None
-    return as_table(table, str(path))
 
 
 def as_table(value: object, place: str) -> dict[str, Any]:
@@ -131,7 +103,8 @@ def get_entry(table: Mapping[str, Any], key: str, place: str) -> Any:
     if key not in table:
         raise DatasetError(
             f"{place}: {key!r} is missing{did_you_mean(key, table)}.",
-            fix="the file may be cut off, or of another kind: export it again",
+            why=f"the keys there are {list_names(list(table))}" if table else "there is no key at all",
+            fix="add it, or export the file again; of another kind of file, name the kind",
         )
     return table[key]
 
@@ -269,42 +242,49 @@ def pose_from_matrix(value: object, place: str) -> Pose:
     return Pose(rotation_matrix(matrix[:3, :3], place), matrix[:3, 3])
 
 
-def lens_from_matrix(matrix: Floats, coefficients: Sequence[float], *, fisheye: bool, place: str) -> Lens:
+def lens_from_matrix(matrix: Floats, coefficients: Sequence[float], *, fisheye: bool, place: str) -> Lens | OtherLens:
     """Make a lens from OpenCV's camera matrix and distortion coefficients.
 
     Args:
-        matrix: (3, 3), in pixels.
+        matrix: (3, 3), in pixels; it may have a skew.
         coefficients: In OpenCV's order, see `lens_from_numbers`.
         fisheye: Whether they are those of cv2.fisheye.
         place: Where they stand, for the error.
 
     Raises:
-        DatasetError: The matrix has a skew, or there is no such lens here.
+        DatasetError: It is no camera matrix, or there is no such lens.
     """
-    skew = (matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1)
-    if any(skew):
+    if any((matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1)):
         raise DatasetError(
             f"{place}: the camera matrix {shorten(matrix.tolist())} has entries beside fx, fy, cx, cy.",
-            why="it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; the lens models here have no skew",
-            fix="calibrate without skew",
+            why="it must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+            fix="correct the values; of a projection matrix, give the camera matrix",
         )
-    return lens_from_numbers((matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), coefficients, fisheye, place)
+    linear = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    lens = lens_from_numbers(linear, coefficients, fisheye, place)
+    return with_skew(lens, float(matrix[0, 1])) if matrix[0, 1] else lens
 
 
-def lens_from_numbers(linear: Sequence[float], coefficients: Sequence[float], fisheye: bool, place: str) -> Lens:
+def lens_from_numbers(
+    linear: Sequence[float], coefficients: Sequence[float], fisheye: bool, place: str
+) -> Lens | OtherLens:
     """Make a lens from focal lengths, principal point and OpenCV's distortion coefficients.
 
     Args:
         linear: Fx, fy, cx, cy in pixels.
-        coefficients: k1, k2, p1, p2, k3 or a part of them; of a fisheye k1, k2, k3, k4. Any beyond k3 must be zero.
+        coefficients: The first 0, 4, 5, 8, 12 or 14 of k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tau_x, tau_y; of
+            a fisheye k1, k2, k3, k4.
         fisheye: Whether they are those of cv2.fisheye.
         place: Where they stand, for the error.
 
+    Returns:
+        The lens; one that is not among the families here where a coefficient beyond k3 is not zero.
+
     Raises:
-        DatasetError: Their number is wrong, or the lens model has more terms than ours.
+        DatasetError: Their number is wrong.
     """
     given = [float(k) for k in coefficients]
-    counts = (4,) if fisheye else (0, 4, 5, 8, 12, 14)
+    counts = (0, 4) if fisheye else (0, 4, 5, 8, 12, 14)
     if len(given) not in counts:
         raise DatasetError(
             f"{place}: {len(given)} distortion coefficients.",
@@ -314,14 +294,7 @@ def lens_from_numbers(linear: Sequence[float], coefficients: Sequence[float], fi
     focal = [float(x) for x in linear]
     if fisheye:
         return KannalaBrandt(*focal, *given)
-    if any(given[5:]):
-        raise DatasetError(
-            f"{place}: distortion coefficients beyond k3 are not zero: {shorten(given[5:])}.",
-            why="the rational, thin-prism and tilted lens models of OpenCV are not supported; supported are "
-            "Brown-Conrady (k1, k2, p1, p2, k3) and Kannala-Brandt (fisheye, k1 ... k4)",
-            fix="calibrate with five coefficients, or with the fisheye model",
-        )
-    return BrownConrady(*focal, *given[:5])
+    return rational_lens(focal, given) if any(given[5:]) else BrownConrady(*focal, *given[:5])
 
 
 def shorten(value: object) -> str:
@@ -331,3 +304,13 @@ def shorten(value: object) -> str:
         value: Anything.
     """
     return reprlib.repr(value)[:80]
+
+
+def list_names(names: Sequence[str]) -> str:
+    """Names as an error message shows them: the first `MAX_NAMES_SHOWN`, each shortened.
+
+    Args:
+        names: Of keys or files.
+    """
+    shown = ", ".join(shorten(name)[1:-1] for name in names[:MAX_NAMES_SHOWN])
+    return shown + (f" and {len(names) - MAX_NAMES_SHOWN} more" if len(names) > MAX_NAMES_SHOWN else "")

@@ -18,7 +18,10 @@ from scipy.spatial.transform import Rotation
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError, did_you_mean
 from implicam.exchange.checks import MAX_CAMERAS, lens_from_numbers, read_numbers, read_text, shorten
-from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.model import UNKNOWN_UNIT, Rig
+from implicam.exchange.other_lenses import OtherLens
+from implicam.exchange.refits import make_camera
+from implicam.exchange.source import Source
 from implicam.files import replacing_folder
 from implicam.geometry import Pose
 from implicam.images import ENDINGS
@@ -124,6 +127,15 @@ def _image_names(rig: Rig) -> tuple[list[str], list[str]]:
     return names, notes
 
 
+def knows(source: Source) -> bool:
+    """Whether it is a folder, or a file of such a folder.
+
+    Args:
+        source: What is given.
+    """
+    return bool({CAMERAS_FILE, IMAGES_FILE} & source.file_names)
+
+
 def read(path: Path) -> Rig:
     """Read a folder with cameras.txt and images.txt; each image becomes a camera, named after it.
 
@@ -151,18 +163,20 @@ def read(path: Path) -> Rig:
             why=f"each image is a camera of the rig, and a rig has at most {MAX_CAMERAS}",
             fix="keep one image of each camera",
         )
-    names, cameras = _camera_names([name for name, _, _ in images]), []
+    names, cameras, notes = _camera_names([name for name, _, _ in images]), [], []
     for name, (image, key, pose) in zip(names, images, strict=True):
         if key not in lenses:
             raise DatasetError(
                 f"{path / IMAGES_FILE}: image {image!r} wants camera {key!r}, which {CAMERAS_FILE} does not have.",
                 fix="export both files together",
             )
-        with naming(path):
-            cameras.append(ExplicitCamera(name, *lenses[key], pose))
+        size, lens = lenses[key]
+        camera, cost = make_camera(name, size, lens, pose, str(path))
+        cameras.append(camera)
+        notes += cost
     unit = re.search(f"^{_UNIT_COMMENT}(.{{1,40}})$", text, re.MULTILINE)
     with naming(path):
-        return Rig(tuple(cameras), unit[1].strip() if unit else UNKNOWN_UNIT)
+        return Rig(tuple(cameras), unit[1].strip() if unit else UNKNOWN_UNIT, tuple(notes))
 
 
 def _content_lines(text: str) -> list[tuple[int, str]]:
@@ -183,7 +197,7 @@ def _image_lines(text: str) -> list[tuple[int, str]]:
     return first
 
 
-def _read_camera(line: str, place: str) -> tuple[str, tuple[int, int, Lens]]:
+def _read_camera(line: str, place: str) -> tuple[str, tuple[tuple[int, int], Lens | OtherLens]]:
     parts = line.split()
     if len(parts) < 4 or not (parts[2].isdecimal() and parts[3].isdecimal() and len(parts[2] + parts[3]) < 20):
         raise DatasetError(
@@ -201,7 +215,7 @@ def _read_camera(line: str, place: str) -> tuple[str, tuple[int, int, Lens]]:
     wanted = 4 if fisheye or len(distortion) < 4 else len(distortion)
     distortion += [0.0] * (wanted - len(distortion))
     linear[2:] = [linear[2] - CENTRE_OFFSET_PX, linear[3] - CENTRE_OFFSET_PX]
-    return key, (int(parts[2]), int(parts[3]), lens_from_numbers(linear, distortion, fisheye, place))
+    return key, ((int(parts[2]), int(parts[3])), lens_from_numbers(linear, distortion, fisheye, place))
 
 
 def _read_image(line: str, place: str) -> tuple[str, str, Pose]:

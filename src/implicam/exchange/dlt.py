@@ -12,6 +12,7 @@ v upwards (`"lower-left"`). DLTdv 8 has a function, dlt_invert, that turns the o
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,6 @@ import numpy as np
 from implicam.dataset.model import Camera
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
-from implicam.exchange.anipose import read_toml
 from implicam.exchange.checks import (
     as_list,
     as_table,
@@ -33,6 +33,7 @@ from implicam.exchange.checks import (
 )
 from implicam.exchange.fits import Cost, fit_projection_matrix, pinhole_from_matrix
 from implicam.exchange.model import ExplicitCamera, Rig
+from implicam.exchange.source import Source, read_toml
 from implicam.files import toml_text, write_text
 from implicam.lenses import Floats
 
@@ -120,6 +121,15 @@ def read(path: Path) -> Rig:
         notes.append(f"Every camera looks away from the world's origin. Is image_origin {origin!r} right?")
     with naming(str(path)):
         return Rig(tuple(cameras), unit, tuple(notes))
+
+
+def knows(source: Source) -> bool:
+    """Whether a file holds numbers and commas, and nothing else.
+
+    Args:
+        source: What is given.
+    """
+    return re.fullmatch(r"[-+0-9.,eE\s]+", source.text) is not None
 
 
 def _read_description(path: Path, columns: int) -> tuple[str, str, list[dict[str, Any]]]:

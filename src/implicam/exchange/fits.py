@@ -64,7 +64,20 @@ def pixel_lattice(camera: ExplicitCamera) -> Floats:
     Raises:
         DatasetError: The image size is not known.
     """
-    u, v = (np.linspace(-0.5, size - 0.5, LATTICE_POINTS_PER_SIDE) for size in camera.size)
+    return lattice_of(*camera.size)
+
+
+def lattice_of(width: int, height: int) -> Floats:
+    """Pixels that cover an image from edge to edge.
+
+    Args:
+        width: In pixels.
+        height: In pixels.
+
+    Returns:
+        (n, 2).
+    """
+    u, v = (np.linspace(-0.5, side - 0.5, LATTICE_POINTS_PER_SIDE) for side in (width, height))
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 

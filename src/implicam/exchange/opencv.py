@@ -1,4 +1,4 @@
-"""`opencv`: one YAML file that cv2.FileStorage reads, with the keys of OpenCV's own calibration programs.
+"""`opencv`: YAML, XML or JSON of cv2.FileStorage, with the keys of OpenCV's own calibration programs.
 
     cameras:
        -
@@ -10,13 +10,14 @@
     length_unit: m
 
 OpenCV itself has no unit; its multi-camera functions want metres, so metres are written. Read are also files with
-`rvec`, `tvec` in place of R, T, and the file of one camera that OpenCV's calibration program writes, which has no pose.
+`rvec`, `tvec` in place of R, T, the file of one camera that OpenCV's calibration program writes, several of these with
+their poses, up to 14 coefficients and `xi` of cv2.omnidir (by a refit), and the keys of `MATRIX_KEYS`.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import astuple
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,23 +25,25 @@ import numpy as np
 
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
-from implicam.exchange.checks import (
-    MAX_CAMERAS,
-    as_list,
-    as_table,
-    check_text,
-    get_entry,
-    lens_from_matrix,
-    read_integer,
-    read_numbers,
-    read_yaml,
-    rotation_matrix,
-    shorten,
-)
+from implicam.exchange.checks import MAX_CAMERAS, as_list, as_table, check_text, get_entry, shorten
 from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.refits import make_camera
+from implicam.exchange.source import Source, read_yaml
+from implicam.exchange.storage import lens_lines, matrix_lines, read_lens, read_pose, read_size
 from implicam.files import write_text
-from implicam.geometry import Pose, rotation_from_vector
-from implicam.lenses import Floats, KannalaBrandt
+from implicam.geometry import Pose
+from implicam.lenses import KannalaBrandt
+
+MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M", "mtx")
+DISTORTION_KEYS = (
+    "distortion_coefficients",
+    "Distortion_Coefficients",
+    "distCoeffs",
+    "dist_coeffs",
+    "dist_coeff",
+    "dist",
+    "D",
+)
 
 
 def write(rig: Rig, path: Path) -> list[str]:
@@ -70,77 +73,79 @@ def _camera_text(camera: ExplicitCamera) -> str:
         f"image_width: {width}",
         f"image_height: {height}",
         f"fisheye_model: {int(isinstance(lens, KannalaBrandt))}",
-        *_matrix_lines("camera_matrix", np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])),
-        *_matrix_lines("distortion_coefficients", np.array(astuple(lens)[4:])[:, None]),
-        *_matrix_lines("R", pose.rotation),
-        *_matrix_lines("T", pose.translation[:, None]),
+        *lens_lines(lens, "camera_matrix", "distortion_coefficients"),
+        *matrix_lines("R", pose.rotation),
+        *matrix_lines("T", pose.translation[:, None]),
     ]
     return "   -\n" + "".join(f"      {line}\n" for line in lines)
 
 
-def _matrix_lines(name: str, values: Floats) -> list[str]:
-    rows, columns = values.shape
-    data = ", ".join(repr(float(x)) for x in values.ravel())
-    return [f"{name}: !!opencv-matrix", f"   rows: {rows}", f"   cols: {columns}", "   dt: d", f"   data: [ {data} ]"]
+def knows(source: Source) -> bool:
+    """Whether a file has a camera matrix, or a list of cameras.
+
+    Args:
+        source: What is given.
+    """
+    keys = set(source.keys)
+    short = bool(set(MATRIX_KEYS) & keys) and bool(set(DISTORTION_KEYS) & keys)
+    return short or bool({"cameras", "camera_matrix", "Camera_Matrix", "cameraMatrix"} & keys)
 
 
-def read(path: Path) -> Rig:
+def read(paths: Sequence[Path]) -> Rig:
     """Read a rig; the head of this file says which files.
 
     Args:
-        path: The YAML file.
+        paths: One file, or several that belong together, each with one camera or more.
 
     Raises:
-        DatasetError: The file has a mistake; the error names the key and the cure.
+        DatasetError: A file has a mistake, or does not say where a camera of several stands; the error names the key
+            and the cure.
     """
-    table = read_yaml(path)
-    place = str(path)
-    unit = check_text(table.get("length_unit", UNKNOWN_UNIT), f"{place}: length_unit")
+    tables = [(table, place) for path in paths for table, place in _camera_tables(path)]
+    units = {check_text(table.get("length_unit", UNKNOWN_UNIT), f"{place}: length_unit") for table, place in tables}
+    if len(units) > 1:
+        raise DatasetError(f"{paths[0]} and others have the units {shorten(sorted(units))}.", fix="give one unit")
+    cameras, notes = [], []
+    for table, place in tables:
+        camera, said = _read_camera(table, place, alone=len(tables) == 1)
+        cameras.append(camera)
+        notes += said
+    with naming(str(paths[0])):
+        return Rig(tuple(cameras), units.pop(), tuple(notes))
+
+
+def _camera_tables(path: Path) -> list[tuple[dict[str, Any], str]]:
+    """The cameras of a file, each with its place."""
+    table, place = read_yaml(path), str(path)
     if "cameras" not in table:
-        posed = {"R", "rvec"} & set(table)
-        notes = () if posed else ("The file has no pose: the world is the camera's own frame.",)
-        return Rig((_read_camera({"name": path.stem, **table}, place),), unit, notes)
+        return [({"name": path.stem, **table}, place)]
+    unit = {"length_unit": table["length_unit"]} if "length_unit" in table else {}
+    listed = as_list(table["cameras"], f"{place}: cameras")
     places = [f"{place}: cameras[{i}]" for i in range(MAX_CAMERAS)]
-    listed = zip(as_list(table["cameras"], f"{place}: cameras"), places, strict=False)
-    cameras = tuple(_read_camera(as_table(camera, where), where) for camera, where in listed)
-    with naming(place):
-        return Rig(cameras, unit)
+    return [(as_table(camera, where) | unit, where) for camera, where in zip(listed, places, strict=False)]
 
 
-def _read_camera(table: dict[str, Any], place: str) -> ExplicitCamera:
+def _read_camera(table: dict[str, Any], place: str, *, alone: bool) -> tuple[ExplicitCamera, list[str]]:
     name = check_text(get_entry(table, "name", place), f"{place}: name")
     place = f"{place} ({shorten(name)})"
-    k = _read_matrix(get_entry(table, "camera_matrix", place), f"{place}: camera_matrix", (3, 3))
-    given = _read_matrix(get_entry(table, "distortion_coefficients", place), f"{place}: distortion_coefficients", (-1,))
-    fisheye = read_integer(table.get("fisheye_model", 0), f"{place}: fisheye_model") != 0
-    lens = lens_from_matrix(k, given.tolist(), fisheye=fisheye, place=place)
-    sizes = [table[key] for key in ("image_width", "image_height") if key in table]
-    width, height = [read_integer(size, f"{place}: image size") for size in sizes] if len(sizes) == 2 else (None, None)
-    with naming(place):
-        return ExplicitCamera(name, width, height, lens, _read_pose(table, place))
-
-
-def _read_pose(table: dict[str, Any], place: str) -> Pose:
-    if "R" in table or "T" in table:
-        r = _read_matrix(get_entry(table, "R", place), f"{place}: R", (3, 3))
-        return Pose(rotation_matrix(r, f"{place}: R"), _read_matrix(get_entry(table, "T", place), f"{place}: T", (3,)))
-    if "rvec" in table or "tvec" in table:
-        rotation = rotation_from_vector(_read_matrix(get_entry(table, "rvec", place), f"{place}: rvec", (3,)))
-        return Pose(rotation, _read_matrix(get_entry(table, "tvec", place), f"{place}: tvec", (3,)))
-    return Pose(np.eye(3), np.zeros(3))
-
-
-def _read_matrix(value: object, place: str, shape: tuple[int, ...]) -> Floats:
-    """An OpenCV matrix as an array; a vector may be a row, a column, one-dimensional (OpenCV 5) or a plain list."""
-    if isinstance(value, list):
-        return read_numbers(value, shape, place)
-    matrix = as_table(value, place)
-    keys = ("rows", "cols")
-    given = get_entry(matrix, "sizes", place) if "sizes" in matrix else [get_entry(matrix, key, place) for key in keys]
-    sizes = tuple(int(size) for size in read_numbers(given, (-1,), f"{place} size"))
-    if len(shape) == 2 and sizes != shape:
+    matrix = next((key for key in MATRIX_KEYS if key in table), MATRIX_KEYS[0])
+    distortion = next((key for key in DISTORTION_KEYS if key in table), DISTORTION_KEYS[0])
+    lens, notes = read_lens(table, matrix, distortion, name, place)
+    pose = _read_pose(table, place)
+    if pose is None and not alone:
         raise DatasetError(
-            f"{place} has the size {shorten(sizes)}; it must be {' x '.join(map(str, shape))}.", fix="correct the value"
+            f"{place} does not say where the camera stands.",
+            why="it has neither R and T nor rvec and tvec, and there are several cameras",
+            fix="add R and T (x_camera = R x_world + T), for the camera that is the world the identity and zeros; or "
+            "calibrate the places: implicam calibrate --method explicit",
         )
-    count = shape if len(shape) == 1 else (shape[0] * shape[1],)
-    return read_numbers(get_entry(matrix, "data", place), count, f"{place}.data").reshape(shape)
+    notes += [] if pose else ["The file has no pose: the world is the camera's own frame."]
+    camera, cost = make_camera(name, read_size(table, place), lens, pose or Pose(np.eye(3), np.zeros(3)), place)
+    return camera, [*notes, *cost]
+
+
+def _read_pose(table: dict[str, Any], place: str) -> Pose | None:
+    for rotation, translation in (("R", "T"), ("rvec", "tvec")):
+        if rotation in table or translation in table:
+            return read_pose(table, place, rotation, translation)
+    return None
