@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import yaml
 
+from implicam.calibrators import load_calibration
+from implicam.calibrators.explicit import calibration_of, rig_of
 from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.exchange import FORMATS, UNKNOWN_UNIT, ExplicitCamera, Rig, export_cameras, import_cameras
 from implicam.exchange.other_lenses import rational_lens
@@ -648,3 +650,13 @@ def test_the_table_of_the_docs_has_every_format():
         r"^\| `([a-z0-9-]+)` \|", (Path(__file__).parents[1] / "docs" / "exchange.md").read_text(), re.MULTILINE
     )
     assert set(FORMATS) <= set(rows)
+
+
+def test_cameras_that_were_imported_go_on_to_another_program(tmp_path):
+    """Without known points there is nothing about which a lens could be fitted again: it is the one of the file."""
+    rig = import_cameras(CASES / "opencv-stereo-file" / "stereo.yml", unit="mm")
+    calibration_of(rig, "pair", 0.3).save(tmp_path / "pair.implicam")
+    again, notes = rig_of(load_calibration(tmp_path / "pair.implicam"))
+    assert notes == []
+    assert [c.lens for c in again.cameras] == [c.lens for c in rig.cameras]
+    np.testing.assert_allclose(again.cameras[1].camera_from_world.centre, [60, 0, 0], atol=1e-12)

@@ -85,7 +85,7 @@ def fitted_cameras(rig: FittedRig, known: Floats) -> Iterator[FittedCamera]:
             yield FittedCamera(*of, None, None, what)
             continue
         note = ""
-        if len(model.field.inducing):  # forward-gp
+        if len(model.field.inducing) and len(known):  # forward-gp; cameras of another program have no known points
             camera, note = _nearest(model, rig.frame.to_working(known), camera)
         yield FittedCamera(*of, camera.lens, _world(camera, rig.frame), note)
 

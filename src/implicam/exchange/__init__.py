@@ -56,8 +56,8 @@ def _one_file(read: Callable[[Path], Rig]) -> Read:
 
 
 FORMATS = {
-    "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml"),
     "colmap": Format(colmap.write, _one_file(colmap.read), colmap.knows, "COLMAP's model, a folder"),
+    "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml"),
     "caliscope": Format(caliscope.write, _one_file(caliscope.read), caliscope.knows, "caliscope's camera_array.toml"),
     "pose2sim": Format(
         anipose.write_pose2sim,

@@ -18,6 +18,7 @@ MAX_BYTES = 1 << 18  # YAML takes seconds for more
 MAX_COEFFICIENTS = 14  # of OpenCV's largest lens model
 MAX_CAMERAS = 1000
 MAX_NAMES_SHOWN = 12  # in an error message
+MAX_NUMBER = 1e100  # larger ones cannot be squared
 MAX_EXACT_INTEGER = 1 << 53  # every smaller float that is whole is exact
 
 ROTATION_ROUNDING, MAX_ROTATION_ERROR = 1e-9, 1e-3
@@ -196,6 +197,8 @@ def _read_number(value: object, place: str) -> float:
             raise ValueError
     except (ValueError, OverflowError):
         raise DatasetError(f"{place} = {shorten(value)} is not a finite number.", fix="correct the value") from None
+    if abs(number) > MAX_NUMBER:
+        raise DatasetError(f"{place} = {shorten(value)} is too large a number.", fix="correct the value")
     return number
 
 

@@ -1,4 +1,4 @@
-"""`colmap`: a sparse model of COLMAP as text: a folder with cameras.txt, images.txt and an empty points3D.txt.
+"""`colmap`: a sparse model of COLMAP: a folder with cameras.txt, images.txt and an empty points3D.txt; read also .bin.
 
 COLMAP puts (0, 0) at the *corner* of the top-left pixel: its cx, cy are ours + 0.5. A pose is camera_from_world, as a
 quaternion (w, x, y, z) and a translation. COLMAP has no unit; a comment in cameras.txt keeps ours. Written is one image
@@ -17,9 +17,16 @@ from scipy.spatial.transform import Rotation
 
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError, did_you_mean
-from implicam.exchange.checks import MAX_CAMERAS, lens_from_numbers, read_numbers, read_text, shorten
+from implicam.exchange.checks import MAX_CAMERAS, lens_from_numbers, read_numbers, shorten
+from implicam.exchange.colmap_files import MODEL_NUMBERS, CameraEntry, Model, read_model
 from implicam.exchange.model import UNKNOWN_UNIT, Rig
-from implicam.exchange.other_lenses import OtherLens
+from implicam.exchange.other_lenses import (
+    OtherLens,
+    division_lens,
+    extended_unified_lens,
+    field_of_view_lens,
+    thin_prism_fisheye_lens,
+)
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source
 from implicam.files import replacing_folder
@@ -28,37 +35,43 @@ from implicam.images import ENDINGS
 from implicam.lenses import KannalaBrandt, Lens
 
 CAMERAS_FILE, IMAGES_FILE, POINTS_FILE = "cameras.txt", "images.txt", "points3D.txt"
-MAX_BYTES = 1 << 26  # images.txt lists the points of every image
+SAME_POSE = 1e-6  # of a rotation's entries, and as a part of the shift: a rig that did not move
 CENTRE_OFFSET_PX = 0.5  # COLMAP's u and v of the centre of the top-left pixel
 
 _UNIT_COMMENT = "# implicam: the length unit is "
 
-# How parameters become (fx, fy, cx, cy) and distortion in OpenCV's order.
-Split = Callable[[list[float]], tuple[list[float], list[float]]]
+# How parameters become fx, fy, cx, cy and a lens of them.
+Make = Callable[[list[float], list[float], str], Lens | OtherLens]
 
 
-def _split_one_focal(p: list[float]) -> tuple[list[float], list[float]]:
-    return [p[0], p[0], p[1], p[2]], p[3:]
+def _perspective(linear: list[float], rest: list[float], place: str) -> Lens | OtherLens:
+    """OpenCV's coefficients, of which one alone or two are k1, k2."""
+    return lens_from_numbers(linear, rest + [0.0] * (4 - len(rest)), False, place)
 
 
-def _split_two_focals(p: list[float]) -> tuple[list[float], list[float]]:
-    return p[:4], p[4:]
+def _fisheye(linear: list[float], rest: list[float], place: str) -> Lens | OtherLens:
+    return lens_from_numbers(linear, rest + [0.0] * (4 - len(rest)), True, place)
 
 
-MODELS: dict[str, tuple[int, Split, bool]] = {
-    "SIMPLE_PINHOLE": (3, _split_one_focal, False),
-    "PINHOLE": (4, _split_two_focals, False),
-    "SIMPLE_RADIAL": (4, _split_one_focal, False),
-    "RADIAL": (5, _split_one_focal, False),
-    "OPENCV": (8, _split_two_focals, False),
-    "FULL_OPENCV": (12, _split_two_focals, False),
-    "SIMPLE_FISHEYE": (3, _split_one_focal, True),
-    "FISHEYE": (4, _split_two_focals, True),
-    "SIMPLE_RADIAL_FISHEYE": (4, _split_one_focal, True),
-    "RADIAL_FISHEYE": (5, _split_one_focal, True),
-    "OPENCV_FISHEYE": (8, _split_two_focals, True),
+MODELS: dict[str, tuple[int, Make]] = {
+    "SIMPLE_PINHOLE": (1, _perspective),
+    "PINHOLE": (2, _perspective),
+    "SIMPLE_RADIAL": (1, _perspective),
+    "RADIAL": (1, _perspective),
+    "OPENCV": (2, _perspective),
+    "FULL_OPENCV": (2, _perspective),
+    "SIMPLE_FISHEYE": (1, _fisheye),
+    "FISHEYE": (2, _fisheye),
+    "SIMPLE_RADIAL_FISHEYE": (1, _fisheye),
+    "RADIAL_FISHEYE": (1, _fisheye),
+    "OPENCV_FISHEYE": (2, _fisheye),
+    "FOV": (2, lambda linear, rest, _: field_of_view_lens(rest[0], linear)),
+    "EUCM": (2, lambda linear, rest, _: extended_unified_lens(rest[0], rest[1], linear)),
+    "THIN_PRISM_FISHEYE": (2, lambda linear, rest, _: thin_prism_fisheye_lens(linear, rest)),
+    "SIMPLE_DIVISION": (1, lambda linear, rest, _: division_lens(rest[0], linear)),
+    "DIVISION": (2, lambda linear, rest, _: division_lens(rest[0], linear)),
 }
-"""The models read: the number of their parameters, their order, and whether it is a fisheye. Written are OPENCV,
+"""The models read: how many focal lengths come first, and the lens of the parameters after cx, cy. Written are OPENCV,
 FULL_OPENCV and OPENCV_FISHEYE."""
 
 
@@ -128,106 +141,95 @@ def _image_names(rig: Rig) -> tuple[list[str], list[str]]:
 
 
 def knows(source: Source) -> bool:
-    """Whether it is a folder, or a file of such a folder.
+    """Whether it is a folder of a model, or a file of one.
 
     Args:
         source: What is given.
     """
-    return bool({CAMERAS_FILE, IMAGES_FILE} & source.file_names)
+    return bool(
+        {f"{name}{ending}" for name in ("cameras", "images") for ending in (".txt", ".bin")} & source.file_names
+    )
 
 
 def read(path: Path) -> Rig:
-    """Read a folder with cameras.txt and images.txt; each image becomes a camera, named after it.
+    """Read a model, text or binary.
+
+    Each image becomes a camera, named after it; of a model with a rig each of its sensors, at the place it has in the
+    rig, which is the world where the rig moved.
 
     Args:
         path: The folder, or one of its files.
 
     Raises:
-        DatasetError: It is no such folder, or a file has a mistake; the error names the line.
+        DatasetError: It is no such folder, or a file has a mistake; the error names the line or the byte.
     """
-    if path.is_file() and path.name in (CAMERAS_FILE, IMAGES_FILE, POINTS_FILE):
-        path = path.parent
-    if not (path / CAMERAS_FILE).is_file() or not (path / IMAGES_FILE).is_file():
+    path = path.parent if path.is_file() else path
+    model = read_model(path)
+    views, notes = _rig_views(model)
+    if not views:
+        views, notes = [(image.name, image.camera, image.pose) for image in model.images], []
+    if len(views) > MAX_CAMERAS:
         raise DatasetError(
-            f"{path} is no COLMAP text model.",
-            why=f"it must be a folder with {CAMERAS_FILE} and {IMAGES_FILE}",
-            fix="colmap model_converter --input_path MODEL --output_path TEXT --output_type TXT",
-        )
-    text = read_text(path / CAMERAS_FILE, MAX_BYTES)
-    lenses = dict(_read_camera(line, f"{path / CAMERAS_FILE}, line {n}") for n, line in _content_lines(text))
-    lines = _image_lines(read_text(path / IMAGES_FILE, MAX_BYTES))
-    images = [_read_image(line, f"{path / IMAGES_FILE}, line {n}") for n, line in lines]
-    if len(images) > MAX_CAMERAS:
-        raise DatasetError(
-            f"{path / IMAGES_FILE} has {len(images)} images.",
+            f"{path}: it has {len(views)} images.",
             why=f"each image is a camera of the rig, and a rig has at most {MAX_CAMERAS}",
             fix="keep one image of each camera",
         )
-    names, cameras, notes = _camera_names([name for name, _, _ in images]), [], []
-    for name, (image, key, pose) in zip(names, images, strict=True):
-        if key not in lenses:
+    cameras = []
+    for name, (image, key, pose) in zip(_camera_names([view[0] for view in views]), views, strict=True):
+        if key not in model.cameras:
             raise DatasetError(
-                f"{path / IMAGES_FILE}: image {image!r} wants camera {key!r}, which {CAMERAS_FILE} does not have.",
+                f"{path}: image {image!r} wants camera {key!r}, which the file of cameras does not have.",
                 fix="export both files together",
             )
-        size, lens = lenses[key]
-        camera, cost = make_camera(name, size, lens, pose, str(path))
+        entry = model.cameras[key]
+        camera, cost = make_camera(name, entry.size, _lens_of(entry), pose, str(path))
         cameras.append(camera)
         notes += cost
-    unit = re.search(f"^{_UNIT_COMMENT}(.{{1,40}})$", text, re.MULTILINE)
+    unit = re.search(f"^{_UNIT_COMMENT}(.{{1,40}})$", model.comment, re.MULTILINE)
     with naming(path):
         return Rig(tuple(cameras), unit[1].strip() if unit else UNKNOWN_UNIT, tuple(notes))
 
 
-def _content_lines(text: str) -> list[tuple[int, str]]:
-    """Lines with their numbers, from 1, that are neither empty nor comments."""
-    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1)]
-    return [(n, line) for n, line in lines if line and not line.startswith("#")]
+def _rig_views(model: Model) -> tuple[list[tuple[str, str, Pose]], list[str]]:
+    """For each sensor of the rigs the name of one of its images, its camera and its place; and what to know of them.
+
+    None where each camera is a rig of its own, as in models without rigs. Places are those of rigs and frames, not of
+    images: COLMAP 4.2.0 writes images that do not agree with them (colmap/colmap issue 4752).
+    """
+    rigs = [rig for rig in model.rigs if len(rig.sensors) > 1 and None not in rig.sensors.values()]
+    if not rigs or len(rigs) < len(model.rigs):
+        return [], []
+    views, moved = [], False
+    for rig in rigs:
+        frames = [frame.pose for frame in model.frames if frame.rig == rig.key]
+        world = frames[0] if frames else Pose(np.eye(3), np.zeros(3))
+        if any(not _is_same(world, frame) for frame in frames):
+            world, moved = Pose(np.eye(3), np.zeros(3)), True
+        names = {image.camera: image.name for image in reversed(model.images)}
+        views += [(names.get(k, f"camera{k}"), k, p @ world) for k, p in rig.sensors.items() if p is not None]
+    if moved and len(rigs) > 1:
+        return [], []
+    return views, ["The rig moved: the world is its own frame, that of its first sensor."] if moved else []
 
 
-def _image_lines(text: str) -> list[tuple[int, str]]:
-    """The first line of each image: the line after it lists points, and may be empty."""
-    first, skip = [], False
-    for n, line in enumerate(text.splitlines(), 1):
-        if skip:
-            skip = False
-        elif line.strip() and not line.lstrip().startswith("#"):
-            first.append((n, line.strip()))
-            skip = True
-    return first
+def _is_same(a: Pose, b: Pose) -> bool:
+    near = np.abs(a.translation - b.translation).max() <= SAME_POSE * (np.abs(a.translation).max() or 1.0)
+    return bool(near and np.abs(a.rotation - b.rotation).max() <= SAME_POSE)
 
 
-def _read_camera(line: str, place: str) -> tuple[str, tuple[tuple[int, int], Lens | OtherLens]]:
-    parts = line.split()
-    if len(parts) < 4 or not (parts[2].isdecimal() and parts[3].isdecimal() and len(parts[2] + parts[3]) < 20):
+def _lens_of(entry: CameraEntry) -> Lens | OtherLens:
+    if entry.model not in MODELS:
         raise DatasetError(
-            f"{place}: {shorten(line)} is not CAMERA_ID MODEL WIDTH HEIGHT PARAMS.", fix="export it again"
-        )
-    key, model = parts[:2]
-    if model not in MODELS:
-        raise DatasetError(
-            f"{place}: the lens model {shorten(model)} is not supported{did_you_mean(model, MODELS)}.",
+            f"{entry.place}: the lens model {shorten(entry.model)} is not supported"
+            f"{did_you_mean(entry.model, MODELS)}.",
             why=f"supported are {', '.join(MODELS)}",
             fix="reconstruct with --ImageReader.camera_model OPENCV or OPENCV_FISHEYE",
         )
-    count, split, fisheye = MODELS[model]
-    linear, distortion = split(read_numbers(parts[4:], (count,), f"{place}: PARAMS of {model}").tolist())
-    wanted = 4 if fisheye or len(distortion) < 4 else len(distortion)
-    distortion += [0.0] * (wanted - len(distortion))
-    linear[2:] = [linear[2] - CENTRE_OFFSET_PX, linear[3] - CENTRE_OFFSET_PX]
-    return key, ((int(parts[2]), int(parts[3])), lens_from_numbers(linear, distortion, fisheye, place))
-
-
-def _read_image(line: str, place: str) -> tuple[str, str, Pose]:
-    parts = line.split()
-    if len(parts) < 10:
-        raise DatasetError(
-            f"{place}: {shorten(line)} is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME.", fix="export it again"
-        )
-    w, x, y, z, *translation = read_numbers(parts[1:8], (7,), f"{place}: pose").tolist()
-    if not abs(np.linalg.norm([w, x, y, z]) - 1) < 1e-3:
-        raise DatasetError(f"{place}: the quaternion does not have length 1.", fix="export it again")
-    return parts[9], parts[8], Pose(Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(translation))
+    focals, make = MODELS[entry.model]
+    count = MODEL_NUMBERS[entry.model][1]
+    params = read_numbers(entry.params, (count,), f"{entry.place}: PARAMS of {entry.model}").tolist()
+    f, (cx, cy), rest = params[:focals], params[focals : focals + 2], params[focals + 2 :]
+    return make([f[0], f[-1], cx - CENTRE_OFFSET_PX, cy - CENTRE_OFFSET_PX], rest, entry.place)
 
 
 def _camera_names(images: list[str]) -> list[str]:

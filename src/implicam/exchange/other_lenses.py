@@ -165,6 +165,24 @@ def field_of_view_lens(omega: float, linear: Sequence[float]) -> OtherLens:
     return OtherLens("the field-of-view lens model", project, linear[2], linear[3])
 
 
+def division_lens(k: float, linear: Sequence[float]) -> OtherLens:
+    """COLMAP's DIVISION: the undistorted radius is r / (1 + k r²); A. Fitzgibbon, CVPR 2001.
+
+    Args:
+        k: Of the squared distorted radius.
+        linear: Fx, fy, cx, cy in pixels.
+    """
+
+    def project(points: Floats) -> tuple[Floats, Bools]:
+        xy, valid = _plane(points, points[:, 2])
+        root = 1 - 4 * k * np.sum(xy**2, axis=1)
+        # r_u (1 + k r²) = r, the smaller root
+        ratio = 2 / (1 + np.sqrt(np.where(root >= 0, root, np.nan)))
+        return _pixels(xy * ratio[:, None], linear), valid & (root >= 0)
+
+    return OtherLens("COLMAP's division model", project, linear[2], linear[3])
+
+
 def thin_prism_fisheye_lens(linear: Sequence[float], coefficients: Sequence[float]) -> OtherLens:
     """COLMAP's THIN_PRISM_FISHEYE: OpenCV's radial, decentring and thin prism terms after the angle to the axis.
 

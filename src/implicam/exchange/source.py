@@ -16,7 +16,7 @@ from implicam.dataset.tables import parse_toml
 from implicam.errors import DatasetError, import_extra
 from implicam.exchange.checks import as_table, list_names, read_text, shorten
 
-_YAML_KEY = re.compile(r"""^(["']?)([A-Za-z_][^:"'#{}\[\]\n]*)\1[ \t]*:(?:[ \t]|$)""", re.MULTILINE)
+_YAML_KEY = re.compile(r"""^(["']?)([A-Za-z_][-\w. ]{0,80})\1[ \t]*:(?:[ \t]|$)""", re.MULTILINE)
 
 
 @dataclass(frozen=True)
