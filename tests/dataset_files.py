@@ -97,6 +97,7 @@ def assert_same(a: Dataset, b: Dataset) -> None:
     assert same_numbers(a.observations.uv, b.observations.uv)
     assert same_numbers(a.observations.sd, b.observations.sd)
     assert same_columns(a.observations.extra, b.observations.extra)
+    assert same_columns(a.columns, b.columns)
     assert (a.known is None) == (b.known is None)
     if a.known and b.known:
         assert a.known.shots.tolist() == b.known.shots.tolist()

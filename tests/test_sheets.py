@@ -283,6 +283,51 @@ def test_columns_of_views_go_to_their_cameras(tmp_path: Path) -> None:
     assert read.observations.sd[0, 0].tolist() == [0.25, 0.5]
 
 
+TRAJECTORY = (
+    "point,frame,marker,u_a,v_a,u_b,v_b,likelihood_a,likelihood_b\n"
+    "p1,1,A,1,2,3,4,.9,.8\np2,1,B,5,6,,,.7,\np3,2,A,,,,,,\n"
+)
+
+
+@pytest.mark.parametrize("form", ["again.csv", "again.npz", "again.parquet", "folder"])
+def test_columns_of_points_that_are_to_be_measured_are_kept(form: str, tmp_path: Path) -> None:
+    if form.endswith("parquet"):
+        pytest.importorskip("pyarrow")
+    data = sheet(tmp_path, TRAJECTORY)
+    assert {name: column.tolist() for name, column in data.columns.items()} == {
+        "frame": ["1", "1", "2"], "marker": ["A", "B", "A"],
+    }  # fmt: skip
+    if form == "folder":
+        data = data.select([1, 0])  # a folder without positions has no place for a point that nobody saw
+    write_dataset(data, tmp_path / form)
+    assert_same(read_dataset(tmp_path / form), data)
+
+
+def test_further_columns_reach_measured_csv(tmp_path: Path) -> None:
+    data = sheet(tmp_path, TRAJECTORY)
+    further = data.further_columns()
+    assert {name: column.tolist() for name, column in further.items()} == {
+        "frame": ["1", "1", "2"], "marker": ["A", "B", "A"], "likelihood_a": [".9", ".7", ""],
+        "likelihood_b": [".8", "", ""],
+    }  # fmt: skip
+    nothing = np.full((3, 3), np.nan)
+    measured = Measurement(
+        data.points, nothing, np.full((3, 3, 3), np.nan), np.zeros(3, int), nothing[:, 0], np.array(["a"] * 3), "mm"
+    )
+    measured.with_columns({**further, "views": data.points}).write_csv(tmp_path / "m.csv")
+    rows = list(csv.reader((tmp_path / "m.csv").read_text().splitlines()))
+    assert rows[0][13:] == ["share_calibration", "frame", "marker", "likelihood_a", "likelihood_b", "views_"]
+    assert rows[3][14:] == ["2", "A", "", "", "p3"]
+
+
+def test_a_column_of_points_has_one_text_for_all_views(tmp_path: Path) -> None:
+    write_dataset(sheet(tmp_path, TRAJECTORY).select([0]), tmp_path / "rig")
+    path = tmp_path / "rig" / "observations.csv"
+    path.write_text(path.read_text().replace("p1,b,3.0,4.0,1", "p1,b,3.0,4.0,2"))
+    with pytest.raises(DatasetError, match="frame = '2', and '1' in another view of point 'p1'"):
+        read_dataset(tmp_path / "rig")
+
+
 @pytest.mark.parametrize("first", ["sep=;\n", "sep=;\r\n", '"sep=;"\n'])
 def test_the_line_that_tells_excel_the_separator(first: str, tmp_path: Path) -> None:
     assert sheet(tmp_path, first + "x;y;z;u_a;v_a\n1;2;3;4;5\n").xyz.tolist() == [[1, 2, 3]]

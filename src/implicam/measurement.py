@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -39,6 +40,7 @@ class Measurement:
             no number of it can be trusted, and every reason begins with `DOUBTFUL`. Empty where nothing is wrong.
         share_calibration: (n,) from 0 to 1, the share of the variance (trace of cov) that more known points could
             remove; the rest is the pixel noise of this measurement. NaN where the method cannot tell them apart.
+        columns: Further columns of the data that were measured, (n,) text each, which measured.csv repeats.
     """
 
     points: Names
@@ -50,6 +52,7 @@ class Measurement:
     length_unit: str
     alarm: str = ""
     share_calibration: Floats = field(default_factory=lambda: np.zeros(0))
+    columns: Mapping[str, Names] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """A covariance is symmetric to the last bit, whatever order a method or a processor summed it in."""
@@ -71,6 +74,16 @@ class Measurement:
         return np.array(
             [str(reason).removeprefix(DOUBTFUL).removeprefix("; ") for reason in self.reason], dtype=np.str_
         )
+
+    def with_columns(self, columns: Mapping[str, Names]) -> Measurement:
+        """The same measurement with further columns for measured.csv.
+
+        Args:
+            columns: (n,) text each, such as `Dataset.further_columns` gives; one with a name of `MEASURED_COLUMNS` gets
+                an underscore behind it.
+        """
+        free = {f"{name}_" if name in MEASURED_COLUMNS else name: column for name, column in columns.items()}
+        return replace(self, columns=free)
 
     def with_alarm(self, alarm: str) -> Measurement:
         """The same measurement with every row marked as doubtful.
@@ -106,5 +119,5 @@ class Measurement:
             share = self.share_calibration[i]
             tail = [str(int(self.views[i])), "" if np.isnan(p) else repr(float(p)), str(self.reason[i])]
             tail.append("" if np.isnan(share) else repr(float(share)))
-            rows.append([str(name), *row, *tail])
-        write_text(Path(path), csv_text(MEASURED_COLUMNS, rows))
+            rows.append([str(name), *row, *tail, *(str(column[i]) for column in self.columns.values())])
+        write_text(Path(path), csv_text([*MEASURED_COLUMNS, *self.columns], rows))

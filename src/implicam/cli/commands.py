@@ -181,7 +181,7 @@ def measure_command(
     data = _read_to_measure(dataset, table, fitted.data.length_unit)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
-        measured = fitted.measure(data.observations)
+        measured = fitted.measure(data.observations).with_columns(data.further_columns())
         progress("measuring", 1, 1)
     measured.write_csv(output)
     count, typical = int(measured.measured.sum()), _typical(measured.sd)

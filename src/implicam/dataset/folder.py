@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,9 @@ DESCRIPTION, POINTS, VIEWS, IMAGES = "dataset.toml", "points.csv", "observations
 TRUTH = "truth.toml"
 """What only a simulated rig has beside its data; its photographs can be taken again."""
 
+_OF_POINTS = "point_columns"
+"""Entry of dataset.toml: which columns of observations.csv say something of the point, not of the view."""
+
 _SD_NUMBER = NumberColumn("leave the cell empty where no uncertainty is stated", missing=("",))
 _POSITION_NUMBER = NumberColumn("a known point needs its position: add it, or remove the point")
 _PIXEL_NUMBER = NumberColumn(
@@ -65,7 +69,26 @@ def read_folder(path: Path) -> Dataset:
     observations, missing = _read_observations(path, cameras, table and table[0])
     notes = (f"{missing} rows of {VIEWS} have no pixels: views that are missing.",) if missing else ()
     with naming(path / DESCRIPTION):
-        return Dataset(name, unit, observations, table and table[1], extra, notes)
+        listed = extra.pop(_OF_POINTS, []) if table is None else []
+        observations, columns = _columns_of_points(observations, listed)
+        return Dataset(name, unit, observations, table and table[1], extra, notes, columns)
+
+
+def _columns_of_points(observations: Observations, listed: Any) -> tuple[Observations, dict[str, Names]]:
+    """The columns of observations.csv that dataset.toml says are those of points, one text for all views of each."""
+    seen, rest, found = observations.seen, dict(observations.extra), dict[str, Names]()
+    for name in listed if isinstance(listed, list) else [listed]:
+        if name not in rest:
+            raise DatasetError(f"{VIEWS} has no column {str(name)!r}.", fix=f"remove it from {_OF_POINTS}, or add it")
+        views = rest.pop(name)
+        found[name] = views[np.arange(len(views)), seen.argmax(axis=1)]
+        for i, k in np.argwhere((views != found[name][:, None]) & seen)[:1]:
+            texts, point = (str(views[i, k])[:60], str(found[name][i])[:60]), str(observations.points[i])
+            raise DatasetError(
+                f"{VIEWS}: {name} = {texts[0]!r}, and {texts[1]!r} in another view of point {point!r}.",
+                fix=f"give all views of a point the same {name}, or remove it from {_OF_POINTS}",
+            )
+    return replace(observations, extra=rest), found
 
 
 def read_description(path: Path) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
@@ -246,6 +269,12 @@ def folder_files(data: Dataset) -> dict[str, str]:
             would be lost.
     """
     _refuse_to_lose(data)
+    if data.columns:
+        repeated = {c: np.where(data.observations.seen, v[:, None], "") for c, v in data.columns.items()}
+        observations = replace(data.observations, extra={**repeated, **data.observations.extra})
+        data = replace(
+            data, observations=observations, columns={}, extra={_OF_POINTS: list(data.columns), **data.extra}
+        )
     files = {DESCRIPTION: description_text(data), VIEWS: _observations_text(data.observations)}
     if data.known is not None:
         files[POINTS] = _points_text(data.points, data.known)

@@ -44,6 +44,9 @@ TRUTH_COLUMNS = (
 )  # fmt: skip
 """Extra columns of points.csv that `implicam simulate` writes: where the point really was, and its Cramer-Rao limit."""
 
+TRUE_VIEW_COLUMNS = ("true_u", "true_v", "outlier")
+"""Extra columns of observations.csv that `implicam simulate` writes."""
+
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 
 
@@ -244,6 +247,8 @@ class Dataset:
         known: The positions, in the order of the observations; None where they are to be measured.
         extra: Other entries of dataset.toml, as plain values.
         notes: What was corrected in reading, such as marks for missing views; not written to files.
+        columns: Further columns of points without known positions as text, (n,) each, such as a frame; where positions
+            are known, these are columns of `known`.
     """
 
     name: str
@@ -252,11 +257,19 @@ class Dataset:
     known: KnownPositions | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    columns: Mapping[str, Names] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_name(self.name, "dataset name")
         check_name(self.length_unit, "length unit")
-        _freeze(self, extra=_check_entries(self.extra, _DATASET_KEYS, f"dataset {self.name!r}"))
+        taken = (*VIEW_COLUMNS, *SD_VIEW, *self.observations.extra)
+        columns = _check_columns(self.columns, (len(self.observations),), taken)
+        _freeze(self, extra=_check_entries(self.extra, _DATASET_KEYS, f"dataset {self.name!r}"), columns=columns)
+        if self.columns and self.known is not None:
+            raise DatasetError(
+                f"dataset {self.name!r} has columns of its own, and known positions.",
+                fix="put the columns into those of the known positions",
+            )
         if self.known is not None and len(self.known.shots) != len(self.observations):
             raise DatasetError(
                 f"{len(self.observations)} observed points, but {len(self.known.shots)} known positions.",
@@ -334,7 +347,26 @@ class Dataset:
             index: (n,) a boolean mask; or numbers of points, in the order wanted.
         """
         known = self.known.select(index) if self.known else None
-        return replace(self, observations=self.observations.select(index), known=known)
+        columns = {key: value[_index(index)] for key, value in self.columns.items()}
+        return replace(self, observations=self.observations.select(index), known=known, columns=columns)
+
+    def further_columns(self) -> dict[str, Names]:
+        """What files say of each point besides its position, (n,) text each, as measured.csv repeats it.
+
+        A column of views is one column where all views of each point agree, else one for each camera: NAME_CAMERA.
+        The truth and the limits of a simulation are left out.
+        """
+        own = self.known.extra if self.known else self.columns
+        found = {name: column for name, column in own.items() if name not in TRUTH_COLUMNS}
+        seen = self.observations.seen
+        of_views = {name: views for name, views in self.observations.extra.items() if name not in TRUE_VIEW_COLUMNS}
+        for name, views in of_views.items():
+            first = views[np.arange(len(self)), seen.argmax(axis=1)]
+            if ((views == first[:, None]) | ~seen).all():
+                found[name] = np.where(seen.any(axis=1), first, "")
+            else:
+                found |= {f"{name}_{camera.name}": views[:, k] for k, camera in enumerate(self.cameras)}
+        return found
 
     def with_cameras(self, names: Sequence[str]) -> Dataset:
         """The dataset of some cameras; every point stays, seen or not.
@@ -457,7 +489,8 @@ def join(first: Dataset, second: Dataset) -> Dataset:
             np.concatenate([p.sd, q.sd]),
             _join_columns(p.extra, q.extra, (len(first),), (len(second),)),
         )
-    return replace(first, observations=observations, known=known)
+    columns = _join_columns(first.columns, second.columns, (len(first),), (len(second),))
+    return replace(first, observations=observations, known=known, columns=columns)
 
 
 def metres_per(unit: str) -> float:

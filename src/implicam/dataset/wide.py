@@ -169,7 +169,8 @@ def _assemble(table: Columns, layout: _Layout) -> Dataset:
                 "points",
             )
         known = table.known_positions(points, layout.point_extra)
-    return Dataset(layout.name, layout.unit, observations, known, layout.extra)
+    columns = {} if known else {c: np.array(table.texts[c], dtype=np.str_) for c in layout.point_extra}
+    return Dataset(layout.name, layout.unit, observations, known, layout.extra, columns=columns)
 
 
 def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
@@ -216,7 +217,7 @@ def _make_columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
     view_extra = [
         (f"{key}_{c.name}", v[:, k]) for key, v in observations.extra.items() for k, c in enumerate(data.cameras)
     ]
-    extra = [*(data.known.extra.items() if data.known else ()), *view_extra]
+    extra = [*(data.known.extra if data.known else data.columns).items(), *view_extra]
     _check_distinct(data.cameras, [column for column, _ in extra])
     description = parse_toml(description_text(data))
     if observations.extra:
@@ -374,6 +375,11 @@ def arrays_from_dataset(data: Dataset) -> dict[str, NDArray[Any]]:
             "point_columns": np.array(list(k.extra), dtype=np.str_),
             "point_text": np.array([*k.extra.values()], dtype=np.str_).reshape(len(k.extra), len(data)),
         }
+    elif data.columns:
+        arrays |= {
+            "point_columns": np.array(list(data.columns), dtype=np.str_),
+            "point_text": np.array([*data.columns.values()], dtype=np.str_).reshape(len(data.columns), len(data)),
+        }
     return arrays
 
 
@@ -393,11 +399,12 @@ def dataset_from_arrays(arrays: Mapping[str, NDArray[Any]], path: Path) -> Datas
             name, unit, cameras, extra = description_from_toml(description, path)
             view_extra = dict(zip(arrays["view_columns"].tolist(), arrays["view_text"], strict=True))
             observations = Observations(arrays["points"], cameras, arrays["uv"], arrays["uv_sd"], view_extra)
-            known = None
+            known, columns = None, {}
+            if "xyz" in arrays or "point_columns" in arrays:
+                columns = dict(zip(arrays["point_columns"].tolist(), arrays["point_text"], strict=True))
             if "xyz" in arrays:
-                point_extra = dict(zip(arrays["point_columns"].tolist(), arrays["point_text"], strict=True))
-                known = KnownPositions(arrays["shots"], arrays["xyz"], arrays["xyz_sd"], point_extra)
-            return Dataset(name, unit, observations, known, extra)
+                known = KnownPositions(arrays["shots"], arrays["xyz"], arrays["xyz_sd"], columns)
+            return Dataset(name, unit, observations, known, extra, columns={} if known else columns)
     except KeyError as error:
         raise DatasetError(f"{path} has no array {error}.", fix="write it again with implicam") from None
     except (ValueError, TypeError, IndexError) as error:
