@@ -291,7 +291,7 @@ def test_it_keeps_the_contract(test: Any, tmp_path: Any, request: pytest.Fixture
     needs_one_way(request)
     given = {"case": CASE, "tmp_path": tmp_path}
     names = test.__code__.co_varnames[: test.__code__.co_argcount]
-    (more,) = [mark.args for mark in test.pytestmark if mark.args[0] != "case"] or [None]
+    (more,) = [mark.args for mark in test.pytestmark if mark.name == "parametrize" and mark.args[0] != "case"] or [None]
     for value in [None] if more is None else more[1]:
         test(**{name: given.get(name, value) for name in names})
 

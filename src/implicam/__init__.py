@@ -55,6 +55,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.evaluation import cross_validate as cross_validate
     from implicam.evaluation import evaluate as evaluate
     from implicam.evaluation import leave_out_shots as leave_out_shots
+    from implicam.measurement import MeasuredPoint as MeasuredPoint
     from implicam.measurement import Measurement as Measurement
     from implicam.simulate import simulated as simulated
     from implicam.verdict import Verdict as Verdict
@@ -77,7 +78,7 @@ _NAMES = {
         "MissingExtraError", "NumericalError", "PartError", "UsageError",
     ),
     "implicam.evaluation": ("Evaluation", "cross_validate", "evaluate", "leave_out_shots"),
-    "implicam.measurement": ("Measurement",),
+    "implicam.measurement": ("MeasuredPoint", "Measurement"),
     "implicam.simulate": ("simulated",),
     "implicam.verdict": ("Verdict", "judge"),
 }  # fmt: skip

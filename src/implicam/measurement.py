@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from implicam.dataset import Floats, Names
 from implicam.dataset.folder import csv_text
+from implicam.dataset.frames import keep_others, rigid_parts
+from implicam.dataset.model import metres_per
+from implicam.errors import UsageError, did_you_mean, import_extra
 from implicam.files import write_text
+from implicam.formatting import decimal_number
 
 MEASURED_COLUMNS = (
     "point", "x", "y", "z", "sd_x", "sd_y", "sd_z", "cov_xy", "cov_xz", "cov_yz", "views", "consistency", "reason",
@@ -19,13 +25,60 @@ MEASURED_COLUMNS = (
 )  # fmt: skip
 
 
+MAX_LINES_SHOWN = 7
+"""Points that an interactive Python shows of a measurement."""
+MAX_CHARACTERS_SHOWN = 110
+
 DOUBTFUL = "doubtful: the table as a whole contradicts the calibration"
 """How the reason of every row begins where there is an alarm."""
 
 
 @dataclass(frozen=True, eq=False)
+class MeasuredPoint:
+    """One point of a `Measurement`, which has the meaning of each field.
+
+    Attributes:
+        point: Its name.
+        xyz: (3,), NaN where it could not be measured.
+        cov: (3, 3) covariance of the position.
+        views: Number of views used.
+        consistency: p-value of the test that the views agree.
+        reason: Why it was not measured, or which views were left out.
+        length_unit: Of the position.
+        share_calibration: Share of the variance that more known points could remove.
+    """
+
+    point: str
+    xyz: Floats
+    cov: Floats
+    views: int
+    consistency: float
+    reason: str
+    length_unit: str
+    share_calibration: float
+
+    @property
+    def sd(self) -> Floats:
+        """(3,) standard uncertainties of x, y and z."""
+        return np.asarray(np.sqrt(np.diagonal(self.cov)))
+
+    @property
+    def measured(self) -> bool:
+        """Whether there is a position."""
+        return not np.isnan(self.xyz[0])
+
+    def __repr__(self) -> str:
+        if not self.measured:
+            return f"{self.point}: not measured, {self.reason}"
+        position = ", ".join(f"{axis} {_with_sd(*pair)}" for axis, *pair in zip("xyz", self.xyz, self.sd, strict=True))
+        return f"{self.point}: {position} {self.length_unit}, {self.views} views{self.reason and '; '}{self.reason}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Measurement:
     """Positions of n points, in the world frame and length unit of the calibration.
+
+    `measurement[0]`, `measurement["p0001"]` and iteration give a `MeasuredPoint` each.
 
     Attributes:
         points: (n,) names.
@@ -62,6 +115,132 @@ class Measurement:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __getitem__(self, which: int | str) -> MeasuredPoint:
+        """A point by its number, from the end where that is negative, or by its name.
+
+        Args:
+            which: The number or the name.
+
+        Raises:
+            IndexError: There is no such number; it ends an iteration.
+            UsageError: There is no such name, or it is neither.
+        """
+        if isinstance(which, str):
+            found = np.flatnonzero(self.points == which)
+            if not len(found):
+                near = did_you_mean(which, map(str, self.points))
+                raise UsageError(f"there is no point {which!r}{near}.", fix="`points` has the names")
+            which = int(found[0])
+        if not isinstance(which, int | np.integer):
+            raise UsageError(
+                f"a measurement is asked for one point, by number or name, and not by {type(which).__name__}.",
+                fix="for some of the points: measurement.select(index)",
+            )
+        i = range(len(self))[which]  # IndexError
+        return MeasuredPoint(
+            str(self.points[i]), self.xyz[i], self.cov[i], int(self.views[i]), float(self.consistency[i]),
+            str(self.reason[i]), self.length_unit, float(self.share_calibration[i]),
+        )  # fmt: skip
+
+    def __iter__(self) -> Iterator[MeasuredPoint]:
+        return (self[i] for i in range(len(self)))
+
+    def __repr__(self) -> str:
+        lines = [self._summary]
+        shown = min(len(self), MAX_LINES_SHOWN + (len(self) == MAX_LINES_SHOWN + 1))
+        lines += [f"  {_shortened(repr(self[i]))}" for i in range(shown)]
+        lines += [f"  ... and {len(self) - shown} more"] if shown < len(self) else []
+        return "\n".join([*lines, *([f"  ALARM: {_shortened(self.alarm)}"] if self.alarm else [])])
+
+    def _repr_html_(self) -> str:
+        heads = "".join(
+            f"<th>{head}</th>" for head in ("point", *(f"{a}, {self.length_unit}" for a in "xyz"), "views", "reason")
+        )
+        rows = []
+        for one in (self[i] for i in range(min(len(self), MAX_LINES_SHOWN))):
+            axes = [_with_sd(*pair) for pair in zip(one.xyz, one.sd, strict=True)] if one.measured else ["-"] * 3
+            cells = [one.point, *axes, str(one.views), _shortened(one.reason)]
+            rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
+        more = f"<p>... and {len(self) - len(rows)} more</p>" if len(rows) < len(self) else ""
+        alarm = f"<p><b>ALARM:</b> {escape(self.alarm)}</p>" if self.alarm else ""
+        table = f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+        return f"<p>{escape(self._summary)}</p>{alarm}{table}{more}"
+
+    @property
+    def _summary(self) -> str:
+        count, sd = int(self.measured.sum()), self.sd[self.measured]
+        typical = (
+            ", ".join(f"{a} {decimal_number(x)}" for a, x in zip("xyz", np.median(sd, axis=0), strict=True))
+            if count
+            else ""
+        )
+        stated = f", typical sd {typical} {self.length_unit}" if count and np.isfinite(sd).all() else ""
+        return f"measurement of {len(self):,} point{'s' * (len(self) != 1)}, {count:,} measured{stated}"
+
+    def select(self, index: ArrayLike) -> Measurement:
+        """The measurement of some points; the alarm, which is of the whole table, stays.
+
+        Args:
+            index: A boolean mask (n,); or numbers of points, in the order wanted.
+        """
+        i = np.asarray(index)
+        i = i if i.size else i.astype(np.intp)
+        return replace(
+            self, points=self.points[i], xyz=self.xyz[i], cov=self.cov[i], views=self.views[i],
+            consistency=self.consistency[i], reason=self.reason[i], share_calibration=self.share_calibration[i],
+            columns={key: column[i] for key, column in self.columns.items()},
+        )  # fmt: skip
+
+    def without_points(self, names: Iterable[str]) -> Measurement:
+        """The measurement of all other points.
+
+        Args:
+            names: Of the points to leave out.
+
+        Raises:
+            UsageError: There is no such point.
+        """
+        return self.select(keep_others(self.points, names))
+
+    def in_unit(self, unit: str) -> Measurement:
+        """The same measurement in another length unit.
+
+        Args:
+            unit: For example "m".
+
+        Raises:
+            DatasetError: The unit has no known length.
+        """
+        factor = metres_per(self.length_unit) / metres_per(unit)
+        return replace(self, xyz=self.xyz * factor, cov=self.cov * factor**2, length_unit=unit)
+
+    def transformed(self, pose: Any) -> Measurement:
+        """The same points in another frame of the world; the covariances turn with it.
+
+        Args:
+            pose: What takes a position to the other frame: SciPy's Rotation, or a rigid 4 x 4 matrix (a translation in
+                the length unit).
+
+        Raises:
+            UsageError: It is no rotation and no rigid matrix.
+        """
+        rotation, shift = rigid_parts(pose)
+        return replace(self, xyz=self.xyz @ rotation.T + shift, cov=rotation @ self.cov @ rotation.T)
+
+    def to_dataframe(self) -> Any:
+        """A pandas table with the columns of measured.csv, NaN where there is no number.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        pandas = import_extra("pandas", "pandas", "a table of pandas")
+        off_diagonal = self.cov[:, [0, 0, 1], [1, 2, 2]]
+        values = np.concatenate([self.xyz, self.sd, off_diagonal], axis=1).T
+        columns = dict(zip(MEASURED_COLUMNS, [self.points.astype(object), *values], strict=False))
+        tail = (self.views, self.consistency, self.reason.astype(object), self.share_calibration)
+        further = {key: column.astype(object) for key, column in self.columns.items()}
+        return pandas.DataFrame(columns | dict(zip(MEASURED_COLUMNS[10:], tail, strict=True)) | further)
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -121,3 +300,15 @@ class Measurement:
             tail.append("" if np.isnan(share) else repr(float(share)))
             rows.append([str(name), *row, *tail, *(str(column[i]) for column in self.columns.values())])
         write_text(Path(path), csv_text([*MEASURED_COLUMNS, *self.columns], rows))
+
+
+def _with_sd(value: float, sd: float) -> str:
+    """A number with its uncertainty, both to the second digit of the uncertainty."""
+    if not np.isfinite(sd) or sd <= 0:
+        return f"{value:.6g}"
+    decimals = max(0, 1 - int(np.floor(np.log10(sd))))
+    return f"{value + 0.0:.{decimals}f} ± {sd:.{decimals}f}"
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= MAX_CHARACTERS_SHOWN else f"{text[: MAX_CHARACTERS_SHOWN - 3]}..."

@@ -47,7 +47,7 @@ from implicam.calibrators.protocol import (
     per_axis,
 )
 from implicam.dataset import Dataset, Floats, Observations, describe_copies, remove_copies
-from implicam.dataset.requirements import match_cameras
+from implicam.dataset.requirements import match_cameras, observations_of, require_dataset
 from implicam.dataset.unused import Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
@@ -149,6 +149,7 @@ class InverseGP(CalibratorBase):
             MissingExtraError: The preset is `paper`, and its software is not installed.
             NumericalError: No search for the hyperparameters succeeded.
         """
+        require_dataset(data)
         if self.preset == "smooth":
             return self._fitted_smooth(data, progress)
         if self.preset == "paper":
@@ -208,7 +209,7 @@ def _train(
     return tuple(Hyperparameters(fit.kernel, fit.noise_variance) for fit in fits)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class InverseGPCalibration(CalibrationBase):
     """GPs conditioned on the known points that every camera saw.
 
@@ -290,11 +291,11 @@ class InverseGPCalibration(CalibrationBase):
         usable = self._usable
         return self.pixels.apply(pixels_of(usable)), self.positions.apply(usable.xyz)
 
-    def measure(self, observations: Observations) -> Measurement:
+    def measure(self, observations: Observations | Dataset) -> Measurement:
         """Measure the points that every camera saw, and whose pixels are like those learned from (`smooth`).
 
         Args:
-            observations: What the cameras saw, by their names.
+            observations: What the cameras saw, by their names; or a dataset that has it.
 
         Returns:
             Positions in the world with their covariances; other points keep their row, with a reason.
@@ -302,7 +303,7 @@ class InverseGPCalibration(CalibrationBase):
         Raises:
             DatasetError: A camera of the calibration is missing, or has images of another size.
         """
-        observations = match_cameras(self.used.observations, observations)
+        observations = match_cameras(self.used.observations, observations_of(observations))
         seen = observations.seen
         reason = missing_view_reasons(seen, observations.camera_names, self.method).astype(object)
         complete = np.flatnonzero(seen.all(axis=1))

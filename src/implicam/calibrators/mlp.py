@@ -33,7 +33,7 @@ from implicam.calibrators.mlp_settings import DEFAULT_SETTINGS, MLPSettings
 from implicam.calibrators.mlp_training import Examples, train
 from implicam.calibrators.protocol import Arrays, CalibrationBase, CalibratorBase, FitSummary, finite_column, per_axis
 from implicam.dataset import Dataset, Floats, Observations, describe_copies, remove_copies
-from implicam.dataset.requirements import match_cameras
+from implicam.dataset.requirements import match_cameras, observations_of, require_dataset
 from implicam.dataset.unused import Unused
 from implicam.errors import FitError, UsageError
 from implicam.formatting import percent
@@ -94,6 +94,7 @@ class MLP(CalibratorBase):
             FitError: There are too few points that every camera saw.
             MissingExtraError: PyTorch is not installed.
         """
+        require_dataset(data)
         (found,) = self.fit_many([data], progress)
         if isinstance(found, FitError):
             raise found
@@ -154,7 +155,7 @@ def _split(n: int, seed: int, share: float) -> NDArray[np.bool_]:
     return held_out
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MLPCalibration(CalibrationBase):
     """A trained network, and which of the usable known points (n,) were kept for early stopping."""
 
@@ -173,11 +174,11 @@ class MLPCalibration(CalibrationBase):
         """The data without the points and cameras that are there twice."""
         return remove_copies(self.data, cameras_too=True)
 
-    def measure(self, observations: Observations) -> Measurement:
+    def measure(self, observations: Observations | Dataset) -> Measurement:
         """Measure the points that every camera saw.
 
         Args:
-            observations: What the cameras saw, by their names.
+            observations: What the cameras saw, by their names; or a dataset that has it.
 
         Returns:
             Positions in the world with their covariances; other points keep their row, with a reason.
@@ -185,7 +186,7 @@ class MLPCalibration(CalibrationBase):
         Raises:
             DatasetError: A camera of the calibration is missing, or has images of another size.
         """
-        observations = match_cameras(self.used.observations, observations)
+        observations = match_cameras(self.used.observations, observations_of(observations))
         seen = observations.seen
         complete = seen.all(axis=1)
         n = len(observations)

@@ -24,6 +24,7 @@ from implicam.calibrators.position_processes import PositionProcesses
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import FitError, UsageError
+from implicam.formatting import decimal_number
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig, Sensitivity
@@ -117,11 +118,11 @@ class Calibration(Protocol):
     def rejected(self) -> tuple[Rejected, ...]:
         """The views that the fit does not use because they contradict the others, the farthest first."""
 
-    def measure(self, observations: Observations) -> Measurement:
+    def measure(self, observations: Observations | Dataset) -> Measurement:
         """Measure each point; one that cannot be measured keeps its row, with a reason.
 
         Args:
-            observations: What the cameras saw, by their names.
+            observations: What the cameras saw, by their names; or a dataset that has it.
 
         Returns:
             Positions in the world, with covariances where they are stated.
@@ -411,6 +412,16 @@ class CalibrationBase:
     calibrator: Calibrator
     data: Dataset
 
+    def __repr__(self) -> str:
+        """Two lines; `summary()` and `implicam info` of its file say more."""
+        cameras = int(self.data.observations.seen.any(axis=0).sum())
+        summary = self.summary()  # type: ignore[attr-defined]
+        off = ", ".join(f"{axis} {decimal_number(rms)}" for axis, rms in summary.leave_one_out_rms.items())
+        return (
+            f"{self.calibrator.method} calibration of {cameras} cameras from {len(self.data)} known points of "
+            f"{self.data.name!r}\n  {summary.how} within {off} {self.data.length_unit} rms"
+        )
+
     @property
     def rejected(self) -> tuple[Rejected, ...]:
         """None: the method uses every view of the points it uses."""
@@ -481,11 +492,11 @@ class RigCalibration(CalibrationBase):
         """Whether every camera is restrained to what lenses do."""
         return self.map.follows_lenses_only
 
-    def measure(self, observations: Observations) -> Measurement:
+    def measure(self, observations: Observations | Dataset) -> Measurement:
         """Measure each point with the views it has, two or more.
 
         Args:
-            observations: What the cameras saw, by their names.
+            observations: What the cameras saw, by their names; or a dataset that has it.
 
         Returns:
             Positions in the world with error bars, and of each point without one the reason.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from implicam.dataset.copies import describe_copies, find_copies, remove_copies
 from implicam.dataset.folder import folder_files, read_folder, write_folder
+from implicam.dataset.joining import join
 from implicam.dataset.marks import remove_marks
 from implicam.dataset.model import (
     TRUTH_COLUMNS,
@@ -18,7 +19,6 @@ from implicam.dataset.model import (
     Observations,
     Truth,
     covariance_from_columns,
-    join,
 )
 from implicam.dataset.table_options import TableOptions, size_text
 from implicam.dataset.wide import (

@@ -9,12 +9,12 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import date, time
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from implicam.dataset.plain import to_plain
 from implicam.errors import DatasetError, did_you_mean
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,6 @@ _CAMERA_KEYS, _DATASET_KEYS = ("name", "width", "height"), ("name", "length_unit
 # A text column is as wide as its longest text in every row, so one long cell would cost gigabytes.
 MAX_NAME_CHARACTERS, MAX_CELL_CHARACTERS = 200, 1000
 MAX_IMAGE_SIZE_PX = 1_000_000
-MAX_TOML_DEPTH = 50
 
 OUTSIDE_MARGIN_SHARE, OUTSIDE_MARGIN_PX = 0.02, 2.0
 """How far outside its image a centre may lie, for half of the ball is still in it: share of the longer side, and px."""
@@ -236,7 +235,7 @@ class Truth:
     limit: Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dataset:
     """Observations, the known positions of the same points, and the length unit.
 
@@ -276,13 +275,105 @@ class Dataset:
                 fix="give both for the same points, in the same order",
             )
 
+    @classmethod
+    def from_arrays(
+        cls,
+        uv: ArrayLike | Mapping[str, ArrayLike],
+        xyz: ArrayLike | None = None,
+        *,
+        sd: ArrayLike | None = None,
+        position_sd: ArrayLike | None = None,
+        cameras: Sequence[str | Camera] | None = None,
+        size: tuple[int, int] | Sequence[tuple[int, int]] | None = None,
+        points: Sequence[object] | None = None,
+        shots: Sequence[object] | None = None,
+        length_unit: str = "mm",
+        name: str = "arrays",
+    ) -> Dataset:
+        """A dataset from arrays.
+
+        >>> import numpy as np
+        >>> uv = np.array([[[640.5, 480.2], [610.1, 475.0]], [[700.0, 480.9], [np.nan, np.nan]]])
+        >>> Dataset.from_arrays(uv, [[0, 0, 0], [10, 0, 0]], cameras=["left", "right"], size=(1280, 960))
+        dataset 'arrays' in mm: 2 points with known positions, 2 cameras
+          left   1280 x 960 px, 2 views
+          right  1280 x 960 px, 1 view
+          known  x 0 to 10.0, y 0 to 0, z 0 to 0
+
+        Args:
+            uv: (n, cameras, 2) pixels; NaN or masked where a camera did not see the point. Or the pixels (n, 2) of each
+                camera by its name. (-1, -1) and (0, 0) are taken for views that are missing, and `notes` says so.
+            xyz: (n, 3) known positions in the world frame, in the length unit; None where they are to be measured.
+            sd: Standard uncertainty of the pixels, px: a number, (cameras,), (n, cameras) or (n, cameras, 2); None
+                where it is not known.
+            position_sd: Standard uncertainty of the known positions in the length unit: a number, (3,) or (n, 3).
+            cameras: Their names; cam1, cam2, ... where none are given.
+            size: Width and height of the images in pixels, of all or one pair for each camera.
+            points: n names; p0001, p0002, ... where none are given.
+            shots: n names: the points of one exposure share one. Each point is a shot of its own where none are given.
+            length_unit: Of all positions.
+            name: Of the dataset.
+
+        Raises:
+            DatasetError: A shape, a type or a number is not possible; says how to mend it.
+        """
+        from implicam.dataset.arrays import from_arrays  # it is made of what this module defines
+
+        return from_arrays(
+            uv, xyz, sd=sd, position_sd=position_sd, cameras=cameras, size=size, points=points, shots=shots,
+            length_unit=length_unit, name=name,
+        )  # fmt: skip
+
+    @classmethod
+    def from_dataframe(
+        cls, table: Any, *, unit: str | None = None, first_pixel: int = 0, v_up: bool = False, size: Any = None
+    ) -> Dataset:
+        """A dataset from a table of pandas, read as `read_dataset` reads the same table in a file.
+
+        Args:
+            table: A pandas.DataFrame with a row for each point (x, y, z, u_cam1, v_cam1, ...) or for each view (point,
+                camera, u, v). An index with a name is a column.
+            unit: The length unit; None where the headings state it.
+            first_pixel: How the centre of the first pixel is counted, 0 or 1.
+            v_up: Whether v is counted from the bottom row upwards.
+            size: Width and height of the images in pixels, of all or for each camera by name.
+
+        Raises:
+            UsageError: It is no table of pandas, or the options contradict it.
+            DatasetError: There are two ways to read it, or it has a mistake; names the row, the value and the cure.
+        """
+        from implicam.dataset.dataframe import dataset_from_dataframe
+        from implicam.dataset.table_options import TableOptions, size_text
+
+        return dataset_from_dataframe(table, TableOptions(unit, first_pixel, v_up, size_text(size)))
+
+    def to_dataframe(self) -> Any:
+        """A table of pandas with a row for each point, and the columns of a wide CSV (docs/formats.md).
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        from implicam.dataset.dataframe import dataset_to_dataframe
+
+        return dataset_to_dataframe(self)
+
     def __len__(self) -> int:
         return len(self.observations)
+
+    def __repr__(self) -> str:
+        from implicam.dataset.summary import describe_dataset
+
+        return describe_dataset(self)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """The rig's cameras."""
         return self.observations.cameras
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """The cameras' names, in the order of the observations."""
+        return self.observations.camera_names
 
     @property
     def points(self) -> Names:
@@ -397,6 +488,47 @@ class Dataset:
         self.observations.with_cameras(names)  # says which name is unknown
         return self.with_cameras([name for name in self.observations.camera_names if name not in names])
 
+    def without_points(self, names: Iterable[str]) -> Dataset:
+        """The dataset without some points.
+
+        Args:
+            names: Of the points to leave out.
+
+        Raises:
+            UsageError: There is no such point.
+        """
+        from implicam.dataset.frames import keep_others
+
+        return self.select(keep_others(self.points, names))
+
+    def in_unit(self, unit: str) -> Dataset:
+        """The dataset in another length unit: known positions and their uncertainties.
+
+        Args:
+            unit: For example "m".
+
+        Raises:
+            DatasetError: The unit has no known length.
+        """
+        from implicam.dataset.frames import move_known_positions
+
+        factor = self.metres_per_unit / metres_per(unit)
+        return move_known_positions(self, np.eye(3), np.zeros(3), factor, unit)
+
+    def transformed(self, pose: Any) -> Dataset:
+        """The dataset in another frame of the world: known positions and their uncertainties; pixels stay.
+
+        Args:
+            pose: What takes a position to the other frame: SciPy's Rotation, or a rigid 4 x 4 matrix (a translation in
+                the length unit).
+
+        Raises:
+            UsageError: It is no rotation and no rigid matrix.
+        """
+        from implicam.dataset.frames import move_known_positions, rigid_parts
+
+        return move_known_positions(self, *rigid_parts(pose), 1.0, self.length_unit)
+
     def split(self, n: int, *, seed: int) -> tuple[Dataset, Dataset]:
         """Split the points at random into two datasets.
 
@@ -454,45 +586,6 @@ class Dataset:
             yield str(shot), self.select(self.shots != shot), self.select(self.shots == shot)
 
 
-def join(first: Dataset, second: Dataset) -> Dataset:
-    """One dataset of the points of two, named and described as the first.
-
-    Args:
-        first: Its points come first.
-        second: With the same cameras and length unit, and with known positions if the first has them.
-
-    Raises:
-        DatasetError: The two do not belong together, or a point has the same name in both.
-    """
-    if first.cameras != second.cameras or first.length_unit != second.length_unit:
-        raise DatasetError(
-            f"datasets {first.name!r} and {second.name!r} do not belong to one rig.",
-            why="their cameras or length units differ",
-            fix="join only datasets with the same [[cameras]] and length_unit",
-        )
-    if (first.known is None) != (second.known is None):
-        raise DatasetError("one dataset has known positions and the other has none.", fix="join datasets of one kind")
-    a, b = first.observations, second.observations
-    observations = Observations(
-        np.concatenate([a.points, b.points]),
-        a.cameras,
-        np.concatenate([a.uv, b.uv]),
-        np.concatenate([a.sd, b.sd]),
-        _join_columns(a.extra, b.extra, a.uv.shape[:2], b.uv.shape[:2]),
-    )
-    known = None
-    if first.known and second.known:
-        p, q = first.known, second.known
-        known = KnownPositions(
-            np.concatenate([p.shots, q.shots]),
-            np.concatenate([p.xyz, q.xyz]),
-            np.concatenate([p.sd, q.sd]),
-            _join_columns(p.extra, q.extra, (len(first),), (len(second),)),
-        )
-    columns = _join_columns(first.columns, second.columns, (len(first),), (len(second),))
-    return replace(first, observations=observations, known=known, columns=columns)
-
-
 def metres_per(unit: str) -> float:
     """The length of a unit in metres.
 
@@ -525,14 +618,6 @@ def covariance_from_columns(sd: Floats, off_diagonal: Floats) -> Floats:
     cov[:, [0, 1, 2], [0, 1, 2]] = sd**2
     cov[:, [0, 0, 1], [1, 2, 2]] = cov[:, [1, 2, 2], [0, 0, 1]] = off_diagonal
     return cov
-
-
-def _join_columns(
-    a: Mapping[str, Names], b: Mapping[str, Names], shape_a: tuple[int, ...], shape_b: tuple[int, ...]
-) -> dict[str, Names]:
-    keys = [*a, *(key for key in b if key not in a)]
-    empty_a, empty_b = np.full(shape_a, ""), np.full(shape_b, "")
-    return {key: np.concatenate([a.get(key, empty_a), b.get(key, empty_b)]) for key in keys}
 
 
 def _array(value: ArrayLike, shape: tuple[int, ...], name: str) -> Floats:
@@ -712,40 +797,6 @@ def _check_entries(extra: Mapping[str, Any], taken: Sequence[str], whose: str) -
             fix="use text, numbers, booleans, dates, and lists and tables of these",
         ) from None
     return entries
-
-
-def to_plain(value: Any, depth: int = 0) -> Any:
-    """A copy made of the types that TOML knows.
-
-    Args:
-        value: Text, numbers, booleans, dates, lists and mappings of these; NumPy's numbers and arrays as well.
-        depth: How deeply the value is nested already.
-
-    Raises:
-        ValueError: It has no form in TOML.
-    """
-    if depth > MAX_TOML_DEPTH:
-        raise ValueError("it is nested too deeply")
-    if isinstance(value, np.generic | np.ndarray):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        if not all(isinstance(key, str) for key in value):
-            raise ValueError("the keys of a table are text")
-        return {_encodable(key): to_plain(item, depth + 1) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_plain(item, depth + 1) for item in value]
-    if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        raise ValueError("a whole number has more than 64 bits")
-    if isinstance(value, str):
-        return _encodable(value)
-    if not isinstance(value, int | float | date | time):
-        raise ValueError(f"a value of type {type(value).__name__} has no form in TOML")
-    return value
-
-
-def _encodable(text: str) -> str:
-    text.encode()  # UnicodeEncodeError, a ValueError, for half of a surrogate pair
-    return text
 
 
 def _freeze(value: object, **fields: Any) -> None:

@@ -2,14 +2,59 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset import Observations
-from implicam.errors import DatasetError, FitError
+from implicam.dataset import Dataset, Observations
+from implicam.errors import DatasetError, FitError, UsageError
 
 MAX_RELATIVE_THICKNESS = 1e-3
 """Thickness over width of what is called a plane, or a line."""
+
+
+def observations_of(given: Observations | Dataset) -> Observations:
+    """What the cameras saw.
+
+    Args:
+        given: The observations, or a dataset that has them.
+
+    Raises:
+        UsageError: It is neither; says what would do.
+    """
+    found = given.observations if isinstance(given, Dataset) else given
+    if not isinstance(found, Observations):
+        raise UsageError(
+            f"observations are wanted, and not {_type_of(given)}.",
+            fix=_reading(given, "measure(ic.Dataset.from_arrays(uv)), or measure(ic.read_dataset(path))"),
+        )
+    return found
+
+
+def require_dataset(given: object) -> None:
+    """Refuse what is no dataset.
+
+    Args:
+        given: What a fit was asked to learn from.
+
+    Raises:
+        UsageError: It is no dataset; says what would do.
+    """
+    if not isinstance(given, Dataset):
+        raise UsageError(
+            f"a dataset is wanted, and not {_type_of(given)}.",
+            why="a fit needs the known positions beside the pixels" if isinstance(given, Observations) else "",
+            fix=_reading(given, "fit(ic.Dataset.from_arrays(uv, xyz)), or fit(ic.read_dataset(path))"),
+        )
+
+
+def _type_of(given: object) -> str:
+    return f"an array of shape {given.shape}" if isinstance(given, np.ndarray) else f"a {type(given).__name__}"
+
+
+def _reading(given: object, otherwise: str) -> str:
+    return f"read it first: ic.read_dataset({str(given)!r})" if isinstance(given, str | Path) else otherwise
 
 
 def match_cameras(trained: Observations, observations: Observations) -> Observations:

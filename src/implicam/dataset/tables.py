@@ -26,8 +26,8 @@ from implicam.dataset.model import (
     check_name,
     check_position_sd,
     check_unique,
-    to_plain,
 )
+from implicam.dataset.plain import to_plain
 from implicam.errors import DatasetError
 
 MAX_LINE_BYTES = 1 << 18  # no line of a table is longer; a longer one means that the file is something else

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.dataset.arrays import default_names
 from implicam.dataset.folder import csv_text, description_text, format_cells
 from implicam.dataset.model import (
     SD_POINT,
@@ -152,7 +153,7 @@ def _assemble(table: Columns, layout: _Layout) -> Dataset:
 
     uv, sd = views(("u", "v")), views(SD_VIEW)
     check_views(uv, sd, cameras, lambda i, k: table.place(i))
-    points = table.texts.get("point", [f"p{i + 1:04d}" for i in range(table.n)])
+    points = table.texts.get("point", default_names(table.n))
     check_unique(points, "point", table.place)
     empty = [""] * table.n
     view_extra = {
@@ -198,8 +199,18 @@ def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
         return _assemble(table, layout)
 
 
-def _make_columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
-    """The columns of the table (numbers or text), and the sidecar's text."""
+def make_columns(data: Dataset) -> tuple[dict[str, NDArray[Any]], str]:
+    """The columns of the table, and the text of its description.
+
+    Args:
+        data: The dataset.
+
+    Returns:
+        The columns, numbers or text, (n,) each; and TOML.
+
+    Raises:
+        DatasetError: It has no points, or two columns would have the same name.
+    """
     if not len(data):
         raise DatasetError(f"dataset {data.name!r} has no points.", fix="a table needs one; write it as .npz")
     observations = data.observations
@@ -254,7 +265,7 @@ def write_wide_csv(data: Dataset, path: Path) -> None:
         DatasetError: A table cannot hold the dataset: it has no points, or a column that could be mistaken for another.
         ImplicamError: The files cannot be written.
     """
-    columns, description = _make_columns(data)
+    columns, description = make_columns(data)
     text = [v.tolist() if v.dtype.kind == "U" else format_cells(v) for v in columns.values()]
     sidecar = _description_path(path)
     unchanged = sidecar.is_file() and sidecar.read_bytes() == description.encode()
@@ -340,7 +351,7 @@ def write_parquet(data: Dataset, path: Path) -> None:
     """
     pyarrow = import_extra("pyarrow", "parquet", "writing Parquet")
     parquet = import_extra("pyarrow.parquet", "parquet", "writing Parquet")
-    columns, description = _make_columns(data)
+    columns, description = make_columns(data)
     table = pyarrow.table({c: pyarrow.array(v.tolist()) for c, v in columns.items()})
     with replacing(path) as temporary:
         parquet.write_table(table.replace_schema_metadata({"implicam": description}), temporary)

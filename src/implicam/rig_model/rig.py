@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.dataset import Names, Observations
-from implicam.dataset.requirements import match_cameras
+from implicam.dataset import Dataset, Names, Observations
+from implicam.dataset.requirements import match_cameras, observations_of
 from implicam.geometry import Floats
 from implicam.measurement import Measurement
 from implicam.rig_model.alarm import Table, alarm_of
@@ -77,11 +77,11 @@ class FittedRig:
         """Whether every camera is of a kind that cannot follow anything that lenses do not do."""
         return all(model.family in LENS_KINDS for model in self.posterior.models)
 
-    def measure(self, observations: Observations) -> Measurement:
+    def measure(self, observations: Observations | Dataset) -> Measurement:
         """Measure each point with the views it has, two or more.
 
         Args:
-            observations: What the cameras saw, by their names.
+            observations: What the cameras saw, by their names; or a dataset that has it.
 
         Returns:
             Positions in the world with error bars, and of each point without one the reason; and the alarm, if there is
@@ -90,6 +90,7 @@ class FittedRig:
         Raises:
             DatasetError: None of the cameras is one of the calibration, or one has images of another size.
         """
+        observations = observations_of(observations)
         known = [name for name in self.trained.camera_names if name in observations.camera_names]
         trained = self.trained.with_cameras(known) if known else self.trained
         observations = match_cameras(trained, observations)

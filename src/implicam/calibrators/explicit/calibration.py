@@ -41,6 +41,7 @@ from implicam.calibrators.protocol import (
     solvable,
 )
 from implicam.dataset import Dataset, Observations
+from implicam.dataset.requirements import observations_of, require_dataset
 from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
@@ -131,6 +132,7 @@ class Explicit(CalibratorBase):
             UsageError: The options ask for boards or known points that are not there.
             MissingExtraError: The preset is one of the paper's, and OpenCV is not installed.
         """
+        require_dataset(data)
         with explain_fit_error(data), solvable(), blas_threads(1):
             if self.preset != JOINT:
                 return ExplicitCalibration(self, data, self._fitted_like_the_paper(data, progress))
@@ -189,7 +191,7 @@ class Explicit(CalibratorBase):
         return {}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ExplicitCalibration(RigCalibration):
     """Cameras with lens models and poses, and the covariance of all of it."""
 
@@ -213,12 +215,12 @@ class ExplicitCalibration(RigCalibration):
             settings=self.calibrator.settings.rig_model,
         )
 
-    def measure(self, observations: Observations) -> Measurement:
+    def measure(self, observations: Observations | Dataset) -> Measurement:
         """Measure each point with the views it has, two or more: by maximum likelihood; with the paper's presets by
         linear triangulation.
 
         Args:
-            observations: What the cameras saw, by their names.
+            observations: What the cameras saw, by their names; or a dataset that has it.
 
         Returns:
             Positions in the world with error bars, and of each point without one the reason.
@@ -228,7 +230,7 @@ class ExplicitCalibration(RigCalibration):
         """
         if self.fitted.inflation is None:
             return self.map.measure(observations)
-        return measure_linearly(self.fitted, self.map, observations)
+        return measure_linearly(self.fitted, self.map, observations_of(observations))
 
     @property
     def unused(self) -> tuple[Unused, ...]:

@@ -30,6 +30,7 @@ from implicam.calibrators.protocol import (
     solvable,
 )
 from implicam.dataset import Dataset, remove_copies
+from implicam.dataset.requirements import require_dataset
 from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
@@ -94,6 +95,7 @@ class ForwardGP(CalibratorBase):
         Raises:
             FitError: Fewer than two cameras can be calibrated, or the points do not fill a volume.
         """
+        require_dataset(data)
         with explain_fit_error(data):
             return self._fit(data, progress)
 
@@ -111,7 +113,7 @@ class ForwardGP(CalibratorBase):
         return ForwardGPCalibration(self, data, frame, replace(fitted, uncalibrated=uncalibrated))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ForwardGPCalibration(RigCalibration):
     """A fitted rig."""
 

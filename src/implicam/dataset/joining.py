@@ -1,0 +1,58 @@
+"""One dataset of the points of two."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from implicam.dataset.model import Dataset, KnownPositions, Names, Observations
+from implicam.errors import DatasetError
+
+
+def join(first: Dataset, second: Dataset) -> Dataset:
+    """One dataset of the points of two, named and described as the first.
+
+    Args:
+        first: Its points come first.
+        second: With the same cameras and length unit, and with known positions if the first has them.
+
+    Raises:
+        DatasetError: The two do not belong together, or a point has the same name in both.
+    """
+    if first.cameras != second.cameras or first.length_unit != second.length_unit:
+        raise DatasetError(
+            f"datasets {first.name!r} and {second.name!r} do not belong to one rig.",
+            why="their cameras or length units differ",
+            fix="join only datasets with the same [[cameras]] and length_unit",
+        )
+    if (first.known is None) != (second.known is None):
+        raise DatasetError("one dataset has known positions and the other has none.", fix="join datasets of one kind")
+    a, b = first.observations, second.observations
+    observations = Observations(
+        np.concatenate([a.points, b.points]),
+        a.cameras,
+        np.concatenate([a.uv, b.uv]),
+        np.concatenate([a.sd, b.sd]),
+        _join_columns(a.extra, b.extra, a.uv.shape[:2], b.uv.shape[:2]),
+    )
+    known = None
+    if first.known and second.known:
+        p, q = first.known, second.known
+        known = KnownPositions(
+            np.concatenate([p.shots, q.shots]),
+            np.concatenate([p.xyz, q.xyz]),
+            np.concatenate([p.sd, q.sd]),
+            _join_columns(p.extra, q.extra, (len(first),), (len(second),)),
+        )
+    columns = _join_columns(first.columns, second.columns, (len(first),), (len(second),))
+    return replace(first, observations=observations, known=known, columns=columns)
+
+
+def _join_columns(
+    a: Mapping[str, Names], b: Mapping[str, Names], shape_a: tuple[int, ...], shape_b: tuple[int, ...]
+) -> dict[str, Names]:
+    keys = [*a, *(key for key in b if key not in a)]
+    empty_a, empty_b = np.full(shape_a, ""), np.full(shape_b, "")
+    return {key: np.concatenate([a.get(key, empty_a), b.get(key, empty_b)]) for key in keys}
