@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from implicam.dataset.model import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.errors import HardwareError, UsageError
 from implicam.hardware import Frame, FrameSource, RobotOptions, simulated_rig
 from implicam.hardware.protocol import Box, Floats, check_position, format_position, incomplete_spec_error

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from implicam.dataset import Floats, Names
 from implicam.dataset.folder import csv_text
 from implicam.dataset.frames import keep_others, rigid_parts
-from implicam.dataset.model import metres_per
+from implicam.dataset.units import metres_per
 from implicam.errors import UsageError, did_you_mean, import_extra
 from implicam.files import write_text
 from implicam.formatting import decimal_number

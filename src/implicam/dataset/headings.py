@@ -12,7 +12,8 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from implicam.dataset.model import METRES_PER_UNIT, SD_POINT, VIEW_COLUMNS
+from implicam.dataset.model import SD_POINT, VIEW_COLUMNS
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.errors import DatasetError, did_you_mean
 
 _FAMILIES = (("u", "v"), ("x", "y"), ("px", "py"), ("col", "row"), ("column", "row"), ("spalte", "zeile"))

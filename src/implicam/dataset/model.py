@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from implicam.dataset.plain import to_plain
+from implicam.dataset.units import metres_per
 from implicam.errors import DatasetError, did_you_mean
 
 Floats = NDArray[np.float64]
@@ -45,8 +46,6 @@ TRUTH_COLUMNS = (
 
 TRUE_VIEW_COLUMNS = ("true_u", "true_v", "outlier")
 """Extra columns of observations.csv that `implicam simulate` writes."""
-
-METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
 
 
 @dataclass(frozen=True)
@@ -584,24 +583,6 @@ class Dataset:
             )
         for shot in shots:
             yield str(shot), self.select(self.shots != shot), self.select(self.shots == shot)
-
-
-def metres_per(unit: str) -> float:
-    """The length of a unit in metres.
-
-    Args:
-        unit: For example "mm", see `METRES_PER_UNIT`.
-
-    Raises:
-        DatasetError: The unit has no known length.
-    """
-    if unit not in METRES_PER_UNIT:
-        raise DatasetError(
-            f"the length unit is {unit!r}, which has no known size{did_you_mean(unit, METRES_PER_UNIT)}.",
-            why="lengths are wanted in another unit",
-            fix=f"use one of {', '.join(METRES_PER_UNIT)}",
-        )
-    return METRES_PER_UNIT[unit]
 
 
 def covariance_from_columns(sd: Floats, off_diagonal: Floats) -> Floats:

@@ -11,7 +11,8 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from implicam.dataset.model import Camera, metres_per
+from implicam.dataset.model import Camera
+from implicam.dataset.units import metres_per
 from implicam.errors import DatasetError
 from implicam.geometry import Pose
 from implicam.lenses import Bools, BrownConrady, Floats, Lens

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from implicam.dataset.model import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.hardware.protocol import Floats, Robot, RobotOptions
 from implicam.registry import missing_members

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from implicam.dataset.model import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.errors import HardwareError, UsageError
 from implicam.hardware.protocol import (
     Box,

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from implicam.dataset.model import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.errors import HardwareError, UsageError, import_extra
 from implicam.hardware.protocol import (
     Box,

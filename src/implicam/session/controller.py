@@ -26,7 +26,7 @@ import numpy as np
 from implicam.active import Loop, PredictedCovariance, Step, Target
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
-from implicam.dataset.model import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.detect import Detected, Detector, View, correct_outlines
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.formatting import json_safe

@@ -28,7 +28,7 @@ from implicam.active.acquisitions import ACQUISITIONS, DEFAULT_ACQUISITION
 from implicam.active.design_model import can_design_experiments, design_error, design_methods
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
-from implicam.dataset.model import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.detect import Ball
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import (

@@ -1,0 +1,25 @@
+"""Length units."""
+
+from __future__ import annotations
+
+from implicam.errors import DatasetError, did_you_mean
+
+METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+
+
+def metres_per(unit: str) -> float:
+    """The length of a unit in metres.
+
+    Args:
+        unit: For example "mm", see `METRES_PER_UNIT`.
+
+    Raises:
+        DatasetError: The unit has no known length.
+    """
+    if unit not in METRES_PER_UNIT:
+        raise DatasetError(
+            f"the length unit is {unit!r}, which has no known size{did_you_mean(unit, METRES_PER_UNIT)}.",
+            why="lengths are wanted in another unit",
+            fix=f"use one of {', '.join(METRES_PER_UNIT)}",
+        )
+    return METRES_PER_UNIT[unit]
