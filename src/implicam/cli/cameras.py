@@ -11,14 +11,16 @@ from implicam.calibrators import load_calibration
 from implicam.calibrators.explicit import calibration_of, rig_of
 from implicam.cli import show
 from implicam.cli.app import Json, command, must_be_calibration, must_not_replace
-from implicam.exchange import FORMATS, UNKNOWN_UNIT, export_cameras, import_cameras
+from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, WRITTEN, export_cameras, import_cameras
 
 
 @command("export")
 def export_command(
     calibration: Annotated[Path, typer.Argument(help="A calibration by explicit, or by forward-gp.")],
-    to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(FORMATS)}.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The file to write; for colmap a folder.")],
+    to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(WRITTEN)}.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=f"The file to write; for {', '.join(FOLDERS)} a folder.")
+    ],
     json: Json = False,
 ) -> None:
     """Write the cameras for another program: lenses and places, as far as its format holds them."""

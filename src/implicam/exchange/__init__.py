@@ -12,12 +12,36 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from implicam.errors import DatasetError, UsageError, did_you_mean
-from implicam.exchange import anipose, caliscope, colmap, dlt, easymocap, fits, kalibr, opencv, opencv_stereo, ros
+from implicam.exchange import (
+    anipose,
+    caliscope,
+    colmap,
+    dlt,
+    easymocap,
+    fits,
+    kalibr,
+    myptv,
+    opencv,
+    opencv_stereo,
+    openptv,
+    qualisys,
+    ros,
+)
 from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.exchange.source import Source
 from implicam.lenses import BrownConrady, KannalaBrandt
 
-__all__ = ["FORMATS", "UNKNOWN_UNIT", "ExplicitCamera", "Format", "Rig", "export_cameras", "import_cameras"]
+__all__ = [
+    "FOLDERS",
+    "FORMATS",
+    "UNKNOWN_UNIT",
+    "WRITTEN",
+    "ExplicitCamera",
+    "Format",
+    "Rig",
+    "export_cameras",
+    "import_cameras",
+]
 
 
 Write = Callable[[Rig, Path], list[str]]
@@ -28,12 +52,13 @@ Read = Callable[[Sequence[Path]], Rig]
 class Format:
     """How a format is written, how it is read, how it is recognised, and what it is in a few words.
 
-    write: gives notes, each a sentence on what the format lost or cost; none where it holds everything.
+    write: gives notes, each a sentence on what the format lost or cost; none where it holds everything. None of a
+        format that is only read.
     read: takes the files or folders that belong together.
     knows: whether what is given is of this format, by its content.
     """
 
-    write: Write
+    write: Write | None
     read: Read
     knows: Callable[[Source], bool]
     what: str
@@ -56,6 +81,7 @@ def _one_file(read: Callable[[Path], Rig]) -> Read:
 
 
 FORMATS = {
+    "qualisys": Format(None, _one_file(qualisys.read), qualisys.knows, "Qualisys's .qca.txt"),
     "colmap": Format(colmap.write, _one_file(colmap.read), colmap.knows, "COLMAP's model, a folder"),
     "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml"),
     "caliscope": Format(caliscope.write, _one_file(caliscope.read), caliscope.knows, "caliscope's camera_array.toml"),
@@ -78,9 +104,17 @@ FORMATS = {
         opencv_stereo.write, opencv_stereo.read, opencv_stereo.knows, "K1, D1, K2, D2, R, T of cv2.stereoCalibrate"
     ),
     "opencv": Format(opencv.write, opencv.read, opencv.knows, "OpenCV FileStorage, YAML, XML or JSON"),
+    "openptv": Format(openptv.write, openptv.read, openptv.knows, "OpenPTV's .ori and .addpar with ptv.par", True),
+    "myptv": Format(myptv.write, myptv.read, myptv.knows, "MyPTV's camera files, Tsai model", True),
     "dlt": Format(dlt.write, _one_file(dlt.read), dlt.knows, "DLT coefficients as a CSV of DLTdv or easyWand", True),
 }
 """In the order in which they are tried on a file."""
+
+WRITTEN = tuple(name for name, form in FORMATS.items() if form.write)
+"""The names of those that are written too."""
+
+FOLDERS = ("colmap", "easymocap", "ros", "openptv", "myptv")
+"""The names of those that are a folder when they are written."""
 
 
 def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
@@ -100,6 +134,8 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
         ImplicamError: The file cannot be written.
     """
     form = _find_format(to)
+    if form.write is None:
+        raise UsageError(f"{to} is read, and not written.", fix=f"choose one of {', '.join(WRITTEN)}")
     for camera in rig.cameras:
         if not (form.fits_lenses or isinstance(camera.lens, BrownConrady | KannalaBrandt)):
             raise DatasetError(

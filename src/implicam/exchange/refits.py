@@ -40,6 +40,9 @@ MIN_RAYS = 50
 AIM_STEPS, DIFFERENCE_RAD, MAX_AIM_RAD = 8, 1e-6, 0.05
 """Newton's method onto the pixels of the lattice: its steps, its differences, and how far a ray may turn in all."""
 
+FAR_PX = 1e9
+"""A pixel that is farther off is none."""
+
 MAX_ASSUMED_SIDE_PX = 20_000
 """A larger image is no image, where its size is guessed from the principal point."""
 
@@ -131,6 +134,7 @@ def _sample(lens: OtherLens, width: int, height: int) -> tuple[Floats, Floats]:
         rays = np.column_stack([flat, np.repeat(np.cos(angles), DIRECTIONS)])
         with np.errstate(all="ignore"):
             uv, valid = lens.project(rays)
+            uv = np.where(np.abs(uv) < FAR_PX, uv, np.nan)
         uv, seen = uv.reshape(ANGLES, DIRECTIONS, 2), valid.reshape(ANGLES, DIRECTIONS)
         # beyond the first pixel that comes back towards the middle, the lens has folded
         radius = np.linalg.norm(uv - uv[0], axis=2)

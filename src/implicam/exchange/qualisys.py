@@ -1,0 +1,117 @@
+"""`qualisys`: the calibration that QTM (Qualisys) exports, NAME.qca.txt, which is XML. Read only.
+
+    cameras/camera    serial, model, active
+      fov_video       left, top, right, bottom: what of the sensor the pictures show
+      transform       x, y, z: the camera's centre, mm; r11 ... r33: from the world to a camera frame with y up, z back
+      intrinsic       focalLengthU, focalLengthV, centerPointU, centerPointV, in 1/64 pixel; sensorMaxU, sensorMaxV;
+                      radialDistortion1 to 3, tangentalDistortion1 and 2: OpenCV's k1, k2, k3, p1, p2, not scaled
+
+Where in a pixel its coordinates begin is not documented: they are taken as Pose2Sim does, 64 a pixel, from the centre
+of the first one. Pose2Sim divides the distortion by 64 as well, which real files contradict.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from implicam.dataset.tables import naming
+from implicam.errors import DatasetError
+from implicam.exchange.checks import MAX_CAMERAS, get_entry, lens_from_matrix, list_names, read_numbers, rotation_matrix
+from implicam.exchange.model import ExplicitCamera, Rig
+from implicam.exchange.refits import make_camera
+from implicam.exchange.source import Source, read_xml
+from implicam.geometry import Pose
+
+UNITS_PER_PIXEL = 64.0
+FROM_Y_UP = np.diag([1.0, -1.0, -1.0])
+
+INTRINSICS = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew")
+DISTORTION = (
+    "radialDistortion1",
+    "radialDistortion2",
+    "tangentalDistortion1",
+    "tangentalDistortion2",
+    "radialDistortion3",
+)
+ROTATION = tuple(f"r{row}{column}" for row in "123" for column in "123")
+
+
+def knows(source: Source) -> bool:
+    """Whether it is XML of a calibration with cameras.
+
+    Args:
+        source: What is given.
+    """
+    return source.keys[:1] == ("calibration",) and "cameras" in source.keys
+
+
+def read(path: Path) -> Rig:
+    """Read the cameras that are active, named by their serial numbers.
+
+    Args:
+        path: The .qca.txt file.
+
+    Returns:
+        The cameras, in millimetres.
+
+    Raises:
+        DatasetError: The file has a mistake; the error names the camera and the value.
+    """
+    elements = read_xml(path).findall("cameras/camera")
+    active = [element for element in elements if element.get("active", "1") not in ("0", "false")]
+    if not 0 < len(active) <= MAX_CAMERAS:
+        raise DatasetError(
+            f"{path}: {len(active)} of {len(elements)} cameras are active.",
+            fix="calibrate in QTM, and export the calibration again",
+        )
+    cameras, notes = [], ["Qualisys does not say where in a pixel its coordinates begin: half a pixel is not known."]
+    for i, element in enumerate(active):
+        camera, said = _read_camera(element, f"{path}: camera {element.get('serial', i)}")
+        cameras.append(camera)
+        notes += said
+    left_out = [element.get("serial", "?") for element in elements if element not in active]
+    notes += [f"Left out, because they are not active: {list_names(left_out)}."] if left_out else []
+    with naming(str(path)):
+        return Rig(tuple(cameras), "mm", tuple(notes))
+
+
+def _read_camera(element: Element, place: str) -> tuple[ExplicitCamera, list[str]]:
+    name = str(get_entry(element.attrib, "serial", place))
+    values, at, window = (_child(element, tag, place) for tag in ("intrinsic", "transform", "fov_video"))
+    left, top, right, bottom = _numbers(window, ("left", "top", "right", "bottom"), f"{place}: fov_video")
+    ends = _numbers(values, ("sensorMaxU", "sensorMaxV"), f"{place}: intrinsic")
+    # some versions give the last pixel, some the one after it
+    last = [int(far < (end + 1) // UNITS_PER_PIXEL) for far, end in zip((right, bottom), ends, strict=True)]
+    size = int(right - left + last[0]), int(bottom - top + last[1])
+    fx, fy, cx, cy, skew = (value / UNITS_PER_PIXEL for value in _numbers(values, INTRINSICS, f"{place}: intrinsic"))
+    k = np.array([[fx, skew, cx - left], [0, fy, cy - top], [0, 0, 1.0]])
+    lens = lens_from_matrix(k, _numbers(values, DISTORTION, f"{place}: intrinsic"), fisheye=False, place=place)
+    given = np.array(_numbers(at, ROTATION, f"{place}: transform")).reshape(3, 3)
+    turn = FROM_Y_UP @ rotation_matrix(given, f"{place}: r11 ... r33")
+    centre = np.array(_numbers(at, ("x", "y", "z"), f"{place}: transform"))
+    camera, notes = make_camera(name, size, lens, Pose(turn, -turn @ centre), place)
+    if element.get("viewrotation", "0") not in ("0", "none"):
+        notes.append(
+            f"Camera {name!r}: QTM turns its view by {element.get('viewrotation')} degrees; the lens is that of the "
+            "picture as the sensor has it."
+        )
+    return camera, notes
+
+
+def _child(element: Element, tag: str, place: str) -> Element:
+    found = element.find(tag)
+    if found is None:
+        raise DatasetError(
+            f"{place}: {tag} is missing.",
+            why=f"it has {list_names([child.tag for child in element]) or 'nothing'}",
+            fix="export the calibration of video cameras again",
+        )
+    return found
+
+
+def _numbers(element: Element, keys: tuple[str, ...], place: str) -> list[float]:
+    given = [element.get(key, "0") if key == "skew" else get_entry(element.attrib, key, place) for key in keys]
+    return [float(read_numbers(value, (), f"{place}: {key}")) for key, value in zip(keys, given, strict=True)]
