@@ -1,7 +1,7 @@
 """Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium).
 
 Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of the demo's
-overlays, and one of a simulated board; compares all methods, which takes minutes.
+overlays, and two of simulated boards; compares all methods, which takes minutes.
 Dots: `python benchmarks/dots.py ../shared/real --overlays docs/images`.
 """
 
@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 IMAGES = Path(__file__).parent / "images"
@@ -45,6 +46,12 @@ def main() -> None:
         implicam("simulate", str(board), "--images", "--target", "board", "--boards", "1", "--cameras", "cam5")
         implicam("detect", str(board))
         shutil.copy(board / "detections" / "overlays" / "cam5" / "board01.jpg", IMAGES / "detect-board.jpg")
+        covered = Path(folder) / "covered"
+        implicam("simulate", str(covered), "--images", "--target", "board", "--boards", "1", "--cameras", "cam5",
+                 "--missing", "1", "--seed", "3")  # fmt: skip
+        implicam("detect", str(covered), "--infer")
+        overlay = Image.open(covered / "detections" / "overlays" / "cam5" / "board01.jpg")
+        overlay.crop((430, 250, 800, 560)).resize((740, 620)).save(IMAGES / "detect-covered.jpg", quality=85)
         six = Path(folder) / "six"
         implicam("simulate", str(six), "--positions", "random", "--points", "200", "--check", "300")
         implicam("compare", str(six), "--train", "17,35,87,157", "--seeds", "3", "--check", str(six / "check"),

@@ -11,8 +11,9 @@ pytest.importorskip("cv2")
 
 from implicam.dataset import KnownPositions, read_dataset
 from implicam.detect.blobs import find_scale, find_spots, measure_spots
-from implicam.detect.dots import Dots, _Camera
+from implicam.detect.dots import Dots
 from implicam.detect.model import Detected, View
+from implicam.detect.projective import Departure, ProjectiveProcess
 from implicam.errors import DatasetError, UsageError
 from implicam.images import read_picture
 
@@ -354,14 +355,15 @@ def test_predictions_by_the_others_are_those_of_a_fit_without():
     uv = 0.8 * xyz[:, :2] + 0.05 * xyz[:, 2:] + np.random.default_rng(0).normal(0, 1e-3, (len(xyz), 2))
     sd = np.full(len(xyz), 1e-3)
     theta = np.array([0.8, 0, 0.05, 0, 0, 0.8, 0.05, 0, 0, 0, 0])
-    camera = _Camera.condition(xyz, uv, sd, theta, 0.01, 1.0, 1e-3, turns=1)
-    others = camera.leave_one_out()
+    departure = Departure(0.01, 1.0, 1e-3)
+    camera = ProjectiveProcess.condition(xyz, uv, sd**2, theta, departure, turns=1)
+    others, spread = camera.leave_one_out()
     for row in (0, 7):
         kept = np.delete(np.arange(len(xyz)), row)
-        alone = _Camera.condition(xyz[kept], uv[kept], sd[kept], theta, 0.01, 1.0, 1e-3, turns=1)
-        predicted = alone.predict(xyz[[row]])
-        assert others.uv[row] == pytest.approx(predicted.uv[0], abs=1e-9)
-        assert others.sd[row] ** 2 == pytest.approx(predicted.sd[0] ** 2 + sd[row] ** 2, rel=1e-6)
+        alone = ProjectiveProcess.condition(xyz[kept], uv[kept], sd[kept] ** 2, theta, departure, turns=1)
+        predicted, covariance = alone.predict(xyz[[row]])
+        assert others[row] == pytest.approx(predicted[0], abs=1e-9)
+        assert spread[row] == pytest.approx(covariance[0] + sd[row] ** 2 * np.eye(2), rel=1e-6, abs=1e-12)
 
 
 @real

@@ -21,8 +21,9 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.detect.grid import Grid, grow_grid, join_grids
-from implicam.detect.model import Detected, DetectorBase, View, nothing
-from implicam.detect.numbering import END, MORE, Numbering, find_numberings, find_sides
+from implicam.detect.model import Detected, DetectorBase, Inferred, View, nothing
+from implicam.detect.numbering import END, MORE, Numbering, Sides, find_numberings, find_sides
+from implicam.detect.plane import MAX_SEARCH_SD_SQUARES, BoardPlane, complete_grid
 from implicam.detect.seeds import find_saddles, from_libcbdetect, from_opencv, from_saddles, resize, to_original_pixels
 from implicam.errors import UsageError
 from implicam.images import Grey, opencv
@@ -45,12 +46,16 @@ MIN_CORNERS_OF_ANOTHER = 12
 class Board(DetectorBase):
     """A checkerboard with rows x columns inner corners, and squares of `square` millimetres.
 
-    rows + columns must be odd: a board whose half turn looks the same cannot be numbered.
+    rows + columns must be odd: a board whose half turn looks the same cannot be numbered. infer: place the hidden
+    corners, too, as `Detected.inferred`. refine: move each corner to where it and all others together say it is; its
+    error is about halved, but is that of its neighbours then, so that the standard uncertainty written stays its own.
     """
 
     rows: int = 8
     columns: int = 11
     square: float = 13.29
+    infer: bool = False
+    refine: bool = False
 
     def __post_init__(self) -> None:
         if min(self.rows, self.columns) < 3 or max(self.rows, self.columns) > 200:
@@ -76,6 +81,8 @@ class Board(DetectorBase):
         *,
         board: Annotated[str | None, Option("inner corners, 8x11", "RxC")] = None,
         square: Annotated[float | None, Option("edge of a square", "MM", 0)] = None,
+        infer: Annotated[bool, Option("write where hidden corners must be to detections/inferred.csv")] = False,
+        refine: Annotated[bool, Option("move each corner to where all together say; not for calibration")] = False,
     ) -> Board:
         """Make the detector from the options of the command line.
 
@@ -84,12 +91,14 @@ class Board(DetectorBase):
             described: The table [target] of dataset.toml, whose rows and columns stand in for `board`.
             board: Inner corners, rows x columns: "8x11".
             square: Edge of a square in millimetres.
+            infer: Whether hidden corners are placed.
+            refine: Whether corners are moved to where all together say they are.
 
         Raises:
             UsageError: The size is not known, or there can be no such board.
         """
         rows, columns = parse_board_size(board, described, "--board 8x11 (inner corners, rows x columns)")
-        return cls(rows, columns, float(square or 1.0))
+        return cls(rows, columns, float(square or 1.0), infer, refine)
 
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
@@ -131,10 +140,12 @@ class Board(DetectorBase):
 
     def _join_parts(self, picture: Grey, grids: list[Grid], limit: int) -> list[Grid]:
         """The parts of a board that something covers, joined where that is certain."""
-        if not grids or self._is_whole(grids[0]):
+        if not grids or self._is_whole(grids[0]) or self._is_too_large(grids[0]):
             return grids
-        first, rest = grids[0], []
+        first, rest = complete_grid(picture, grids[0], (self.rows, self.columns)), []
         for grid in grids[1:]:
+            if _share_corners(first, grid):
+                continue
             both = join_grids(picture, first, grid, (self.rows, self.columns), limit)
             if both is None or both.count <= first.count:
                 rest.append(grid)
@@ -164,7 +175,7 @@ class Board(DetectorBase):
 
     def _read(self, picture: Grey, grids: list[Grid], view: View) -> Detected:
         """Number the largest grid that may be the board."""
-        ends = [find_sides(picture, grid) for grid in grids]
+        ends = [self._find_sides(picture, grid) for grid in grids]
         ways = [find_numberings(grid, end, self.rows, self.columns) for grid, end in zip(grids, ends, strict=True)]
         fitting = [k for k in range(len(grids)) if ways[k]]
         if not fitting or (fitting[0] > 0 and len(ways[fitting[0]]) > 1):
@@ -189,9 +200,19 @@ class Board(DetectorBase):
                     "the board. Take the other one away, or cover it.",
                     outlines=(*outline, hull_of(grids[k].uv[grids[k].occupied])),
                 )
-        return replace(
+        found = replace(
             possible[0], reason=explain_missing(len(possible[0]), self.rows * self.columns), outlines=outline
         )
+        if not self.infer or self._is_whole(grid):
+            return found
+        return replace(found, inferred=self._infer_hidden(picture, grid, ways[first][0], view))
+
+    def _find_sides(self, picture: Grey, grid: Grid) -> Sides:
+        """What follows the grid; a part of a board is read as far as its corners can place what is beyond them."""
+        size = max(self.rows, self.columns)
+        if self._is_whole(grid) or self._is_too_large(grid):
+            return find_sides(picture, grid)
+        return find_sides(picture, grid, self._plane_of(grid), size - min(grid.rows, grid.columns))
 
     def _name_corners(self, grid: Grid, way: Numbering, view: View) -> Detected:
         """The corners under their names, in the order of their numbers."""
@@ -199,8 +220,30 @@ class Board(DetectorBase):
         there = grid.occupied
         number = (row * self.columns + column)[there]
         order = np.argsort(number)
-        uv, sd = grid.uv[there][order], grid.corners.sd[there.ravel()][order]
+        uv, sd = grid.uv[there], grid.corners.sd[there.ravel()][order]
+        if self.refine:
+            uv = self._plane_of(grid).predict(np.argwhere(there).astype(np.float64)).uv
+        uv = uv[order]
         return Detected(tuple(corner_name(view.shot, int(j)) for j in number[order]), uv, sd)
+
+    def _plane_of(self, grid: Grid) -> BoardPlane:
+        return BoardPlane.of(grid, max(self.rows, self.columns) / 2)
+
+    def _infer_hidden(self, picture: Grey, grid: Grid, way: Numbering, view: View) -> Inferred:
+        """The corners that were not found, where they are in the picture and are placed well enough."""
+        reach, shape = max(self.rows, self.columns), (grid.rows, grid.columns)
+        nodes: Floats = np.argwhere(~grid.pad(reach).occupied).astype(np.float64) - reach
+        row, column = way.at(nodes[:, 0].astype(np.intp), nodes[:, 1].astype(np.intp), shape)
+        own = (row >= 0) & (row < self.rows) & (column >= 0) & (column < self.columns)
+        number = (row * self.columns + column)[own]
+        nodes = nodes[own]
+        plane = self._plane_of(grid)
+        places, sd = plane.locate(nodes)
+        inside = ((places.uv > -0.5) & (places.uv < np.array(picture.shape)[::-1] - 0.5)).all(axis=1)
+        kept = np.flatnonzero(inside & (sd < MAX_SEARCH_SD_SQUARES))
+        kept = kept[np.argsort(number[kept])]
+        names = tuple(corner_name(view.shot, int(j)) for j in number[kept])
+        return Inferred(names, *plane.predict(nodes[kept]))
 
     def _may_be_hidden_part(self, grid: Grid, way: Numbering, other: Grid) -> bool:
         """Whether another grid lies about where corners of the board are missing, so that it need be no other board."""
@@ -213,10 +256,10 @@ class Board(DetectorBase):
         place = place[:, :2] / place[:, 2:]
         return bool(((place > -1.5) & (place < np.array([self.rows, self.columns]) + 0.5)).all())
 
-    def _explain_misfit(self, grid: Grid, ends: tuple[str, str, str, str]) -> str:
+    def _explain_misfit(self, grid: Grid, ends: Sides) -> str:
         """Why no grid can be the board."""
         size = f"{grid.rows} x {grid.columns}"
-        whole = all(end == END for end in ends)
+        whole = all(end[0] == END for end in ends)
         exactly = "has" if whole else "has at least"
         if sorted((grid.rows, grid.columns)) == sorted((self.rows, self.columns)):
             return (
@@ -224,7 +267,7 @@ class Board(DetectorBase):
                 f"black and white squares exchanged. Give the size of the whole board instead of {self.rows} x "
                 f"{self.columns}."
             )
-        more = " and more" if not whole and MORE in ends else ""
+        more = " and more" if not whole and any(end[0] == MORE for end in ends) else ""
         return (
             f"the checkerboard in view {exactly} {size} inner corners{more}, which is no board of {self.rows} x "
             f"{self.columns}. Give the size that the board has, or take this one out of the picture."

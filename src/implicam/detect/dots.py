@@ -5,11 +5,8 @@ other dots must be, those nearest to the labels best. Where the prediction is su
 one, the spot that is there gets the name; the camera is fitted again, until nothing changes. Dots that the others
 contradict are dropped.
 
-The camera is a projective one with a smooth departure from it (water, glass, a lens), as one Gaussian process: to first
-order in the eleven numbers of a camera matrix, pixel = f(theta, xyz) + g(xyz), so the covariance of two pixels is
-J S J^T + k, with J the derivatives of f, S a prior that knows no more than how large the picture is, and k a smooth
-kernel (Rasmussen & Williams, section 2.7). Flat targets, few labels and labels in one plane need no case of their own:
-what the dots seen do not fix is uncertain by what the prior allows.
+The camera is a projective one with a smooth departure from it (water, glass, a lens), as one Gaussian process
+(`projective.py`).
 """
 
 from __future__ import annotations
@@ -28,10 +25,9 @@ from implicam.dataset.folder import POINTS, read_points
 from implicam.dataset.tables import read_name, read_number, read_table
 from implicam.detect.blobs import find_scale, find_spots, measure_spots
 from implicam.detect.model import Detected, DetectorBase, View, nothing
+from implicam.detect.projective import Departure, ProjectiveProcess, fit_affine
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.formatting import list_some
-from implicam.gp.kernels import Kernel
-from implicam.gp.linalg import cholesky, solve, solve_lower
 from implicam.images import Grey
 from implicam.registry import Option
 
@@ -221,129 +217,38 @@ class _Prediction(NamedTuple):
     sd: Floats
 
 
-@dataclass(frozen=True, eq=False)
 class _Camera:
-    """The Gaussian process of one camera, conditioned on dots seen (see the head of this file).
+    """The process of one camera (`projective.py`), with the most probable of a few departures."""
 
-    Everything is in normalised units: positions with mean 0 and rms 1 over the target, pixels in `scale`.
-    """
-
-    xyz: Floats
-    uv: Floats
-    sd: Floats
-    theta: Floats
-    prior: Floats  # (11, 11) covariance of theta
-    bend: float  # sd of the departure from a projective camera, in the units of uv
-    reach: float  # its correlation length, in the units of xyz
-    slack: float  # sd of where dots are, in the units of uv
-    L: Floats
-    alpha: Floats
-    evidence: float
-
-    @classmethod
-    def fit(cls, xyz: Floats, uv: Floats, sd: Floats) -> _Camera:
-        """With the most probable of a few departures; with few dots, one per cent of the target's size."""
-        first = cls.condition(xyz, uv, sd, _fit_affine(xyz, uv), 0.01, 1.0, 0.001)
-        if len(xyz) < MIN_DOTS_FOR_DEPARTURE:
-            return first
-        some = np.random.default_rng(0).permutation(len(xyz))[:MAX_DOTS_FOR_DEPARTURE]
-        trials = [
-            cls.condition(xyz[some], uv[some], sd[some], first.theta, bend, reach, slack, turns=1)
-            for bend in (0.001, 0.004, 0.016)
-            for reach in (0.7, 1.5)
-            for slack in (0.0002, 0.001, 0.004)
-        ]
-        best = max(trials, key=lambda trial: trial.evidence)
-        return cls.condition(xyz, uv, sd, first.theta, best.bend, best.reach, best.slack)
-
-    @classmethod
-    def condition(
-        cls,
-        xyz: Floats,
-        uv: Floats,
-        sd: Floats,
-        theta: Floats,
-        bend: float,
-        reach: float,
-        slack: float,
-        *,
-        turns: int = 5,
-    ) -> _Camera:
-        noise = np.repeat(sd**2 + slack**2, 2)
-        prior = _prior_covariance(theta)
-        for turn in range(turns):
-            image, J = _project(theta, xyz)
-            K = J @ prior @ J.T + np.kron(_smooth_kernel(bend, reach)(xyz, xyz), np.eye(2))
-            K[np.diag_indices_from(K)] += noise
-            L = cholesky(np.asfortranarray(K))
-            rest = (uv - image).ravel() + J @ theta
-            alpha = solve(L, rest)
-            if turn < turns - 1:
-                theta = prior @ (J.T @ alpha)
-        evidence = -0.5 * rest @ alpha - np.log(np.diag(L)).sum()
-        return cls(xyz, uv, sd, theta, prior, bend, reach, slack, L, alpha, float(evidence))
+    def __init__(self, xyz: Floats, uv: Floats, sd: Floats) -> None:
+        """From dots seen; with few of them, the departure is one per cent of the target's size."""
+        theta = fit_affine(xyz, uv)
+        best = ProjectiveProcess.condition(xyz, uv, sd**2, theta, Departure(0.01, 1.0, 0.001))
+        if len(xyz) >= MIN_DOTS_FOR_DEPARTURE:
+            some = np.random.default_rng(0).permutation(len(xyz))[:MAX_DOTS_FOR_DEPARTURE]
+            trials = [
+                ProjectiveProcess.condition(
+                    xyz[some], uv[some], sd[some] ** 2, best.theta, Departure(bend, reach, slack), turns=1
+                )
+                for bend in (0.001, 0.004, 0.016)
+                for reach in (0.7, 1.5)
+                for slack in (0.0002, 0.001, 0.004)
+            ]
+            departure = max(trials, key=lambda trial: trial.evidence).departure
+            best = ProjectiveProcess.condition(xyz, uv, sd**2, best.theta, departure)
+        self.process = best
 
     def predict(self, xyz: Floats) -> _Prediction:
-        image, J = _project(self.theta, xyz)
-        known = _project(self.theta, self.xyz)[1]
-        smooth = np.kron(_smooth_kernel(self.bend, self.reach)(self.xyz, xyz), np.eye(2))
-        K = known @ self.prior @ J.T + smooth
-        v = solve_lower(self.L, K)
-        prior = np.einsum("ij,jk,ik->i", J, self.prior, J) + self.bend**2
-        variance = np.maximum(prior - np.einsum("ij,ij->j", v, v), 0).reshape(-1, 2)
-        uv = image + (K.T @ self.alpha - J @ self.theta).reshape(-1, 2)
-        return _Prediction(uv, np.sqrt(variance.mean(axis=1) + self.slack**2))
+        uv, covariance = self.process.predict(xyz)
+        return _Prediction(uv, np.sqrt(np.einsum("nii->n", covariance) / 2))
 
     def leave_one_out(self) -> _Prediction:
-        """What the other dots say of each (both of its pixel's coordinates left out)."""
-        n = len(self.xyz)
-        inverse = solve(self.L, np.eye(2 * n))
-        blocks = np.linalg.inv(inverse.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)])
-        uv = self.uv - np.einsum("nij,nj->ni", blocks, self.alpha.reshape(n, 2))
-        return _Prediction(uv, np.sqrt(np.einsum("nii->n", blocks) / 2))
+        uv, covariance = self.process.leave_one_out()
+        return _Prediction(uv, np.sqrt(np.einsum("nii->n", covariance) / 2))
 
 
 MIN_DOTS_FOR_DEPARTURE, MAX_DOTS_FOR_DEPARTURE = 12, 120
 """Dots from which the departure can be told, and so many of them as suffice for it."""
-
-AFFINE_PRIOR_VARIANCES = np.array([1.5] * 3 + [5.0]) ** 2
-"""Prior variances of a row of the camera matrix, with pixels in units of the labels' size: all that is possible."""
-
-ALONG_PRIOR_SD, ACROSS_PRIOR_SD = 0.2, 0.06
-"""Prior sd of the perspective: how much the distance from the camera changes over the target, as a part of itself,
-along the line of sight; and across it, which is what an axis that does not meet the target does."""
-
-
-def _prior_covariance(theta: Floats) -> Floats:
-    """Prior covariance (11, 11) of the numbers of a camera; its line of sight is that of theta."""
-    sight = np.cross(theta[:3], theta[4:7])
-    sight = sight / max(float(np.linalg.norm(sight)), 1e-9)
-    S = np.zeros((11, 11))
-    S[np.arange(8), np.arange(8)] = np.tile(AFFINE_PRIOR_VARIANCES, 2)
-    S[8:, 8:] = (ALONG_PRIOR_SD**2 - ACROSS_PRIOR_SD**2) * np.outer(sight, sight) + ACROSS_PRIOR_SD**2 * np.eye(3)
-    return S
-
-
-def _project(theta: Floats, xyz: Floats) -> tuple[Floats, Floats]:
-    """Pixels (n, 2), and their derivatives (2 n, 11), for points (n, 3)."""
-    n = len(xyz)
-    one = np.hstack([xyz, np.ones((n, 1))])
-    away = np.maximum(1 + xyz @ theta[8:], 0.1)[:, None]
-    uv = np.column_stack([one @ theta[:4], one @ theta[4:8]]) / away
-    J = np.zeros((n, 2, 11))
-    J[:, 0, :4] = J[:, 1, 4:8] = one / away
-    J[:, :, 8:] = -uv[..., None] * (xyz / away)[:, None]
-    return uv, J.reshape(2 * n, 11)
-
-
-def _smooth_kernel(bend: float, reach: float) -> Kernel:
-    return Kernel("squared-exponential", bend**2, np.full(3, reach))
-
-
-def _fit_affine(xyz: Floats, uv: Floats) -> Floats:
-    one = np.hstack([xyz, np.ones((len(xyz), 1))])
-    normal = one.T @ one + 1e-6 * len(xyz) * np.eye(4)
-    return np.concatenate([*np.linalg.solve(normal, one.T @ uv).T, np.zeros(3)])
 
 
 class _Search:
@@ -436,7 +341,7 @@ class _Search:
         if len(rows) > MAX_DOTS_FOR_DEPARTURE:
             some = np.sort(np.random.default_rng(0).permutation(len(rows))[:MAX_DOTS_FOR_DEPARTURE])
             rows, uv, sd = rows[some], uv[some], sd[some]
-        camera = _Camera.fit(self.xyz[rows], (uv - middle) / scale, sd / scale)
+        camera = _Camera(self.xyz[rows], (uv - middle) / scale, sd / scale)
         predicted, by_others = camera.predict(self.xyz), camera.leave_one_out()
         predicted.uv[rows], predicted.sd[rows] = by_others
         self.uv, self.sd = middle + scale * predicted.uv, scale * predicted.sd

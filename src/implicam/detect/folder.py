@@ -2,6 +2,7 @@
 
     detections/journal.jsonl          what was found in each picture, kept as it comes (detect/journal.py)
     detections/summary.csv            a row per picture: how many points, and why not more
+    detections/inferred.csv           where hidden points must be, if that was asked for; no observations
     detections/<camera>.jpg           all pictures of a camera on a sheet
     detections/overlays/<camera>/     each picture with what was found
     detections/written.toml           the SHA-256 of the observations.csv that detect wrote
@@ -38,6 +39,7 @@ from implicam.images import PATTERN, find_pictures, in_order, one_thread_each
 from implicam.progress import Progress, silent
 
 DETECTIONS, JOURNAL_FILE, SUMMARY_FILE, WRITTEN_FILE = "detections", "journal.jsonl", "summary.csv", "written.toml"
+INFERRED_FILE = "inferred.csv"
 BACKUP_NAME = "observations.before-detect"
 
 MAX_NAMES, MAX_NOTES = 5, 20
@@ -120,6 +122,7 @@ def detect_folder(
         data, more = _gather(rig, results)
         folder = rig.path / DETECTIONS
         write_text(folder / SUMMARY_FILE, _summary_csv(rig, results))
+        more += _write_inferred(folder / INFERRED_FILE, results)
         if data is not None:
             data, said = (correct or detector.correct)(data)
             more += [*said, *_write(rig, data)]
@@ -374,6 +377,25 @@ def _summary_csv(rig: _Rig, results: Iterable[Result]) -> str:
         for r in results
     ]
     return csv_text(("camera", "shot", "file", "found", "expected", "reason"), rows)
+
+
+def _write_inferred(path: Path, results: Iterable[Result]) -> list[str]:
+    """Write what was inferred, and say so; a file of an earlier run goes where nothing was."""
+    rows = []
+    for result in results:
+        found = result.found.inferred
+        for name, uv, covariance in zip(found.points, found.uv, found.covariance, strict=True):
+            sd = np.sqrt(np.diag(covariance))
+            numbers = [*uv, *sd, covariance[0, 1] / sd.prod()]
+            rows.append((name, result.view.camera, *(f"{number:.6g}" for number in numbers)))
+    if not rows:
+        path.unlink(missing_ok=True)
+        return []
+    write_text(path, csv_text(("point", "camera", "u", "v", "sd_u", "sd_v", "correlation"), rows))
+    return [
+        f"{len(rows)} hidden points were inferred from those seen: {DETECTIONS}/{path.name}, not {VIEWS}, for they say "
+        "nothing new to a calibration."
+    ]
 
 
 def _count_by_camera(results: Sequence[Result]) -> Iterator[Count]:

@@ -73,6 +73,13 @@ class Grid:
         return int(self.occupied.sum())
 
     @property
+    def clear(self) -> Bools:
+        """(rows, columns) where a corner was found that nothing else cuts into."""
+        misfit = self.corners.misfit.reshape(self.rows, self.columns)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(misfit < max(3 * float(np.nanmedian(misfit)), 0.1), dtype=np.bool_)
+
+    @property
     def polarity(self) -> float:
         """+1 where the square right below and right of node (0, 0) is bright, -1 where it is dark."""
         return float(np.sign(np.nansum(self._signed_heights()))) or 1.0
@@ -128,6 +135,20 @@ class Grid:
         """
         known = np.argwhere(self.occupied).astype(np.float64)
         return predict_places(known, self.uv[self.occupied], nodes)
+
+    def levels_near(self, nodes: Floats) -> tuple[Floats, Floats]:
+        """The grey between dark and bright, and from there to bright, of the known corner nearest to each node.
+
+        Args:
+            nodes: (n, 2) row and column, whole numbers or not.
+
+        Returns:
+            (n,) and (n,).
+        """
+        known = np.argwhere(self.occupied)
+        nearest = np.argmin(np.linalg.norm(nodes[:, None] - known[None], axis=2), axis=1)
+        row = known[nearest] @ [self.columns, 1]
+        return self.corners.mean[row], np.abs(self.corners.height[row])
 
 
 class Places(NamedTuple):
@@ -236,7 +257,7 @@ def _grid_from_seed(picture: Grey, seed: Floats) -> Grid | None:
     good = _judge_corners(found, nodes, places._replace(uv=rough.uv[rough.occupied]), None)
     good &= _have_four_squares(picture, places._replace(uv=found.uv), found.mean, found.height)
     grid = replace(rough, corners=_scatter_corners(found, rough.occupied.ravel()))
-    grid = grid.keep_only(_scatter(good, rough.occupied))
+    grid = grid.keep_only(scatter(good, rough.occupied))
     return grid.crop() if grid.count >= 9 else None
 
 
@@ -255,7 +276,13 @@ def _handedness(uv: Floats) -> float:
     return float(np.nanmedian(right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0]))
 
 
-def _judge_corners(found: Corners, nodes: NDArray[np.intp], places: Places, grid: Grid | None) -> Bools:
+def _judge_corners(
+    found: Corners,
+    nodes: NDArray[np.intp],
+    places: Places,
+    grid: Grid | None,
+    astray: Floats | float = MAX_ASTRAY_SQUARES,
+) -> Bools:
     """Which of the corners fitted (n,) at nodes (n, 2) are corners of this checkerboard."""
     with np.errstate(invalid="ignore"):
         signed = found.height * (1 - 2 * (nodes.sum(axis=1) % 2))
@@ -270,7 +297,7 @@ def _judge_corners(found: Corners, nodes: NDArray[np.intp], places: Places, grid
         steps[~good] = np.eye(2)
         away = np.where(good[:, None], found.uv - places.uv, np.inf)
         moved = np.asarray(np.linalg.solve(steps, away[..., None]), dtype=np.float64)[..., 0]
-        good &= (np.abs(moved) < MAX_ASTRAY_SQUARES).all(axis=1) & (found.turned < MAX_TURN_RAD)
+        good &= (np.abs(moved).max(axis=1) < astray) & (found.turned < MAX_TURN_RAD)
         return np.asarray(good & sound & (polarity * signed > MIN_HEIGHT_RATIO * usual), dtype=np.bool_)
 
 
@@ -285,29 +312,50 @@ def _extend(picture: Grey, grid: Grid, *, reach: int, limit: int) -> Grid:
         near[: used_rows[0]] = near[used_rows[-1] + 1 :] = False
     if len(used_columns) >= limit:
         near[:, : used_columns[0]] = near[:, used_columns[-1] + 1 :] = False
-    if not near.any():
-        return grid
-    nodes = np.argwhere(near)
-    places = wide.places(nodes.astype(np.float64))
-    plausible = _have_four_squares(picture, places, *_expected_levels(wide, nodes))
-    near, nodes, places = _scatter(plausible, near), nodes[plausible], Places(*(x[plausible] for x in places))
+    return add_corners(picture, wide, near, wide.places(np.argwhere(near).astype(np.float64)), 0 if reach == 1 else 2)
+
+
+def add_corners(
+    picture: Grey,
+    grid: Grid,
+    where: Bools,
+    places: Places,
+    neighbours: int,
+    astray: Floats | float = MAX_ASTRAY_SQUARES,
+) -> Grid:
+    """Look for corners at nodes where none is known.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        grid: The corners known.
+        where: (rows, columns) the n nodes to look at.
+        places: Where they must be, in the order of `np.argwhere(where)`.
+        neighbours: So many of the four neighbours of a corner must be found with it.
+        astray: (n,) or one number, squares that a corner may lie from its place.
+
+    Returns:
+        The grid with the corners found, without empty rows and columns at the rim.
+    """
+    nodes = np.argwhere(where)
     if len(nodes) == 0:
-        return grid
+        return grid.crop()
+    plausible = _have_four_squares(picture, places, *_expected_levels(grid, nodes))
+    astray = np.broadcast_to(astray, len(nodes))[plausible]
+    where, nodes, places = scatter(plausible, where), nodes[plausible], Places(*(x[plausible] for x in places))
+    if len(nodes) == 0:
+        return grid.crop()
     found = fit_corners(picture, places.uv, places.right, places.down)
-    good = _scatter(_judge_corners(found, nodes, places, wide), near)
-    if reach > 1:
-        good &= _count_neighbours(good) >= 2
-    corners = _merge_corners(wide.corners, _scatter_corners(found, near.ravel()), good.ravel())
-    return Grid(wide.rows, wide.columns, corners).crop()
+    good = scatter(_judge_corners(found, nodes, places, grid, astray), where)
+    if neighbours:
+        good &= _count_neighbours(good) >= neighbours
+    corners = _merge_corners(grid.corners, _scatter_corners(found, where.ravel()), good.ravel())
+    return Grid(grid.rows, grid.columns, corners).crop()
 
 
 def _expected_levels(grid: Grid, nodes: NDArray[np.intp]) -> tuple[Floats, Floats]:
-    """Mean and height (n,) that corners at nodes (n, 2) should have: those of the nearest known corner."""
-    known = np.argwhere(grid.occupied)
-    nearest = np.argmin(np.linalg.norm(nodes[:, None] - known[None], axis=2), axis=1)
-    row = known[nearest] @ [grid.columns, 1]
-    sign = 1 - 2 * (nodes.sum(axis=1) % 2)
-    return grid.corners.mean[row], sign * grid.polarity * np.abs(grid.corners.height[row])
+    """Mean and signed height (n,) that corners at nodes (n, 2) should have."""
+    mean, height = grid.levels_near(nodes.astype(np.float64))
+    return mean, (1 - 2 * (nodes.sum(axis=1) % 2)) * grid.polarity * height
 
 
 def _have_four_squares(picture: Grey, places: Places, mean: Floats, height: Floats) -> Bools:
@@ -353,21 +401,24 @@ def _drop_wrong_corners(grid: Grid) -> Grid | None:
         nodes = np.argwhere(grid.occupied)
         uv = grid.uv[grid.occupied]
         off = np.linalg.norm(grid.places(nodes.astype(np.float64)).uv - uv, axis=1)
-        misfit = grid.corners.misfit.reshape(grid.occupied.shape)[grid.occupied]
         inner = _count_neighbours(grid.occupied)[grid.occupied] >= 3  # the others are extrapolated: less certain
         bound = np.where(inner, 5, 12) * (np.median(off[inner]) if inner.any() else np.median(off)) + 0.1
-        good = (off < bound) & (misfit < np.maximum(3 * np.median(misfit), 0.1))
-        there = _scatter(good, grid.occupied)
+        there = scatter(off < bound, grid.occupied) & grid.clear
         there &= _count_neighbours(there) >= 1
-        there = _drop_thin_rims(there)
-        if there.sum() == grid.count:
+        smaller = drop_thin_rims(grid.keep_only(there))
+        if smaller.count == grid.count:
             return grid
-        grid = grid.keep_only(there).crop()
+        grid = smaller
     return grid if grid.count >= 9 else None
 
 
-def _drop_thin_rims(there: Bools) -> Bools:
-    there = there.copy()
+def drop_thin_rims(grid: Grid) -> Grid:
+    """Without outermost rows and columns of fewer than `MIN_CORNERS_OF_LINE` corners.
+
+    Args:
+        grid: The corners.
+    """
+    there = grid.occupied
     changed = True
     while changed and there.any():
         changed = False
@@ -377,7 +428,7 @@ def _drop_thin_rims(there: Bools) -> Bools:
                 if 0 < lines[k].sum() < MIN_CORNERS_OF_LINE:
                     lines[k] = False
                     changed = True
-    return there
+    return grid.keep_only(there).crop()
 
 
 def predict_places(known: Floats, uv: Floats, nodes: Floats) -> Places:
@@ -427,7 +478,13 @@ def _fit_homographies(x: Floats, y: Floats, weight: Floats) -> Floats:
     return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
 
 
-def _scatter(values: Bools, where: Bools) -> Bools:
+def scatter(values: Bools, where: Bools) -> Bools:
+    """Values (k,) put where `where` is true, false elsewhere.
+
+    Args:
+        values: One for each place.
+        where: The k places.
+    """
     out = np.zeros_like(where)
     out[where] = values
     return out

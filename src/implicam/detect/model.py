@@ -5,7 +5,7 @@ CONTRIBUTING.md has the recipe for one more.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -23,6 +23,18 @@ class View(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class Inferred:
+    """Points that the picture does not show, placed by those that it shows: no observations, for they say nothing new.
+
+    points: n names. uv: (n, 2) pixels. covariance: (n, 2, 2) of each; the errors of neighbours are alike.
+    """
+
+    points: tuple[str, ...] = ()
+    uv: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+    covariance: Floats = field(default_factory=lambda: np.zeros((0, 2, 2)))
+
+
+@dataclass(frozen=True, eq=False)
 class Detected:
     """What was found in one picture.
 
@@ -30,6 +42,7 @@ class Detected:
     standard uncertainties. reason: why nothing, or not everything, was found; empty where all is well. outlines:
     curves (k, 2) in pixels for the overlay, such as the edge of a ball. others: what else might have been meant, the
     likelier first; only `Detector.settle` looks at it. notes: anything a detector wants to remember, as plain values.
+    inferred: what is hidden, where a detector was asked for it.
     """
 
     points: tuple[str, ...] = ()
@@ -39,6 +52,7 @@ class Detected:
     outlines: tuple[Floats, ...] = ()
     others: tuple[Detected, ...] = ()
     notes: Mapping[str, Any] = field(default_factory=dict)
+    inferred: Inferred = field(default_factory=Inferred)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -53,6 +67,10 @@ class Detected:
             "outlines": [curve.tolist() for curve in self.outlines],
             "others": [other.as_dict() for other in self.others],
             "notes": dict(self.notes),
+            "inferred": [
+                [name, *uv.tolist(), *covariance.ravel().tolist()]
+                for name, uv, covariance in zip(*vars(self.inferred).values(), strict=True)
+            ],
         }
 
     @classmethod
@@ -70,7 +88,13 @@ class Detected:
             tuple(np.array(curve, dtype=np.float64).reshape(-1, 2) for curve in table["outlines"]),
             tuple(cls.from_dict(other) for other in table["others"]),
             dict(table["notes"]),
+            _read_inferred(table["inferred"]),
         )
+
+
+def _read_inferred(rows: Sequence[Sequence[Any]]) -> Inferred:
+    numbers = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 6)
+    return Inferred(tuple(str(row[0]) for row in rows), numbers[:, :2], numbers[:, 2:].reshape(-1, 2, 2))
 
 
 def nothing(reason: str, **more: Any) -> Detected:

@@ -11,7 +11,7 @@ import numpy as np
 
 from implicam import drawing
 from implicam.dataset import Floats
-from implicam.detect.model import Detected, View
+from implicam.detect.model import Detected, Inferred, View
 from implicam.drawing import Canvas, Pixels
 
 INK_COLOUR = (40, 50, 60)
@@ -28,6 +28,9 @@ MAX_NAMED_POINTS = 12
 
 RIMMED_RADIUS_PX = 4.0
 """Pixels: marks of this radius and larger are rings with a dark rim, smaller ones are dots."""
+
+ELLIPSE_SDS = 2.45
+"""Standard deviations to the ellipse that holds 95 % in two dimensions."""
 
 _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
 _CORNER = re.compile(r".*-c(\d{3,})")
@@ -154,11 +157,23 @@ class _Window:
         lines = [uv[chain] for chain in chains if len(chain) > 1]
         canvas.stroke(lines, drawing.SKY, rim=int(_ring_radius(uv) >= RIMMED_RADIUS_PX))
         _draw_marks(canvas, uv, drawing.VERMILLION)
+        self._draw_inferred(canvas, found.inferred, _ring_radius(uv))
         if chains:
             _write_numbers(canvas, found.points, uv, chains, few=not names)
         elif names:
             _write_names(canvas, found.points, uv)
         return canvas
+
+    def _draw_inferred(self, canvas: Canvas, inferred: Inferred, radius: float) -> None:
+        """Hollow rings where hidden points must be, and the ellipses that hold 95 % where those are larger."""
+        circle = drawing.circle(np.zeros(2), 1.0)
+        curves = []
+        for place, covariance in zip(self.place(inferred.uv), inferred.covariance, strict=True):
+            curves.append(place + radius * circle)
+            root = np.linalg.cholesky(covariance) * self.scale * ELLIPSE_SDS
+            if np.linalg.norm(root, 2) > radius:
+                curves.append(place + circle @ root.T)
+        canvas.stroke(curves, drawing.ORANGE, rim=int(radius >= RIMMED_RADIUS_PX))
 
 
 def _find_neighbourhood(found: Detected, shape: tuple[int, ...]) -> _Window | None:
