@@ -299,6 +299,21 @@ def test_the_unit_of_what_is_measured_does_not_matter_and_that_of_known_points_d
     assert "is in m, and the calibration is in mm" in ran.err
 
 
+def test_measured_points_come_in_the_unit_that_is_asked_for(made: Path, cli: Cli) -> None:
+    tables = {}
+    for unit in ("mm", "m"):
+        ran = cli("measure", made / "rig.implicam", made / "rig" / "check", "--unit", unit, "-o", f"{unit}.csv")
+        assert ran.code == 0
+        assert f" {unit}\n" in ran.out
+        tables[unit] = np.genfromtxt(f"{unit}.csv", delimiter=",", names=True, dtype=None, encoding="utf-8")
+    for column, power in (("x", 1), ("sd_z", 1), ("cov_xy", 2)):
+        np.testing.assert_allclose(tables["m"][column] * 1e3**power, tables["mm"][column], rtol=1e-9)
+    ran = cli("measure", made / "rig.implicam", made / "rig" / "check", "--unit", "furlong", "-o", "x.csv")
+    assert ran.code == 1
+    assert "furlong" in ran.err
+    assert not Path("x.csv").exists()
+
+
 @pytest.mark.slow
 def test_cameras_and_without(cli: Cli) -> None:
     cli("simulate", "rig", "--positions", "random", "--points", "60", "--check", "20")

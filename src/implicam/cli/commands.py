@@ -58,6 +58,7 @@ from implicam.cli.settings import (
 )
 from implicam.dataset import Dataset, TableOptions, write_dataset
 from implicam.dataset.table_options import DOCUMENTED
+from implicam.dataset.units import metres_per
 from implicam.dataset.wide import is_unit_missing
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
@@ -173,16 +174,23 @@ def measure_command(
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
-    """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not."""
+    """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not.
+
+    The table is in the length unit of the calibration, or in that of --unit.
+    """
     refuse_folder(output)
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
-    data = _read_to_measure(dataset, table, fitted.data.length_unit)
+    unit = table.unit or fitted.data.length_unit
+    metres_per(unit)  # an unknown one is refused before the work
+    data = _read_to_measure(dataset, replace(table, unit=None), fitted.data.length_unit)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
         measured = fitted.measure(data.observations).with_columns(data.further_columns())
         progress("measuring", 1, 1)
+    if unit != measured.length_unit:
+        measured = measured.in_unit(unit)
     measured.write_csv(output)
     count, typical = int(measured.measured.sum()), _typical(measured.sd)
     known = measured.share_calibration[np.isfinite(measured.share_calibration)]
@@ -217,7 +225,7 @@ def _read_to_measure(path: Path, table: TableOptions, likely: str) -> Dataset:
     try:
         return read(path, table)
     except DatasetError as error:
-        if table.unit is not None or not is_unit_missing(error):
+        if not is_unit_missing(error):
             raise
         return read(path, replace(table, unit=likely))
 
