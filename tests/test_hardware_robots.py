@@ -66,8 +66,9 @@ class Controller:
 
 
 @pytest.fixture
-def controller() -> Iterator[Controller]:
+def controller(monkeypatch: pytest.MonkeyPatch) -> Iterator[Controller]:
     pytest.importorskip("rtde_control", reason="the extra robot is not installed")
+    monkeypatch.setattr("implicam.hardware.ur.SILENCE_SECONDS", 3.0)  # it shares the cores with other tests
     made = Controller()
     yield made
     made.end()
