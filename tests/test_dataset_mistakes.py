@@ -731,7 +731,7 @@ def test_mistakes_in_a_wide_table(mistake: str, tmp_path: Path) -> None:
 
 
 PARQUET_MISTAKES: dict[str, tuple[str, Callable[[Any], Any], str]] = {
-    "no description": ("x", lambda t: t.replace_schema_metadata({}), "carries no implicam description"),
+    "no description": ("x", lambda t: t.replace_schema_metadata({}), "the length unit of x, y, z is not stated"),
     "text": ("u_cam1", lambda t: t.set_column(0, "u_cam1", [["a", "b", "c"]]), "row 1: u_cam1 = 'a' is not a number"),
     "lists": (
         "u_cam1",

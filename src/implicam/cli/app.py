@@ -55,7 +55,7 @@ def command_line() -> str:
 
 
 CALIBRATION_SUFFIX = ".implicam"
-FILE_SUFFIXES = (".csv", ".parquet", ".npz")
+FILE_SUFFIXES = (".csv", ".xlsx", ".parquet", ".npz")
 FOLDER_FILES = ("dataset.toml", "points.csv", "observations.csv")
 
 Function = TypeVar("Function", bound=Callable[..., Any])

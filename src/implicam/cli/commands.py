@@ -371,13 +371,13 @@ def report_command(
 @command("convert")
 @with_table_options
 def convert_command(
-    dataset: Annotated[Path, typer.Argument(help="A folder, .csv, .parquet or .npz.")],
+    dataset: Annotated[Path, typer.Argument(help="A folder, .csv, .tsv, .xlsx, .parquet or .npz.")],
     out: Annotated[Path, typer.Argument(help="The same, in another form: the ending chooses.")],
     table: TableOptions = DOCUMENTED,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is a folder that exists.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a dataset in another form: folder, wide CSV, Parquet, NPZ; nothing is lost."""
+    """Write a dataset in another form: folder, wide CSV, Excel, Parquet, NPZ."""
     if out.exists() and out.resolve() == dataset.resolve():
         raise UsageError(f"{dataset} would be replaced by itself.", fix="give another name to write to")
     data = read(dataset, table)

@@ -24,9 +24,11 @@ from implicam.dataset.table_options import TableOptions, size_text
 from implicam.dataset.wide import (
     arrays_from_dataset,
     dataset_from_arrays,
+    read_excel_workbook,
     read_npz_dataset,
     read_parquet,
     read_wide_csv,
+    write_excel_workbook,
     write_npz_dataset,
     write_parquet,
     write_wide_csv,
@@ -57,6 +59,10 @@ __all__ = [
 ]
 
 
+TEXT_SUFFIXES = (".csv", ".tsv", ".txt")
+OTHER_WORKBOOKS = (".xls", ".xlsm", ".xlsb", ".ods", ".numbers")
+
+
 def read_dataset(
     path: str | Path,
     *,
@@ -65,7 +71,7 @@ def read_dataset(
     v_up: bool = False,
     size: str | tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
 ) -> Dataset:
-    """Read a dataset from a folder, a .csv, a .parquet or an .npz.
+    """Read a dataset from a folder, a .csv, .tsv or .txt, an .xlsx, a .parquet or an .npz.
 
     Args:
         path: The folder or file.
@@ -102,10 +108,12 @@ def _read(path: Path, unit: str | None) -> Dataset:
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path)
-    if suffix == ".csv":
+    if suffix in TEXT_SUFFIXES:
         return read_wide_csv(path, unit)
     if suffix == ".parquet":
-        return read_parquet(path)
+        return read_parquet(path, unit)
+    if suffix == ".xlsx":
+        return read_excel_workbook(path, unit)
     if suffix == ".npz":
         return read_npz_dataset(path)
     old = find_left_behind(path)
@@ -116,7 +124,9 @@ def _read(path: Path, unit: str | None) -> Dataset:
     raise DatasetError(
         f"{path} is not a dataset." if path.exists() else f"{path} does not exist.",
         why="" if path.exists() else f"the working folder is {Path.cwd()}",
-        fix="give a folder with dataset.toml, or a .csv, .parquet or .npz file; see docs/formats.md",
+        fix="save it as .xlsx or as CSV"
+        if suffix in OTHER_WORKBOOKS
+        else "give a folder with dataset.toml, or a .csv, .tsv, .xlsx, .parquet or .npz file; see docs/formats.md",
     )
 
 
@@ -132,7 +142,7 @@ def write_dataset(
 
     Args:
         data: The dataset.
-        path: Where to; .csv, .parquet and .npz make a file, any other ending makes a folder.
+        path: Where to; .csv, .xlsx, .parquet and .npz make a file, any other ending makes a folder.
         overwrite: Whether an existing dataset folder may be replaced.
         also: Text files to add to a folder: relative name -> text.
         fill: Called with the temporary folder to write more into it, before it is renamed.
@@ -144,6 +154,10 @@ def write_dataset(
     suffix = path.suffix.lower()
     if suffix == ".csv":
         write_wide_csv(data, path)
+    elif suffix == ".xlsx":
+        write_excel_workbook(data, path)
+    elif suffix in (*TEXT_SUFFIXES, *OTHER_WORKBOOKS):
+        raise DatasetError(f"{path}: no dataset is written as {suffix}.", fix="end the name in .csv, or in .xlsx")
     elif suffix == ".parquet":
         write_parquet(data, path)
     elif suffix == ".npz":

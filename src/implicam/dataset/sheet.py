@@ -69,7 +69,7 @@ def sheet_of_text(path: Path) -> Sheet:
         DatasetError: There is no such file, it is no text, or has no header.
     """
     require_file(path, f"put a comma-separated table with the columns {EXAMPLE_HEADER} there")
-    writing = find_separator(path, _is_header)
+    writing = find_separator(path, is_header)
     first, header = next(rows_of(path, writing), (1, list[str]()))
     if not header:
         raise DatasetError(f"{path} is empty.", fix=f"its first line must be {EXAMPLE_HEADER}, then one row per entry")
@@ -82,12 +82,30 @@ def sheet_of_text(path: Path) -> Sheet:
     return Sheet(str(path), header, rows, first=first, writing=writing)
 
 
-def _is_header(header: Sequence[str]) -> bool:
+def is_header(header: Sequence[str]) -> bool:
+    """Whether names are those of a table that can be read.
+
+    Args:
+        header: Without spaces around them.
+    """
     try:
         read_headings(header, "")
     except DatasetError:
         return False
     return True
+
+
+def cell_text(value: object) -> str:
+    """A value as it would stand in a CSV: a whole number without a point, another to its last bit, nothing for None.
+
+    Args:
+        value: Of a cell of a workbook or a Parquet file.
+    """
+    if value is None:
+        return ""
+    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
+        return str(int(value))
+    return str(value)
 
 
 def read_sheet(sheet: Sheet) -> Brought:

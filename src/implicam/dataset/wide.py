@@ -8,7 +8,7 @@ without it is one that people bring: sheet.py reads it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset.arrays import default_names
+from implicam.dataset.excel import DESCRIPTION_SHEET, read_excel, write_excel
 from implicam.dataset.folder import csv_text, description_text, format_cells
 from implicam.dataset.model import (
     SD_POINT,
@@ -31,10 +32,12 @@ from implicam.dataset.model import (
     check_unique,
     check_views,
 )
-from implicam.dataset.sheet import EXAMPLE_HEADER, Sheet, read_sheet, sheet_of_text
+from implicam.dataset.sheet import EXAMPLE_HEADER, Sheet, cell_text, read_sheet, sheet_of_text
 from implicam.dataset.tables import (
     Columns,
     NumberColumn,
+    Row,
+    check_headings,
     description_from_toml,
     naming,
     parse_toml,
@@ -108,7 +111,9 @@ def read_brought(sheet: Sheet, path: Path, unit: str | None) -> Dataset:
     if unit is None and not brought.unit:
         raise DatasetError(
             f"{path}: {_UNIT_MISSING}",
-            why=f"a table carries it in {_description_path(path).name} beside it, which is not there",
+            why=f"a table carries it in {_description_path(path).name} beside it, which is not there"
+            if path.suffix.lower() == ".csv"
+            else "no heading says it",
             fix='add --unit mm, or unit="mm" in read_dataset(...)',
         )
     if unit is not None and brought.unit not in ("", unit):
@@ -276,14 +281,69 @@ def write_wide_csv(data: Dataset, path: Path) -> None:
         write_text(sidecar, description)
 
 
-def read_parquet(path: Path) -> Dataset:
+def read_excel_workbook(path: Path, unit: str | None = None) -> Dataset:
+    """Read a wide table from Excel's .xlsx.
+
+    Args:
+        path: The file.
+        unit: The length unit where the workbook has no description; else it is not used.
+
+    Raises:
+        DatasetError: It is no workbook, the unit is not stated, or there is a mistake; names the sheet and the row.
+        MissingExtraError: openpyxl is not installed.
+    """
+    sheet, text = read_excel(path)
+    if text is None:
+        return read_brought(sheet, path, unit)
+    try:
+        description = parse_toml(text)
+    except ValueError as error:
+        raise DatasetError(
+            f"{path}, sheet {DESCRIPTION_SHEET!r}: not valid TOML: {error}.", fix="write it again, or delete the sheet"
+        ) from None
+    check_headings(sheet.header_place, sheet.header)
+    layout = _described_layout(sheet.header, description, path)
+    numbers = dict.fromkeys(layout.numbers(), NumberColumn("leave the cell empty where there is no value", ("", "nan")))
+    table = read_columns(sheet.place, sheet.header, sheet.rows(), (), numbers, sheet.unit)
+    with naming(path):
+        return _assemble(table, layout)
+
+
+def write_excel_workbook(data: Dataset, path: Path) -> None:
+    """Write a wide table as Excel's .xlsx, its description on a sheet beside it.
+
+    Args:
+        data: The dataset.
+        path: The file; one that is there is replaced.
+
+    Raises:
+        DatasetError: A table cannot hold the dataset: it has no points, or a column that could be mistaken for another.
+        MissingExtraError: openpyxl is not installed.
+        ImplicamError: The file cannot be written.
+    """
+    columns, description = _make_columns(data)
+    cells = [(name, [None if value != value else value for value in v.tolist()]) for name, v in columns.items()]
+    write_excel(path, cells, description)
+
+
+def _sheet_of_columns(path: Path, header: list[str], columns: list[list[str]]) -> Sheet:
+    """A Parquet file without a description as a sheet."""
+
+    def rows() -> Iterator[Row]:
+        return ((i, list(row)) for i, row in enumerate(zip(*columns, strict=True), 1))
+
+    return Sheet(str(path), header, rows, unit="row", first=0)
+
+
+def read_parquet(path: Path, unit: str | None = None) -> Dataset:
     """Read a wide table from Parquet.
 
     Args:
         path: The file.
+        unit: The length unit where the file has no description; else it is not used.
 
     Raises:
-        DatasetError: It is no readable Parquet file of implicam, or has a mistake.
+        DatasetError: It is no readable Parquet file, the unit is not stated, or it has a mistake.
         MissingExtraError: pyarrow is not installed.
     """
     parquet = import_extra("pyarrow.parquet", "parquet", "reading Parquet")
@@ -295,20 +355,18 @@ def read_parquet(path: Path) -> Dataset:
         metadata = table.schema.metadata or {}
         description = parse_toml(metadata[b"implicam"].decode()) if b"implicam" in metadata else None
         columns = {c: table.column(i).to_pylist() for i, c in enumerate(table.column_names)}
+        names = list(table.column_names)
     except (arrow.ArrowException, OSError, ValueError, TypeError, KeyError, OverflowError, MemoryError) as error:
         raise DatasetError(
             f"{path} is not a readable Parquet file.", why=str(error)[:300], fix="write it again"
         ) from None
-    if description is None:
-        raise DatasetError(
-            f"{path} carries no implicam description.",
-            why="name, unit and image sizes are kept in the metadata of the schema",
-            fix="write it with implicam, or convert it to a wide CSV and state the unit",
-        )
-    for column, times in Counter(table.column_names).items():
+    for column, times in Counter(names).items():
         if times > 1:
             raise DatasetError(f"{path}: the column {column[:60]!r} is there {times} times.", fix="leave one out")
-    layout = _described_layout(table.column_names, description, path)
+    if description is None:
+        text = [[cell_text(value) for value in column] for column in columns.values()]
+        return read_brought(_sheet_of_columns(path, names, text), path, unit)
+    layout = _described_layout(names, description, path)
     numeric = set(layout.numbers())
     numbers = {c: _read_numbers(v, c, path) for c, v in columns.items() if c in numeric}
     texts = {c: _read_texts(v, c, path) for c, v in columns.items() if c not in numeric}
