@@ -321,7 +321,7 @@ def write_excel_workbook(data: Dataset, path: Path) -> None:
         MissingExtraError: openpyxl is not installed.
         ImplicamError: The file cannot be written.
     """
-    columns, description = _make_columns(data)
+    columns, description = make_columns(data)
     cells = [(name, [None if value != value else value for value in v.tolist()]) for name, v in columns.items()]
     write_excel(path, cells, description)
 
