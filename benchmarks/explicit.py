@@ -1,9 +1,10 @@
 """The classical calibration at its best, beside forward-gp: the tables of docs/choose.md on `explicit`.
 
-    python benchmarks/explicit.py [--rigs 16] [--only points,boards,hard,photographs] [-o results/explicit.md]
+    python benchmarks/explicit.py [--rigs 16] [--only points,boards,aligned,hard,photographs] [-o results/explicit.md]
 
 points: the same known points for both; lenses inside the model family, and with errors outside of it (0.5 px rms).
-boards: the paper's budgets of checkerboard pictures, simulated corners (0.2 px), 40 known points to align. hard: 20
+boards: the paper's budgets of checkerboard pictures, simulated corners (0.2 px), 40 known points to align. aligned: the
+error bars with few known points, and what they would be if they came from the boards alone. hard: 20
 rigs with bad corners (0.5 px noise, lens errors of 1 px, 20 % missing, 5 % wrong). photographs: rendered boards, 5 %
 noise and 1.5 px blur, through the detector. *limit*: Cramer-Rao with perfectly known cameras. ± and intervals: over
 rigs, 95 %.
@@ -12,17 +13,24 @@ rigs, 95 %.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from forward import HEAD, held_out, row, run_parts
 from implicam.calibrators import Explicit, ForwardGP
+from implicam.calibrators.explicit import ExplicitCalibration
+from implicam.calibrators.explicit.boards import boards_of
+from implicam.calibrators.explicit.camera_groups import CameraGroups, calibrate_groups
+from implicam.calibrators.explicit.from_boards import fit_to_boards
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.coverage import tercile_labels
-from implicam.dataset import Observations
+from implicam.dataset import Dataset, Observations
 from implicam.detect.board import Board
 from implicam.detect.model import View
 from implicam.errors import ImplicamError
 from implicam.geometry import depth_of_points
+from implicam.progress import silent
 from implicam.simulate import (
     Optics,
     Studio,
@@ -40,6 +48,8 @@ RIGS = {"stereo": ("stereo", None), "6 cameras": ("bar6", None), "dome8": ("dome
 BUDGETS = ((50, 10), (25, 6), (10, 4))
 KNOWN = 40
 """Points that bring a calibration from boards into the world."""
+FEW, DRAWS = (8, 40), 4
+"""The same where they are few, and how many draws of them on each rig."""
 
 
 def outcome(make, known, others, seed):
@@ -95,6 +105,51 @@ def boards(pool, rigs):
                 yield row(f"{cameras}, {each} + {pairs}, {lens_error:g} px", list(pool.map(from_boards, jobs)))
     jobs = [("2R4W", (25, 6), 0.0, "icp", seed) for seed in range(rigs)]
     yield row("2R4W, 25 + 6, 0 px, aligned by icp", list(pool.map(from_boards, jobs)))
+
+
+def few_aligned(job):
+    """For each number of known points, and error bars from the boards alone or not, the outcome of all draws."""
+    cameras, (each, pairs), lens_error, seed = job
+    rig = build_rig("bar6", seed=seed, cameras=cameras, lens_error=lens_error)
+    shown = simulate_boards(rig, each_and_pairs(rig, each, pairs), seed=seed)
+    others, found = held_out(rig, seed), {}
+    with blas_threads(1):
+        groups = calibrate_groups(boards_of(shown), "auto")
+        for alone in (True, False):
+            settings = ExplicitSettings(error_ratio_prior_log_sd=1e-6) if alone else ExplicitSettings()
+            own = [replace(g, bundle=replace(g.bundle, settings=settings)) for g in groups.groups]
+            make = AlreadyAdjusted(replace(groups, groups=tuple(own)), shown, settings)
+            for n in FEW:
+                of_draws = [outcome(make, known_points(rig, n, 1000 * seed + k), others, seed) for k in range(DRAWS)]
+                columns = zip(*(one for one in of_draws if not isinstance(one, str)), strict=True)
+                found[n, alone] = tuple(sum(c) if isinstance(c[0], int) else np.concatenate(c) for c in columns)
+    return found
+
+
+class AlreadyAdjusted(NamedTuple):
+    """explicit from boards that are adjusted already."""
+
+    groups: CameraGroups
+    shown: Dataset
+    settings: ExplicitSettings
+
+    def fit(self, known):
+        """Align it to known points."""
+        fitted = fit_to_boards(known, self.groups, self.shown, "points", silent)
+        return ExplicitCalibration(Explicit(boards=self.shown, settings=self.settings), known, fitted)
+
+
+def aligned(pool, rigs):
+    """Few known points to align with, four draws of them on each rig."""
+    yield HEAD.format("cameras, pictures, lens error, known points, error bars")
+    for cameras, budget, lens_error in (("2R", (10, 4), 0.0), ("2R", (10, 4), 0.5), ("2R", (50, 10), 0.5)):
+        jobs = [(cameras, budget, lens_error, seed) for seed in range(rigs)]
+        outcomes = list(pool.map(few_aligned, jobs))
+        for n in FEW:
+            for alone in (True, False):
+                bars = "from the boards alone" if alone else "from the known points, too"
+                label = f"{cameras}, {budget[0]} + {budget[1]}, {lens_error:g} px, {n}, {bars}"
+                yield row(label, [one[n, alone] for one in outcomes])
 
 
 def badly(job):
@@ -153,7 +208,7 @@ def _ratio(found):
     return np.sqrt(np.sum(errors[ok] ** 2) / np.nansum(np.trace(limit[ok], axis1=1, axis2=2)))
 
 
-PARTS = {"points": points, "boards": boards, "hard": hard, "photographs": photographs}
+PARTS = {"points": points, "boards": boards, "aligned": aligned, "hard": hard, "photographs": photographs}
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +20,10 @@ import implicam as ic
 from command_line import Cli, cli
 from implicam.calibration_file import describe
 from implicam.calibrators import CALIBRATORS, CalibratorBase
+from implicam.calibrators.explicit import ExplicitCalibration
+from implicam.calibrators.explicit.settings import OF_PAPER_PRESETS, OF_PIPELINE
 from implicam.calibrators.protocol import settings_type
+from implicam.cli.settings import settings_table, settings_text
 from implicam.errors import CalibrationFileError, FitError, UsageError
 from implicam.files import toml_text
 from implicam.rig_model.settings import RigModelSettings
@@ -368,7 +372,7 @@ def test_calibrate_takes_settings_and_info_gives_them_back(method: str, cli: Cli
     (machine,) = [
         one for one in cli("info", "a.implicam", "--settings", "--json").json["settings"] if one["name"] in given
     ][:1]
-    assert set(machine) == {"name", "value", "default", "unit", "text"}
+    assert set(machine) == {"name", "value", "default", "unit", "text", "in_force"}
     assert machine["value"] == given[machine["name"]]
 
 
@@ -407,3 +411,40 @@ def test_settings_files_that_cannot_be_read_are_refused(cli: Cli, tmp_path: Path
         assert ran.code != 0
         assert told in ran.err
         assert "fix:" in ran.err
+
+
+# explicit: what its presets have a use for
+
+
+def test_what_the_paper_presets_read_is_what_is_in_force() -> None:
+    folder = ROOT / "calibrators" / "explicit"
+    pipeline, preset = (set(re.findall(r"settings\.(\w+)", (folder / name).read_text())) for name in
+                        ("opencv_pipeline.py", "paper_preset.py"))  # fmt: skip
+    names = {field.name for field in fields(ic.ExplicitSettings)}
+    assert pipeline & names == set(OF_PIPELINE)
+    assert preset & names <= set(OF_PAPER_PRESETS) <= names
+    assert ic.Explicit().idle_settings == set(OF_PIPELINE)
+    idle = ic.Explicit(preset="paper").idle_settings
+    assert idle == names - set(OF_PAPER_PRESETS) == ic.Explicit(preset="paper-bundle").idle_settings
+
+
+def test_settings_that_do_nothing_are_told() -> None:
+    """Shown last, and in the notes where somebody set one."""
+    settings = ic.ExplicitSettings(point_folds=4, wide_from_degrees=80.0)
+    notes = {}
+    for preset, idle, used in (
+        ("paper", "point_folds", "wide_from_degrees"),
+        ("joint", "wide_from_degrees", "point_folds"),
+    ):
+        calibrator = ic.Explicit(preset=preset, settings=settings)
+        fit = ExplicitCalibration(calibrator, None, SimpleNamespace(notes=("first",)))  # type: ignore[arg-type]
+        in_force, _, without_effect = settings_text(fit).partition("do nothing")
+        assert f"{used} = " in in_force
+        assert f"{idle} = " not in in_force
+        assert f"{idle} = " in without_effect
+        assert ic.ExplicitSettings.from_table(tomllib.loads(settings_text(fit))) == settings
+        states = {one["name"]: one["in_force"] for one in settings_table(fit)["settings"]}
+        assert (states[used], states[idle]) == (True, False)
+        notes[preset] = fit.notes()
+    assert notes["paper"] == ["first", "The preset paper has no use for the settings point_folds."]
+    assert notes["joint"] == ["first", "The preset joint has no use for the settings wide_from_degrees."]

@@ -50,6 +50,7 @@ UNITS = {
     "_sds": "standard deviations",
     "_nats": "nats",
     "_px": "px",
+    "_degrees": "degrees",
     "lengthscale": "half sides; log distance",
     "lengthscale_prior_median": "half sides; log distance",
     **dict.fromkeys(

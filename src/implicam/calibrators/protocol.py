@@ -351,6 +351,11 @@ class CalibratorBase:
         """None: what is always installed is enough."""
         return None
 
+    @property
+    def idle_settings(self) -> frozenset[str]:
+        """Names of the settings that do nothing with these options: none."""
+        return frozenset()
+
     def as_table(self) -> dict[str, Any]:
         """The options and all settings, as a calibration file keeps them; without options that are datasets."""
         given = ((field, getattr(self, field.name)) for field in fields(self) if not _is_dataset(field))  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from implicam.calibrators import Calibration, Calibrator
 from implicam.calibrators.protocol import SETTINGS
 from implicam.dataset.tables import parse_toml
 from implicam.errors import UsageError
-from implicam.settings import Settings
+from implicam.settings import Described, Settings
 
 SettingsFile = Annotated[
     Path | None,
@@ -51,6 +51,11 @@ def with_settings(calibrator: Calibrator, path: Path | None) -> Calibrator:
     return replace(calibrator, settings=settings)  # type: ignore[type-var]
 
 
+def _idle(holder: Calibrator | Calibration) -> frozenset[str]:
+    """Names of the settings that do nothing with the options of a calibration."""
+    return frozenset(getattr(getattr(holder, "calibrator", holder), "idle_settings", ()))
+
+
 def settings_of(holder: Calibrator | Calibration) -> Settings | None:
     """The settings of a calibrator, or of the one that made a calibration; None where it has none."""
     found = getattr(getattr(holder, "calibrator", holder), SETTINGS, None)
@@ -77,28 +82,38 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def settings_text(calibration: Calibration) -> str:
-    """All settings of a calibration as TOML, each with its text, its unit and its default.
+    """All settings of a calibration as TOML, each with its text, its unit and its default; last those that do nothing
+    with its options.
 
     Raises:
         UsageError: its method has none.
     """
-    settings = _needed(calibration)
+    settings, idle = _needed(calibration), _idle(calibration)
     changed = len(settings.changed())
     of = f"{calibration.method}: {len(settings.described())} settings, "
     lines = [f"# {of}{'all at their defaults' if not changed else f'{changed} not at the default'}"]
-    for one in settings.described():
-        usual = "" if one.value == one.default else f"; the default is {_toml(one.default)}"
-        lines += ["", *(f"# {line}" for line in textwrap.wrap(one.text, LINE_WIDTH - 2))]
-        lines.append(f"{one.name} = {_toml(one.value)}  # {one.unit}{usual}")
+    in_force = [one for one in settings.described() if one.name not in idle]
+    lines += [line for one in in_force for line in _setting_lines(one)]
+    if idle:
+        lines += ["", f"# --- {len(idle)} settings that do nothing with the options of this calibration ---"]
+        lines += [line for one in settings.described() if one.name in idle for line in _setting_lines(one)]
     return "\n".join(lines)
+
+
+def _setting_lines(one: Described) -> list[str]:
+    usual = "" if one.value == one.default else f"; the default is {_toml(one.default)}"
+    text = [f"# {line}" for line in textwrap.wrap(one.text, LINE_WIDTH - 2)]
+    return ["", *text, f"{one.name} = {_toml(one.value)}  # {one.unit}{usual}"]
 
 
 def settings_table(calibration: Calibration) -> dict[str, Any]:
     """The same for machines; UsageError where its method has none."""
+    idle = _idle(calibration)
     return {
         "method": calibration.method,
         "settings": [
             one._replace(value=_plain(one.value), default=_plain(one.default))._asdict()
+            | {"in_force": one.name not in idle}
             for one in _needed(calibration).described()
         ],
     }

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
+from implicam.calibrators.explicit.misfit import Left, error_ratio
 from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.dataset import Names
 from implicam.errors import FitError
@@ -37,7 +38,8 @@ class Known(NamedTuple):
 class Alignment(NamedTuple):
     """rig_from_world; used (n,) the known points it comes from; K (6, P) how its step (rotation vector, translation)
     follows errors of the cameras' unknowns, and own (6, 6) its covariance from the points' own noise; errors and sds
-    (m, 3) of the used points in the world, each left out in turn; scale: world over rig, if it were free."""
+    (m, 3) of the used points in the world, each left out in turn; scale: world over rig, if it were free; error_ratio:
+    how many times larger errors are than the cameras' covariance says (misfit.py)."""
 
     rig_from_world: Pose
     used: Bools
@@ -46,6 +48,7 @@ class Alignment(NamedTuple):
     errors: Floats
     sds: Floats
     scale: float
+    error_ratio: float = 1.0
 
     @property
     def misfit(self) -> float:
@@ -111,6 +114,12 @@ def align(
     alike = np.broadcast_to(usual * np.eye(3), cov.shape)
     motions = [(pose, Q, G, W, residual), _weighted(pose, measured, alike, xyz, sd, used, there)]
 
+    weighted = Left(
+        residual[used], W[used], G[used], Q, point[used], spread[used],
+        pose.rotation * sd[used][:, None, :], known.shots[pairs][used],
+    )  # fmt: skip
+    ratio = error_ratio(weighted, settings.error_ratio_prior_log_sd)
+
     def alignment(pose: Pose, Q: Floats, G: Floats, W: Floats, residual: Floats) -> Alignment:
         B = (Q @ G.swapaxes(1, 2) @ W)[used]
         own = _own_noise(B, point[used], pose, sd[used], known.shots[pairs][used])
@@ -119,7 +128,7 @@ def align(
         left = point[used] + follows @ follows.swapaxes(1, 2) + G[used] @ own @ G[used].swapaxes(1, 2)
         left = left + pose.rotation @ (sd[used][:, :, None] ** 2 * np.eye(3)) @ pose.rotation.T
         errors, sds = left_out(pose, Q, G[used], W[used], residual[used], left)
-        return Alignment(pose, used, K, own, errors, sds, extent_ratio(measured[used], xyz[used]))
+        return Alignment(pose, used, K, own, errors, sds, extent_ratio(measured[used], xyz[used]), ratio)
 
     def loss(one: Alignment) -> float:
         return float(np.sum(one.errors**2 / (usual + sd[used] ** 2)))

@@ -8,7 +8,7 @@ from the normal equations and go into every position that is measured.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -30,7 +30,12 @@ from implicam.calibrators.explicit.paper_preset import (
     fit_like_the_paper,
     measure_linearly,
 )
-from implicam.calibrators.explicit.settings import DEFAULT_SETTINGS, ExplicitSettings
+from implicam.calibrators.explicit.settings import (
+    DEFAULT_SETTINGS,
+    OF_PAPER_PRESETS,
+    OF_PIPELINE,
+    ExplicitSettings,
+)
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -113,6 +118,13 @@ class Explicit(CalibratorBase):
     def library(self) -> tuple[str, str] | None:
         """The paper's pipeline is OpenCV."""
         return None if self.preset == JOINT else ("cv2", "images")
+
+    @property
+    def idle_settings(self) -> frozenset[str]:
+        """Names of the settings that do nothing with this preset."""
+        if self.preset == JOINT:
+            return frozenset(OF_PIPELINE)
+        return frozenset(field.name for field in fields(ExplicitSettings)) - frozenset(OF_PAPER_PRESETS)
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ExplicitCalibration:
         """Fit to the known points; or to the boards, and then to the known points.
@@ -265,7 +277,10 @@ class ExplicitCalibration(RigCalibration):
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return list(self.fitted.notes)
+        changed = self.calibrator.settings.changed()
+        idle = sorted(changed.keys() & self.calibrator.idle_settings)
+        told = [f"The preset {self.calibrator.preset} has no use for the settings {', '.join(idle)}."] if idle else []
+        return [*self.fitted.notes, *told]
 
     def summary(self) -> FitSummary:
         """Leave-one-out errors of the known points; of each camera the lens model and the noise."""

@@ -143,26 +143,35 @@ def _together(parts: Sequence[Part], trained: Observations, frame: Frame, notes:
 def _aligned(data: Dataset, trained: Observations, group: CameraGroup, boards: Dataset, how: str, frame: Frame) -> Part:
     """A group of cameras that boards join, by the known points that it measures."""
     known, bundle = data.positions, group.bundle
-    posterior = group_posterior(group, bundle.cameras, group.root)
     settings = bundle.settings
-    in_rig = FittedRig(
-        trained,
-        data.length_unit,
-        WORLD_FRAME,
-        group.cameras,
-        posterior,
-        misfit_adds=True,
-        settings=settings.rig_model,
-    )
-    uv, noise = in_rig.views(data.observations)
-    found = locate(posterior, uv, noise, settings=settings.rig_model)
-    uv[found.left_out] = np.nan
     points = Known(known.xyz, np.nan_to_num(known.sd), known.shots)
-    alignment = align(posterior.models, group.root, uv, noise, found.xyz, points, how, settings)
-    cameras, root = in_frame(*in_world(bundle.cameras, group.root, alignment), frame.offset, frame.scale)
+
+    def measuring(by: CameraGroup) -> FittedRig:
+        return FittedRig(
+            trained,
+            data.length_unit,
+            WORLD_FRAME,
+            by.cameras,
+            group_posterior(by, by.bundle.cameras, by.root),
+            misfit_adds=True,
+            settings=settings.rig_model,
+        )
+
+    in_rig = measuring(group)
+    uv, noise = in_rig.views(data.observations)
+    found = locate(in_rig.posterior, uv, noise, settings=settings.rig_model)
+    uv[found.left_out] = np.nan
+    first = align(in_rig.posterior.models, group.root, uv, noise, found.xyz, points, how, settings)
+    truer = replace(
+        group, bundle=replace(bundle, noise=first.error_ratio * bundle.noise), root=first.error_ratio * group.root
+    )
+    in_rig = measuring(truer)
+    _, noise = in_rig.views(data.observations)
+    alignment = align(in_rig.posterior.models, truer.root, uv, noise, found.xyz, points, how, settings)
+    cameras, root = in_frame(*in_world(bundle.cameras, truer.root, alignment), frame.offset, frame.scale)
     return Part(
         group.cameras,
-        group_posterior(group, cameras, root).models,
+        group_posterior(truer, cameras, root).models,
         root,
         tuple(group.choices[c] for c in group.cameras),
         alignment.errors,
@@ -172,7 +181,7 @@ def _aligned(data: Dataset, trained: Observations, group: CameraGroup, boards: D
         (
             *_moved_notes(in_rig, found.left_out, np.asarray(np.isfinite(uv).all(axis=2))),
             *group_notes(group, trained, boards),
-            *_alignment_notes(alignment, data.length_unit),
+            *_alignment_notes(first, data.length_unit),
         ),
     )
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from implicam.calibrators.explicit.adjust import Bundle, Placed, Views, adjust
 from implicam.calibrators.explicit.boards import MIN_BOARDS, Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import AUTO, Choice
+from implicam.calibrators.explicit.settings import ExplicitSettings
 from implicam.calibrators.explicit.zhang import planar_poses
 from implicam.errors import FitError
 from implicam.geometry import Floats, Pose
@@ -32,24 +33,6 @@ from implicam.rig_model import CentralCamera, Image, Prior
 
 FAMILIES = (BrownConrady.family, KannalaBrandt.family)
 """Of lenses that OpenCV calibrates."""
-
-WIDE_FROM_DEGREES = 75.0
-"""Horizontal angle of view from which a lens is wide: the paper's 2.8 mm lenses are regular, those up to 2.2 mm not."""
-
-MIN_OWN_PICTURES = 10
-"""Pictures that a camera took alone, from which its lens is learned from those only, as in the paper."""
-
-MIN_PAIR_PICTURES = 3
-"""Pictures that two cameras took together, for a stereo calibration."""
-
-FISHEYE_GUESSES = (1.25, 1.5, 2.0, 3.0)
-"""Focal lengths to start from where OpenCV's own guess leads nowhere, over that guess, the longer side / pi."""
-
-MAX_REPROJECTION_HALF_SIDES = 0.02
-"""Reprojection error of a camera, in half the longer side of its image, beyond which OpenCV's answer is none."""
-
-MAX_PICTURE_ERROR_RATIO = 5.0
-"""Reprojection error of a picture over the camera's median one, beyond which the picture is taken out."""
 
 ITERATIONS, TOLERANCE = 200, 1e-9
 """Of OpenCV's iterations; its defaults of 30 for pairs stop before they have settled."""
@@ -117,12 +100,15 @@ def calibrate_with_opencv(boards: Boards, family: str, joint: bool, progress: Pr
         reference = next((c for c, single in singles.items() if not single.wide), next(iter(singles), -1))
         poses = _chained(boards, views, singles, reference, progress)
     lost = [c for c in singles if c not in poses]
-    uncalibrated += [(c, f"no chain of pairs with {MIN_PAIR_PICTURES} common pictures leads to it") for c in lost]
+    uncalibrated += [
+        (c, f"no chain of pairs with {boards.settings.min_pair_pictures} common pictures leads to it") for c in lost
+    ]
     if len(poses) < 2:
         raise FitError(
             f"{len(poses)} of {len(boards.cameras)} cameras can be calibrated together; a position takes two.",
             why="; ".join(f"{boards.names[c]}: {why}" for c, why in sorted(uncalibrated)),
-            fix=f"show every camera the board in {MIN_OWN_PICTURES} places or more, and in {MIN_PAIR_PICTURES} or more "
+            fix=f"show every camera the board in {boards.settings.min_own_pictures} places or more, and in "
+            f"{boards.settings.min_pair_pictures} or more "
             "to every two neighbours at once",
         )
     rig = _rig(boards, views, singles, poses, reference, sorted(uncalibrated))
@@ -134,20 +120,20 @@ def _calibrated(boards: Boards, c: int, family: str) -> _Single:
     every = boards.of_camera(c)
     seen = np.bincount([view.board for view in boards.views])
     own = [view for view in every if seen[view.board] == 1]
-    views = own if len(own) >= MIN_OWN_PICTURES else list(every)
+    views = own if len(own) >= boards.settings.min_own_pictures else list(every)
     half = boards.images[c].half
     size = _size(boards, c)
     regular = None if family == KannalaBrandt.family else _regular(views, size)
     if family == AUTO:
-        wide = regular is None or _angle_of_view(regular.K, size) > WIDE_FROM_DEGREES
+        wide = regular is None or _angle_of_view(regular.K, size) > boards.settings.wide_from_degrees
     else:
         wide = family == KannalaBrandt.family
     if wide:
-        return _fisheye(views, size, half)
+        return _fisheye(views, size, half, boards.settings)
     if regular is None:
         raise FitError("cv2.calibrateCamera fails: its pictures do not fix a perspective lens.")
     left = _rms(_picture_errors(views, regular))
-    if not left < MAX_REPROJECTION_HALF_SIDES * half:
+    if not left < boards.settings.max_reprojection_half_sides * half:
         raise FitError(f"cv2.calibrateCamera leaves {left:.3g} px: no perspective lens sees its pictures so.")
     return regular
 
@@ -171,16 +157,17 @@ def _regular(views: Sequence[BoardView], size: tuple[int, int]) -> _Single | Non
     return _Single(False, np.asarray(K), np.asarray(D), ()) if K[0, 0] > 0 and np.isfinite(K).all() else None
 
 
-def _fisheye(views: Sequence[BoardView], size: tuple[int, int], half: float) -> _Single:
+def _fisheye(views: Sequence[BoardView], size: tuple[int, int], half: float, settings: ExplicitSettings) -> _Single:
     """By the fisheye interface, without the pictures that it leaves far off."""
-    found, errors = _fisheye_of_all(views, size, half)
-    far = errors > MAX_PICTURE_ERROR_RATIO * np.median(errors)
+    found, errors = _fisheye_of_all(views, size, half, settings)
+    far = errors > settings.max_picture_error_ratio * np.median(errors)
     if far.any() and (~far).sum() >= MIN_BOARDS:
         taken_out = tuple(view.board for view, out in zip(views, far, strict=True) if out)
-        found, errors = _fisheye_of_all([view for view in views if view.board not in taken_out], size, half)
+        kept = [view for view in views if view.board not in taken_out]
+        found, errors = _fisheye_of_all(kept, size, half, settings)
         found = found._replace(taken_out=taken_out)
     left = _rms(errors)
-    if not left < MAX_REPROJECTION_HALF_SIDES * half:
+    if not left < settings.max_reprojection_half_sides * half:
         raise FitError(f"cv2.fisheye.calibrate leaves {left:.3g} px: no fisheye lens sees its pictures so.")
     return found
 
@@ -192,14 +179,16 @@ def _opencv_reason(error: Exception) -> str:
     return found[1] if found else text
 
 
-def _fisheye_of_all(views: Sequence[BoardView], size: tuple[int, int], half: float) -> tuple[_Single, Floats]:
+def _fisheye_of_all(
+    views: Sequence[BoardView], size: tuple[int, int], half: float, settings: ExplicitSettings
+) -> tuple[_Single, Floats]:
     """The first start that leaves little, else the best, and the error of each picture; FitError where all fail."""
     cv2 = opencv()
     namespace = cv2 if hasattr(cv2, "CALIB_RECOMPUTE_EXTRINSIC") else cv2.fisheye  # OpenCV 5, OpenCV 4
     flags = namespace.CALIB_RECOMPUTE_EXTRINSIC | namespace.CALIB_FIX_SKEW
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, ITERATIONS, TOLERANCE)
     found, why = list[tuple[_Single, Floats]](), "it finds no lens"
-    for factor in (None, *FISHEYE_GUESSES):
+    for factor in (None, *settings.fisheye_start_focal_ratio):
         K, D, start = None, None, flags
         if factor is not None:
             focal = factor * max(size) / np.pi
@@ -214,7 +203,7 @@ def _fisheye_of_all(views: Sequence[BoardView], size: tuple[int, int], half: flo
             continue
         single = _Single(True, np.asarray(K), np.asarray(D), ())
         found.append((single, _picture_errors(views, single)))
-        if np.median(found[-1][1]) < MAX_REPROJECTION_HALF_SIDES * half:
+        if np.median(found[-1][1]) < settings.max_reprojection_half_sides * half:
             break
     if not found:
         raise FitError(f"cv2.fisheye.calibrate fails: {why}.")
@@ -295,7 +284,7 @@ def _chained(
         for new in [c for c in singles if c not in poses]:
             common = {old: len(seen[old].keys() & seen[new].keys()) for old in frontier}
             old = max(common, key=lambda c: common[c])
-            if common[old] < MIN_PAIR_PICTURES:
+            if common[old] < boards.settings.min_pair_pictures:
                 continue
             progress("calibrating pairs with OpenCV", len(poses) + len(reached) - 1, len(singles) - 1)
             pose = _stereo(boards, seen[old], seen[new], singles[old], singles[new])
@@ -321,7 +310,7 @@ def _stereo(
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, ITERATIONS, TOLERANCE)
     most = max(set(counts), key=lambda count: (counts.count(count), count))
     try:
-        if a.wide and b.wide and most >= 4 and counts.count(most) >= MIN_PAIR_PICTURES:
+        if a.wide and b.wide and most >= 4 and counts.count(most) >= boards.settings.min_pair_pictures:
             pairs = [pair for pair, count in zip(pairs, counts, strict=True) if count == most]
             xyz, uv_a = _points([one for one, _ in pairs], np.float64)
             _, uv_b = _points([one for _, one in pairs], np.float64)

@@ -92,6 +92,9 @@ class ExplicitSettings(CameraSettings):
     # a place in the world: cameras that boards join
     max_aligned_squared_mahalanobis: float = 25.0
     """Squared distance, in its own covariance, of a known point from where it should be: one in 65,000 of good ones."""
+    error_ratio_prior_log_sd: float = 0.3
+    """Prior sd of the logarithm of how many times larger errors are than the boards say: lenses that their models do
+    not hold show in what is left at the known points (misfit.py)."""
     min_icp_residual_ratio: float = 1.3
     """Two ways to match points by closeness are told apart where one leaves so many times what the other leaves."""
     max_alignment_error_extents: float = 0.05
@@ -105,11 +108,45 @@ class ExplicitSettings(CameraSettings):
     max_second_place_chi_squared: float = 9.0
     """Squared residuals, in the noise, that a second place may have more than the first and be as good."""
 
+    # the paper's own pipeline with OpenCV: the presets paper and paper-bundle
+    wide_from_degrees: float = 75.0
+    """Horizontal angle of view from which a lens is wide: the paper's 2.8 mm lenses are regular, those up to 2.2 mm
+    not."""
+    min_own_pictures: int = 10
+    """Pictures that a camera took alone, from which its lens is learned from those only, as in the paper."""
+    min_pair_pictures: int = 3
+    """Pictures that two cameras took together, for a stereo calibration."""
+    fisheye_start_focal_ratio: tuple[float, ...] = (1.25, 1.5, 2.0, 3.0)
+    """Focal lengths to start from where OpenCV's own guess leads nowhere, over that guess, the longer side / pi."""
+    max_reprojection_half_sides: float = 0.02
+    """Reprojection error of a camera beyond which OpenCV's answer is none."""
+    max_picture_error_ratio: float = 5.0
+    """Reprojection error of a picture over the camera's median one, beyond which the picture is taken out."""
+
     @cached_property
     def rig_model(self) -> RigModelSettings:
         """For the rig model, whose field and whose errors of known positions this method has no use for."""
         return RigModelSettings(**{field.name: getattr(self, field.name) for field in fields(CameraSettings)})
 
+
+OF_PIPELINE = (
+    "wide_from_degrees",
+    "min_own_pictures",
+    "min_pair_pictures",
+    "fisheye_start_focal_ratio",
+    "max_reprojection_half_sides",
+    "max_picture_error_ratio",
+)
+"""That the preset `joint` has no use for."""
+
+OF_PAPER_PRESETS = (
+    *OF_PIPELINE,
+    "min_corners",
+    "min_icp_residual_ratio",
+    "max_alignment_error_extents",
+    "max_mirrored_ratio",
+)
+"""All that the paper's presets use."""
 
 DEFAULT_SETTINGS = ExplicitSettings()
 """What `Explicit()` uses."""
