@@ -68,7 +68,7 @@ def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     learners = [row for row in table if row["method"] not in LINES]
     explicit = [row for row in table if row["method"] in LINES]
     sets = _words(table, "set")
-    figure = new_figure(7.5, 1.2 + 2.6 * max(len(sets), 1))
+    figure = new_figure(7.5, 1.7 + 2.6 * max(len(sets), 1))
     panels = figure.subplots(max(len(sets), 1), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for axes, name in zip(panels, sets or [""], strict=True):
         _runs_of_methods(
@@ -82,7 +82,7 @@ def rmse_curves(rows: Iterable[Row], *, total: int | None = None) -> Any:
     _against_known(panels[-1:], _sizes(learners), total)
     for axes, name in zip(panels, sets, strict=False):
         _label_lines(axes, _where(explicit, set=name))
-    place_legend(figure, panels, _RUNS_LEGEND, columns=3)
+    place_legend(figure, panels, _RUNS_LEGEND, columns=2)
     return figure
 
 
