@@ -429,7 +429,7 @@ def rectified_pair(tmp_path, *, vertical=False, model="plumb_bob"):
 def test_the_places_of_a_rectified_pair_of_ros_follow_from_r_and_p(tmp_path, vertical):
     files, k, d, turn, t = rectified_pair(tmp_path, vertical=vertical)
     for given in (files, [tmp_path]):
-        rig = import_cameras(given, "ros")
+        rig = import_cameras(given)
         assert [c.name for c in rig.cameras] == ["narrow_stereo_left", "narrow_stereo_right"]
         np.testing.assert_allclose(rig.cameras[1].camera_from_world.translation, t, atol=1e-12)
         assert_sees(rig.cameras[1], AHEAD, opencv_pixels(AHEAD, k, d, turn, t))
@@ -650,6 +650,16 @@ def test_the_table_of_the_docs_has_every_format():
         r"^\| `([a-z0-9-]+)` \|", (Path(__file__).parents[1] / "docs" / "exchange.md").read_text(), re.MULTILINE
     )
     assert set(FORMATS) <= set(rows)
+
+
+def test_a_size_that_the_file_does_not_say_is_given():
+    rig = import_cameras(CASES / "opencv-stereo-file" / "stereo.yml", unit="mm")
+    sized = rig.with_sizes({"cam1": (640, 480)})
+    assert [(c.width, c.height) for c in sized.cameras] == [(640, 480), (None, None)]
+    with pytest.raises(DatasetError, match="cam1' has images of 640 x 480 px in the file"):
+        sized.with_sizes({"cam1": (1280, 960)})
+    with pytest.raises(DatasetError, match="there is no camera 'cam3'"):
+        rig.with_sizes({"cam3": (640, 480)})
 
 
 def test_cameras_that_were_imported_go_on_to_another_program(tmp_path):

@@ -11,6 +11,7 @@ from implicam.calibrators import load_calibration
 from implicam.calibrators.explicit import calibration_of, rig_of
 from implicam.cli import show
 from implicam.cli.app import Json, command, must_be_calibration, must_not_replace
+from implicam.dataset.table_options import TableOptions
 from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, WRITTEN, export_cameras, import_cameras
 
 
@@ -50,6 +51,10 @@ def import_command(
     unit: Annotated[
         str | None, typer.Option("--unit", metavar="UNIT", help="Length unit, where the file does not state it.")
     ] = None,
+    size: Annotated[
+        str | None,
+        typer.Option("--size", metavar="SIZE", help="Of the images, where the file does not state it: 1280x800."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Make a calibration of another program's cameras, to measure with them and to check them."""
@@ -58,6 +63,7 @@ def import_command(
         must_not_replace(output, file)
     rig = import_cameras(cameras, kind)
     rig = rig.in_unit(unit) if unit and rig.length_unit != UNKNOWN_UNIT else import_cameras(cameras, kind, unit=unit)
+    rig = rig.with_sizes(TableOptions(size=size).sizes(tuple(camera.name for camera in rig.cameras))) if size else rig
     calibration = calibration_of(rig, cameras[0].stem, noise)
     calibration.save(output)
     if json:

@@ -7,13 +7,14 @@ format's own conventions are converted in its own file.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
 from implicam.dataset.model import Camera
 from implicam.dataset.units import metres_per
-from implicam.errors import DatasetError
+from implicam.errors import DatasetError, did_you_mean
 from implicam.geometry import Pose
 from implicam.lenses import Bools, BrownConrady, Floats, Lens
 
@@ -82,6 +83,34 @@ class Rig:
         for name, times in Counter(camera.name for camera in self.cameras).items():
             if times > 1:
                 raise DatasetError(f"camera {name!r} is there {times} times.", fix="give each a name of its own")
+
+    def with_sizes(self, sizes: Mapping[str, tuple[int, int]]) -> Rig:
+        """The same rig with the image sizes that its file does not say.
+
+        Args:
+            sizes: Camera -> width and height in pixels.
+
+        Raises:
+            DatasetError: There is no such camera, or it has another size.
+        """
+        names = [camera.name for camera in self.cameras]
+        for name in sizes:
+            if name not in names:
+                raise DatasetError(
+                    f"there is no camera {name!r}{did_you_mean(name, names)}.",
+                    fix=f"the cameras are {', '.join(names)}",
+                )
+        for camera in self.cameras:
+            own = (camera.width, camera.height)
+            if own not in ((None, None), sizes.get(camera.name, own)):
+                raise DatasetError(
+                    f"camera {camera.name!r} has images of {camera.width} x {camera.height} px in the file, and "
+                    "another size is given.",
+                    fix="leave out the size; the lens is that of images of the file's size",
+                )
+        known = {camera.name: (camera.width, camera.height) for camera in self.cameras} | dict(sizes)
+        sized = [replace(c, width=known[c.name][0], height=known[c.name][1]) for c in self.cameras]
+        return replace(self, cameras=tuple(sized))
 
     def in_unit(self, unit: str) -> Rig:
         """The same rig with lengths in another unit.

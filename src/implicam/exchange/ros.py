@@ -133,12 +133,13 @@ def _matrix_lines(name: str, values: Floats) -> list[str]:
 
 
 def knows(source: Source) -> bool:
-    """Whether a file has a distortion model beside its camera matrix.
+    """Whether a file has a distortion model beside its camera matrix; or the first file of a folder.
 
     Args:
         source: What is given.
     """
-    keys = set(source.keys)
+    files = _files_in(source.path) if source.path.is_dir() else []
+    keys = set((Source((files[0],)) if files else source).keys)
     return "distortion_model" in keys and bool({"camera_matrix", "K", "k"} & keys)
 
 
@@ -166,7 +167,9 @@ def read(paths: Sequence[Path]) -> Rig:
     Raises:
         DatasetError: A file has a mistake; or there are several cameras, and no file says where they stand.
     """
-    files = [file for path in paths for file in (sorted(path.glob("*.y*ml")) if path.is_dir() else [path])]
+    files = [file for path in paths for file in (_files_in(path) if path.is_dir() else [path])]
+    if not files:
+        raise DatasetError(f"{paths[0]}: there is no .yaml file.", fix="give the camera_info files, one a camera")
     infos = _distinct([_read_info(read_yaml(file), file) for file in files])
     first = infos[0].rectified
     own = Pose(np.eye(3), np.zeros(3))
@@ -190,6 +193,10 @@ def read(paths: Sequence[Path]) -> Rig:
     notes.insert(0, world if alone else "The world is the first camera's frame; places are those of R and P.")
     with naming(str(paths[0])):
         return Rig(tuple(camera for camera, _ in read), UNKNOWN_UNIT if alone else "m", tuple(notes))
+
+
+def _files_in(folder: Path) -> list[Path]:
+    return sorted([*folder.glob("*.yaml"), *folder.glob("*.yml")])
 
 
 def _distinct(infos: list[_Info]) -> list[_Info]:
