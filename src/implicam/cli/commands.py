@@ -57,6 +57,7 @@ from implicam.cli.settings import (
     with_settings,
 )
 from implicam.dataset import Dataset, TableOptions, write_dataset
+from implicam.dataset.programs import PROGRAMS, read_program, write_program
 from implicam.dataset.table_options import DOCUMENTED
 from implicam.dataset.units import metres_per
 from implicam.dataset.wide import is_unit_missing
@@ -374,19 +375,32 @@ def convert_command(
     dataset: Annotated[Path, typer.Argument(help="A folder, .csv, .tsv, .xlsx, .parquet or .npz.")],
     out: Annotated[Path, typer.Argument(help="The same, in another form: the ending chooses.")],
     table: TableOptions = DOCUMENTED,
+    source: Annotated[
+        str | None, typer.Option("--from", metavar="PROGRAM", help=f"Read the files of {', '.join(PROGRAMS)}.")
+    ] = None,
+    to: Annotated[str | None, typer.Option("--to", metavar="PROGRAM", help="Write the files of one of these.")] = None,
+    positions: Annotated[
+        Path | None, typer.Option("--positions", help="With --from dltdv, easywand, argus: rows of x,y,z.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT if it is a folder that exists.")] = False,
     json: Json = False,
 ) -> None:
-    """Write a dataset in another form: folder, wide CSV, Excel, Parquet, NPZ."""
+    """Write a dataset in another form: folder, wide CSV, Excel, Parquet, NPZ, or the files of another program."""
     if out.exists() and out.resolve() == dataset.resolve():
         raise UsageError(f"{dataset} would be replaced by itself.", fix="give another name to write to")
-    data = read(dataset, table)
-    write_dataset(data, out, overwrite=overwrite)
+    if positions is not None and source is None:
+        raise UsageError("--positions belongs to the files of another program.", fix="add --from PROGRAM")
+    data = read(dataset, table) if source is None else read_program(dataset, source, table, positions)
+    if to is None:
+        write_dataset(data, out, overwrite=overwrite)
+        notes = list(data.notes)
+    else:
+        notes = [*data.notes, *write_program(data, out, to)]
     if json:
-        show.emit_json({"dataset": str(out), "points": len(data), "notes": list(data.notes)})
+        show.emit_json({"dataset": str(out), "points": len(data), "notes": notes})
         return
     show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
-    show.notes(data.notes)
+    show.notes(notes)
 
 
 @command("info")

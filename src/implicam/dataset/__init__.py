@@ -67,7 +67,7 @@ def read_dataset(
     path: str | Path,
     *,
     unit: str | None = None,
-    first_pixel: int = 0,
+    first_pixel: int | None = None,
     v_up: bool = False,
     size: str | tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
 ) -> Dataset:
@@ -76,7 +76,7 @@ def read_dataset(
     Args:
         path: The folder or file.
         unit: The length unit of a table without a description; None to use the unit that the data state.
-        first_pixel: How the file counts the centre of the first pixel, 0 or 1.
+        first_pixel: How the file counts the centre of the first pixel, 0 or 1; None for 0.
         v_up: Whether it counts v from the bottom row upwards.
         size: Width and height of the pictures, for all cameras or for each by name; None to use what the data state.
 

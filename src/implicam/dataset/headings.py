@@ -339,7 +339,7 @@ def _of_cameras(found: dict[str, Axes], known: bool, place: str) -> dict[str, Ax
         raise DatasetError(
             f"{place}: {_quoted(columns)} are a pair, and it cannot be told whether {others[0]!r} is a camera{also}.",
             why=f"a pair of columns may be the pixels of a camera, or a marker in the picture of one{more}",
-            fix=_RENAME,
+            fix=f"{_RENAME}; or, of a table of DLTdv, Argus and others, implicam convert --from PROGRAM",
         )
     return cameras
 

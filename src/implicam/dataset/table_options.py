@@ -24,7 +24,8 @@ class TableOptions:
 
     Attributes:
         unit: The length unit of the positions; None where the file states it.
-        first_pixel: The number of the first pixel's centre, 0 or 1; 0 here and in OpenCV, 1 in MATLAB.
+        first_pixel: The number of the first pixel's centre, 0 or 1; 0 here and in OpenCV, 1 in MATLAB. None for 0, or
+            for what another program is known to do.
         v_up: Whether v is counted upwards from the bottom row; needs the heights of the pictures.
         size: Width and height of the pictures: "1920x1080", or "cam1=1920x1080,cam2=1280x800"; None where the file
             states them, or they are not known.
@@ -33,7 +34,9 @@ class TableOptions:
     unit: Annotated[
         str | None, Option("length unit of the positions, of a file that does not state it", "UNIT", panel=PANEL)
     ] = None
-    first_pixel: Annotated[int, Option("the number of the first pixel: 0, or 1 as in MATLAB", "0|1", panel=PANEL)] = 0
+    first_pixel: Annotated[
+        int | None, Option("the number of the first pixel: 0, or 1 as in MATLAB", "0|1", panel=PANEL)
+    ] = None
     v_up: Annotated[bool, Option("v is counted from the bottom row upwards", panel=PANEL)] = False
     size: Annotated[
         str | None,
@@ -41,7 +44,7 @@ class TableOptions:
     ] = None
 
     def __post_init__(self) -> None:
-        if self.first_pixel not in (0, 1):
+        if self.first_pixel not in (None, 0, 1):
             raise UsageError(
                 f"the first pixel cannot have the number {self.first_pixel!r}.",
                 why="programs count the centres of pixels from 0, or from 1",
@@ -87,7 +90,7 @@ class TableOptions:
             return data
         cameras = self._sized(data)
         observations, notes = data.observations, list(data.notes)
-        uv = observations.uv - self.first_pixel
+        uv = observations.uv - (self.first_pixel or 0)
         if self.first_pixel:
             notes.append("Pixels were counted from 1: u and v are less by 1 here, where the first is 0.")
         if self.v_up:

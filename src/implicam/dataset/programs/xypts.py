@@ -1,0 +1,160 @@
+"""`dltdv`, `easywand`, `argus`: one table of pixels, a row a frame, two columns for each point and camera.
+
+DLTdv 8 and easyWand call them pt1_cam1_X, pt1_cam1_Y (v from the top, the first pixel is 1), Argus NAME_cam_1_x,
+NAME_cam_1_y; NaN is a point that was not clicked. DLTdv 5 and older Argus count v from below: --v-up. The known
+positions of calibration points are another file (`xyz`, no header): of the rows of the table, or of the points of its
+only row.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from implicam.dataset.dialect import find_separator, rows_of
+from implicam.dataset.folder import csv_text, format_cells
+from implicam.dataset.model import Dataset
+from implicam.dataset.programs.views import Numbers, Views, pixel_number
+from implicam.dataset.tables import check_width
+from implicam.errors import DatasetError, did_you_mean
+from implicam.files import write_text
+
+DLTDV = re.compile(r"(?P<point>pt\d+)_(?P<camera>cam\d+)_(?P<axis>[xy])", re.IGNORECASE)
+ARGUS = re.compile(r"(?P<point>.+)_(?P<camera>cam_\d+)_(?P<axis>[xy])", re.IGNORECASE)
+
+Columns = dict[tuple[str, str], dict[str, int]]
+"""(point, camera) -> axis -> number of the column."""
+
+
+def read_dltdv(path: Path, positions: Sequence[Numbers]) -> Views:
+    """Read the xypts.csv of DLTdv or easyWand.
+
+    Args:
+        path: The file.
+        positions: Known positions; empty where there are none.
+
+    Raises:
+        DatasetError: A heading is no pair of such a table, a cell is no number, or the positions do not fit.
+    """
+    return _read(path, positions, DLTDV, "pt1_cam1_X")
+
+
+def read_argus(path: Path, positions: Sequence[Numbers]) -> Views:
+    """Read the xypts.csv of Argus.
+
+    Args:
+        path: The file.
+        positions: Known positions; empty where there are none.
+
+    Raises:
+        DatasetError: A heading is no pair of such a table, a cell is no number, or the positions do not fit.
+    """
+    return _read(path, positions, ARGUS, "track_cam_1_x")
+
+
+def _read(path: Path, positions: Sequence[Numbers], form: re.Pattern[str], example: str) -> Views:
+    writing = find_separator(path, lambda header: form.fullmatch(header[0]) is not None)
+    rows = list(rows_of(path, writing))
+    if not rows:
+        raise DatasetError(f"{path} is empty.", fix=f"its first line names columns such as {example}")
+    columns = _pairs([cell.strip() for cell in rows[0][1]], form, example, f"{path}, line {rows[0][0]}")
+    points = list(dict.fromkeys(point for point, _ in columns))
+    frames = rows[1:]
+    names = _names(points, len(frames), positions, path)
+    views = Views()
+    for frame, (line, row) in enumerate(check_width(f"{path}, line", len(rows[0][1]), frames), 1):
+        place = f"{path}, line {line}"
+        for (point, camera), axes in columns.items():
+            pixel = pixel_number(row[axes["x"]], place, "x"), pixel_number(row[axes["y"]], place, "y")
+            name = names[frame - 1][points.index(point)]
+            views.add(name, camera, pixel, place)
+            views.describe(name, frame=str(frame), marker=point)
+            if positions:
+                i = frame - 1 if len(points) == 1 else points.index(point)
+                views.place_point(name, positions[i], place)
+    return views
+
+
+def _names(points: list[str], frames: int, positions: Sequence[Numbers], path: Path) -> list[list[str]]:
+    """The name of each point of each frame: p0001 where a frame has one, else frame and point."""
+    several = len(points) > 1
+    if positions and (len(positions) != (len(points) if several else frames) or (several and frames > 1)):
+        raise DatasetError(
+            f"{path} has {frames} rows of {len(points)} points, and there are {len(positions)} known positions.",
+            why="known positions belong to the rows of one point, or to the points of one row",
+            fix="digitize the known points as the rows of one point, in the order of their positions",
+        )
+    if not several:
+        return [[f"p{frame:04d}"] for frame in range(1, frames + 1)]
+    return [[f"{frame} {point}" for point in points] for frame in range(1, frames + 1)]
+
+
+def _pairs(header: list[str], form: re.Pattern[str], example: str, place: str) -> Columns:
+    columns: Columns = {}
+    for i, heading in enumerate(header):
+        found = form.fullmatch(heading)
+        if found is None:
+            raise DatasetError(
+                f"{place}: the column {heading[:60]!r} is not of the kind {example!r}.",
+                fix="give the table as the program wrote it; implicam convert lists the kinds it reads (--help)",
+            )
+        axes = columns.setdefault((found["point"], found["camera"].lower().replace("_", "")), {})
+        if found["axis"].lower() in axes:
+            raise DatasetError(f"{place}: the column {heading!r} is there twice.", fix="leave one out")
+        axes[found["axis"].lower()] = i
+    for axes in columns.values():
+        if len(axes) == 1:
+            ((axis, i),) = axes.items()
+            other = header[i][:-1] + {"x": "y", "y": "x", "X": "Y", "Y": "X"}[header[i][-1]]
+            alone = [header[next(iter(a.values()))] for a in columns.values() if len(a) == 1 and axis not in a]
+            raise DatasetError(
+                f"{place}: there is a column {header[i]!r} but no {other!r}{did_you_mean(other, alone)}.",
+                fix="correct the heading, or add the other column",
+            )
+    return columns
+
+
+def write_dltdv(data: Dataset, path: Path) -> list[str]:
+    """Write xypts.csv, and the known positions beside it: a row for each point.
+
+    Args:
+        data: The dataset; its pixels as the program counts them.
+        path: The file; the positions are in the file of the same name with xyz in place of xypts.
+
+    Returns:
+        What it could not hold, in sentences.
+
+    Raises:
+        ImplicamError: A file cannot be written.
+    """
+    return _write(data, path, [f"pt1_cam{k + 1}_{axis}" for k in range(len(data.cameras)) for axis in "XY"])
+
+
+def write_argus(data: Dataset, path: Path) -> list[str]:
+    """Write xypts.csv as Argus has it, and the known positions beside it: a row for each point.
+
+    Args:
+        data: The dataset; its pixels as the program counts them.
+        path: The file; the positions are in the file of the same name with xyz in place of xypts.
+
+    Returns:
+        What it could not hold, in sentences.
+
+    Raises:
+        ImplicamError: A file cannot be written.
+    """
+    return _write(data, path, [f"track1_cam_{k + 1}_{axis}" for k in range(len(data.cameras)) for axis in "xy"])
+
+
+def _write(data: Dataset, path: Path, header: list[str]) -> list[str]:
+    pixels = data.observations.uv.reshape(len(data), -1)
+    rows = [[cell or "NaN" for cell in format_cells(row)] for row in pixels]
+    write_text(path, csv_text(header, rows))
+    notes = [f"The cameras are {', '.join(f'{i} = {c.name}' for i, c in enumerate(data.cameras, 1))}; names are lost."]
+    if data.known is not None:
+        beside = path.with_name(path.stem.replace("xypts", "xyz") + ".csv")
+        beside = beside if beside != path else path.with_name(path.stem + "_xyz.csv")
+        write_text(beside, "".join(",".join(format_cells(row)) + "\n" for row in data.xyz))
+        notes.append(f"The known positions are in {beside.name}.")
+    return notes

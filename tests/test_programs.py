@@ -1,0 +1,161 @@
+"""Files of other programs: read with their own conventions, written so that they come back, refused with the cure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from implicam.cli import main
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
+from implicam.dataset.programs import PROGRAMS, read_program, write_program
+from implicam.dataset.table_options import TableOptions
+from implicam.errors import DatasetError, ImplicamError
+
+MM = TableOptions(unit="mm")
+
+
+def known_points() -> Dataset:
+    points = np.array([f"p{i + 1:04d}" for i in range(6)])
+    uv = np.random.default_rng(2).uniform(10, 600, (6, 3, 2)).round(3)
+    uv[2, 1] = np.nan
+    xyz = np.random.default_rng(3).uniform(-50, 50, (6, 3)).round(2)
+    cameras = tuple(Camera(f"cam{k + 1}") for k in range(3))
+    known = KnownPositions(points, xyz, np.full(xyz.shape, np.nan))
+    return Dataset("rig", "mm", Observations(points, cameras, uv, np.full(uv.shape, np.nan)), known)
+
+
+@pytest.mark.parametrize("kind", [name for name, program in PROGRAMS.items() if program.write])
+def test_what_is_written_comes_back(kind: str, tmp_path: Path) -> None:
+    data = known_points()
+    path = tmp_path / ("folder" if "ptv" in kind else "a_xypts.csv")
+    notes = write_program(data, path, kind)
+    assert notes
+    again = read_program(path, kind, MM, None if "ptv" in kind else tmp_path / "a_xyz.csv")
+    order = [again.xyz.tolist().index(xyz) for xyz in data.xyz.tolist()]
+    np.testing.assert_allclose(again.observations.uv[order], data.observations.uv, atol=1e-10)
+    assert again.observations.camera_names == data.observations.camera_names
+
+
+def test_dltdv_counts_from_one_and_older_ones_from_below(tmp_path: Path) -> None:
+    path = tmp_path / "a_xypts.csv"
+    path.write_text("pt1_cam1_X,pt1_cam1_Y,pt1_cam2_X,pt1_cam2_Y\n1,1,NaN,NaN\nNaN,NaN,NaN,NaN\n11,21,31,41\n")
+    read = read_program(path, "dltdv")
+    np.testing.assert_array_equal(read.observations.uv[:, 0], [[0, 0], [10, 20]])
+    assert read.points.tolist() == ["p0001", "p0003"]
+    assert read.columns["frame"].tolist() == ["1", "3"]
+    assert any("counted from 1" in note for note in read.notes)
+    assert any("1 of 3 points were seen by no camera" in note for note in read.notes)
+    older = read_program(path, "dltdv", TableOptions(v_up=True, size="640x480"))
+    np.testing.assert_array_equal(older.observations.uv[:, 0], [[0, 479], [10, 459]])
+
+
+def test_several_points_of_dltdv_are_named_by_frame_and_point(tmp_path: Path) -> None:
+    path = tmp_path / "xypts.tsv"
+    path.write_text("pt1_cam1_X\tpt1_cam1_Y\tpt2_cam1_X\tpt2_cam1_Y\n1\t2\t3\t4\n5\t6\t7\t8\n")
+    assert read_program(path, "dltdv").points.tolist() == ["1 pt1", "1 pt2", "2 pt1", "2 pt2"]
+    (tmp_path / "xyz.csv").write_text("0,0,0\n1,1,1\n")
+    with pytest.raises(DatasetError, match="2 rows of 2 points, and there are 2 known positions"):
+        read_program(path, "dltdv", MM, tmp_path / "xyz.csv")
+    path.write_text("pt1_cam1_X\tpt1_cam1_Y\tpt2_cam1_X\tpt2_cam1_Y\n1\t2\t3\t4\n")
+    assert read_program(path, "dltdv", MM, tmp_path / "xyz.csv").xyz.tolist() == [[0, 0, 0], [1, 1, 1]]
+
+
+def test_key_points_without_pixels_are_missing_whatever_their_likelihood(tmp_path: Path) -> None:
+    """DeepLabCut issue 1650: NaN, NaN with the likelihood 1."""
+    head = "scorer,s,s,s,s,s,s\nbodyparts,nose,nose,nose,tail,tail,tail\ncoords,x,y,likelihood,x,y,likelihood\n"
+    (tmp_path / "leftDLC_resnet50.csv").write_text(head + "0,1.5,2,.9,nan,nan,1.0\n1,3,4,.8,5,6,.7\n")
+    (tmp_path / "rightDLC_resnet50.csv").write_text(head + "0,7,8,.6,9,10,.5\n1,,,1.0,11,12,.4\n")
+    read = read_program(tmp_path, "deeplabcut")
+    assert read.observations.camera_names == ("left", "right")
+    assert read.points.tolist() == ["0 nose", "0 tail", "1 nose", "1 tail"]
+    assert read.observations.seen.tolist() == [[True, True], [False, True], [True, False], [True, True]]
+    assert read.observations.extra["likelihood"].tolist() == [[".9", ".6"], ["", ".5"], [".8", ""], [".7", ".4"]]
+    assert read.columns["marker"].tolist() == ["nose", "tail", "nose", "tail"]
+
+
+def test_animals_of_deeplabcut(tmp_path: Path) -> None:
+    head = "scorer,s,s,s,s\nindividuals,a,a,b,b\nbodyparts,nose,nose,nose,nose\ncoords,x,y,x,y\n"
+    (tmp_path / "cam1DLC.csv").write_text(head + "0,1,2,3,4\n")
+    assert read_program(tmp_path, "deeplabcut").points.tolist() == ["0 a nose", "0 b nose"]
+
+
+def test_sleap(tmp_path: Path) -> None:
+    head = "track,frame_idx,instance.score,head.x,head.y,head.score,tail.x,tail.y,tail.score\n"
+    (tmp_path / "cam1.csv").write_text(head + "t0,0,.9,1,2,.8,,,\n")
+    (tmp_path / "cam2.csv").write_text(head + "t0,0,.9,3,4,.7,5,6,.6\n")
+    read = read_program(tmp_path, "sleap")
+    assert read.points.tolist() == ["0 t0 head", "0 t0 tail"]
+    np.testing.assert_array_equal(read.observations.uv[1], [[np.nan, np.nan], [5, 6]])
+
+
+def test_points_of_openptv_that_were_not_found(tmp_path: Path) -> None:
+    for camera in "12":
+        (tmp_path / f"plane_a_{camera}.tif.fix").write_text("  1  0.0 0.0 5.0\n  2  1.0 0.0 5.0\n")
+    (tmp_path / "plane_a_1.tif.crd").write_text("1 10.5 20.5\n2 -999 -999\n")
+    (tmp_path / "plane_a_2.tif.crd").write_text("1 30 40\n2 50 60\n")
+    read = read_program(tmp_path, "openptv", MM)
+    assert read.points.tolist() == ["plane_a 1", "plane_a 2"]
+    assert read.observations.camera_names == ("cam1", "cam2")
+    assert read.observations.seen.tolist() == [[True, True], [False, True]]
+    assert read.xyz.tolist() == [[0, 0, 5], [1, 0, 5]]
+
+
+REFUSED: dict[str, tuple[str, dict[str, str], str]] = {
+    "half a pair": ("dltdv", {"x.csv": "pt1_cam1_X,pt1_cam2_Y\n1,2\n"}, "'pt1_cam1_X' but no 'pt1_cam1_Y'"),
+    "another heading": ("dltdv", {"x.csv": "pt1_cam1_X,pt1_cam1_Y,note\n1,2,a\n"}, "'note' is not of the kind"),
+    "half a view": ("dltdv", {"x.csv": "pt1_cam1_X,pt1_cam1_Y\n1,NaN\n"}, "u = 1, v = nan"),
+    "nothing seen": ("dltdv", {"x.csv": "pt1_cam1_X,pt1_cam1_Y\nNaN,NaN\n"}, "all pixels are missing"),
+    "no table of DeepLabCut": ("deeplabcut", {"x.csv": "a,b\n1,2\n"}, "is no table of DeepLabCut"),
+    "no table of SLEAP": ("sleap", {"x.csv": "frame_idx,head.x\n1,2\n"}, "is no analysis table of SLEAP"),
+    "four numbers": ("myptv", {"cam1_cal_points": "1 2 3 4\n"}, "4 cells"),
+    "a word": ("myptv", {"cam1_cal_points": "1 2 3 4 five\n"}, "cell 5 = 'five' is not a number"),
+    "a point twice": ("myptv", {"cam1_cal_points": "1 2 3 4 5\n6 7 3 4 5\n"}, "is seen twice by camera 'cam1'"),
+    "targets alone": ("openptv", {"cam1.1_targets": "1\n0 1 2 3 4 5 6 -1\n"}, "has files _targets and no .crd"),
+    "no positions": ("openptv", {"a1.tif.crd": "1 2 3\n"}, "has no a1.tif.fix beside it"),
+    "two places": (
+        "openptv",
+        {"a1.tif.fix": "1 0 0 0", "a1.tif.crd": "1 2 3", "a2.tif.fix": "1 0 0 9", "a2.tif.crd": "1 2 3"},
+        "is at (0.0, 0.0, 9.0), and at (0.0, 0.0, 0.0) elsewhere",
+    ),
+    "no unit": ("myptv", {"cam1_cal_points": "1 2 3 4 5\n"}, "the length unit of x, y, z is not stated"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_wrong_is_named(case: str, tmp_path: Path) -> None:
+    kind, files, said = REFUSED[case]
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    path = tmp_path / "x.csv" if kind == "dltdv" else tmp_path
+    with pytest.raises(DatasetError) as caught:
+        read_program(path, kind, None if case == "no unit" else MM)
+    assert said in caught.value.what
+    assert caught.value.fix
+
+
+def test_unknown_programs_and_those_that_are_only_read(tmp_path: Path) -> None:
+    with pytest.raises(ImplicamError, match="did you mean 'dltdv'"):
+        read_program(tmp_path, "dltv")
+    with pytest.raises(ImplicamError, match="files of sleap are read, and not written"):
+        write_program(known_points(), tmp_path / "x", "sleap")
+
+
+def convert(*words: Any) -> int:
+    with pytest.raises(SystemExit) as end:
+        main(["convert", *map(str, words)])
+    return int(end.value.code or 0)
+
+
+def test_convert_reads_and_writes_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = known_points()
+    write_program(data, tmp_path / "cal_xypts.csv", "dltdv")
+    words = ("--from", "dltdv", "--positions", tmp_path / "cal_xyz.csv", "--unit", "mm")
+    assert convert(tmp_path / "cal_xypts.csv", tmp_path / "rig", *words) == 0
+    np.testing.assert_allclose(read_dataset(tmp_path / "rig").observations.uv, data.observations.uv, atol=1e-10)
+    assert convert(tmp_path / "rig", tmp_path / "ptv", "--to", "myptv") == 0
+    assert (tmp_path / "ptv" / "target_file").exists()
+    assert "names of the points are lost" in capsys.readouterr().err
+    assert convert(tmp_path / "rig", tmp_path / "x.csv", "--positions", tmp_path / "cal_xyz.csv") == 2
