@@ -457,3 +457,29 @@ def test_a_header_of_many_columns_takes_linear_time(tmp_path: Path) -> None:
     assert len(read_dataset(folder).positions.extra) == 30_000
     assert len(read_headings(["u_a", "v_a", *many], "w.csv").further) == 30_000
     assert time.process_time() - began < 20.0  # a slow machine; quadratic took minutes
+
+
+PUBLIC_REPORTS = {
+    # SheetJS issue 2239: the comma of the numbers was taken for the separator, and numbers were cut in two
+    "semicolons with decimal commas": ("u_a;v_a;u_b;v_b\n1,1;2,2;3,3;4,1\n", [[1.1, 2.2], [3.3, 4.1]]),
+    # IATI.cloud issue 1622: the first line tells Excel the separator, and is no heading
+    "sep=": ("sep=;\nu_a;v_a;u_b;v_b\n1,5;2;3;4\n", [[1.5, 2], [3, 4]]),
+    # BTKCore issue 9: points that are hidden were exported as 0
+    "zeros": ("u_a,v_a,u_b,v_b\n0,0,3,4\n", [[np.nan, np.nan], [3, 4]]),
+    # openturns issue 3064: a table in which a row has nothing but nan
+    "nothing but nan": ('"u_a";"v_a";"u_b";"v_b"\nnan;nan;nan;nan\n', [[np.nan, np.nan], [np.nan, np.nan]]),
+    # biodiverse issue 691: blank or NA coordinates stopped the import
+    "blank and NA": ("u_a,v_a,u_b,v_b\nNA,NA,,\n", [[np.nan, np.nan], [np.nan, np.nan]]),
+}
+
+
+@pytest.mark.parametrize("report", PUBLIC_REPORTS)
+def test_tables_of_public_bug_reports(report: str, tmp_path: Path) -> None:
+    text, pixels = PUBLIC_REPORTS[report]
+    np.testing.assert_array_equal(sheet(tmp_path, text).observations.uv[0], pixels)
+
+
+def test_point_pairs_of_one_picture_are_no_cameras(tmp_path: Path) -> None:
+    """Calcam issue 102: nobody knew how its table of point pairs looks, and a guess was read without a word."""
+    with pytest.raises(DatasetError, match="it cannot be told whether 'Image' is a camera"):
+        sheet(tmp_path, "Machine X,Machine Y,Machine Z,Image X,Image Y\n1,2,3,4,5\n")
