@@ -452,6 +452,23 @@ def test_the_classical_way_on_the_command_line(made: Path, cli: Cli) -> None:
     assert "made without known points" in cli("evaluate", "alone.implicam", "--cv", "3").err
 
 
+def test_the_command_writes_maps(made: Path, cli: Cli) -> None:
+    words = ("export", made / "rig.implicam", "--to", "undistortion-maps")
+    ran = cli(*words, "-o", "maps", "--size", "160x100", "--alpha", "0")
+    assert ran.code == 0
+    assert ran.out.startswith("maps: pixel maps that make pinholes of ")
+    told = cli(*words, "-o", "maps", "--size", "160x100", "--json").json
+    assert {f"{camera['name']}.npz" for camera in told["cameras"]} < {path.name for path in Path("maps").iterdir()}
+    assert told["cameras"][0]["width"] == 160
+    for wrong, said in (
+        (["--size", "160"], "is no size"),
+        (["--alpha", "3"], "from 0 to 1"),
+    ):
+        assert said in cli(*words, "-o", "maps", *wrong).err
+    assert "option of undistortion-maps" in cli(*words[:3], "opencv", "-o", "x.yml", "--alpha", "0").err
+    assert "did you mean 'undistortion-maps'" in cli(*words[:3], "undistortion", "-o", "x").err
+
+
 def test_a_neural_network_says_what_its_numbers_are(made: Path, cli: Cli) -> None:
     pytest.importorskip("torch")
     ran = cli("calibrate", made / "rig", "--method", "mlp", "-o", "n.implicam")

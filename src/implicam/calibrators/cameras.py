@@ -87,13 +87,20 @@ def fitted_cameras(rig: FittedRig, known: Floats) -> Iterator[FittedCamera]:
         note = ""
         if len(model.field.inducing) and len(known):  # forward-gp; cameras of another program have no known points
             camera, note = _nearest(model, rig.frame.to_working(known), camera)
-        yield FittedCamera(*of, camera.lens, _world(camera, rig.frame), note)
+        yield FittedCamera(*of, camera.lens, world_pose(camera.pose, rig.frame), note)
 
 
-def _world(camera: CentralCamera, frame: Frame) -> Pose:
-    """camera_from_world of a camera of the working frame: the inverse of its offset and scale."""
-    turned = camera.pose.rotation @ frame.offset
-    return Pose(camera.pose.rotation, camera.pose.translation * frame.scale - turned)
+def world_pose(pose: Pose, frame: Frame) -> Pose:
+    """The pose in the world of a camera of the working frame: the inverse of its offset and scale.
+
+    Args:
+        pose: camera_from_working.
+        frame: The working frame.
+
+    Returns:
+        camera_from_world, in the world's length unit.
+    """
+    return Pose(pose.rotation, pose.translation * frame.scale - pose.rotation @ frame.offset)
 
 
 def _nearest(model: CameraModel, points: Floats, camera: CentralCamera) -> tuple[CentralCamera, str]:

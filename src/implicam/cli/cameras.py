@@ -3,35 +3,88 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from implicam.calibrators import load_calibration
+from implicam.calibrators import Calibration, load_calibration
 from implicam.calibrators.explicit import calibration_of, rig_of
+from implicam.calibrators.undistortion import PinholeView, pinhole_maps
 from implicam.cli import show
-from implicam.cli.app import Json, command, must_be_calibration, must_not_replace
+from implicam.cli.app import Json, command, must_be_calibration, must_be_folder, must_not_replace
+from implicam.cli.options import Options, OptionsOfParts, options_of_fields
 from implicam.dataset.table_options import TableOptions
+from implicam.errors import UsageError, did_you_mean
 from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, WRITTEN, export_cameras, import_cameras
+from implicam.exchange.pixel_maps import MAPS_FORMAT, write_maps
+
+NAMES = (*WRITTEN, MAPS_FORMAT)
 
 
-@command("export")
-def export_command(
+def _map_options() -> Options:
+    return {MAPS_FORMAT: options_of_fields(PinholeView)}
+
+
+def _export(
     calibration: Annotated[Path, typer.Argument(help="A calibration by explicit, or by forward-gp.")],
-    to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(WRITTEN)}.")],
+    to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(NAMES)}.")],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help=f"The file to write; for {', '.join(FOLDERS)} a folder.")
+        Path,
+        typer.Option("--output", "-o", help=f"The file to write; for {', '.join((*FOLDERS, MAPS_FORMAT))} a folder."),
     ],
     json: Json = False,
+    **options: Any,
 ) -> None:
-    """Write the cameras for another program: lenses and places, as far as its format holds them."""
+    """Write the cameras for another program: lenses and places, as far as its format holds them; or pixel maps that
+    make pinholes of them, with the sd of the maps."""
     must_not_replace(output, calibration)
+    if to not in (*FORMATS, MAPS_FORMAT):
+        raise UsageError(
+            f"there is no format {to!r}{did_you_mean(to, NAMES)}.", fix=f"choose one of {', '.join(NAMES)}"
+        )
+    given = {name: value for name, value in options.items() if value is not None}
+    if to == MAPS_FORMAT:
+        _export_maps(load_calibration(calibration), PinholeView(**_with_size(given)), output, json)
+        return
+    if given:
+        raise UsageError(
+            f"--{min(given).replace('_', '-')} is an option of {MAPS_FORMAT}, and {to} has none.", fix="leave it out"
+        )
     rig, lost = rig_of(load_calibration(calibration))
     notes = [*lost, *export_cameras(rig, to, output)]
     if json:
         show.emit_json({"cameras": len(rig.cameras), "format": to, "file": str(output), "notes": notes})
         return
     show.line(f"{output}: {len(rig.cameras)} cameras as {FORMATS[to].what}")
+    show.notes(notes)
+
+
+export_command = command("export")(OptionsOfParts(_export, "output", _map_options))
+
+
+def _with_size(given: dict[str, Any]) -> dict[str, Any]:
+    """The options with WxH as two numbers."""
+    if "size" not in given:
+        return given
+    sides = str(given["size"]).lower().split("x")
+    if len(sides) != 2 or not all(side.isdecimal() for side in sides):
+        raise UsageError(
+            f"--size {given['size']!r} is no size.", fix="give width and height in pixels: --size 1280x800"
+        )
+    return given | {"size": (int(sides[0]), int(sides[1]))}
+
+
+def _export_maps(calibration: Calibration, view: PinholeView, output: Path, json: bool) -> None:
+    must_be_folder(output)
+    with show.progress(json) as progress:
+        maps, notes = pinhole_maps(calibration, view, progress)
+    write_maps(maps, calibration.data.length_unit, output)
+    told = [each.summary() for each in maps]
+    if json:
+        show.emit_json({"cameras": told, "format": MAPS_FORMAT, "folder": str(output), "notes": notes})
+        return
+    show.line(f"{output}: pixel maps that make pinholes of {len(maps)} cameras")
+    show.table(show.maps_table(told))
     show.notes(notes)
 
 

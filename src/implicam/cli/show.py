@@ -301,6 +301,24 @@ def detection_table(run: DetectionRun) -> Table:
     return text_table("", ["camera", "pictures", "with target", "points", "typical sd, px"], rows)
 
 
+def maps_table(told: Sequence[Mapping[str, Any]]) -> Table:
+    """A camera a row: the pinhole it becomes, how much of its picture is filled, and how well its map is known."""
+    rows = [
+        [
+            str(each["name"]),
+            f"{each['width']}x{each['height']}",
+            decimal_number(each["focal_length_px"], 4),
+            percent(each["share_filled"]),
+            percent(each["share_among_known_points"]),
+            *(decimal_number(math.nan if each[key] is None else each[key], 2) for key in
+              ("median_sd_px", "median_sd_beyond_px")),
+        ]
+        for each in told
+    ]  # fmt: skip
+    headings = ["camera", "size", "focal\nlength", "filled", "known\npoints", "sd there,\npx", "sd beyond,\npx"]
+    return text_table("", headings, rows)
+
+
 def demo_table(demo: Demo) -> Table:
     """Cameras and known points down, accuracy and honesty of each method across."""
     lines: dict[tuple[str, int], list[Trial]] = {}

@@ -235,6 +235,19 @@ class FittedRig:
             corrected = np.sqrt(given**2 + usual**2 - stated**2)
         return np.where(np.isfinite(given) & (given > 0), corrected, usual)
 
+    def misfit(self, number: int) -> float:
+        """What a camera's lens model leaves of its views, besides their noise.
+
+        Args:
+            number: Of the camera in `posterior.models`.
+
+        Returns:
+            Pixels, sd: zero where a field follows what the lens does not (`misfit_adds`). Where the views do not state
+            their noise it cannot be told from a misfit, and this is the most: both together.
+        """
+        usual, stated = self.posterior.models[number].noise, float(np.nan_to_num(self._stated[self.cameras[number]]))
+        return float(np.sqrt(max(usual**2 - stated**2, 0.0))) if self.misfit_adds else 0.0
+
     @cached_property
     def _stated(self) -> Floats:
         return stated_noise(self.trained)
