@@ -4,11 +4,12 @@
 # make methods   all methods side by side, the first table of docs/choose.md
 # make odd       300 rigs of all kinds: how many are right, refused, silently wrong
 # make active   the tables and the figure of docs/active.md
-# make paper  the paper's experiments on five rigs, hours; docs/reproduce.md
+# make paper  the paper's experiments on five rigs, docs/reproduce.md; goes on from what benchmarks/results keeps
 # make clean  start over
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PAPER_CELLS := benchmarks/results/paper-cells.tar.xz
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt
 
 .PHONY: demo test test-slow check lint bench real rigs methods odd active paper clean
@@ -56,6 +57,7 @@ active: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/active.py
 
 paper: $(VENV)/.dev
+	test -d implicam-paper/cells || { mkdir -p implicam-paper && tar -xJf $(PAPER_CELLS) -C implicam-paper; }
 	$(BIN)/implicam paper all
 	$(BIN)/python docs/make_reproduce.py implicam-paper
 
