@@ -81,8 +81,8 @@ def _one_file(read: Callable[[Path], Rig]) -> Read:
 
 
 FORMATS = {
-    "qualisys": Format(None, _one_file(qualisys.read), qualisys.knows, "Qualisys's .qca.txt"),
     "colmap": Format(colmap.write, _one_file(colmap.read), colmap.knows, "COLMAP's model, a folder"),
+    "qualisys": Format(None, _one_file(qualisys.read), qualisys.knows, "Qualisys's .qca.txt"),
     "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml"),
     "caliscope": Format(caliscope.write, _one_file(caliscope.read), caliscope.knows, "caliscope's camera_array.toml"),
     "pose2sim": Format(
@@ -108,7 +108,7 @@ FORMATS = {
     "myptv": Format(myptv.write, myptv.read, myptv.knows, "MyPTV's camera files, Tsai model", True),
     "dlt": Format(dlt.write, _one_file(dlt.read), dlt.knows, "DLT coefficients as a CSV of DLTdv or easyWand", True),
 }
-"""In the order in which they are tried on a file."""
+"""In the order in which they are tried on a file: first the one that may be binary, and is known by names of files."""
 
 WRITTEN = tuple(name for name, form in FORMATS.items() if form.write)
 """The names of those that are written too."""
