@@ -202,10 +202,13 @@ def test_killed_at_any_moment_the_old_or_the_new_is_there(victim: Victim, templa
     old, new = state(template, victim.target), state(whole, victim.target)
     sources = {name: state(template, name) for name in ("rig", "rig.implicam")}
     in_time = 0
-    for i, delay in enumerate(np.linspace(0.3 * seconds, 1.1 * seconds, 24)):
+    for i, share in enumerate(np.linspace(0.3, 1.1, 24)):
         folder = tmp_path / str(i)
         shutil.copytree(template, folder)
-        in_time += killed_at(victim, folder, float(delay))
+        killed = killed_at(victim, folder, float(share * seconds))
+        in_time += killed
+        if not killed and share < 0.9:  # it was done sooner: the machine was busier when the run was timed
+            seconds *= 0.8
         check_kill(folder, victim, old, new, sources)
         assert real(victim.words, folder).code == 0
         assert state(folder, victim.target) == new
