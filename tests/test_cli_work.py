@@ -314,6 +314,18 @@ def test_measured_points_come_in_the_unit_that_is_asked_for(made: Path, cli: Cli
     assert not Path("x.csv").exists()
 
 
+def test_a_unit_without_a_known_size_measures_and_is_not_converted(made: Path, cli: Cli) -> None:
+    cli("convert", made / "rig", "rig.csv")
+    Path("rig.csv.toml").unlink()
+    assert cli("calibrate", "rig.csv", "-o", "x.implicam", "--unit", "squares").code == 0
+    assert cli("measure", "x.implicam", made / "rig" / "check").code == 0
+    assert cli("measure", "x.implicam", made / "rig" / "check", "--unit", "squares").code == 0
+    ran = cli("measure", "x.implicam", made / "rig" / "check", "--unit", "m", "-o", "x.csv")
+    assert ran.code == 1
+    assert "squares" in ran.err
+    assert not Path("x.csv").exists()
+
+
 @pytest.mark.slow
 def test_cameras_and_without(cli: Cli) -> None:
     cli("simulate", "rig", "--positions", "random", "--points", "60", "--check", "20")

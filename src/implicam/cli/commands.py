@@ -183,8 +183,10 @@ def measure_command(
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
     judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
-    unit = table.unit or fitted.data.length_unit
-    metres_per(unit)  # an unknown one is refused before the work
+    unit = table.unit or fitted.data.length_unit  # one without a known size is converted to no other
+    if unit != fitted.data.length_unit:
+        metres_per(unit)  # refused before the work
+        metres_per(fitted.data.length_unit)
     data = _read_to_measure(dataset, replace(table, unit=None), fitted.data.length_unit)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
