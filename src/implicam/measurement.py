@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from implicam.dataset import Floats, Names
-from implicam.dataset.folder import csv_text
+from implicam.dataset.folder import csv_text, format_cells
 from implicam.dataset.frames import keep_others, rigid_parts
 from implicam.dataset.units import metres_per
 from implicam.errors import UsageError, did_you_mean, import_extra
@@ -235,12 +235,15 @@ class Measurement:
             MissingExtraError: pandas is not installed.
         """
         pandas = import_extra("pandas", "pandas", "a table of pandas")
+        columns = self._table()
+        return pandas.DataFrame({key: v.astype(object) if v.dtype.kind == "U" else v for key, v in columns.items()})
+
+    def _table(self) -> dict[str, NDArray[Any]]:
+        """The columns of measured.csv, numbers or text, (n,) each."""
         off_diagonal = self.cov[:, [0, 0, 1], [1, 2, 2]]
-        values = np.concatenate([self.xyz, self.sd, off_diagonal], axis=1).T
-        columns = dict(zip(MEASURED_COLUMNS, [self.points.astype(object), *values], strict=False))
-        tail = (self.views, self.consistency, self.reason.astype(object), self.share_calibration)
-        further = {key: column.astype(object) for key, column in self.columns.items()}
-        return pandas.DataFrame(columns | dict(zip(MEASURED_COLUMNS[10:], tail, strict=True)) | further)
+        numbers = np.concatenate([self.xyz, self.sd, off_diagonal], axis=1).T
+        tail = (self.views, self.consistency, self.reason, self.share_calibration)
+        return {**dict(zip(MEASURED_COLUMNS, (self.points, *numbers, *tail), strict=True)), **self.columns}
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -289,17 +292,9 @@ class Measurement:
         Raises:
             ImplicamError: It cannot be written.
         """
-        off_diagonal = self.cov[:, [0, 0, 1], [1, 2, 2]]
-        numbers = np.concatenate([self.xyz, self.sd, off_diagonal], axis=1)
-        rows = []
-        for i, name in enumerate(self.points):
-            row = ["" if np.isnan(x) else repr(float(x)) for x in numbers[i]]
-            p = self.consistency[i]
-            share = self.share_calibration[i]
-            tail = [str(int(self.views[i])), "" if np.isnan(p) else repr(float(p)), str(self.reason[i])]
-            tail.append("" if np.isnan(share) else repr(float(share)))
-            rows.append([str(name), *row, *tail, *(str(column[i]) for column in self.columns.values())])
-        write_text(Path(path), csv_text([*MEASURED_COLUMNS, *self.columns], rows))
+        table = self._table()
+        cells = [format_cells(v) if v.dtype.kind == "f" else v.astype(np.str_).tolist() for v in table.values()]
+        write_text(Path(path), csv_text(list(table), zip(*cells, strict=True)))
 
 
 def _with_sd(value: float, sd: float) -> str:
