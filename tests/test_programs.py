@@ -27,7 +27,10 @@ def known_points() -> Dataset:
     return Dataset("rig", "mm", Observations(points, cameras, uv, np.full(uv.shape, np.nan)), known)
 
 
-@pytest.mark.parametrize("kind", [name for name, program in PROGRAMS.items() if program.write])
+KEY_POINTS = ("deeplabcut", "sleap")
+
+
+@pytest.mark.parametrize("kind", [name for name in PROGRAMS if name not in KEY_POINTS])
 def test_what_is_written_comes_back(kind: str, tmp_path: Path) -> None:
     data = known_points()
     path = tmp_path / ("folder" if "ptv" in kind else "a_xypts.csv")
@@ -136,11 +139,47 @@ def test_what_is_wrong_is_named(case: str, tmp_path: Path) -> None:
     assert caught.value.fix
 
 
-def test_unknown_programs_and_those_that_are_only_read(tmp_path: Path) -> None:
+def trajectory() -> Dataset:
+    frames, markers = ["3", "3", "4", "4"], ["nose", "tail", "nose", "tail"]
+    uv = np.random.default_rng(4).uniform(10, 600, (4, 2, 2)).round(3)
+    uv[1, 0] = np.nan
+    cameras = Camera("left"), Camera("right")
+    likelihood = np.array([[".9", ".8"], ["", ".7"], [".6", ".5"], [".4", ".3"]])
+    points = np.array([f"{frame} {marker}" for frame, marker in zip(frames, markers, strict=True)])
+    views = Observations(points, cameras, uv, np.full(uv.shape, np.nan), {"likelihood": likelihood})
+    return Dataset("walk", "mm", views, columns={"frame": np.array(frames), "marker": np.array(markers)})
+
+
+@pytest.mark.parametrize("kind", KEY_POINTS)
+def test_key_points_that_are_written_come_back(kind: str, tmp_path: Path) -> None:
+    data = trajectory()
+    assert write_program(data, tmp_path / "out", kind) == []
+    again = read_program(tmp_path / "out", kind)
+    assert again.points.tolist() == data.points.tolist()
+    assert again.observations.camera_names == data.observations.camera_names
+    np.testing.assert_allclose(again.observations.uv, data.observations.uv, atol=1e-10)
+    assert again.observations.extra["likelihood"].tolist() == data.observations.extra["likelihood"].tolist()
+    assert {name: texts.tolist() for name, texts in again.columns.items()} == {
+        name: texts.tolist() for name, texts in data.columns.items()
+    }
+    notes = write_program(known_points(), tmp_path / "known", kind)
+    assert any("names of points are lost" in note for note in notes)
+    assert any("Known positions are not in it" in note for note in notes)
+    np.testing.assert_allclose(read_program(tmp_path / "known", kind).observations.uv, known_points().observations.uv)
+
+
+def test_tables_of_deeplabcut_are_what_pandas_reads_as_deeplabcut_does(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    write_program(trajectory(), tmp_path, "deeplabcut")
+    table = pandas.read_csv(tmp_path / "leftDLC.csv", header=[0, 1, 2], index_col=0)
+    assert table.index.tolist() == [3, 4]
+    assert table.columns.tolist()[:3] == [("implicam", "nose", axis) for axis in ("x", "y", "likelihood")]
+    np.testing.assert_array_equal(table["implicam", "tail", "x"], trajectory().observations.uv[1::2, 0, 0])
+
+
+def test_unknown_programs(tmp_path: Path) -> None:
     with pytest.raises(ImplicamError, match="did you mean 'dltdv'"):
         read_program(tmp_path, "dltv")
-    with pytest.raises(ImplicamError, match="files of sleap are read, and not written"):
-        write_program(known_points(), tmp_path / "x", "sleap")
 
 
 def convert(*words: Any) -> int:

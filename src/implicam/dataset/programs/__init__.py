@@ -1,6 +1,6 @@
 """Files of other programs that hold points in pictures: what each is, how it is read, and how it is written.
 
-To add one: write a file with `read(path, positions) -> Views` and perhaps `write(data, path) -> notes`, its conventions
+To add one: write a file with `read(path, positions) -> Views` and `write(data, path) -> notes`, its conventions
 in its head; add it to `PROGRAMS`, to the table of docs/formats.md, and to tests/test_programs.py.
 """
 
@@ -25,7 +25,7 @@ class Program:
     """How a program's files are read and written, what they are, and how it counts the first pixel."""
 
     read: Callable[[Path, Sequence[Numbers]], Views]
-    write: Callable[[Dataset, Path], list[str]] | None
+    write: Callable[[Dataset, Path], list[str]]
     what: str
     first_pixel: int = 0
 
@@ -36,8 +36,10 @@ PROGRAMS = {
     "argus": Program(xypts.read_argus, xypts.write_argus, "xypts.csv of Argus"),
     "myptv": Program(ptv.read_myptv, ptv.write_myptv, "a folder of cal_points of MyPTV"),
     "openptv": Program(ptv.read_openptv, ptv.write_openptv, "a folder of .fix and .crd of OpenPTV"),
-    "deeplabcut": Program(pose.read_deeplabcut, None, "a folder of tables of DeepLabCut, one a camera"),
-    "sleap": Program(pose.read_sleap, None, "a folder of analysis tables of SLEAP, one a camera"),
+    "deeplabcut": Program(
+        pose.read_deeplabcut, pose.write_deeplabcut, "a folder of tables of DeepLabCut, one a camera"
+    ),
+    "sleap": Program(pose.read_sleap, pose.write_sleap, "a folder of analysis tables of SLEAP, one a camera"),
 }
 
 
@@ -80,14 +82,11 @@ def write_program(data: Dataset, path: str | Path, kind: str) -> list[str]:
         What the format could not hold, in sentences.
 
     Raises:
-        UsageError: There is no such program, or its files are read only.
+        UsageError: There is no such program.
         DatasetError: The format cannot hold the dataset.
         ImplicamError: The files cannot be written.
     """
     program = _find(kind)
-    if program.write is None:
-        writable = ", ".join(name for name, one in PROGRAMS.items() if one.write)
-        raise UsageError(f"files of {kind} are read, and not written.", fix=f"choose one of {writable}")
     cameras = tuple(replace(camera, width=None, height=None) for camera in data.cameras)  # pixels from 1 may be outside
     observations = replace(data.observations, cameras=cameras, uv=data.observations.uv + program.first_pixel)
     return program.write(replace(data, observations=observations), Path(path))

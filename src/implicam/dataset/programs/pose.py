@@ -11,9 +11,16 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from implicam.dataset.folder import csv_text, format_cells
+from implicam.dataset.model import Dataset
 from implicam.dataset.programs.views import Numbers, Views, files_of, pixel_number
 from implicam.dataset.tables import check_width, split_lines
 from implicam.errors import DatasetError
+from implicam.files import write_text
+
+ONLY_MARKER = "point"
 
 
 def read_deeplabcut(path: Path, positions: Sequence[Numbers]) -> Views:
@@ -85,6 +92,89 @@ def read_sleap(path: Path, positions: Sequence[Numbers]) -> Views:
                 _add(views, name, file.stem, f"{file}, line {line}", values)
                 views.describe(name, frame=frame, marker=" ".join(word for word in (track, node) if word))
     return views
+
+
+def write_deeplabcut(data: Dataset, path: Path) -> list[str]:
+    """Write a table for each camera, CAMERADLC.csv, as DeepLabCut has them for one animal.
+
+    Args:
+        data: The dataset; its columns `frame` and `marker` say what each point is. Without them a point is a frame.
+        path: The folder.
+
+    Returns:
+        What it could not hold, in sentences.
+
+    Raises:
+        ImplicamError: A file cannot be written.
+    """
+    key_points = _KeyPoints(data)
+    head = [
+        ["scorer", *["implicam"] * (3 * len(key_points.markers))],
+        ["bodyparts", *(marker for marker in key_points.markers for _ in range(3))],
+        ["coords", *["x", "y", "likelihood"] * len(key_points.markers)],
+    ]
+    for c, camera in enumerate(data.observations.camera_names):
+        write_text(path / f"{camera}DLC.csv", csv_text(head[0], [*head[1:], *key_points.rows(c)]))
+    return key_points.notes
+
+
+def write_sleap(data: Dataset, path: Path) -> list[str]:
+    """Write a table for each camera, CAMERA.csv, as SLEAP exports the analysis of one animal.
+
+    Args:
+        data: The dataset; its columns `frame` and `marker` say what each point is. Without them a point is a frame.
+        path: The folder.
+
+    Returns:
+        What it could not hold, in sentences.
+
+    Raises:
+        ImplicamError: A file cannot be written.
+    """
+    key_points = _KeyPoints(data)
+    header = ["track", "frame_idx", "instance.score"]
+    header += [f"{marker}.{axis}" for marker in key_points.markers for axis in ("x", "y", "score")]
+    for c, camera in enumerate(data.observations.camera_names):
+        rows = [["", row[0], "", *row[1:]] for row in key_points.rows(c)]
+        write_text(path / f"{camera}.csv", csv_text(header, rows))
+    return key_points.notes
+
+
+class _KeyPoints:
+    """The points of a dataset as markers in frames, and what such a table cannot hold."""
+
+    def __init__(self, data: Dataset) -> None:
+        columns = data.columns if data.known is None else data.known.extra
+        self._data, self.notes = data, []
+        at = list(zip(columns.get("frame", ()), columns.get("marker", ()), strict=True))
+        if len(set(at)) == len(data) and all(frame.isdecimal() and marker for frame, marker in at):
+            frames, of_points = [int(frame) for frame, _ in at], [str(marker) for _, marker in at]
+        else:
+            frames, of_points = list(range(len(data))), [ONLY_MARKER] * len(data)
+            self.notes.append(
+                f"Each point is a frame, numbered from 0, of one marker {ONLY_MARKER!r}; names of points are lost."
+            )
+        if data.known is not None:
+            self.notes.append("Known positions are not in it: keep the dataset for them.")
+        self.markers = list(dict.fromkeys(of_points))
+        self._frames = sorted(set(frames))
+        row = {frame: i for i, frame in enumerate(self._frames)}
+        self._at = [row[frame] for frame in frames], [self.markers.index(marker) for marker in of_points]
+
+    def rows(self, camera: int) -> list[list[str]]:
+        """Of each frame its number, then u, v and the likelihood of each marker, empty where it was not seen."""
+        observations = self._data.observations
+        stated = observations.extra.get("likelihood")
+        likelihood = stated[:, camera] if stated is not None else np.full(len(self._data), "")
+        pixels, seen = observations.uv[:, camera], observations.seen[:, camera]
+        cells = [[["", "", ""] for _ in self.markers] for _ in self._frames]
+        for i, (frame, marker) in enumerate(zip(*self._at, strict=True)):
+            if seen[i]:
+                cells[frame][marker] = [*format_cells(pixels[i]), str(likelihood[i]) or "1"]
+        return [
+            [str(frame), *(cell for three in row for cell in three)]
+            for frame, row in zip(self._frames, cells, strict=True)
+        ]
 
 
 def _add(views: Views, name: str, camera: str, place: str, cells: dict[str, str]) -> None:
