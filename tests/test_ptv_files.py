@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from implicam.errors import DatasetError, ImplicamError, UsageError
-from implicam.exchange import UNKNOWN_UNIT, WRITTEN, ExplicitCamera, Rig, export_cameras, import_cameras
+from implicam.errors import DatasetError, ImplicamError
+from implicam.exchange import UNKNOWN_UNIT, ExplicitCamera, Rig, export_cameras, import_cameras
 from implicam.geometry import Pose, look_at
 from implicam.lenses import BrownConrady
 from test_exchange import damaged, points, random_rig
@@ -283,9 +283,10 @@ def test_the_calibration_of_qualisys_is_read(tmp_path):
     assert seen[1, 1] < 510  # y is up
     assert any("not active: 26002" in note for note in rig.notes)
     assert any("half a pixel" in note for note in rig.notes)
-    with pytest.raises(UsageError, match="qualisys is read, and not written"):
-        export_cameras(rig, "qualisys", tmp_path / "x")
-    assert "qualisys" not in WRITTEN
+    export_cameras(rig, "qualisys", tmp_path / "again.qca.txt")
+    (again,) = import_cameras(tmp_path / "again.qca.txt").cameras
+    assert (again.name, again.size, again.lens) == (camera.name, camera.size, camera.lens)
+    np.testing.assert_allclose(again.pixel_from_world(before)[0], seen, atol=1e-9)
     path.write_text(path.read_text().replace(' centerPointU="60800"', ""))
     with pytest.raises(DatasetError, match=r"camera 26001: intrinsic: 'centerPointU' is missing"):
         import_cameras(path)

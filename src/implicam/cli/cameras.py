@@ -15,10 +15,10 @@ from implicam.cli.app import Json, command, must_be_calibration, must_be_folder,
 from implicam.cli.options import Options, OptionsOfParts, options_of_fields
 from implicam.dataset.table_options import TableOptions
 from implicam.errors import UsageError, did_you_mean
-from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, WRITTEN, export_cameras, import_cameras
+from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, export_cameras, import_cameras
 from implicam.exchange.pixel_maps import MAPS_FORMAT, write_maps
 
-NAMES = (*WRITTEN, MAPS_FORMAT)
+NAMES = (*FORMATS, MAPS_FORMAT)
 
 
 def _map_options() -> Options:

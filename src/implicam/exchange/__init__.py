@@ -35,7 +35,6 @@ __all__ = [
     "FOLDERS",
     "FORMATS",
     "UNKNOWN_UNIT",
-    "WRITTEN",
     "ExplicitCamera",
     "Format",
     "Rig",
@@ -52,13 +51,12 @@ Read = Callable[[Sequence[Path]], Rig]
 class Format:
     """How a format is written, how it is read, how it is recognised, and what it is in a few words.
 
-    write: gives notes, each a sentence on what the format lost or cost; none where it holds everything. None of a
-        format that is only read.
+    write: gives notes, each a sentence on what the format lost or cost; none where it holds everything.
     read: takes the files or folders that belong together.
     knows: whether what is given is of this format, by its content.
     """
 
-    write: Write | None
+    write: Write
     read: Read
     knows: Callable[[Source], bool]
     what: str
@@ -82,7 +80,7 @@ def _one_file(read: Callable[[Path], Rig]) -> Read:
 
 FORMATS = {
     "colmap": Format(colmap.write, _one_file(colmap.read), colmap.knows, "COLMAP's model, a folder"),
-    "qualisys": Format(None, _one_file(qualisys.read), qualisys.knows, "Qualisys's .qca.txt"),
+    "qualisys": Format(qualisys.write, _one_file(qualisys.read), qualisys.knows, "Qualisys's .qca.txt", True),
     "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml"),
     "caliscope": Format(caliscope.write, _one_file(caliscope.read), caliscope.knows, "caliscope's camera_array.toml"),
     "pose2sim": Format(
@@ -110,9 +108,6 @@ FORMATS = {
 }
 """In the order in which they are tried on a file: first the one that may be binary, and is known by names of files."""
 
-WRITTEN = tuple(name for name, form in FORMATS.items() if form.write)
-"""The names of those that are written too."""
-
 FOLDERS = ("colmap", "easymocap", "ros", "openptv", "myptv")
 """The names of those that are a folder when they are written."""
 
@@ -134,8 +129,6 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
         ImplicamError: The file cannot be written.
     """
     form = _find_format(to)
-    if form.write is None:
-        raise UsageError(f"{to} is read, and not written.", fix=f"choose one of {', '.join(WRITTEN)}")
     for camera in rig.cameras:
         if not (form.fits_lenses or isinstance(camera.lens, BrownConrady | KannalaBrandt)):
             raise DatasetError(

@@ -17,14 +17,13 @@ from pathlib import Path
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
 from implicam.exchange.checks import MAX_CAMERAS, check_text, get_entry, list_names, read_integer, shorten
-from implicam.exchange.fits import fit_four_coefficients
+from implicam.exchange.fits import nearest_brown_conrady
 from implicam.exchange.folders import write_folder
-from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.model import UNKNOWN_UNIT, Rig
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source, read_yaml
 from implicam.exchange.storage import lens_lines, matrix_lines, read_lens, read_pose
 from implicam.geometry import vector_from_rotation
-from implicam.lenses import BrownConrady, Lens
 
 INTRINSICS_FILE, EXTRINSICS_FILE = "intri.yml", "extri.yml"
 
@@ -49,7 +48,7 @@ def write(rig: Rig, path: Path) -> list[str]:
     listed = ["%YAML:1.0", "---", "names:", *(f"  - {json.dumps(name)}" for name in names)]
     intrinsics, extrinsics, notes = list(listed), list(listed), []
     for name, camera in zip(names, rig.cameras, strict=True):
-        lens, lost = _choose_lens(camera)
+        lens, lost = nearest_brown_conrady(camera, "EasyMocap")
         notes += lost
         pose = camera.camera_from_world
         intrinsics += lens_lines(lens, f"K_{name}", f"dist_{name}")
@@ -62,13 +61,6 @@ def write(rig: Rig, path: Path) -> list[str]:
     if names != [camera.name for camera in rig.cameras]:
         notes.append("What is no letter or digit in camera names became _.")
     return [f"EasyMocap's files have no unit: lengths are in {rig.length_unit}.", *notes]
-
-
-def _choose_lens(camera: ExplicitCamera) -> tuple[Lens, list[str]]:
-    if isinstance(camera.lens, BrownConrady):
-        return camera.lens, []
-    lens, cost = fit_four_coefficients(camera)
-    return lens, [f"Camera {camera.name!r}: EasyMocap has no fisheye; fitted again with k1, k2, p1, p2: {cost}."]
 
 
 def knows(source: Source) -> bool:

@@ -151,6 +151,25 @@ def fit_four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | 
     return found, cost
 
 
+def nearest_brown_conrady(camera: ExplicitCamera, program: str) -> tuple[BrownConrady, list[str]]:
+    """The lens of a program that has k1, k2, p1, p2, k3 and no fisheye: its own, or the nearest with the first four.
+
+    Args:
+        camera: With its image size.
+        program: The program's name, for the note.
+
+    Returns:
+        The lens; and a note on what another one costs.
+
+    Raises:
+        DatasetError: It is off by more than `MAX_LENS_DIFFERENCE_PX` pixels somewhere.
+    """
+    if isinstance(camera.lens, BrownConrady):
+        return camera.lens, []
+    lens, cost = fit_four_coefficients(camera)
+    return lens, [f"Camera {camera.name!r}: {program} has no fisheye; fitted again with k1, k2, p1, p2: {cost}."]
+
+
 def projection_matrix(camera: ExplicitCamera) -> Floats:
     """The projection matrix of the camera without its distortion.
 

@@ -1,4 +1,4 @@
-"""`qualisys`: the calibration that QTM (Qualisys) exports, NAME.qca.txt, which is XML. Read only.
+"""`qualisys`: the calibration that QTM (Qualisys) exports, NAME.qca.txt, which is XML.
 
     cameras/camera    serial, model, active
       fov_video       left, top, right, bottom: what of the sensor the pictures show
@@ -12,20 +12,24 @@ of the first one. Pose2Sim divides the distortion by 64 as well, which real file
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from implicam.dataset.tables import naming
 from implicam.errors import DatasetError
 from implicam.exchange.checks import MAX_CAMERAS, get_entry, lens_from_matrix, list_names, read_numbers, rotation_matrix
+from implicam.exchange.fits import nearest_brown_conrady
 from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source, read_xml
+from implicam.files import write_text
 from implicam.geometry import Pose
 
 UNITS_PER_PIXEL = 64.0
+HALF_PIXEL = "Qualisys does not say where in a pixel its coordinates begin: half a pixel is not known."
 FROM_Y_UP = np.diag([1.0, -1.0, -1.0])
 
 INTRINSICS = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew")
@@ -37,6 +41,44 @@ DISTORTION = (
     "radialDistortion3",
 )
 ROTATION = tuple(f"r{row}{column}" for row in "123" for column in "123")
+
+
+def write(rig: Rig, path: Path) -> list[str]:
+    """Write the file, in millimetres; names are written as serial numbers.
+
+    Args:
+        rig: The cameras, all with image sizes, in a known unit.
+        path: The file.
+
+    Returns:
+        Notes on the unit, on half a pixel, and on what refitting a lens cost in pixels.
+
+    Raises:
+        DatasetError: The unit or an image size is not known, or a fisheye is too wide.
+        ImplicamError: The file cannot be written.
+    """
+    root = Element("calibration", source="implicam", type="regular")
+    cameras, notes = SubElement(root, "cameras"), [HALF_PIXEL]
+    for camera in rig.in_unit("mm").cameras:
+        lens, lost = nearest_brown_conrady(camera, "Qualisys")
+        notes += lost
+        width, height = camera.size
+        element = SubElement(cameras, "camera", active="1", serial=camera.name, model="implicam", viewrotation="0")
+        SubElement(element, "fov_video", left="0", top="0", right=str(width - 1), bottom=str(height - 1))
+        pose = camera.camera_from_world
+        turn = dict(zip(ROTATION, (FROM_Y_UP @ pose.rotation).ravel(), strict=True))
+        SubElement(element, "transform", _texts({**dict(zip("xyz", pose.centre, strict=True)), **turn}))
+        linear = [UNITS_PER_PIXEL * value for value in (lens.fx, lens.fy, lens.cx, lens.cy, 0.0)]
+        ends = {"sensorMinU": 0, "sensorMinV": 0, "sensorMaxU": 64 * width - 1, "sensorMaxV": 64 * height - 1}
+        distortion = dict(zip(DISTORTION, astuple(lens)[4:], strict=True))
+        SubElement(element, "intrinsic", _texts({**dict(zip(INTRINSICS, linear, strict=True)), **ends, **distortion}))
+    indent(root)
+    write_text(path, '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n")
+    return notes if rig.length_unit == "mm" else [*notes, f"Lengths are in mm; the rig's unit was {rig.length_unit}."]
+
+
+def _texts(numbers: dict[str, float]) -> dict[str, str]:
+    return {key: repr(value if isinstance(value, int) else float(value)) for key, value in numbers.items()}
 
 
 def knows(source: Source) -> bool:
@@ -67,7 +109,7 @@ def read(path: Path) -> Rig:
             f"{path}: {len(active)} of {len(elements)} cameras are active.",
             fix="calibrate in QTM, and export the calibration again",
         )
-    cameras, notes = [], ["Qualisys does not say where in a pixel its coordinates begin: half a pixel is not known."]
+    cameras, notes = [], [HALF_PIXEL]
     for i, element in enumerate(active):
         camera, said = _read_camera(element, f"{path}: camera {element.get('serial', i)}")
         cameras.append(camera)
