@@ -448,3 +448,18 @@ def test_settings_that_do_nothing_are_told() -> None:
         notes[preset] = fit.notes()
     assert notes["paper"] == ["first", "The preset paper has no use for the settings point_folds."]
     assert notes["joint"] == ["first", "The preset joint has no use for the settings wide_from_degrees."]
+
+
+@pytest.mark.parametrize("preset", ["smooth", "plain"])
+def test_what_inverse_gp_calls_idle_changes_nothing(preset: str) -> None:
+    """And what it does not call so may: each idle setting, doubled, leaves every number as it is."""
+    calibrator = ic.InverseGP(preset=preset)
+    doubled = {name: 2 * getattr(calibrator.settings, name) for name in calibrator.idle_settings}
+    changed = ic.InverseGP(preset=preset, settings=ic.InverseGPSettings(**doubled))
+    assert changed.idle_settings == calibrator.idle_settings
+    fit, usual = changed.fit(known()), calibrator.fit(known())
+    a, b = (calibration.measure(known().observations) for calibration in (fit, usual))
+    np.testing.assert_array_equal(a.xyz, b.xyz)
+    np.testing.assert_array_equal(a.cov, b.cov)
+    (told,) = set(fit.notes()) - set(usual.notes())
+    assert told == f"The preset {preset} has no use for the settings {', '.join(sorted(doubled))}."

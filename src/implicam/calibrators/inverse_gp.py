@@ -32,7 +32,7 @@ from implicam.calibrators.every_camera import (
     scalings,
     seen_by_all,
 )
-from implicam.calibrators.inverse_gp_settings import DEFAULT_SETTINGS, InverseGPSettings
+from implicam.calibrators.inverse_gp_settings import DEFAULT_SETTINGS, OF_PAPER_PRESET, OF_SMOOTH, InverseGPSettings
 from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps, is_principal, learn_smooth
 from implicam.calibrators.pixel_cloud import PixelCloud
 from implicam.calibrators.position_processes import PositionProcess, PositionProcesses
@@ -133,6 +133,12 @@ class InverseGP(CalibratorBase):
     def library(self) -> tuple[str, str] | None:
         """The paper's preset is trained with the paper's software."""
         return ("gpytorch", "paper") if self.preset == "paper" else None
+
+    @property
+    def idle_settings(self) -> frozenset[str]:
+        """Names of the settings that do nothing with this preset."""
+        used_by = {"smooth": OF_SMOOTH, "paper": OF_PAPER_PRESET}
+        return frozenset(name for preset, names in used_by.items() if preset != self.preset for name in names)
 
     def fit(self, data: Dataset, progress: Progress = silent) -> InverseGPCalibration:
         """Fit to the points that every camera saw; the others are listed in `unused`, with the reason.
@@ -402,6 +408,7 @@ class InverseGPCalibration(CalibrationBase):
             *flat,
             *lattice_note(self.data, self.method, self.calibrator.settings),
             *self._suspects(),
+            *self.calibrator.idle_settings_note(),
         ]
 
     @cached_property

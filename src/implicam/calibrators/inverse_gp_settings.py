@@ -53,5 +53,21 @@ class InverseGPSettings(EveryCameraSettings):
     """Learning rate of Adam, of GPyTorch's own tutorial."""
 
 
+OF_SMOOTH = (
+    "axis_lengthscale_prior_median_sds",
+    "pixel_lengthscale_prior_median_sds",
+    "common_lengthscale_prior_log_sd",
+    "own_lengthscale_prior_log_sd",
+    "max_points_for_both_bases",
+    "min_residuals",
+    "max_distance_ratio",
+    "max_plane_distance_ratio",
+    "min_points_for_curved_sheet",
+)
+"""That the preset `smooth` alone uses."""
+
+OF_PAPER_PRESET = ("paper_training_steps", "paper_learning_rate")
+"""That the preset `paper` alone uses."""
+
 DEFAULT_SETTINGS = InverseGPSettings()
 """What `InverseGP()` uses."""

@@ -356,6 +356,13 @@ class CalibratorBase:
         """Names of the settings that do nothing with these options: none."""
         return frozenset()
 
+    def idle_settings_note(self) -> list[str]:
+        """A note on the settings that somebody set and that do nothing with this preset; empty where there is none."""
+        set_in_vain = sorted(getattr(self, SETTINGS).changed().keys() & self.idle_settings)
+        if not set_in_vain:
+            return []
+        return [f"The preset {self.preset} has no use for the settings {', '.join(set_in_vain)}."]  # type: ignore[attr-defined]
+
     def as_table(self) -> dict[str, Any]:
         """The options and all settings, as a calibration file keeps them; without options that are datasets."""
         given = ((field, getattr(self, field.name)) for field in fields(self) if not _is_dataset(field))  # type: ignore[arg-type]

@@ -277,10 +277,7 @@ class ExplicitCalibration(RigCalibration):
 
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        changed = self.calibrator.settings.changed()
-        idle = sorted(changed.keys() & self.calibrator.idle_settings)
-        told = [f"The preset {self.calibrator.preset} has no use for the settings {', '.join(idle)}."] if idle else []
-        return [*self.fitted.notes, *told]
+        return [*self.fitted.notes, *self.calibrator.idle_settings_note()]
 
     def summary(self) -> FitSummary:
         """Leave-one-out errors of the known points; of each camera the lens model and the noise."""
