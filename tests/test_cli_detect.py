@@ -199,3 +199,38 @@ def test_a_board_from_photograph_to_numbered_corners(tmp_path: Path, cli: Cli) -
     error = found.uv[seen] - true_uv
     assert np.abs(error).max() < 0.5  # a wrong number would be off by a square, 40 pixels
     assert np.sqrt(np.mean(error**2)) < 0.1
+
+
+@pytest.mark.slow
+def test_pictures_called_left1_and_right1_become_a_calibration(tmp_path: Path, cli: Cli) -> None:
+    """Nothing but a folder of pictures: names, [target] and the square are all that `explicit` asks for."""
+    made, folder = tmp_path / "made", tmp_path / "pictures"
+    words = ["--rig", "stereo", "--target", "boards", "--each", "2", "--pairs", "4", "--seed", "3"]
+    assert cli("simulate", made, "--images", *words)[0] == 0
+    folder.mkdir()
+    for camera, side in (("cam1", "left"), ("cam2", "right")):
+        for path in (made / "images" / camera).iterdir():
+            shutil.copy(path, folder / f"{side}{int(path.stem.removeprefix('held'))}.png")
+    code, _, err = cli(
+        "detect", folder, "--target", "board", "--board", "8x11", "--square", "13.29", "--unit", "mm", "--no-overlays"
+    )
+    assert code == 0
+    assert "left1.png is shot '1' of camera 'left'" in err
+    data = read_dataset(folder)
+    assert data.observations.camera_names == ("left", "right")
+    assert data.extra["target"] == {"kind": "board", "rows": 8, "columns": 11, "square": 13.29}
+    assert cli("calibrate", folder, "-o", tmp_path / "rig.implicam", "--force")[0] in (0, 1)
+    assert (tmp_path / "rig.implicam").exists()
+
+
+def test_corners_without_a_board_say_what_is_missing(tmp_path: Path, cli: Cli) -> None:
+    """dataset.toml without [target], as detect wrote it before: the error names it, and not points.csv."""
+    (tmp_path / "dataset.toml").write_text(
+        'name = "a"\nlength_unit = "mm"\n[[cameras]]\nname = "left"\n[[cameras]]\nname = "right"\n'
+    )
+    rows = [f"1-c{k:03d},{c},{100 + 9 * k},{50 + 7 * (k % 3)}" for k in range(1, 10) for c in ("left", "right")]
+    (tmp_path / "observations.csv").write_text("\n".join(["point,camera,u,v", *rows]) + "\n")
+    code, _, err = cli("calibrate", tmp_path, "--method", "explicit", "-o", tmp_path / "x.implicam")
+    assert code == 1
+    assert "[target]" in err
+    assert "implicam detect writes it" in err

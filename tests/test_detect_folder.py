@@ -782,3 +782,66 @@ def test_text_that_no_font_has_is_no_problem():
     found = nothing("Grüße 漢字 \x00 \ud800 ∞ " * 3)
     canvas = draw_overlay(np.full((90, 120), 128, np.uint8), Result(View("Kamera Süd", "漢字"), Path("x"), found))
     assert canvas.shape[1] >= 560
+
+
+@dataclass(frozen=True)
+class SpotOnBoard(Spot):
+    """It says that what it looks for is a board."""
+
+    square: float | None = 20.0
+
+    def describe(self):
+        return {"kind": "board", "rows": 3, "columns": 4} | ({"square": self.square} if self.square else {})
+
+
+def target_after(folder, text=None, detector=None):
+    """[target] of dataset.toml after a run; text: what a person wrote into it."""
+    for camera in (1, 2):
+        put(folder / "images" / f"cam{camera}" / "p1.png", photograph(place(camera, 1)))
+    if text is not None:
+        (folder / "dataset.toml").write_text(text)
+    unit = None if text else "mm"
+    run = detect_folder(folder, detector or SpotOnBoard(), unit=unit, overlays=False)
+    return read_dataset(folder).extra.get("target"), run.notes
+
+
+BY_HAND = 'name = "mine"  # my rig\nlength_unit = "mm"\n[[cameras]]\nname = "cam1"\n[[cameras]]\nname = "cam2"\n'
+WHOLE = {"kind": "board", "rows": 3, "columns": 4, "square": 20.0}
+
+
+def test_the_board_is_written_where_a_calibration_looks_for_it(tmp_path):
+    assert target_after(tmp_path / "new")[0] == WHOLE
+    target, notes = target_after(tmp_path / "told", BY_HAND)
+    assert target == WHOLE
+    assert any("now says what was looked for" in note for note in notes)
+    assert (tmp_path / "told" / "dataset.toml").read_text().startswith(BY_HAND.rstrip())
+    part = (
+        'name = "a"\nlength_unit = "mm"\n[target]  # the old board\nkind = "board"\nrows = 3\n'
+        + BY_HAND[BY_HAND.index("[[") :]
+    )
+    assert target_after(tmp_path / "part", part)[0] == WHOLE
+    assert "# the old board" in (tmp_path / "part" / "dataset.toml").read_text()
+    before = (tmp_path / "part" / "dataset.toml").read_bytes()
+    assert target_after(tmp_path / "part", before.decode(), SpotOnBoard(square=20.0000001))[0] == WHOLE
+    assert (tmp_path / "part" / "dataset.toml").read_bytes() == before
+
+
+def test_a_square_of_unknown_size_is_told_and_can_be_given_later(tmp_path):
+    target, notes = target_after(tmp_path, detector=SpotOnBoard(square=None))
+    assert target == {"kind": "board", "rows": 3, "columns": 4}
+    assert any("--square" in note for note in notes)
+    assert target_after(tmp_path, (tmp_path / "dataset.toml").read_text())[0] == WHOLE
+
+
+def test_a_board_that_contradicts_dataset_toml_is_refused_before_the_work(tmp_path):
+    said = BY_HAND + '[target]\nkind = "board"\nrows = 3\ncolumns = 4\nsquare = 25.0\n'
+    with pytest.raises(UsageError, match=r"square = 25\.0, and detect was told 20\.0"):
+        target_after(tmp_path / "a", said)
+    assert not (tmp_path / "a" / "observations.csv").exists()
+    in_metres = BY_HAND.replace('"mm"', '"m"')
+    with pytest.raises(UsageError, match=r"20 m is no size for a board"):
+        target_after(tmp_path / "b", in_metres)
+    other = BY_HAND + '[target]\nkind = "ball"\nradius = 8.0\n'
+    target, notes = target_after(tmp_path / "c", other)
+    assert target == {"kind": "ball", "radius": 8.0}
+    assert any("another one" in note for note in notes)

@@ -563,7 +563,7 @@ def spoilt_target(target: dict[str, Any] | None) -> Dataset:
         ({"kind": "board", "rows": 8, "columns": 11, "square": 0.0}, "square = 0.0 must be a length"),
         ({"kind": "dots"}, "is no board, or not there"),
         ({"kind": "board", "rows": "eight", "columns": 11, "square": 13.0}, "does not describe a board"),
-        ({"kind": "board", "rows": 4, "columns": 5, "square": 13.0}, "is no corner of a board of 4 x 5"),
+        ({"kind": "board", "rows": 4, "columns": 5, "square": 13.0}, "is no corner of a board of 20 corners"),
     ],
 )
 def test_a_board_that_is_not_described_is_a_clear_error(target: dict[str, Any] | None, what: str) -> None:

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from implicam.errors import ImageError, UsageError
-from implicam.images import blank, eight_bit, find_pictures, in_order, one_thread_each, read_picture, write_picture
+from implicam.images import blank, eight_bit, one_thread_each, read_picture, write_picture
+from implicam.picture_names import find_pictures, in_order
 
 cv2 = pytest.importorskip("cv2")
 

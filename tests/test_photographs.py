@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("cv2")
 
 from implicam.errors import UsageError
-from implicam.images import find_pictures, opencv, read_picture
+from implicam.images import opencv, read_picture
+from implicam.picture_names import find_pictures
 from implicam.simulate import Optics, Studio, build_rig, moving_board, random_positions, record, views
 from implicam.simulate.photographs import PADDING_PX, Occluder, lines_of_sight
 

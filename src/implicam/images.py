@@ -1,14 +1,12 @@
-"""Photographs: read one, whole or not at all; write one; find those of a dataset.
+"""Photographs: read one, whole or not at all; write one. Where those of a dataset are: picture_names.py.
 
-A picture is grey, float32, (height, width), from 0 (black) to 1 (what the file's bits can hold at most). Same file
-name = same instant. OpenCV is imported when the first picture is read.
+A picture is grey, float32, (height, width), from 0 (black) to 1 (what the file's bits can hold at most).
+OpenCV is imported when the first picture is read.
 """
 
 from __future__ import annotations
 
-import os
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,9 +22,6 @@ Grey = NDArray[np.float32]
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 MAX_PIXELS = 400_000_000
 MAX_BYTES = 2_000_000_000
-
-PATTERN = "{camera}/{shot}"
-"""Where the picture of a camera and a shot is, below the folder of images and without its ending."""
 
 
 def opencv() -> Any:
@@ -207,89 +202,3 @@ def blank(picture: Grey) -> str:
     if high - low > max(widest, 1e-6):
         return ""
     return "black" if high < 0.03 else "white" if low > 0.97 else "uniformly grey"
-
-
-def find_pictures(folder: Path, pattern: str = PATTERN, cameras: Sequence[str] = ()) -> dict[str, dict[str, Path]]:
-    """The files by camera and shot, both in natural order (2 before 10).
-
-    Hidden files and folders are left out.
-
-    Args:
-        folder: Where to look.
-        pattern: The path below `folder` with {camera} and {shot}, without the ending: "{camera}/{shot}" (a folder per
-            camera), "{shot}_{camera}", ...
-        cameras: Names to look for first, because in "cam_1_003" it is not clear where the camera ends.
-
-    Returns:
-        {camera: {shot: path}}.
-
-    Raises:
-        UsageError: The pattern lacks {camera} or {shot}.
-        ImageError: There are no pictures, or two files are the same camera and shot.
-    """
-    expression = _compile_pattern(pattern, cameras)
-    if not folder.is_dir():
-        raise ImageError(f"there is no folder {folder}.", fix="put the pictures of each camera into images/<camera>/")
-    found: dict[str, dict[str, Path]] = {}
-    for path in sorted(_walk_pictures(folder, pattern.count("/"))):
-        match = expression.fullmatch(path.relative_to(folder).with_suffix("").as_posix())
-        if match is None:
-            continue
-        shots = found.setdefault(match["camera"], {})
-        if match["shot"] in shots:
-            raise ImageError(
-                f"{shots[match['shot']]} and {path} are both the picture of shot {match['shot']!r}.",
-                why="the same name is the same instant",
-                fix="remove one of them",
-            )
-        shots[match["shot"]] = path
-    if not found:
-        raise ImageError(
-            f"{folder} holds no picture that fits the pattern {pattern!r}.",
-            why=f"looked for {', '.join(ENDINGS)}",
-            fix="put the pictures of each camera into images/<camera>/, or give --pattern, "
-            'for example --pattern "{shot}_{camera}"',
-        )
-    return {camera: {shot: found[camera][shot] for shot in in_order(found[camera])} for camera in in_order(found)}
-
-
-def _walk_pictures(folder: Path, depth: int) -> Iterator[Path]:
-    """The pictures so many folders down, behind links to folders on other disks too."""
-    for place, folders, names in os.walk(folder, followlinks=True):
-        here = Path(place)
-        if len(here.relative_to(folder).parts) < depth:
-            folders[:] = [name for name in folders if not name.startswith(".")]
-            continue
-        folders.clear()
-        for name in names:
-            path = here / name
-            if path.suffix.lower() in ENDINGS and not name.startswith(".") and path.is_file():
-                yield path
-
-
-def in_order(names: Sequence[str] | dict[str, Any]) -> list[str]:
-    """Names in natural order: img2 before img10.
-
-    Args:
-        names: In any order.
-    """
-
-    def key(name: str) -> tuple[list[str | int], str]:
-        parts = re.split(r"(\d+)", name)  # text, digits, text, digits, ..., text
-        return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
-
-    return sorted(names, key=key)
-
-
-def _compile_pattern(pattern: str, cameras: Sequence[str]) -> re.Pattern[str]:
-    for word in ("{camera}", "{shot}"):
-        if pattern.count(word) != 1:
-            raise UsageError(
-                f"the pattern {pattern!r} must contain {word} once.",
-                why="a picture belongs to one camera and one shot",
-                fix='write for example "{camera}/{shot}" or "{shot}_{camera}"',
-            )
-    pattern = next((pattern.removesuffix(ending) for ending in ENDINGS if pattern.endswith(ending)), pattern)
-    camera = "|".join([*map(re.escape, sorted(cameras, key=len, reverse=True)), "[^/]+?"])
-    text = re.escape(pattern).replace(r"\{camera\}", f"(?P<camera>{camera})").replace(r"\{shot\}", "(?P<shot>[^/]+)")
-    return re.compile(text)

@@ -11,11 +11,9 @@ import typer
 from implicam.cli import show
 from implicam.cli.app import Json, command, command_line
 from implicam.cli.options import OptionsOfParts
-from implicam.dataset.folder import IMAGES
 from implicam.detect import TARGETS, DetectionRun, detect_folder, detector_from_options, options_of
 from implicam.detect.folder import DETECTIONS
 from implicam.errors import UsageError
-from implicam.images import PATTERN
 from implicam.logs import LOG, log_to_file
 
 
@@ -28,10 +26,12 @@ def _detect(
     target: Annotated[
         str | None, typer.Option(metavar="NAME", help=f"{', '.join(TARGETS)} (default: what dataset.toml says).")
     ] = None,
-    pictures: Annotated[str, typer.Option("--pictures", metavar="FOLDER", help="Where they are in DATASET.")] = IMAGES,
+    pictures: Annotated[
+        str | None, typer.Option("--pictures", metavar="FOLDER", help="Where they are in DATASET (default images).")
+    ] = None,
     pattern: Annotated[
-        str, typer.Option(metavar="PATTERN", help="How their names tell camera and shot, without ending.")
-    ] = PATTERN,
+        str | None, typer.Option(metavar="PATTERN", help='How their names tell camera and shot: "{shot}_{camera}".')
+    ] = None,
     overlays: Annotated[bool, typer.Option(help="Draw what was found, to check by eye.")] = True,
     restart: Annotated[bool, typer.Option("--restart", help="Forget what an earlier run found.")] = False,
     unit: Annotated[

@@ -386,7 +386,9 @@ class Dataset:
             raise DatasetError(
                 f"dataset {self.name!r} has no known positions.",
                 why="there is no points.csv (in a table of one file: no columns named x, y and z, in small letters)",
-                fix="add points.csv with point,shot,x,y,z, or the columns x, y and z; without them a dataset can only "
+                fix="calibrate from its boards alone: --method explicit; or add points.csv with point,shot,x,y,z"
+                if isinstance(self.extra.get("target"), Mapping) and "rows" in self.extra["target"]
+                else "add points.csv with point,shot,x,y,z, or the columns x, y and z; without them a dataset can only "
                 "be measured",
             )
         return self.known

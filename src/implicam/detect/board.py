@@ -20,6 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from implicam.dataset import Floats
+from implicam.dataset.boards import corner_name
 from implicam.detect.grid import Grid, grow_grid, join_grids
 from implicam.detect.model import Detected, DetectorBase, Inferred, View, nothing
 from implicam.detect.numbering import END, MORE, Numbering, Sides, find_numberings, find_sides
@@ -44,7 +45,7 @@ MIN_CORNERS_OF_ANOTHER = 12
 
 @dataclass(frozen=True)
 class Board(DetectorBase):
-    """A checkerboard with rows x columns inner corners, and squares of `square` millimetres.
+    """A checkerboard with rows x columns inner corners, and squares of `square` in the dataset's unit, None if unknown.
 
     rows + columns must be odd: a board whose half turn looks the same cannot be numbered. infer: place the hidden
     corners, too, as `Detected.inferred`. refine: move each corner to where it and all others together say it is; its
@@ -53,7 +54,7 @@ class Board(DetectorBase):
 
     rows: int = 8
     columns: int = 11
-    square: float = 13.29
+    square: float | None = 13.29
     infer: bool = False
     refine: bool = False
 
@@ -64,8 +65,8 @@ class Board(DetectorBase):
                 why="rows and columns are those of the corners between squares, from 3 to 200",
                 fix="for example 8 x 11",
             )
-        if not (np.isfinite(self.square) and self.square > 0):
-            raise UsageError(f"square = {self.square} mm; it must be positive.", fix="measure the edge of a square")
+        if self.square is not None and not (np.isfinite(self.square) and self.square > 0):
+            raise UsageError(f"square = {self.square}; it must be positive.", fix="measure the edge of a square")
         if (self.rows + self.columns) % 2 == 0:
             raise UsageError(
                 f"a board of {self.rows} x {self.columns} inner corners looks the same upside down.",
@@ -80,7 +81,7 @@ class Board(DetectorBase):
         described: Mapping[str, Any],
         *,
         board: Annotated[str | None, Option("inner corners, 8x11", "RxC")] = None,
-        square: Annotated[float | None, Option("edge of a square", "MM", 0)] = None,
+        square: Annotated[float | None, Option("edge of a square, in the dataset's unit", "LENGTH", 0)] = None,
         infer: Annotated[bool, Option("write where hidden corners must be to detections/inferred.csv")] = False,
         refine: Annotated[bool, Option("move each corner to where all together say; not for calibration")] = False,
     ) -> Board:
@@ -90,7 +91,7 @@ class Board(DetectorBase):
             dataset: The dataset's folder.
             described: The table [target] of dataset.toml, whose rows and columns stand in for `board`.
             board: Inner corners, rows x columns: "8x11".
-            square: Edge of a square in millimetres.
+            square: Edge of a square in the dataset's unit.
             infer: Whether hidden corners are placed.
             refine: Whether corners are moved to where all together say they are.
 
@@ -98,11 +99,16 @@ class Board(DetectorBase):
             UsageError: The size is not known, or there can be no such board.
         """
         rows, columns = parse_board_size(board, described, "--board 8x11 (inner corners, rows x columns)")
-        return cls(rows, columns, float(square or 1.0), infer, refine)
+        return cls(rows, columns, float(square) if square else None, infer, refine)
 
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
         return {"target": "board", **asdict(self)}
+
+    def describe(self) -> dict[str, Any]:
+        """The board as [target] has it; without its square where that is not known."""
+        square = {} if self.square is None else {"square": self.square}
+        return {"kind": "board", "rows": self.rows, "columns": self.columns, **square}
 
     def detect(self, picture: Grey, view: View) -> Detected:
         """Find the corners of the board in one picture.
@@ -304,16 +310,6 @@ def parse_board_size(text: str | None, described: Mapping[str, Any], example: st
         raise UsageError(
             "the size of the board is not known." if text is None else f"--board {text!r} is not a size.", fix=example
         ) from None
-
-
-def corner_name(shot: str, number: int) -> str:
-    """The name that a corner has in points.csv.
-
-    Args:
-        shot: The name of the shot.
-        number: Of the corner, from 0; names count from 1.
-    """
-    return f"{shot}-c{number + 1:03d}"
 
 
 def explain_unusable(picture: Grey) -> str:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
+from implicam.dataset.boards import corner_name
 from implicam.detect.board import (
     MAX_SEARCH_PIXELS,
-    corner_name,
     explain_missing,
     explain_unusable,
     hull_of,
@@ -41,7 +41,7 @@ MAX_MARKER_OFF_SQUARES = 0.3
 
 @dataclass(frozen=True)
 class Charuco(DetectorBase):
-    """A ChArUco board of rows x columns SQUARES, edges of squares and markers in millimetres.
+    """A ChArUco board of rows x columns SQUARES, edges of squares and markers in the dataset's unit.
 
     dictionary: OpenCV's name of the set of markers. legacy: printed with OpenCV before 4.6, and an even number of rows.
     Corner 1 is the inner corner at the top left of the board as OpenCV draws it, and numbers run along the rows.
@@ -63,7 +63,7 @@ class Charuco(DetectorBase):
             )
         if not 0 < self.marker < self.square < np.inf:
             raise UsageError(
-                f"marker = {self.marker} mm and square = {self.square} mm do not go together.",
+                f"marker = {self.marker} and square = {self.square} do not go together.",
                 why="a marker lies inside of a square",
                 fix="measure the edges of both on the printed board",
             )
@@ -87,9 +87,10 @@ class Charuco(DetectorBase):
         described: Mapping[str, Any],
         *,
         board: Annotated[str | None, Option("squares, 9x12", "RxC")] = None,
-        square: Annotated[float | None, Option("edge of a square", "MM", 0)] = None,
-        marker: Annotated[float | None, Option("edge of a marker", "MM", 0)] = None,
+        square: Annotated[float | None, Option("edge of a square, in the dataset's unit", "LENGTH", 0)] = None,
+        marker: Annotated[float | None, Option("edge of a marker, in the dataset's unit", "LENGTH", 0)] = None,
         dictionary: Annotated[str | None, Option("OpenCV's name, such as DICT_5X5_100")] = None,
+        legacy: Annotated[bool, Option("printed with OpenCV before 4.6, an even number of rows")] = False,
     ) -> Charuco:
         """Make the detector from the options of the command line.
 
@@ -97,9 +98,10 @@ class Charuco(DetectorBase):
             dataset: The dataset's folder.
             described: The table [target] of dataset.toml, whose rows and columns stand in for `board`.
             board: Squares, rows x columns: "9x12".
-            square: Edge of a square in millimetres.
-            marker: Edge of a marker in millimetres.
+            square: Edge of a square in the dataset's unit.
+            marker: Edge of a marker in the dataset's unit.
             dictionary: OpenCV's name of the markers' dictionary; None for the default of the class.
+            legacy: Whether OpenCV before 4.6 drew it.
 
         Raises:
             UsageError: Something is missing, or there can be no such board.
@@ -107,13 +109,18 @@ class Charuco(DetectorBase):
         rows, columns = parse_board_size(board, described, "--board 9x12 (squares, rows x columns)")
         if not square or not marker:
             raise UsageError(
-                "a ChArUco board needs --square and --marker.", fix="measure both edges on the printed board, in mm"
+                "a ChArUco board needs --square and --marker.", fix="measure both edges on the printed board"
             )
-        return cls(rows, columns, float(square), float(marker), str(dictionary or cls.dictionary))
+        return cls(rows, columns, float(square), float(marker), str(dictionary or cls.dictionary), bool(legacy))
 
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
         return {"target": "charuco", **asdict(self)}
+
+    def describe(self) -> dict[str, Any]:
+        """The board as [target] has it."""
+        kind = {"kind": "charuco", **asdict(self)}
+        return kind if self.legacy else {key: value for key, value in kind.items() if key != "legacy"}
 
     def detect(self, picture: Grey, view: View) -> Detected:
         """Find the corners of the board in one picture.
@@ -180,7 +187,7 @@ class Charuco(DetectorBase):
         if not self._lie_in_their_places(board, names, middle):
             return _refuse(
                 f"the markers do not lie as on a ChArUco board of {self.rows} x {self.columns} squares. Give the size "
-                "that the board has (rows x columns of squares), or legacy for one printed with OpenCV before 4.6."
+                "that the board has (rows x columns of squares), or --legacy for one printed with OpenCV before 4.6."
             )
         if corners is None or ids is None or len(ids) == 0:
             return _refuse(f"{len(names)} markers were read, but no corner lies between two. Show more of it.")

@@ -13,6 +13,7 @@ What is wrong with one picture is a note, and the rest goes on. What a person wr
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import shutil
@@ -25,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, folder_files
+from implicam.dataset.boards import check_size
 from implicam.dataset.folder import DESCRIPTION, IMAGES, VIEWS, csv_text, read_description, read_known
 from implicam.dataset.model import check_name
 from implicam.dataset.tables import parse_toml
@@ -35,7 +37,8 @@ from implicam.detect.sheets import draw_sheets
 from implicam.errors import DatasetError, ImageError, UsageError, did_you_mean
 from implicam.files import replacing, toml_text, write_text
 from implicam.formatting import list_some
-from implicam.images import PATTERN, find_pictures, in_order, one_thread_each
+from implicam.images import one_thread_each
+from implicam.picture_names import find_pictures, in_order, sort_pictures
 from implicam.progress import Progress, silent
 
 DETECTIONS, JOURNAL_FILE, SUMMARY_FILE, WRITTEN_FILE = "detections", "journal.jsonl", "summary.csv", "written.toml"
@@ -86,8 +89,8 @@ def detect_folder(
     detector: Detector,
     *,
     unit: str | None = None,
-    pictures: str = IMAGES,
-    pattern: str = PATTERN,
+    pictures: str | None = None,
+    pattern: str | None = None,
     overlays: bool = True,
     restart: bool = False,
     correct: Correct | None = None,
@@ -101,8 +104,8 @@ def detect_folder(
         dataset: The folder. Without dataset.toml one is made.
         detector: What to look for.
         unit: The length unit of a dataset.toml that is made.
-        pictures: The folder of the pictures, below `dataset`.
-        pattern: How their names tell camera and shot, as `find_pictures` takes it.
+        pictures: The folder of the pictures, below `dataset`; None for `images`, or `dataset` where that is missing.
+        pattern: How their names tell camera and shot, as `find_pictures` takes it; None for what `sort_pictures` reads.
         overlays: Whether to draw pictures to check by eye.
         restart: Forget what an earlier run found.
         correct: What is done to the observations before they are written, instead of `detector.correct`.
@@ -113,7 +116,7 @@ def detect_folder(
         DatasetError: Dataset.toml or points.csv is damaged.
         ImageError: There are no pictures, or nothing was found in any of them.
     """
-    rig = _Rig.of(Path(dataset), unit, Path(dataset) / pictures, pattern)
+    rig = _Rig.of(Path(dataset), unit, pictures, pattern).showing(detector.describe())
     with one_thread_each():
         journal = rig.path / DETECTIONS / JOURNAL_FILE
         looked = detect_all(rig.pictures, detector, journal, restart=restart, progress=progress)
@@ -125,7 +128,7 @@ def detect_folder(
         more += _write_inferred(folder / INFERRED_FILE, results)
         if data is not None:
             data, said = (correct or detector.correct)(data)
-            more += [*said, *_write(rig, data)]
+            more += [*said, *_write(rig, data), *rig.explain_missing_size()]
         sheets, undrawn = draw_sheets(folder, results, progress, redraw=restart) if overlays else ((), ())
     if data is None:
         raise _nothing_found_error(rig, results, sheets)
@@ -157,16 +160,17 @@ class _Rig:
     notes: tuple[str, ...]
 
     @classmethod
-    def of(cls, path: Path, unit: str | None, pictures: Path, pattern: str) -> _Rig:
+    def of(cls, path: Path, unit: str | None, pictures: str | None, pattern: str | None) -> _Rig:
         described = read_description(path) if (path / DESCRIPTION).exists() else None
-        found = find_pictures(pictures, pattern, [camera.name for camera in described[2]] if described else ())
+        known = [camera.name for camera in described[2]] if described else []
+        found, read = _find_pictures(path, pictures, pattern, known)
         name, said, cameras, extra = described or _describe_folder(path, unit, found)
         if unit not in (None, said):
             raise UsageError(
                 f"{path / DESCRIPTION} is in {said!r}, not in {unit!r}.", fix="leave out --unit, or correct the file"
             )
         usable, notes = _choose_usable({camera.name for camera in cameras}, found, path)
-        return cls(path, name, said, cameras, extra, read_known(path), usable, tuple(notes))
+        return cls(path, name, said, cameras, extra, read_known(path), usable, (*read, *notes))
 
     def with_sizes(self, sizes: Mapping[str, tuple[int, int]]) -> _Rig:
         """With the image sizes that dataset.toml does not state: those of most of the pictures."""
@@ -175,6 +179,35 @@ class _Rig:
             width, height = sizes.get(camera.name, (None, None))
             cameras.append(replace(camera, width=camera.width or width, height=camera.height or height))
         return replace(self, cameras=tuple(cameras))
+
+    def showing(self, target: Mapping[str, Any]) -> _Rig:
+        """With [target] of dataset.toml as the detector describes it; UsageError where a person wrote otherwise. What
+        dataset.toml says of another kind of target stays."""
+        if not target:
+            return self
+        check_size(target, self.unit)
+        said = self.extra.get("target", {})
+        if not isinstance(said, Mapping) or said.get("kind", target["kind"]) != target["kind"]:
+            note = f"[target] of {DESCRIPTION} is another one, so a calibration from boards does not know of this one."
+            return replace(self, notes=(*self.notes, note))
+        for key, value in target.items():
+            if key in said and not _same(said[key], value):
+                raise UsageError(
+                    f"{self.path / DESCRIPTION} says of [target] {key} = {said[key]!r}, and detect was told {value!r}.",
+                    why="a calibration from boards goes by dataset.toml",
+                    fix="leave the option out, or correct the file",
+                )
+        return replace(self, extra={**self.extra, "target": {**target, **said}})
+
+    def explain_missing_size(self) -> list[str]:
+        """A note where dataset.toml has a board of unknown size."""
+        target = self.extra.get("target")
+        if not isinstance(target, Mapping) or target.get("kind") != "board" or "square" in target:
+            return []
+        return [
+            "the edge of a square is not known, and a calibration from boards needs it: give --square, in "
+            f"{self.unit}, or write square = ... below [target] in {DESCRIPTION}."
+        ]
 
     def relative(self, path: Path) -> str:
         """A file's name as a note gives it."""
@@ -185,6 +218,25 @@ class _Rig:
         if self.known is None:
             return None
         return int(np.count_nonzero(self.known[1].shots == view.shot)) or None
+
+
+def _same(said: Any, told: Any) -> bool:
+    """Whether two entries of [target] mean the same; lengths may be rounded."""
+    if isinstance(said, int | float) and isinstance(told, int | float):
+        return math.isclose(said, told, rel_tol=1e-6)
+    return bool(said == told)
+
+
+def _find_pictures(
+    path: Path, pictures: str | None, pattern: str | None, cameras: Sequence[str]
+) -> tuple[Mapping[str, Mapping[str, Path]], tuple[str, ...]]:
+    """The pictures by camera and shot, and what there is to say about how they were found."""
+    folder = path / (pictures or IMAGES)
+    if pictures is None and not folder.is_dir() and path.is_dir():
+        folder = path
+    if pattern is not None:
+        return find_pictures(folder, pattern, cameras), ()
+    return sort_pictures(folder, cameras, ignored=(DETECTIONS, IMAGES))
 
 
 def _describe_folder(
@@ -334,11 +386,9 @@ def _order_names(results: Iterable[Result]) -> dict[str, None]:
 def _write(rig: _Rig, data: Dataset) -> list[str]:
     """Write observations.csv, and dataset.toml where there is none; what a person wrote is kept beside it."""
     files = folder_files(data)
-    if not (rig.path / DESCRIPTION).exists():
-        write_text(rig.path / DESCRIPTION, files[DESCRIPTION])
+    notes = _write_description(rig, files[DESCRIPTION])
     target, record = rig.path / VIEWS, rig.path / DETECTIONS / WRITTEN_FILE
     new, old = _sha256(files[VIEWS].encode()), _sha256(target.read_bytes()) if target.exists() else ""
-    notes = []
     ours = [old] if old in (*_read_own_sums(record), new) else []
     if old and not ours:
         kept = _keep_copy(target)
@@ -347,6 +397,34 @@ def _write(rig: _Rig, data: Dataset) -> list[str]:
     write_text(record, toml_text({"observations_sha256": [*ours, new]}))
     write_text(target, files[VIEWS])
     return notes
+
+
+def _write_description(rig: _Rig, whole: str) -> list[str]:
+    """Write dataset.toml where there is none; where there is one, add what it does not say of the target."""
+    path = rig.path / DESCRIPTION
+    if not path.exists():
+        write_text(path, whole)
+        return []
+    text = path.read_text(encoding="utf-8")
+    was, wanted = parse_toml(text).get("target"), rig.extra.get("target")
+    if was == wanted or not isinstance(wanted, Mapping):
+        return []
+    lines = toml_text({key: value for key, value in wanted.items() if not isinstance(was, Mapping) or key not in was})
+    if was is None:
+        text = f"{text.rstrip()}\n\n[target]\n{lines}"
+    else:
+        text = re.sub(r"(?m)^\s*\[\s*target\s*\].*$\n?", lambda match: f"{match[0].rstrip()}\n{lines}", text, count=1)
+    if _target_of(text) != wanted:
+        return [f"{DESCRIPTION} does not say all of the target: write [target] with {lines.strip()!r}."]
+    write_text(path, text)
+    return [f"[target] in {DESCRIPTION} now says what was looked for."]
+
+
+def _target_of(text: str) -> Any:
+    try:
+        return parse_toml(text).get("target")
+    except ValueError:
+        return None
 
 
 def _read_own_sums(record: Path) -> list[str]:

@@ -119,6 +119,9 @@ class Detector(Protocol):
     def options(self) -> dict[str, Any]:
         """All that its results depend on, as plain values: other options, other results."""
 
+    def describe(self) -> dict[str, Any]:
+        """The table [target] that dataset.toml needs of the target, with its kind; empty where it needs none."""
+
     def detect(self, picture: Grey, view: View) -> Detected:
         """Look at one picture. Never raises for what is in the picture: nothing found is a reason.
 
@@ -150,6 +153,10 @@ class Detector(Protocol):
 
 class DetectorBase:
     """What most detectors say of themselves: each picture speaks for itself, and nothing is to be corrected."""
+
+    def describe(self) -> dict[str, Any]:
+        """Nothing: dataset.toml needs no table [target] for it."""
+        return {}
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
         """Change nothing: each picture speaks for itself.

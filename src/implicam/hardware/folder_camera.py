@@ -8,7 +8,8 @@ from typing import ClassVar, NamedTuple, Self
 
 from implicam.errors import HardwareError, ImageError
 from implicam.hardware.protocol import Frame, Grey, wait_for
-from implicam.images import ENDINGS, in_order, read_picture
+from implicam.images import ENDINGS, read_picture
+from implicam.picture_names import in_order
 
 MAX_WRITE_PAUSE_SECONDS = 10.0
 """A file that was written to less long ago may not be whole yet."""

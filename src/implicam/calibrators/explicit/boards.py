@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,17 +11,13 @@ from numpy.typing import NDArray
 
 from implicam.calibrators.explicit.settings import DEFAULT_SETTINGS, ExplicitSettings
 from implicam.dataset import Camera, Dataset, Names
-from implicam.errors import FitError
+from implicam.dataset.boards import CORNER, corner_positions, is_board
+from implicam.errors import DatasetError, FitError
 from implicam.geometry import Floats
 from implicam.rig_model import Image, image_of, relative_noise, stated_noise
 
-MAX_ROWS_OR_COLUMNS = 500
-"""Rows or columns of a board."""
-
 MIN_BOARDS = 3
 """Pictures that a camera needs: Zhang's method takes three planes for a lens."""
-
-CORNER = re.compile(r"(?P<shot>.+)-c(?P<number>[0-9]+)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,57 +105,50 @@ def boards_of(data: Dataset, scale: float = 1.0, settings: ExplicitSettings = DE
 
 
 def has_boards(data: Dataset) -> bool:
-    """Whether a dataset says that it shows a board whose corners can be laid out.
+    """Whether a dataset shows boards: [target] says so, or points are named as corners are.
 
     Args:
-        data: The dataset; its [target] counts.
+        data: The dataset; where it has no known positions, names like board01-c001 count.
 
     Returns:
-        Whether that is of the kind `board` or `charuco`.
+        Whether it does; without [target] it cannot be said where the corners are, and `boards_of` tells it.
     """
-    target = data.extra.get("target")
-    return isinstance(target, Mapping) and target.get("kind") in ("board", "charuco")
+    if is_board(data.extra.get("target")):
+        return True
+    return data.known is None and len(data) > 0 and all(CORNER.fullmatch(str(point)) for point in data.points)
 
 
 def _laid_out(data: Dataset, least: int) -> tuple[Names, Floats]:
     """(n,) the shot of each corner, and (n, 2) where it is on the board; least: corners of one."""
-    if has_boards(data):
-        return _by_target(data, data.extra["target"])
+    target = data.extra.get("target")
+    if is_board(target):
+        return _by_target(data, target)
     if data.known is None:
         raise FitError(
             f"nothing says where the corners of {data.name!r} are on the board.",
             why="[target] in dataset.toml is no board, or not there, and there is no points.csv",
-            fix='write into dataset.toml: [target] kind = "board", rows = 8, columns = 11, square = 13.29',
+            fix='write into dataset.toml: [target] kind = "board", rows = 8, columns = 11, square = 13.29; implicam '
+            "detect writes it where --board and --square are given",
         )
     return data.shots, _by_positions(data, least)
 
 
 def _by_target(data: Dataset, target: Mapping[str, Any]) -> tuple[Names, Floats]:
     try:
-        rows, columns, square = target["rows"], target["columns"], float(target["square"])
-        for what, count in (("rows", rows), ("columns", columns)):
-            if type(count) is not int or not 2 <= count <= MAX_ROWS_OR_COLUMNS:
-                raise ValueError(f"{what} = {count!r} must be a whole number from 2 to {MAX_ROWS_OR_COLUMNS}")
-        if not 1e-9 < square < 1e9:
-            raise ValueError(f"square = {square!r} must be a length")
-    except (KeyError, TypeError, ValueError) as error:
-        raise FitError(
-            f"[target] of {data.name!r} does not describe a board: {error}.",
-            fix='dataset.toml needs [target] kind = "board" with rows, columns (of inner corners) and square',
-        ) from error
-    if target["kind"] == "charuco":  # it counts squares; its corners are those between them
-        rows, columns = rows - 1, columns - 1
+        places = corner_positions(target)
+    except DatasetError as error:
+        raise FitError(f"{data.name!r}: {error.what}", why=error.why, fix=error.fix) from error
     found = [CORNER.fullmatch(str(point)) for point in data.points]
     wrong = [str(point) for point, match in zip(data.points, found, strict=True) if match is None]
     numbers = np.array([int(match["number"]) - 1 if match else 0 for match in found], dtype=np.int64)
-    if wrong or not ((numbers >= 0) & (numbers < rows * columns)).all():
-        name = wrong[0] if wrong else str(data.points[np.argmax((numbers < 0) | (numbers >= rows * columns))])
+    if wrong or not ((numbers >= 0) & (numbers < len(places))).all():
+        name = wrong[0] if wrong else str(data.points[np.argmax((numbers < 0) | (numbers >= len(places)))])
         raise FitError(
-            f"point {name!r} is no corner of a board of {rows} x {columns} inner corners.",
+            f"point {name!r} is no corner of a board of {len(places)} corners, as [target] describes it.",
             fix="name corners as implicam detect does: board01-c001, counted along the rows",
         )
     shots = np.array([match["shot"] if match else "" for match in found], dtype=np.str_)
-    return shots, np.asarray(np.column_stack([numbers % columns, numbers // columns]) * square, dtype=np.float64)
+    return shots, places[numbers]
 
 
 def _by_positions(data: Dataset, least: int) -> Floats:
