@@ -200,7 +200,7 @@ class ForwardGPCalibration(RigCalibration):
         """What the user should know before trusting this calibration; empty where all is well."""
         return [
             *describe_point_copies(self.data),
-            *(kind_notes(self.fitted, self.camera_names) if self.calibrator.lens == AUTO else ()),
+            *(kind_notes(self.fitted, self.used.cameras) if self.calibrator.lens == AUTO else ()),
             *self.diagnosis.notes(),
             *self._label_notes(),
             *self._plane_notes(),

@@ -6,17 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from implicam.dataset import Camera
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.general_camera import GeneralCamera
 
 
-def kind_notes(fitted: FitResult, names: Sequence[str]) -> list[str]:
+def kind_notes(fitted: FitResult, cameras: Sequence[Camera]) -> list[str]:
     """Notes on the cameras that are not ordinary.
 
     Args:
         fitted: The fitted cameras.
-        names: Of these, in the same order.
+        cameras: What the data say of these, in the same order.
 
     Returns:
         One for each such camera, and one before them where all are mirrored.
@@ -29,19 +30,19 @@ def kind_notes(fitted: FitResult, names: Sequence[str]) -> list[str]:
             "All pictures are mirrored: is an axis of the known positions negated, or are two exchanged (left-handed)? "
             "Or is v counted from below?"
         )
-    for number, (name, model) in enumerate(zip(names, models, strict=True)):
-        words = _kind(model)
+    for number, (described, model) in enumerate(zip(cameras, models, strict=True)):
+        words = _kind(model, sized=described.width is not None)
         if mirrored[number] and not all(mirrored):
             words = ["its pictures are mirrored: it looks through a mirror, or v is counted from below", *words]
         if not words:
             continue
         left = fitted.left_by_ordinary(number)
         without = f". An ordinary camera would leave {left:.2g} px" if np.isfinite(left) else ""
-        notes.append(f"{name}: {'; '.join(words)}{without}.")
+        notes.append(f"{described.name}: {'; '.join(words)}{without}.")
     return notes
 
 
-def _kind(model: CameraModel) -> list[str]:
+def _kind(model: CameraModel, sized: bool) -> list[str]:
     camera = model.camera
     if model.family == "none":
         return ["no lens model predicts its views as well as a linear projection and a smooth field do"]
@@ -51,6 +52,11 @@ def _kind(model: CameraModel) -> list[str]:
     off = float(np.linalg.norm(camera.centre - model.image.centre))
     if model.family == "aspect":
         return [f"its pixels are not square, fy / fx = {aspect:.4g}"]
+    if model.family == "crop" and not sized:
+        return [
+            f"its lens looks past the middle of what it saw, by {off:.0f} px: state the size of its images (--size), "
+            "and where their middle is need not be guessed"
+        ]
     if model.family == "crop":
         return [f"its lens looks past the middle of the image, by {off:.0f} px"]
     return [f"tilted sensor or oblique window (fy / fx = {aspect:.3g}, principal point {off:.0f} px off the middle)"]
