@@ -60,6 +60,19 @@ def decimal_number(value: float, digits: int = 3) -> str:
     return f"{value:.{min(decimals, MAX_DECIMALS)}f}"
 
 
+def number_with_sd(value: float, sd: float) -> str:
+    """A number with its uncertainty, both to the second digit of the uncertainty.
+
+    Args:
+        value: The number.
+        sd: Its standard uncertainty.
+    """
+    if not math.isfinite(sd) or sd <= 0:
+        return f"{value:.6g}"
+    decimals = max(0, 1 - math.floor(math.log10(sd)))
+    return f"{value + 0.0:.{decimals}f} ± {sd:.{decimals}f}"
+
+
 def percent(share: float | None, decimals: int = 0, *, none: str = "–") -> str:
     """A share in per cent.
 

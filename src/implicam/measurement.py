@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -17,7 +17,7 @@ from implicam.dataset.frames import keep_others, rigid_parts
 from implicam.dataset.units import metres_per
 from implicam.errors import UsageError, did_you_mean, import_extra
 from implicam.files import write_text
-from implicam.formatting import decimal_number
+from implicam.formatting import decimal_number, number_with_sd
 
 MEASURED_COLUMNS = (
     "point", "x", "y", "z", "sd_x", "sd_y", "sd_z", "cov_xy", "cov_xz", "cov_yz", "views", "consistency", "reason",
@@ -31,6 +31,47 @@ MAX_CHARACTERS_SHOWN = 110
 
 DOUBTFUL = "doubtful: the table as a whole contradicts the calibration"
 """How the reason of every row begins where there is an alarm."""
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """What the errors of n measured points have in common, because one calibration measured them all: the error of each
+    is `E @ z` and an error of its own, z standard normal numbers that all points share. Nothing is computed, and
+    nothing of that size is kept, before somebody asks for a few points.
+
+    Attributes:
+        of_rows: Takes (k,) numbers of points as they were measured, and gives E (k, 3, q).
+        rows: (n,) the number that each point had then.
+        turn: (3, 3) from the axes and the length unit of then to those of now.
+    """
+
+    of_rows: Callable[[NDArray[np.int64]], Floats]
+    rows: NDArray[np.int64]
+    turn: Floats
+
+    def of(self, index: NDArray[np.int64]) -> Floats:
+        """The E (k, 3, q) of some points.
+
+        Args:
+            index: (k,) their numbers.
+        """
+        return np.asarray(self.turn @ self.of_rows(self.rows[index]), dtype=np.float64)
+
+    def select(self, index: ArrayLike) -> SharedErrors:
+        """Of some points.
+
+        Args:
+            index: A mask, or numbers.
+        """
+        return replace(self, rows=self.rows[np.asarray(index)])
+
+    def turned(self, turn: Floats) -> SharedErrors:
+        """In other axes, or another unit.
+
+        Args:
+            turn: (3, 3) that positions are multiplied by.
+        """
+        return replace(self, turn=turn @ self.turn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +111,9 @@ class MeasuredPoint:
     def __repr__(self) -> str:
         if not self.measured:
             return f"{self.point}: not measured, {self.reason}"
-        position = ", ".join(f"{axis} {_with_sd(*pair)}" for axis, *pair in zip("xyz", self.xyz, self.sd, strict=True))
+        position = ", ".join(
+            f"{axis} {number_with_sd(*pair)}" for axis, *pair in zip("xyz", self.xyz, self.sd, strict=True)
+        )
         return f"{self.point}: {position} {self.length_unit}, {self.views} views{self.reason and '; '}{self.reason}"
 
 
@@ -94,6 +137,8 @@ class Measurement:
         share_calibration: (n,) from 0 to 1, the share of the variance (trace of cov) that more known points could
             remove; the rest is the pixel noise of this measurement. NaN where the method cannot tell them apart.
         columns: Further columns of the data that were measured, (n,) text each, which measured.csv repeats.
+        shared: What the errors of the points have in common; None where the method, or a table that was read, cannot
+            say.
     """
 
     points: Names
@@ -106,6 +151,7 @@ class Measurement:
     alarm: str = ""
     share_calibration: Floats = field(default_factory=lambda: np.zeros(0))
     columns: Mapping[str, Names] = field(default_factory=dict)
+    shared: SharedErrors | None = None
 
     def __post_init__(self) -> None:
         """A covariance is symmetric to the last bit, whatever order a method or a processor summed it in."""
@@ -159,7 +205,7 @@ class Measurement:
         )
         rows = []
         for one in (self[i] for i in range(min(len(self), MAX_LINES_SHOWN))):
-            axes = [_with_sd(*pair) for pair in zip(one.xyz, one.sd, strict=True)] if one.measured else ["-"] * 3
+            axes = [number_with_sd(*pair) for pair in zip(one.xyz, one.sd, strict=True)] if one.measured else ["-"] * 3
             cells = [one.point, *axes, str(one.views), _shortened(one.reason)]
             rows.append("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>")
         more = f"<p>... and {len(self) - len(rows)} more</p>" if len(rows) < len(self) else ""
@@ -190,6 +236,7 @@ class Measurement:
             self, points=self.points[i], xyz=self.xyz[i], cov=self.cov[i], views=self.views[i],
             consistency=self.consistency[i], reason=self.reason[i], share_calibration=self.share_calibration[i],
             columns={key: column[i] for key, column in self.columns.items()},
+            shared=self.shared and self.shared.select(i),
         )  # fmt: skip
 
     def without_points(self, names: Iterable[str]) -> Measurement:
@@ -213,7 +260,8 @@ class Measurement:
             DatasetError: The unit has no known length.
         """
         factor = metres_per(self.length_unit) / metres_per(unit)
-        return replace(self, xyz=self.xyz * factor, cov=self.cov * factor**2, length_unit=unit)
+        shared = self.shared and self.shared.turned(factor * np.eye(3))
+        return replace(self, xyz=self.xyz * factor, cov=self.cov * factor**2, length_unit=unit, shared=shared)
 
     def transformed(self, pose: Any) -> Measurement:
         """The same points in another frame of the world; the covariances turn with it.
@@ -226,7 +274,8 @@ class Measurement:
             UsageError: It is no rotation and no rigid matrix.
         """
         rotation, shift = rigid_parts(pose)
-        return replace(self, xyz=self.xyz @ rotation.T + shift, cov=rotation @ self.cov @ rotation.T)
+        shared = self.shared and self.shared.turned(rotation)
+        return replace(self, xyz=self.xyz @ rotation.T + shift, cov=rotation @ self.cov @ rotation.T, shared=shared)
 
     def to_dataframe(self) -> Any:
         """A pandas table with the columns of measured.csv, NaN where there is no number.
@@ -295,14 +344,6 @@ class Measurement:
         table = self._table()
         cells = [format_cells(v) if v.dtype.kind == "f" else v.astype(np.str_).tolist() for v in table.values()]
         write_text(Path(path), csv_text(list(table), zip(*cells, strict=True)))
-
-
-def _with_sd(value: float, sd: float) -> str:
-    """A number with its uncertainty, both to the second digit of the uncertainty."""
-    if not np.isfinite(sd) or sd <= 0:
-        return f"{value:.6g}"
-    decimals = max(0, 1 - int(np.floor(np.log10(sd))))
-    return f"{value + 0.0:.{decimals}f} ± {sd:.{decimals}f}"
 
 
 def _shortened(text: str) -> str:

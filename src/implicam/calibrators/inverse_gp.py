@@ -52,8 +52,8 @@ from implicam.dataset.unused import Unused
 from implicam.errors import UsageError, did_you_mean
 from implicam.gp import SHAPES, Fit, GaussianProcess, Kernel, Smoothness, maximise_each
 from implicam.gp.coregionalised import maximise_coregionalised
-from implicam.gp.linalg import solve_lower
-from implicam.measurement import Measurement
+from implicam.gp.linalg import covariance_root, solve_lower
+from implicam.measurement import Measurement, SharedErrors
 from implicam.progress import Progress, silent
 from implicam.threads import side_by_side
 
@@ -334,7 +334,17 @@ class InverseGPCalibration(CalibrationBase):
             reason.astype(np.str_),
             self.data.length_unit,
             share_calibration=share,
+            shared=SharedErrors(partial(self._shared_errors, observations.uv), np.arange(n), np.eye(3)),
         )
+
+    def _shared_errors(self, uv: Floats, rows: NDArray[np.int64]) -> Floats:
+        """(k, 3, 3 k) of measured points: a root of the joint covariance of the function at their pixels. What is
+        uncertain of lengthscales counts as each point's own."""
+        at = self.position_processes(uv[rows])
+        everywhere = slice(None)
+        joint = sum(np.kron(one.covariance(everywhere, everywhere), one.share) for one in at.processes)
+        root = covariance_root(np.asarray(joint)).reshape(len(rows), 3, -1)
+        return np.asarray(np.sqrt(at.widened)[:, None, None] * root, dtype=np.float64)
 
     def position_processes(self, uv: Floats) -> PositionProcesses:
         """What the processes say of places together; for one that a camera does not see, what they would say at the

@@ -35,6 +35,19 @@ def cholesky(K: Floats) -> Floats:
     return L  # type: ignore[no-any-return]
 
 
+def covariance_root(C: Floats) -> Floats:
+    """R with `R R^T = C`, of a covariance that may be singular; what is negative by rounding counts as zero.
+
+    Args:
+        C: (n, n) symmetric.
+
+    Returns:
+        (n, n).
+    """
+    values, vectors = np.linalg.eigh(0.5 * (C + C.T))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
+
+
 def _reason(K: Floats, info: int) -> NumericalError:
     if not np.isfinite(np.tril(K)).all():
         return NumericalError(

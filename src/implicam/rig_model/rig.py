@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from implicam.dataset import Dataset, Names, Observations
 from implicam.dataset.requirements import match_cameras, observations_of
 from implicam.geometry import Floats
-from implicam.measurement import Measurement
+from implicam.measurement import Measurement, SharedErrors
 from implicam.rig_model.alarm import Table, alarm_of
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
-from implicam.rig_model.triangulate import Labels, Located, locate
+from implicam.rig_model.triangulate import Labels, Located, locate, shared_errors
 
 LENS_KINDS = ("ordinary", "aspect")
 """Kinds of cameras that cannot follow anything that lenses do not do."""
@@ -106,6 +106,7 @@ class FittedRig:
             self._reasons(observations, seen, found),
             self.length_unit,
             share_calibration=found.share,
+            shared=SharedErrors(partial(self._shared_errors, uv, noise, found), np.arange(len(uv)), np.eye(3)),
         )
         cameras = tuple(self.trained.cameras[c] for c in self.cameras)
         table = Table(
@@ -121,6 +122,11 @@ class FittedRig:
             settings=self.settings,
         )
         return measured.with_alarm(alarm_of(table))
+
+    def _shared_errors(self, uv: Floats, noise: Floats, found: Located, rows: NDArray[np.int64]) -> Floats:
+        """(k, 3, q) of located points, in the world."""
+        own = uv[rows], noise[rows], found.xyz[rows], found.left_out[rows]
+        return self.frame.scale * shared_errors(self.posterior, *own, self.labels, self.degrees, self.settings)
 
     def _agree(self, uv: Floats) -> NDArray[np.bool_]:
         """(n,) whether all views (n, C, 2) of each point agree, with the usual noise."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from implicam.geometry import Bools, Floats
+from implicam.gp.linalg import covariance_root
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import consistency, equivalent_normal_noise, refine_positions
 from implicam.rig_model.normal_equations import POINTS_PER_CHUNK, invert_stack
@@ -123,6 +124,46 @@ def locate(
     return Located(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
+def shared_errors(
+    posterior: Posterior,
+    uv: Floats,
+    noise: Floats,
+    xyz: Floats,
+    left_out: Bools,
+    labels: Labels | None = None,
+    degrees: float | None = None,
+    settings: RigModelSettings = DEFAULT_SETTINGS,
+) -> Floats:
+    """What the errors of located points have in common: how they follow from what is unknown of the cameras, and of
+    the known positions, which is the same for all points; eq. (22b).
+
+    Args:
+        posterior: What is known of the C cameras.
+        uv: Pixels (n, C, 2), NaN where a camera does not see a point.
+        noise: (n, C) as of `locate`.
+        xyz: (n, 3) as `locate` found them.
+        left_out: (n, C) the views that it did not use.
+        labels: As of `locate`.
+        degrees: As of `locate`.
+        settings: As of `locate`.
+
+    Returns:
+        E (n, 3, q): the error of a point is `E @ z` and an error of its own, z of q independent standard normal
+        numbers that all points share. NaN where a point has no position.
+    """
+    seen = np.isfinite(uv).all(axis=2) & ~left_out
+    found = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    points = _Seen(posterior, uv, noise, labels, degrees, settings)
+    rows = np.arange(len(uv))[found]
+    step = POINTS_PER_CHUNK // 16  # what the views of each share with all others is large
+    parts = [points.shared(rows[i : i + step], xyz, seen) for i in range(0, len(rows), step)]
+    if not parts:
+        return np.full((len(uv), 3, 0), np.nan)
+    slopes = np.full((len(uv), 3, parts[0].shape[2]), np.nan)
+    slopes[found] = np.concatenate(parts)
+    return slopes
+
+
 def _locate(points: _Seen) -> Located:
     seen = np.asarray(np.isfinite(points.uv).all(axis=2))
     xyz, cov, p = points.solve(np.arange(len(seen)), seen)
@@ -201,6 +242,27 @@ class _Seen:
         parts = np.trace(from_noise, axis1=1, axis2=2) / np.trace(cov, axis1=1, axis2=2)
         share[rows] = np.clip(1 - parts, 0.0, 1.0)
         return share
+
+    def shared(self, rows: NDArray[np.int64], xyz: Floats, seen: Bools) -> Floats:
+        """(k, 3, q) of points rows (k,), whose errors are these times unknowns that all points share; xyz and seen are
+        those of all points."""
+        x, seen, noise = xyz[rows], seen[rows], self.noise[rows]
+        weights = _Weights(self.posterior, x, noise, seen)
+        r, D = _residuals(self.posterior, x, self.uv[rows], seen)
+        if self.degrees is not None:
+            distance = np.einsum("nci,ncij,ncj->nc", r, weights.each, r)
+            weights = _Weights(self.posterior, x, equivalent_normal_noise(noise, distance, seen, self.degrees), seen)
+        n, C = seen.shape
+        WD = apply_weights(LinearisedViews(r, D, weights.each, weights.joint), D).reshape(n, 2 * C, 3)
+        H = D.reshape(n, 2 * C, 3).swapaxes(1, 2) @ WD
+        gain = np.where(seen.repeat(2, axis=1)[:, None], invert_stack(H) @ WD.swapaxes(1, 2), 0.0)
+        E = weights.shared(gain)
+        if self.labels is None or self.labels.unknowns is None:
+            return E
+        known = np.nan_to_num(self.labels.shots.label_slope(x, self.labels.sd))
+        unknowns = self.labels.unknowns
+        own = covariance_root(unknowns.covariance - unknowns.cross.T @ unknowns.cross)
+        return np.concatenate([E + known @ unknowns.cross.T, known @ own], axis=2)
 
     def linearise(
         self, rows: NDArray[np.int64], x: Floats, seen: Bools, before: LinearisedViews | None = None
@@ -358,6 +420,14 @@ class _Weights:
         D = np.where(seen[..., None, None], D, 0).reshape(n, 2 * C, 3)
         through = np.where(seen.repeat(2, axis=1)[..., None], self._through(cross), 0)
         return np.asarray(cov @ D.swapaxes(1, 2) @ self.joint @ through, dtype=np.float64)
+
+    def shared(self, gain: Floats) -> Floats:
+        """(n, 3, q) how positions follow from the white unknowns of the cameras: `gain` (n, 3, 2C) of what the views
+        are off, zero where not seen. In the order of `_through`."""
+        parts = [gain[:, :, 2 * c : 2 * c + 2] @ np.nan_to_num(half) for c, half in enumerate(self.halves)]
+        if self.posterior.tied:
+            parts.append(gain @ np.nan_to_num(self.half))
+        return np.concatenate(parts, axis=2)
 
     def _through(self, cross: Floats) -> Floats:
         """(n, 2C, k) covariance of what the cameras would see with unknowns that `cross` ties to the joint root."""
