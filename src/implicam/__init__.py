@@ -41,6 +41,14 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.dataset import join as join
     from implicam.dataset import read_dataset as read_dataset
     from implicam.dataset import write_dataset as write_dataset
+    from implicam.derived import Quantity as Quantity
+    from implicam.derived import angle as angle
+    from implicam.derived import distance as distance
+    from implicam.derived import distances as distances
+    from implicam.derived import fit_cylinder as fit_cylinder
+    from implicam.derived import fit_motion as fit_motion
+    from implicam.derived import fit_plane as fit_plane
+    from implicam.derived import fit_sphere as fit_sphere
     from implicam.errors import CalibrationFileError as CalibrationFileError
     from implicam.errors import DatasetError as DatasetError
     from implicam.errors import FitError as FitError
@@ -72,6 +80,9 @@ _NAMES = {
     "implicam.coverage": ("Coverage", "assess"),
     "implicam.dataset": (
         "Camera", "Dataset", "KnownPositions", "Observations", "join", "read_dataset", "write_dataset",
+    ),
+    "implicam.derived": (
+        "Quantity", "angle", "distance", "distances", "fit_cylinder", "fit_motion", "fit_plane", "fit_sphere",
     ),
     "implicam.errors": (
         "CalibrationFileError", "DatasetError", "FitError", "HardwareError", "ImageError", "ImplicamError",

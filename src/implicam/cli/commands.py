@@ -61,13 +61,17 @@ from implicam.dataset.programs import PROGRAMS, read_program, write_program
 from implicam.dataset.table_options import DOCUMENTED
 from implicam.dataset.units import metres_per
 from implicam.dataset.wide import is_unit_missing
+from implicam.derived.table import distance_rows, distances_text, read_pairs
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
-from implicam.files import refuse_folder, toml_text
+from implicam.files import refuse_folder, toml_text, write_text
 from implicam.formatting import decimal_number, percent
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
 __all__ = ["EXAMPLES", "app"]
+
+MAX_DISTANCES_SHOWN = 20
+"""On the terminal; all are in the table."""
 
 
 @command("demo")
@@ -172,15 +176,27 @@ def measure_command(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     dataset: Annotated[Path, typer.Argument(help="What the cameras saw.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="The table to write.")] = Path("measured.csv"),
+    between: Annotated[
+        tuple[str, str] | None,
+        typer.Option("--distance", metavar="A B", help="The distance of two points, with its uncertainty."),
+    ] = None,
+    pairs: Annotated[
+        Path | None, typer.Option("--distances", metavar="CSV", help="The same for a table of pairs: a,b.")
+    ] = None,
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
     """Measure every point of a dataset: position, standard uncertainty, covariance; or the reason why not.
 
-    The table is in the length unit of the calibration, or in that of --unit.
+    The table is in the length unit of the calibration, or in that of --unit. Distances of pairs go to distances.csv
+    beside it: their uncertainty knows what the errors of the two points share, which the table does not say.
     """
     refuse_folder(output)
     must_not_replace(output, calibration, dataset)
+    wanted = [*([between] if between else ()), *(read_pairs(pairs) if pairs else ())]
+    beside = output.with_name("distances.csv")
+    if wanted:
+        must_not_replace(beside, calibration, dataset, output, *([pairs] if pairs else []))
     fitted = load_calibration(calibration)
     judged = calibration_file.describe(calibration).get("verdict", {}).get("word", "")
     unit = table.unit or fitted.data.length_unit  # one without a known size is converted to no other
@@ -194,7 +210,10 @@ def measure_command(
         progress("measuring", 1, 1)
     if unit != measured.length_unit:
         measured = measured.in_unit(unit)
+    found = distance_rows(measured, wanted) if wanted else []
     measured.write_csv(output)
+    if wanted:
+        write_text(beside, distances_text(found))
     count, typical = int(measured.measured.sum()), _typical(measured.sd)
     known = measured.share_calibration[np.isfinite(measured.share_calibration)]
     share = float(np.median(known)) if len(known) else math.nan
@@ -203,7 +222,8 @@ def measure_command(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
              "median_share_calibration": share,
              "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
-             "views_left_out": show.left_out(measured), "notes": list(data.notes), "alarm": measured.alarm}
+             "views_left_out": show.left_out(measured), "notes": list(data.notes), "alarm": measured.alarm,
+             **({"distances": str(beside)} if wanted else {})}
         )  # fmt: skip
         raise typer.Exit(int(bool(measured.alarm)))
     text = f"{output}: {len(measured)} rows, {count} measured"
@@ -213,6 +233,10 @@ def measure_command(
     show.line(text)
     if math.isfinite(share):
         show.line(f"more known points could remove {percent(share)} of the variance (median); the rest is pixel noise")
+    if wanted:
+        show.line(f"{beside}: {len(wanted)} distance{'s' * (len(wanted) > 1)}")
+        for row in found[:MAX_DISTANCES_SHOWN]:
+            show.line(f"  {row}")
     if judged in (DOUBTFUL, NOT_USABLE):
         show.note(f"this calibration was found {judged} when it was made: implicam info {calibration} says why")
     show.notes(data.notes)

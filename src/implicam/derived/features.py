@@ -34,6 +34,10 @@ MAX_RADIUS_EXTENTS = 10.0
 """Beyond it a cylinder is a plane, which points that are nearly flat fit in any direction."""
 
 
+Axis = tuple[Floats, Floats, float]
+"""Of a cylinder: a point, the direction, and the radius about it."""
+
+
 @dataclass(frozen=True)
 class Form:
     """How well points agree with a feature.
@@ -219,9 +223,8 @@ def fit_cylinder(measurement: Measurement, points: Sequence[str | int]) -> Cylin
     """
     found = _enough(measurement, points, 5, "a cylinder")
     middle = found.x.mean(axis=0)
-    State = tuple[Floats, Floats, float]  # centre, direction, radius
 
-    def equations(x: Floats, state: State) -> Equations:
+    def equations(x: Floats, state: Axis) -> Equations:
         centre, direction, radius = state
         tangents, off = _across(direction), x - middle - centre
         along = off @ direction
@@ -232,7 +235,7 @@ def fit_cylinder(measurement: Measurement, points: Sequence[str | int]) -> Cylin
         by_step = np.column_stack([-sideways, -along[:, None] * sideways, -np.ones(len(x))])
         return Equations((length - radius)[:, None], by_step[:, None], outward[:, None])
 
-    def move(state: State, step: Floats) -> State:
+    def move(state: Axis, step: Floats) -> Axis:
         centre, direction, radius = state
         moved = centre + _across(direction) @ step[:2]
         direction = _tilted(direction, step[2:4])
@@ -320,7 +323,7 @@ def _nearest_round(d: Floats) -> tuple[Floats, float]:
     return found[:-1], float(np.sqrt(max(found[-1] + found[:-1] @ found[:-1], np.finfo(float).tiny)))
 
 
-def _start_of_cylinder(d: Floats) -> tuple[Floats, Floats, float]:
+def _start_of_cylinder(d: Floats) -> Axis:
     """Centre, direction and radius of a cylinder near points about their middle, by searches from the best of many
     directions."""
 

@@ -55,11 +55,34 @@ def joint(measurement: Measurement, points: Sequence[str | int]) -> JointPositio
     Raises:
         UsageError: A point is not there or was not measured, or the method does not say what errors share.
     """
-    return joint_of_rows(measurement, np.array([find_point(measurement, point) for point in points], dtype=np.int64))
+    return joint_of_rows(
+        measurement, np.array([find_measured_point(measurement, point) for point in points], dtype=np.int64)
+    )
 
 
 def find_point(measurement: Measurement, point: str | int) -> int:
-    """The number of a measured point.
+    """The number of a point, measured or not.
+
+    Args:
+        measurement: The points.
+        point: A name or a number.
+
+    Raises:
+        UsageError: It is not there.
+    """
+    if isinstance(point, str):
+        found = np.flatnonzero(measurement.points == point)
+        if len(found):
+            return int(found[0])
+        near = did_you_mean(point, map(str, measurement.points))
+        raise UsageError(f"there is no point {point!r}{near}.", fix="`points` has the names")
+    if isinstance(point, int | np.integer) and -len(measurement) <= point < len(measurement):
+        return int(point) % len(measurement)
+    raise UsageError(f"there is no point {point!r}.", fix=f"give a name, or a number from 0 to {len(measurement) - 1}")
+
+
+def find_measured_point(measurement: Measurement, point: str | int) -> int:
+    """The number of a point that was measured.
 
     Args:
         measurement: The points.
@@ -68,18 +91,7 @@ def find_point(measurement: Measurement, point: str | int) -> int:
     Raises:
         UsageError: It is not there, or was not measured.
     """
-    if isinstance(point, str):
-        found = np.flatnonzero(measurement.points == point)
-        if not len(found):
-            near = did_you_mean(point, map(str, measurement.points))
-            raise UsageError(f"there is no point {point!r}{near}.", fix="`points` has the names")
-        number = int(found[0])
-    elif isinstance(point, int | np.integer) and -len(measurement) <= point < len(measurement):
-        number = int(point) % len(measurement)
-    else:
-        raise UsageError(
-            f"there is no point {point!r}.", fix=f"give a name, or a number from 0 to {len(measurement) - 1}"
-        )
+    number = find_point(measurement, point)
     if not measurement.measured[number]:
         raise UsageError(
             f"point {str(measurement.points[number])!r} was not measured.",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from implicam.dataset import Floats
-from implicam.derived.joint import JointPositions, find_point, joint, joint_of_rows
+from implicam.derived.joint import JointPositions, find_measured_point, joint, joint_of_rows
 from implicam.errors import UsageError
 from implicam.formatting import number_with_sd
 from implicam.measurement import Measurement
@@ -70,7 +70,7 @@ def distance(measurement: Measurement, a: str | int, b: str | int) -> Quantity:
         The distance in the length unit, with what the two errors share taken into account.
 
     Raises:
-        UsageError: A point is not there or was not measured, both are one, or the method does not say what errors share.
+        UsageError: A point is not there or was not measured, both are one, or what their errors share is not known.
     """
     return distances(measurement, [(a, b)])[0]
 
@@ -88,7 +88,7 @@ def distances(measurement: Measurement, pairs: Sequence[tuple[str | int, str | i
     Raises:
         UsageError: As for `distance`.
     """
-    rows = np.array([[find_point(measurement, point) for point in pair] for pair in pairs], dtype=np.int64)
+    rows = np.array([[find_measured_point(measurement, point) for point in pair] for pair in pairs], dtype=np.int64)
     rows = rows.reshape(len(pairs), 2)
     for a, b in rows[rows[:, 0] == rows[:, 1]]:
         name = str(measurement.points[a])
