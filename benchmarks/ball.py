@@ -34,7 +34,7 @@ from implicam.detect.silhouette import correct_outlines
 from implicam.files import write_text
 from implicam.images import one_thread_each, read_picture, write_picture
 from implicam.simulate import Optics, Studio, build_rig, random_positions, record
-from implicam.simulate.photographs import PAD
+from implicam.simulate.photographs import PADDING_PX
 
 LEVELS = ((0.01, 0.7), (0.02, 1.0), (0.05, 1.5))
 COVERED, FALSE, KNOWN = 0.15, 3.0, 35
@@ -134,7 +134,8 @@ def background_of(studio):
 
     def take(camera, shot):
         rng = np.random.default_rng([studio.seed, 9, camera, shot])
-        return studio._expose(studio._looks[camera].blurred[PAD:-PAD, PAD:-PAD].copy(), camera, rng)
+        inner = slice(PADDING_PX, -PADDING_PX)
+        return studio._expose(studio._looks[camera].blurred[inner, inner].copy(), camera, rng)
 
     return take
 

@@ -1,24 +1,31 @@
 """Dots found in real photographs of known targets, against the pixels that others published.
 
     python benchmarks/dots.py ../shared/real [--seeds 10] [--overlays docs/images] [-o benchmarks/results/dots.md]
+    python benchmarks/dots.py ../shared/real --clicks
 
 Six dots per camera are labelled as a person would: the published pixel, rounded, and up to a pixel beside it. They are
 spread over the target and its depths (the best of 30 random sextets); *any six* takes the first sextet, which may lie
 at one depth. found: of the published dots, within 0.3 px. Everything is the worst over the seeds.
+
+--clicks: as on the page of `implicam label`, which proposes the dots; a click is up to 7 px beside the one meant
+(2 px where dots are dense). What the page finds after four and after six of them, and clicks that missed.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from implicam.dataset import read_dataset
 from implicam.detect.dots import Dots
+from implicam.detect.labelling import Guess, Labelling
 from implicam.detect.model import View
+from implicam.detect.overlay import Result, draw_overlay
 from implicam.files import write_text
-from implicam.images import opencv, read_picture
+from implicam.images import eight_bit, opencv, read_picture
 
 DATASETS = ("water-tank-target", "two-sided-tank", "image-splitter")
 OVERLAYS = {
@@ -26,7 +33,7 @@ OVERLAYS = {
     "two-sided-tank": ("cam3", "dots-two-sided.jpg"),
     "image-splitter": ("cam4", "dots-image-splitter.jpg"),
 }
-FOUND, SKY, ORANGE, RED = 0.3, (233, 180, 86), (0, 159, 230), (60, 60, 255)
+FOUND = 0.3
 
 
 def sextet(xyz, rng, tries):
@@ -86,28 +93,41 @@ def table(folder, seeds):
             yield f"| {name} | {camera.name} | {there} | {worst} | {any_six} |"
 
 
-def overlay(picture, found, path, zoom):
-    """The photograph brightened, dots found, labelled and missing."""
-    cv2 = opencv()
-    low, high = np.quantile(picture, (0.01, 0.98))
-    grey = (np.clip((picture - low) / (high - low), 0, 1) ** 0.6 * 210).astype(np.uint8)
-    canvas = cv2.cvtColor(cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-    radius = max(5, round(2.6 * found.notes["scale"] * zoom))
+def visit(folder, data, camera, seed, scratch):
+    """What a visitor of the page sees after four clicks and after six: (found, wrong) each; clicks that missed."""
+    view, uv = View(data.cameras[camera].name, ""), data.observations.uv[:, camera]
+    at = {name: pixel for name, pixel in zip(map(str, data.points), uv, strict=True) if np.isfinite(pixel[0])}
+    page, rng = (
+        Labelling.open(folder, labels=scratch / f"{folder.name}-{view.camera}-{seed}.csv"),
+        np.random.default_rng(seed),
+    )
+    within = float(np.clip(np.hypot(*page.picture(view).shape) / np.sqrt(len(data)) / 8, 4, 10))
+    counts, missed, guess = [], 0, Guess()
+    for clicks in range(1, 7):
+        while (name := page.propose(view, guess)) not in at:
+            page.skip(view, name)
+        turn = rng.uniform(0, 2 * np.pi)
+        beside = rng.uniform(0, 0.7) * within * np.array([np.cos(turn), np.sin(turn)])
+        missed += not page.place(view, name, at[name] + beside, within)
+        missed += np.linalg.norm(np.array(page.marks(view)[name]) - at[name]) > 2
+        guess = page.guess(view)
+        if clicks in (4, 6):
+            off = [np.linalg.norm(np.array(guess.dots[one][:2]) - at[one]) for one in guess.found if one in at]
+            counts.append((len(guess.found), int(np.sum(np.array(off) > 2))))
+    return *counts, missed
 
-    def at(uv):
-        return tuple(round(float(x)) for x in (np.asarray(uv) + 0.5) * zoom - 0.5)
 
-    apart = [np.sort(np.linalg.norm(found.uv - uv, axis=1))[1] * zoom for uv in found.uv]
-    for name, uv, room in zip(found.points, found.uv, apart, strict=True):
-        colour = ORANGE if name in found.notes["labelled"] else SKY
-        cv2.circle(canvas, at(uv), radius, colour, 1 if colour == SKY else 2, cv2.LINE_AA)
-        if room > 28:
-            u, v = at(uv)
-            cv2.putText(canvas, name, (u + radius, v - radius + 3), 0, 0.32, colour, 1, cv2.LINE_AA)
-    for uv in found.notes["missing"].values():
-        cv2.drawMarker(canvas, at(uv), RED, cv2.MARKER_TILTED_CROSS, 2 * radius, 2, cv2.LINE_AA)
-    quality = [cv2.IMWRITE_JPEG_QUALITY, 60]  # these are for the docs, and noise costs bytes
-    path.write_bytes(cv2.imencode(".jpg", canvas, quality)[1].tobytes())
+def clicks_table(folder):
+    yield "| dataset | camera | dots | found after 4 clicks | after 6 | wrong | clicks that missed |"
+    yield "|---|---|---|---|---|---|---|"
+    with tempfile.TemporaryDirectory() as scratch:
+        for name in DATASETS:
+            data = read_dataset(folder / name)
+            for c, camera in enumerate(data.cameras):
+                seen = [visit(folder / name, data, c, seed, Path(scratch)) for seed in range(3)]
+                four, six = (" ".join(str(one[k][0]) for one in seen) for k in (0, 1))
+                wrong, missed = sum(one[0][1] + one[1][1] for one in seen), sum(one[2] for one in seen)
+                yield f"| {name} | {camera.name} | {len(data)} | {four} | {six} | {wrong} | {missed} of 18 |"
 
 
 def main():
@@ -115,6 +135,7 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--overlays", type=Path)
+    parser.add_argument("--clicks", action="store_true")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
     if options.overlays:
@@ -122,12 +143,13 @@ def main():
             data = read_dataset(options.folder / name)
             c = [one.name for one in data.cameras].index(camera)
             picture, found = detected(options.folder / name, data, c, 0, 30)
-            zoom = {512: 2.0, 1280: 1.0, 2304: 0.6}[picture.shape[1]]
-            overlay(picture, found, options.overlays / file, zoom)
+            drawn = draw_overlay(eight_bit(picture), Result(View(camera, "target"), Path(), found, len(data)))
+            quality = [opencv().IMWRITE_JPEG_QUALITY, 60]  # these are for the docs, and noise costs bytes
+            (options.overlays / file).write_bytes(opencv().imencode(".jpg", drawn[..., ::-1], quality)[1].tobytes())
             print(f"{file}: {len(found)} dots. {found.reason}")
         return
     lines = []
-    for line in table(options.folder, options.seeds):
+    for line in clicks_table(options.folder) if options.clicks else table(options.folder, options.seeds):
         print(line, flush=True)
         lines.append(line)
     if options.output:

@@ -2,7 +2,8 @@
 
 Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of the demo's
 overlays, and two of simulated boards; compares all methods, which takes minutes.
-Dots: `python benchmarks/dots.py ../shared/real --overlays docs/images`.
+Dots: `python benchmarks/dots.py ../shared/real --overlays docs/images`; the page of `implicam label` on one of these
+targets: `python docs/make_pictures.py ../shared/real/water-tank-target`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,11 @@ from pathlib import Path
 
 from PIL import Image
 from playwright.sync_api import sync_playwright
+
+from implicam.dataset import read_dataset
+from implicam.detect.labelling import Labelling
+from implicam.detect.model import View
+from implicam.viewer.label_page import open_page
 
 IMAGES = Path(__file__).parent / "images"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
@@ -31,6 +37,25 @@ def photograph(report: Path) -> None:
         browser.close()
 
 
+def label(target: Path) -> None:
+    """The page of `implicam label` after four clicks, those that it proposes."""
+    data = read_dataset(target)
+    view, at = View("cam1", ""), dict(zip(map(str, data.points), data.observations.uv[:, 0], strict=True))
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page = Labelling.open(target, labels=Path(folder) / "labels.csv")
+        for _ in range(4):
+            name = page.propose(view)
+            page.place(view, name, at[name], 4.0)
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        shown = browser.new_page(viewport={"width": 1440, "height": 900}, color_scheme="dark")
+        with open_page(page, "implicam detect my-tank --target dots", port=0) as (url, _):
+            shown.goto(url)
+            shown.wait_for_function("image && guess && !guess.busy", timeout=60_000)
+            shown.evaluate("all.name = 'my-tank'; all.file = 'my-tank/labels.csv'; paint()")
+            shown.screenshot(path=IMAGES / "label.jpg", type="jpeg", quality=80)
+        browser.close()
+
+
 def implicam(*words: str) -> None:
     """Run a command."""
     subprocess.run([sys.executable, "-m", "implicam", *words], check=True)
@@ -38,6 +63,9 @@ def implicam(*words: str) -> None:
 
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
+    if sys.argv[1:]:
+        label(Path(sys.argv[1]))
+        return
     with tempfile.TemporaryDirectory() as folder:
         demo, board = Path(folder) / "demo", Path(folder) / "board"
         implicam("demo", str(demo))

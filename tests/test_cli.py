@@ -31,6 +31,7 @@ MAKES = {
     "demo": {"implicam-demo"},
     "simulate": {"my-rig"},
     "detect": set(),
+    "label": set(),
     "calibrate": {"my-rig.implicam"},
     "measure": {"measured.csv"},
     "evaluate": {"report.html"},
@@ -76,8 +77,27 @@ def test_the_version(cli: Cli) -> None:
     assert (ran.code, ran.out.split()) == (0, ["implicam", calibration_file.package_version()])
 
 
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete_commands_and_their_options(shell: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    def complete(*words: str) -> str:
+        monkeypatch.setenv("_IMPLICAM_COMPLETE", f"complete_{shell}")
+        monkeypatch.setenv("COMP_WORDS", " ".join(words))
+        monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+        monkeypatch.setenv("_TYPER_COMPLETE_ARGS", " ".join(words))
+        monkeypatch.setenv("_TYPER_COMPLETE_FISH_ACTION", "get-args")
+        return cli().out
+
+    assert "detect" in complete("implicam", "det")
+    assert "--radius" in complete("implicam", "detect", "my-photos", "--rad")  # an option of one detector
+    assert "--lens" in complete("implicam", "calibrate", "my-rig", "--le")
+
+
 HEAVY_EXAMPLES = ("demo", "compare", "report", "acquire", "paper")
 """Those that take 7 to 50 seconds of work each: with `make test-slow`."""
+
+
+ASKS_A_PERSON = ("label",)
+"""Those that end when a person does: tests/test_labelling.py runs it with a browser."""
 
 
 def example(command: str, folder: Path, run: Callable[[str, Path], Ran] = real) -> Ran:
@@ -101,7 +121,7 @@ def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path, cli: Cli) -
         pytest.importorskip(module)
     cli("simulate", "my-photos", "--images", "--cameras", "2R", "--grid", "3x2x2")
     for command in EXAMPLES:
-        if command not in HEAVY_EXAMPLES:  # in this process: to start one costs a second
+        if command not in (*HEAVY_EXAMPLES, *ASKS_A_PERSON):  # in this process: to start one costs a second
             example(command, tmp_path, lambda words, folder: cli(*shlex.split(words)))
     assert len(read_dataset(tmp_path / "my-rig")) == 157
     assert len(read_dataset(tmp_path / "my-rig.csv")) == 157
@@ -179,7 +199,7 @@ def json_commands(made: Path) -> dict[str, list[str]]:
     }
 
 
-@pytest.mark.parametrize("command", [command for command in COMMANDS if command not in ("demo", "paper")])
+@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("demo", "paper", *ASKS_A_PERSON)])
 def test_json_is_json_and_nothing_else(command: str, made: Path, cli: Cli) -> None:
     ran = cli(*json_commands(made)[command], "--json")
     assert ran.code == 0

@@ -131,6 +131,27 @@ def test_uneven_light_and_a_stem_do_not_pull_the_centre():
     assert 0.7 < edge.support < 1
 
 
+def shadowed(centre, radius, away):
+    """A disc before a plate, on which its shadow is seen a quarter darker, softly, some pixels away."""
+    size = 120
+    v, u = np.mgrid[:size, :size].astype(float)
+    shadow = 0.5 - 0.5 * erf((np.hypot(u - centre[0] - away[0], v - centre[1] - away[1]) - radius) / 4)
+    part = 0.5 + 0.5 * erf((np.hypot(u - centre[0], v - centre[1]) - radius) / (np.sqrt(2) * 0.8))
+    return (0.07 + (0.72 * (1 - 0.27 * shadow) - 0.07) * part).astype(np.float32)
+
+
+def test_a_shadow_beside_the_ball_does_not_hide_it():
+    """It draws the template towards itself, and the ball's own edge on that side is too near to be looked for."""
+    centre = np.array([60.3, 58.8])
+    for turn in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        away = np.array([np.cos(turn), np.sin(turn)])
+        picture = shadowed(centre, 17.0, 18 * away)
+        for off in (6.0, 8.0, 10.0):
+            rough = find_rough_edge(picture, centre + off * away, 20.0, step=0.3)
+            assert rough is not None
+            assert np.linalg.norm(fit_edge(picture, rough.ellipse).ellipse.centre - centre) < 0.05
+
+
 def test_no_edge_where_there_is_none():
     rng = np.random.default_rng(0)
     flat = rng.normal(0.5, 0.02, (60, 60)).astype(np.float32)

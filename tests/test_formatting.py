@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from implicam.formatting import decimal_number, json_default, json_safe, number, percent
+from implicam.formatting import decimal_number, json_default, json_safe, number, number_with_sd, percent, without_dust
 
 READABLE = st.floats(1e-8, 1e9) | st.floats(-1e9, -1e-8)
 
@@ -45,6 +45,19 @@ def test_what_is_read_back_is_rounded_by_half_a_digit_at_most(value: float, digi
 def test_signs() -> None:
     assert (number(-1.234), number(-1.234, minus="−"), number(1.234, sign=True)) == ("-1.23", "−1.23", "+1.23")
     assert (number(0.0, sign=True), number(None, sign=True), number(-math.inf, minus="−")) == ("0", "–", "–")
+
+
+def test_what_is_nothing_beside_its_neighbours_is_zero() -> None:
+    assert str(without_dust([-3e-8, 120.0, -0.0])) == "[0.0, 120.0, 0.0]"
+    assert without_dust([-3e-8, 2e-8]) == [-3e-8, 2e-8]  # beside each other they are something
+    assert without_dust([]) == []
+    assert str(without_dust([math.nan, 1.0, -0.0])) == "[nan, 1.0, 0.0]"
+
+
+def test_no_minus_before_zeros() -> None:
+    assert number_with_sd(-3e-8, 0.1) == "0.00 ± 0.10"
+    assert number_with_sd(-0.004, 0.12) == "0.00 ± 0.12"
+    assert number_with_sd(-0.006, 0.12) == "-0.01 ± 0.12"
 
 
 def test_shares() -> None:

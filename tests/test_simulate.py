@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,8 @@ from implicam.simulate import (
     views,
     write_rig,
 )
+from implicam.simulate.rigs import Unusual
+from implicam.simulate.truth import limit_of_detection, read_rig
 
 SPECS = ["bar6", "stereo", "dome8"]
 
@@ -421,3 +424,50 @@ def test_only_the_cameras_of_the_group_take_a_photograph(tmp_path: Path) -> None
     assert sorted(str(p.relative_to(tmp_path / "images")) for p in tmp_path.rglob("*.png")) == [
         "cam2/held001.png", "cam2/held003.png", "cam3/held002.png", "cam3/held003.png",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("spec", "options"),
+    [
+        ("bar6", {"seed": 0}),
+        ("2R", {"seed": 3, "noise": 0.1}),
+        ("grid9", {"seed": 2, "frame": "random", "lens_error": 0.0}),
+        ("dome8", {"seed": 4, "unit": "m", "cameras": "cam5,cam2"}),
+        ("bar6", {"seed": 1, "unusual": Unusual(tilt=5, mirror="cam2", window=10.0)}),
+    ],
+)
+def test_a_rig_is_built_again_from_its_truth(spec: str, options: dict[str, Any], tmp_path: Path) -> None:
+    rig = build_rig(spec, **options)
+    path = tmp_path / "truth.toml"
+    path.write_text(tomli_w.dumps({**write_rig(rig), "shots_seed": 1}))
+    again = read_rig(path)
+    assert again is not None
+    xyz = some_points(rig, 10)
+    for one, other in zip(rig.cameras, again.cameras, strict=True):
+        np.testing.assert_allclose(other.jacobian(xyz), one.jacobian(xyz))
+    table = tomllib.loads(path.read_text())
+    table["cameras"][0]["lens"]["fx"] *= 1.001
+    for text in (tomli_w.dumps(table), "", "name = 3", "[", 'name = "my-drawing.toml"'):
+        path.write_text(text)
+        assert read_rig(path) is None
+    assert read_rig(tmp_path / "none.toml") is None
+
+
+def test_the_limit_of_a_detection_is_that_of_its_views(tmp_path: Path) -> None:
+    rig = build_rig("stereo", seed=1, noise=0.2)
+    data = simulate(rig, random_positions(rig, 20, np.random.default_rng(0)), seed=2)
+    assert data.truth is not None
+    finer = replace(data, observations=replace(data.observations, sd=np.full_like(data.observations.uv, 0.02)))
+    limit, note = limit_of_detection(tmp_path, finer)
+    assert limit.truth is not None
+    assert np.isnan(limit.truth.limit).all()
+    assert "taken out" in note
+    np.testing.assert_array_equal(limit.truth.xyz, data.truth.xyz)
+    (tmp_path / "truth.toml").write_text(tomli_w.dumps(write_rig(rig)))
+    for folder in (tmp_path, tmp_path / "check"):
+        limit, note = limit_of_detection(folder, finer)
+        assert limit.truth is not None
+        np.testing.assert_allclose(limit.truth.limit, data.truth.limit / 100, rtol=1e-9)
+        assert "as detected" in note
+    real = replace(data, known=replace(data.positions, extra={}))
+    assert limit_of_detection(tmp_path, real) == (real, "")

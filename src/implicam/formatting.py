@@ -13,6 +13,9 @@ MIN_DECIMAL_VALUE = 1e-8
 """Smaller numbers would be nothing but zeros on a terminal."""
 MAX_DECIMALS = 9
 
+MAX_DUST_SHARE = 1e-6
+"""Of the largest of several numbers: a smaller one beside it is what rounding leaves, -0.00000003 say."""
+
 
 def number(value: float | None, digits: int = 3, *, sign: bool = False, minus: str = "-") -> str:
     """A number with a number of significant digits, for pages and figures.
@@ -70,7 +73,20 @@ def number_with_sd(value: float, sd: float) -> str:
     if not math.isfinite(sd) or sd <= 0:
         return f"{value:.6g}"
     decimals = max(0, 1 - math.floor(math.log10(sd)))
-    return f"{value + 0.0:.{decimals}f} ± {sd:.{decimals}f}"
+    return f"{round(value, decimals) + 0.0:.{decimals}f} ± {sd:.{decimals}f}"  # + 0.0: no minus before zeros
+
+
+def without_dust(values: Sequence[float]) -> list[float]:
+    """Numbers of one kind, such as the three of a place, with zero for what is nothing beside the largest.
+
+    Args:
+        values: The numbers.
+
+    Returns:
+        The numbers; zero, never minus zero, for those below a part of the largest of `MAX_DUST_SHARE`.
+    """
+    largest = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
+    return [0.0 if abs(value) <= MAX_DUST_SHARE * largest else value for value in values]
 
 
 def percent(share: float | None, decimals: int = 0, *, none: str = "–") -> str:
@@ -128,3 +144,17 @@ def list_some(names: Sequence[str], most: int = 5, total: int | None = None) -> 
     """
     more = (len(names) if total is None else total) - min(len(names), most)
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names without what is the same in all of them, for places with little room: t0012 is 12 beside t0436.
+
+    Args:
+        names: All of them, each different.
+    """
+    low, high = min(names, default=""), max(names, default="")  # what these two share, all of them do
+    same = next((k for k, (one, other) in enumerate(zip(low, high, strict=False)) if one != other), 0)
+    start = low[:same].rstrip("0123456789")
+    rest = [name[len(start) :] for name in names]
+    short = [text.lstrip("0") or "0" for text in rest] if all(text.isdigit() for text in rest) else rest
+    return short if len(set(short)) == len(names) and all(short) else list(names)

@@ -6,6 +6,7 @@ adds the traceback, and `--verbose` or `-v` shows what a command does as it goes
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -27,12 +28,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     try:
         with log_to_stream(sys.stderr) if verbose else nullcontext():
-            load_options(app, given)
+            load_options(app, given or _words_to_complete())
             app(given, prog_name="implicam")
     except ImplicamError as error:
         _fail(str(error), 2 if isinstance(error, UsageError) else 1, debug)
     except Exception as error:
         _fail(str(_unexpected(error)), 1, debug)
+
+
+def _words_to_complete() -> list[str]:
+    """The words of the line that a shell wants completed; none where it does not. Typer's scripts hand them over so:
+    all of them in one variable, bash in another."""
+    if "_IMPLICAM_COMPLETE" not in os.environ:
+        return []
+    return os.environ.get("_TYPER_COMPLETE_ARGS", os.environ.get("COMP_WORDS", "")).split()[1:]
 
 
 def _fail(text: str, code: int, debug: bool) -> NoReturn:

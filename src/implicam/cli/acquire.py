@@ -23,7 +23,7 @@ from implicam.dataset import Floats
 from implicam.dataset.folder import csv_text
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.files import write_text
-from implicam.formatting import decimal_number, percent
+from implicam.formatting import decimal_number, percent, without_dust
 from implicam.images import opencv
 from implicam.logs import LOG, log_to_file
 
@@ -94,7 +94,7 @@ def _suggest(
         steps = {"now": asdict(found.now), "expected": asdict(found.then)}
         show.emit_json({"length_unit": unit, "workspace": found.workspace.name, "targets": targets, **steps})
         return
-    rows = [[str(i), *(f"{x:.5g}" for x in t.xyz)] for i, t in enumerate(found.targets, start=1)]
+    rows = [[str(i), *(f"{x:.5g}" for x in without_dust(t.xyz.tolist()))] for i, t in enumerate(found.targets, start=1)]
     show.line(f"Where to put the next known points, in {unit}:")
     show.table(show.text_table("", ["", "x", "y", "z"], rows))
     seen = [[str(i), *(_pixel(uv) for _, uv in _pairs(cameras, t.uv))] for i, t in enumerate(found.targets, start=1)]

@@ -20,8 +20,9 @@ import implicam.cli.cameras
 import implicam.cli.compare
 import implicam.cli.design
 import implicam.cli.detect
+import implicam.cli.label
 import implicam.cli.paper
-import implicam.cli.simulate  # noqa: F401  the seven register their commands
+import implicam.cli.simulate  # noqa: F401  the eight register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards
@@ -353,7 +354,8 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
     show.line(f"{evaluation.method} on {evaluation.data.name}: {evaluation.how}")
     for table in show.evaluation_tables(evaluation):
         show.table(table)
-    show.line(show.verdict(evaluation.coverage.overall))
+    show.explain(*show.evaluation_words(evaluation))
+    show.line(f"\n{show.verdict(evaluation.coverage.overall)}")
     if report is not None:
         show.line(f"report: {report}")
     show.notes(show.reasons(evaluation.measurement))

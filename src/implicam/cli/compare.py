@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -67,6 +68,8 @@ def compare_command(
         return
     rows = summarise(trials)
     show.table(compare_table(rows, data.length_unit))
+    limited = any(math.isfinite(row.mean["rmse_over_limit"]) for row in rows)
+    show.explain("rmse", *["limit"] * limited, "NEES")
     if output is not None:
         show.line(f"figure: {output}")
     show.notes(compare_failures(trials))

@@ -33,7 +33,7 @@ from implicam.coverage import NEES_RIGHT, Estimate, Summary
 from implicam.demo import HELD_OUT, Demo
 from implicam.detect.folder import DetectionRun
 from implicam.evaluation import Evaluation
-from implicam.formatting import decimal_number, json_safe, percent
+from implicam.formatting import decimal_number, json_safe, percent, without_dust
 from implicam.measurement import Measurement
 from implicam.progress import Progress
 from implicam.verdict import Verdict
@@ -113,6 +113,7 @@ def _value(value: Any) -> str:
     if isinstance(value, Mapping):
         return f"{{ {', '.join(f'{key} = {_value(one)}' for key, one in value.items())} }}" if value else "{}"
     if isinstance(value, list):
+        value = without_dust(value) if all(isinstance(one, float) for one in value) else value
         return f"[{', '.join(map(_value, value))}]"
     return json.dumps(float(f"{value:.6g}") if isinstance(value, float) else value, ensure_ascii=False)
 
@@ -248,6 +249,36 @@ def evaluation_tables(evaluation: Evaluation) -> list[Table]:
         ],
     )
     return [errors, bars, _coverage_table(rows)]
+
+
+_EXPLANATIONS = {
+    "rmse": "root of the mean squared error, along each axis and in 3D",
+    "limit": "Cramer-Rao bound: no method has a smaller rmse on average with this pixel noise;\n1 is the best there is",
+    "stated": "the rmse that the error bars predict",
+    "NEES": "mean squared error in units of the error bars: 3 is right, more is bars too small",
+    "NLL, CRPS": "marks for errors and error bars together, to compare methods on the same data:\nsmaller is better",
+    "per axis, ellipsoid": "% of errors inside the bars of one axis, and of all three at once\n"
+    "(coverage): right is what stands above the column",
+}
+
+
+def explain(*words: str) -> None:
+    """Say what words of a table mean, a line or two each, below it.
+
+    Args:
+        words: Keys of `_EXPLANATIONS`.
+    """
+    for word in words:
+        first, *rest = _EXPLANATIONS[word].splitlines()
+        line(f"{word}: {first}")
+        for text in rest:
+            line(f"  {text}")
+
+
+def evaluation_words(evaluation: Evaluation) -> list[str]:
+    """The words of `evaluation_tables` that want an explanation."""
+    limited = any(math.isfinite(row.rmse_over_limit) for row in evaluation.coverage.rows)
+    return [word for word in _EXPLANATIONS if word != "limit" or limited]
 
 
 def _error_cells(row: Summary, limited: bool) -> list[str]:

@@ -471,11 +471,17 @@ class Dataset:
         Raises:
             DatasetError: There is no such camera.
         """
-        known = self.known
-        if known and set(names) != set(self.observations.camera_names):
-            forgotten = {c: np.full(len(self), "nan") for c in known.extra if c.startswith("limit_")}
-            known = replace(known, extra={**known.extra, **forgotten})
+        whole = set(names) == set(self.observations.camera_names)
+        known = self.known if whole else self.without_limit().known
         return replace(self, observations=self.observations.with_cameras(names), known=known)
+
+    def without_limit(self) -> Dataset:
+        """The dataset with an unknown Cramer-Rao limit, where it is a simulated one: its views are not those that the
+        limit was computed for."""
+        if not self.known:
+            return self
+        forgotten = {c: np.full(len(self), "nan") for c in self.known.extra if c in TRUTH_COLUMNS[3:]}
+        return replace(self, known=replace(self.known, extra={**self.known.extra, **forgotten}))
 
     def without(self, names: Sequence[str]) -> Dataset:
         """The dataset without some cameras; every point stays, seen or not.

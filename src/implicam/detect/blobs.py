@@ -91,15 +91,16 @@ def laplacian(picture: Grey, sigma: float) -> Grey:
     return np.asarray(-(sigma**2) * cv2.Laplacian(smooth, cv2.CV_32F, borderType=cv2.BORDER_REPLICATE))
 
 
-def find_scale(picture: Grey, uv: Floats, largest: float) -> tuple[float, Floats]:
+def find_scale(picture: Grey, uv: Floats, largest: float, within: float = MAX_CLICK_PX) -> tuple[float, Floats]:
     """Find the one scale of the spots that some pixels show.
 
     It is one scale for all: specks of noise and glints, which are small, are at odds with each other.
 
     Args:
         picture: (height, width) grey from 0 to 1.
-        uv: (n, 2) pixels, each within `MAX_CLICK_PX` of a spot.
+        uv: (n, 2) pixels, each near a spot.
         largest: The largest scale to be tried, in pixels.
+        within: How near, in pixels.
 
     Returns:
         The scale in pixels; and the answers (n,) of the spots to it, negative where a spot is dark, NaN outside the
@@ -108,7 +109,7 @@ def find_scale(picture: Grey, uv: Floats, largest: float) -> tuple[float, Floats
     sigmas = MIN_SCALE_PX * SCALE_FACTOR ** np.arange(
         0, 1 + np.log(max(largest / MIN_SCALE_PX, 1.0)) / np.log(SCALE_FACTOR)
     )
-    answers = np.array([_strongest_answers(picture, u, v, sigmas) for u, v in uv]).reshape(-1, len(sigmas))
+    answers = np.array([_strongest_answers(picture, u, v, sigmas, within) for u, v in uv]).reshape(-1, len(sigmas))
     clear = np.sign(answers) * np.maximum(np.abs(answers) - MIN_RESPONSE_NOISES * _answer_noise(picture, sigmas), 0)
     inside = np.isfinite(answers[:, 0])
     height = np.abs(answers[inside]).max(axis=1, keepdims=True)
@@ -117,15 +118,15 @@ def find_scale(picture: Grey, uv: Floats, largest: float) -> tuple[float, Floats
     return float(sigmas[best]), answers[:, best]
 
 
-def _strongest_answers(picture: Grey, u: float, v: float, sigmas: Floats) -> Floats:
-    """The strongest answer, of either sign, to each scale within `MAX_CLICK_PX` of a pixel."""
-    reach = int(np.ceil(4 * sigmas[-1] + MAX_CLICK_PX + 2))
+def _strongest_answers(picture: Grey, u: float, v: float, sigmas: Floats, within: float) -> Floats:
+    """The strongest answer, of either sign, to each scale within so many pixels of a pixel."""
+    reach = int(np.ceil(4 * sigmas[-1] + within + 2))
     left, top = max(round(u) - reach, 0), max(round(v) - reach, 0)
     if not (-0.5 <= u < picture.shape[1] - 0.5 and -0.5 <= v < picture.shape[0] - 0.5):
         return np.full(len(sigmas), np.nan)
     window = np.ascontiguousarray(picture[top : round(v) + reach + 1, left : round(u) + reach + 1])
     rows, columns = np.indices(window.shape)
-    near = np.hypot(columns + left - u, rows + top - v) <= MAX_CLICK_PX
+    near = np.hypot(columns + left - u, rows + top - v) <= within
     found = np.array([laplacian(window, float(sigma))[near] for sigma in sigmas], dtype=np.float64)
     return np.asarray(found[np.arange(len(sigmas)), np.argmax(np.abs(found), axis=1)], dtype=np.float64)
 
@@ -158,6 +159,57 @@ def find_spots(picture: Grey, sigma: float) -> tuple[Floats, Floats]:
     round_enough = (across > 0) & (along < MAX_ELONGATION**2 * across)
     uv = np.column_stack([u, v]).astype(np.float64)[round_enough]
     return uv, answer[v, u].astype(np.float64)[round_enough]
+
+
+def find_spot_near(
+    picture: Grey, uv: Floats, within: float, *, like: Floats | None = None, largest: float = 16.0
+) -> Floats | None:
+    """Find the spot, bright or dark, that a person means who points at a pixel.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        uv: (2,) the pixel.
+        within: So many pixels from it at most.
+        like: (n, 2) pixels of known spots of the same kind, which tell the scale; without, the one that is sought does.
+        largest: The largest scale to be tried, in pixels.
+
+    Returns:
+        (2,) the pixel of its middle; None where there is no spot.
+    """
+    shown, near = (uv[None], within) if like is None or not len(like) else (like, MAX_CLICK_PX)
+    best, answers = find_scale(picture, shown, largest, near)
+    if not np.isfinite(answers).any():
+        return None
+    reach = int(np.ceil(within + 8 * largest + 12))
+    left, top = (max(round(float(x)) - reach, 0) for x in uv)
+    window = picture[top : round(float(uv[1])) + reach + 1, left : round(float(uv[0])) + reach + 1]
+    window = np.ascontiguousarray(1 - window if np.nansum(answers) < 0 else window)
+    corner = np.array([left, top])
+    for sigma in (best, *LONE_SPOT_FACTORS * best) if shown is not like else (best,):
+        found = _nearest_spot(window, uv - corner, within, float(sigma)) if sigma <= largest else None
+        if found is not None:
+            return np.asarray(found + corner, dtype=np.float64)
+    return None
+
+
+def _nearest_spot(picture: Grey, uv: Floats, within: float, sigma: float) -> Floats | None:
+    """The middle (2,) of the spot nearest to a pixel that is not much fainter than the others there."""
+    rough, strength = find_spots(picture, sigma)
+    near = np.linalg.norm(rough - uv, axis=1) <= within + sigma
+    spots, strength = measure_spots(picture, rough[near], sigma).uv, strength[near]
+    off = np.linalg.norm(spots - uv, axis=1)
+    meant = off <= within  # NaN is not
+    if not meant.any():
+        return None
+    meant &= strength >= MIN_STRENGTH_RATIO * strength[meant].max()
+    return np.asarray(spots[np.argmin(np.where(meant, off, np.inf))], dtype=np.float64)
+
+
+LONE_SPOT_FACTORS = np.array([2.0, 3.0])
+"""A single spot may answer best to the scale of a glint or of a speck on it; these are tried then."""
+
+MIN_STRENGTH_RATIO = 0.3
+"""Of the strongest answer near a pixel: fainter spots beside it are not meant."""
 
 
 def _principal_curvatures(answer: Grey, u: NDArray[np.intp], v: NDArray[np.intp]) -> tuple[Floats, Floats]:

@@ -136,19 +136,22 @@ def find_rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float
     """
     for _ in range(3):
         points, rise = _find_steepest_rise(picture, centre, radius)
-        if np.mean(rise > 0.6 * step) < 0.6:  # no ellipse can be better than that
+        steep = rise > 0.6 * step
+        if np.mean(steep) < 0.6:  # no ellipse can be better than that
             return None
-        found = _fit_robust_ellipse(points, centre, radius)
+        found = _fit_robust_ellipse(points, steep, centre, radius)
         if found is None or np.linalg.norm(found[0].centre - centre) > radius:
             return None
         ellipse, on_it = found
-        part = float(np.mean(on_it & (rise > 0.6 * step)))
-        if part < 0.6 or ellipse.axes[1] < 0.55 * ellipse.axes[0]:
+        part = float(np.mean(on_it & steep))
+        if part < 0.45 or ellipse.axes[1] < 0.55 * ellipse.axes[0]:
             return None
         moved = np.linalg.norm(ellipse.centre - centre)
         centre, radius = ellipse.centre, ellipse.radius
         if moved < 0.7:
             break
+    if part < 0.6:  # at the end: from a centre that is off, near parts of the edge are not looked for
+        return None
     return Rough(ellipse, part * float(np.median(rise)))
 
 
@@ -175,12 +178,16 @@ def _find_steepest_rise(picture: Grey, centre: Floats, radius: float) -> tuple[F
     return centre + r[places][:, None] * out, np.asarray(high - low, dtype=np.float64)
 
 
-def _fit_robust_ellipse(points: Floats, centre: Floats, radius: float) -> tuple[Ellipse, Bools] | None:
-    """The ellipse through most of the points, and (n,) which those are: iteratively reweighted, about the centre."""
+def _fit_robust_ellipse(points: Floats, steep: Bools, centre: Floats, radius: float) -> tuple[Ellipse, Bools] | None:
+    """The ellipse through most of the points, and (n,) which those are: iteratively reweighted, about the centre.
+
+    It begins with the steep rises alone. A shadow beside the ball draws the centre towards itself; where the ball's own
+    edge is then too near to be looked for, the edge of the shadow is found, which is less steep.
+    """
     p = (points - centre) / radius
     basis = np.column_stack([p[:, 0] ** 2, 2 * p[:, 0] * p[:, 1], p[:, 1] ** 2, p])
     pull = np.array([1.0, 0, 1, 0, 0])  # towards the circle we came from, gently
-    weight = np.ones(len(p))
+    weight = steep.astype(np.float64)
     for _ in range(5):
         normal = (basis * weight[:, None]).T @ basis + 0.02 * len(p) * np.diag([1.0, 1, 1, 0.1, 0.1])
         solved = np.linalg.solve(normal, basis.T @ weight + 0.02 * len(p) * pull)

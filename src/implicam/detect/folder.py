@@ -27,7 +27,7 @@ import numpy as np
 
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, folder_files
 from implicam.dataset.boards import check_size
-from implicam.dataset.folder import DESCRIPTION, IMAGES, VIEWS, csv_text, read_description, read_known
+from implicam.dataset.folder import DESCRIPTION, IMAGES, POINTS, VIEWS, csv_text, read_description, read_known
 from implicam.dataset.model import check_name
 from implicam.dataset.tables import parse_toml
 from implicam.detect.journal import Entry, JournalResults, detect_all
@@ -40,6 +40,7 @@ from implicam.formatting import list_some
 from implicam.images import one_thread_each
 from implicam.picture_names import find_pictures, in_order, sort_pictures
 from implicam.progress import Progress, silent
+from implicam.simulate.truth import limit_of_detection
 
 DETECTIONS, JOURNAL_FILE, SUMMARY_FILE, WRITTEN_FILE = "detections", "journal.jsonl", "summary.csv", "written.toml"
 INFERRED_FILE = "inferred.csv"
@@ -128,7 +129,8 @@ def detect_folder(
         more += _write_inferred(folder / INFERRED_FILE, results)
         if data is not None:
             data, said = (correct or detector.correct)(data)
-            more += [*said, *_write(rig, data), *rig.explain_missing_size()]
+            data, limit = limit_of_detection(rig.path, data)
+            more += [*said, *_write(rig, data), *rig.explain_missing_size(), *filter(None, [limit])]
         sheets, undrawn = draw_sheets(folder, results, progress, redraw=restart) if overlays else ((), ())
     if data is None:
         raise _nothing_found_error(rig, results, sheets)
@@ -163,7 +165,7 @@ class _Rig:
     def of(cls, path: Path, unit: str | None, pictures: str | None, pattern: str | None) -> _Rig:
         described = read_description(path) if (path / DESCRIPTION).exists() else None
         known = [camera.name for camera in described[2]] if described else []
-        found, read = _find_pictures(path, pictures, pattern, known)
+        found, read = pictures_of(path, pictures, pattern, known)
         name, said, cameras, extra = described or _describe_folder(path, unit, found)
         if unit not in (None, said):
             raise UsageError(
@@ -227,10 +229,24 @@ def _same(said: Any, told: Any) -> bool:
     return bool(said == told)
 
 
-def _find_pictures(
+def pictures_of(
     path: Path, pictures: str | None, pattern: str | None, cameras: Sequence[str]
 ) -> tuple[Mapping[str, Mapping[str, Path]], tuple[str, ...]]:
-    """The pictures by camera and shot, and what there is to say about how they were found."""
+    """Find the pictures of a dataset.
+
+    Args:
+        path: The dataset's folder.
+        pictures: The folder of the pictures, below it; None for `images`, or the dataset where that is missing.
+        pattern: How their names tell camera and shot, as `find_pictures` takes it; None for what `sort_pictures` reads.
+        cameras: Names of cameras that are known.
+
+    Returns:
+        {camera: {shot: file}}, and what there is to say about how they were found.
+
+    Raises:
+        UsageError: The pattern is none.
+        ImageError: There are no pictures.
+    """
     folder = path / (pictures or IMAGES)
     if pictures is None and not folder.is_dir() and path.is_dir():
         folder = path
@@ -396,6 +412,8 @@ def _write(rig: _Rig, data: Dataset) -> list[str]:
     # Both sums first: after a kill between the two, the next run still recognises its own file.
     write_text(record, toml_text({"observations_sha256": [*ours, new]}))
     write_text(target, files[VIEWS])
+    if data.truth is not None:  # nobody but `simulate` writes this, and the limit is that of the views
+        write_text(rig.path / POINTS, files[POINTS])
     return notes
 
 

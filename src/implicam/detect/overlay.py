@@ -13,6 +13,8 @@ from implicam import drawing
 from implicam.dataset import Floats
 from implicam.detect.model import Detected, Inferred, View
 from implicam.drawing import Canvas, Pixels
+from implicam.formatting import short_names
+from implicam.images import brighten
 
 INK_COLOUR = (40, 50, 60)
 STATES = {"found": drawing.GREEN, "partly found": drawing.ORANGE, "nothing found": drawing.VERMILLION}
@@ -22,6 +24,10 @@ MAX_SIDE_PX, MIN_SIDE_PX = 1600, 800
 
 TILE_PX, TEXT_PX = (320, 240), 62
 """The width and height of a thumbnail, and the height of the text below it."""
+
+MAX_SIDE_OF_DOTS_PX, NAME_PX, MAX_NAME_PX = 6000, 13, 22
+"""Pixels: the longer side that a picture of labelled dots may have so that their names can be read, and the least and
+the largest size of these."""
 
 MAX_NAMED_POINTS = 12
 """So many points have their names beside them."""
@@ -78,10 +84,35 @@ def draw_overlay(grey: Pixels | None, result: Result) -> Pixels:
     scale = min(1.0, MAX_SIDE_PX / longest)
     if longest < MIN_SIDE_PX:
         scale = float(min(16, MAX_SIDE_PX // longest))
+    if _is_labelled(result.found):
+        grey = brighten(grey)
+        scale = max(scale, min(_scale_to_read(result.found), MAX_SIDE_OF_DOTS_PX / longest))
     whole = _Window(0, 0, width, height, scale)
     canvas = whole.draw(grey, result.found)
     _draw_magnified(canvas, grey, result.found, whole)
     return _add_caption(canvas, result).pixels
+
+
+def _is_labelled(found: Detected) -> bool:
+    """Whether these are dots of a target of which some were labelled: each has a name to read, found or not."""
+    return "labelled" in found.notes
+
+
+def _scale_to_read(found: Detected) -> float:
+    """How many times larger than it is a picture must be for the names of its dots to have room."""
+    names, uv, _ = _all_dots(found)
+    if len(uv) < 2:
+        return 0.0
+    widest = max(drawing.text_width(name, NAME_PX) for name in names)
+    return float(max(widest + 4, 2 * RIMMED_RADIUS_PX + NAME_PX + 6) / np.median(_distances_to_nearest(uv)))
+
+
+def _all_dots(found: Detected) -> tuple[list[str], Floats, Floats]:
+    """Short names and pixels (n, 2) of the dots found and then of the missing ones, and the pixels (m, 2) of the
+    missing ones alone."""
+    missing = found.notes.get("missing", {})
+    gone = np.array(list(missing.values()), dtype=np.float64).reshape(-1, 2)
+    return short_names([*found.points, *missing]), np.concatenate([found.uv, gone]), gone
 
 
 def draw_thumbnail(grey: Pixels | None, result: Result) -> Pixels:
@@ -98,6 +129,7 @@ def draw_thumbnail(grey: Pixels | None, result: Result) -> Pixels:
     if grey is None:
         inner = _draw_unreadable(width, height)
     else:
+        grey = brighten(grey) if _is_labelled(result.found) else grey
         whole = _Window.fitting(0, 0, grey.shape[1], grey.shape[0])
         window = _find_neighbourhood(result.found, grey.shape) or whole
         inner = window.draw(grey, result.found, names=False)
@@ -147,6 +179,9 @@ class _Window:
     def draw(self, grey: Pixels, found: Detected, *, names: bool = True) -> Canvas:
         """That part of the picture with outlines, lines, marks and names."""
         canvas = self.cut(grey)
+        if _is_labelled(found):
+            self._draw_dots(canvas, found, names=names)
+            return canvas
         canvas.stroke([self.place(drawing.finite_points(curve)) for curve in found.outlines], drawing.SKY)
         if not len(found):
             for other in found.others[:1]:
@@ -163,6 +198,24 @@ class _Window:
         elif names:
             _write_names(canvas, found.points, uv)
         return canvas
+
+    def _draw_dots(self, canvas: Canvas, found: Detected, *, names: bool) -> None:
+        """Rings around the dots found, thick ones around those that a person labelled, crosses where others must be."""
+        texts, every, gone = _all_dots(found)
+        uv, gone = self.place(every), self.place(gone)
+        apart = float(np.median(_distances_to_nearest(uv))) if len(uv) > 1 else np.inf
+        radius, size = float(np.clip(0.2 * apart, 2.0, 9.0)), float(np.clip(0.3 * apart, NAME_PX, MAX_NAME_PX))
+        rim = int(radius >= RIMMED_RADIUS_PX)
+        by_hand = [name in found.notes["labelled"] for name in found.points]
+        for labelled, colour in ((False, drawing.SKY), (True, drawing.ORANGE)):
+            at = [place for place, hand in zip(uv, by_hand, strict=False) if hand == labelled]
+            canvas.stroke([drawing.circle(place, radius + 2 * labelled) for place in at], colour, 1 + 2 * labelled, rim)
+        arms = 0.8 * radius * np.array([[(-1, -1), (1, 1)], [(-1, 1), (1, -1)]])
+        canvas.stroke([place + arm for place in gone for arm in arms], drawing.VERMILLION, 2, rim)
+        if names and self.scale >= 0.99 * _scale_to_read(found):
+            colours = [drawing.ORANGE if hand else drawing.SKY for hand in by_hand]
+            for text, (u, v), colour in zip(texts, uv, [*colours, *[drawing.VERMILLION] * len(gone)], strict=True):
+                canvas.write(text, (u, v + radius + 3 + size / 2), size, colour, "mm", rim=1)
 
     def _draw_inferred(self, canvas: Canvas, inferred: Inferred, radius: float) -> None:
         """Hollow rings where hidden points must be, and the ellipses that hold 95 % where those are larger."""
@@ -303,6 +356,8 @@ def _add_caption(canvas: Canvas, result: Result) -> Canvas:
     """The canvas above a strip that says which picture this is, what was found, and what was not, why."""
     width, colour = max(canvas.width, 560), STATES[result.state]
     lines = drawing.wrap_text(result.found.reason, width - 24, 15, 5)
+    if _is_labelled(result.found):
+        lines.insert(0, "ring: found; thick ring: labelled; cross: missing")
     strip = drawing.blank(width, 34 + 22 * len(lines) + (6 if lines else 0), drawing.DARK)
     strip.fill(0, 0, width, 4, colour)
     strip.fill(width - 30, 12, width - 13, 29, colour)

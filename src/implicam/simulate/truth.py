@@ -1,13 +1,22 @@
-"""The truth about a simulated rig as plain tables, for `truth.toml`."""
+"""The truth about a simulated rig as plain tables, for `truth.toml`, and the rig that such a file tells of."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from implicam.dataset import Dataset
+from implicam.dataset.folder import TRUTH
+from implicam.dataset.tables import parse_toml
+from implicam.errors import ImplicamError
 from implicam.geometry import Pose
 from implicam.simulate.camera import SimulatedCamera
-from implicam.simulate.rigs import Rig, Unusual
+from implicam.simulate.noise import with_limit
+from implicam.simulate.rigs import Rig, Unusual, build_rig
 
 
 def write_rig(rig: Rig) -> dict[str, Any]:
@@ -29,6 +38,74 @@ def write_rig(rig: Rig) -> dict[str, Any]:
         "volume": {"size": volume.size.tolist(), "world_from_box": _pose_table(volume.world_from_box)},
         "cameras": [_camera_table(camera) for camera in rig.cameras],
     }
+
+
+def read_rig(path: Path) -> Rig | None:
+    """Build the rig again that `truth.toml` tells of.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The rig; None where there is no such file, or where the rig cannot be built from it: one that was drawn in a
+        file of its own, or by another version of implicam.
+    """
+    try:
+        table = parse_toml(path.read_text(encoding="utf-8"))
+        first = table["cameras"][0]
+        rig = build_rig(
+            str(table["name"]),
+            seed=int(table["seed"]),
+            lens_error=float(first["lens_error_rms_px"]),
+            noise=float(first["noise_sd_px"]),
+            frame=table["frame"],
+            unit=table["length_unit"],
+            cameras=",".join(str(camera["name"]) for camera in table["cameras"]),
+            unusual=Unusual(**{one.name: table[one.name] for one in fields(Unusual) if one.name in table}),
+        )
+    except (OSError, ImplicamError, LookupError, TypeError, ValueError, AttributeError):
+        return None
+    told = zip(write_rig(rig)["cameras"], table["cameras"], strict=False)
+    return rig if all(_same_camera(one, other) for one, other in told) else None
+
+
+def _same_camera(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether name, lens and pose are those of the other, to the last digits."""
+
+    def numbers(camera: Mapping[str, Any]) -> list[float]:
+        lens = [value for value in camera["lens"].values() if not isinstance(value, str)]
+        pose = camera["camera_from_world"]
+        return [float(x) for x in (*lens, *np.ravel(pose["rotation"]), *pose["translation"])]
+
+    try:
+        here, there = numbers(one), numbers(other)
+    except (LookupError, TypeError, ValueError, AttributeError):
+        return False
+    return one["name"] == other.get("name") and len(here) == len(there) and np.allclose(here, there, rtol=1e-9)
+
+
+def limit_of_detection(folder: Path, data: Dataset) -> tuple[Dataset, str]:
+    """Give a simulated dataset whose views were detected the Cramer-Rao limit of these views.
+
+    What the simulation wrote is the limit of the pixel noise that it was told, which detection does not have.
+
+    Args:
+        folder: The dataset's, beside or below `truth.toml`.
+        data: With the views that were detected.
+
+    Returns:
+        The dataset, its limit unknown where the rig cannot be built again; and what there is to say, empty where
+        nothing is: it is no simulation.
+    """
+    if data.truth is None:
+        return data, ""
+    beside = folder.resolve() / TRUTH
+    rig = read_rig(beside if beside.exists() else folder.resolve().parent / TRUTH)
+    if rig is None or {camera.name for camera in rig.cameras} != {camera.name for camera in data.cameras}:
+        why = f"the simulated rig cannot be built again from {TRUTH}"
+        return data.without_limit(), f"the Cramer-Rao limit of the simulation is taken out of points.csv: {why}."
+    data = with_limit(rig, data)
+    return data, "points.csv now has the Cramer-Rao limit of the views as detected, instead of those as simulated."
 
 
 def _camera_table(camera: SimulatedCamera) -> dict[str, Any]:

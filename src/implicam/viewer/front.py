@@ -1,7 +1,7 @@
-"""The front door of `implicam acquire`: who may talk to the page, and so to the robot.
+"""The front door of the pages of `acquire` and `label`: who may talk to them, and so to a robot.
 
-The page itself (viser) listens on 127.0.0.1 on a port that nobody is told. This small server listens where people look
-for it, checks each request and passes it on. What it keeps out, and by what:
+The page itself (viser, Starlette) listens on 127.0.0.1 on a port that nobody is told. This small server listens where
+people look for it, checks each request and passes it on. What it keeps out, and by what:
 
 - a web page elsewhere that opens a WebSocket to this machine: the Origin must be the Host it came to;
 - a name that an attacker's DNS points to this machine (rebinding): only known Hosts are answered;
@@ -58,8 +58,8 @@ TOKEN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>impl
 <style>body{font:20px/1.5 system-ui,sans-serif;max-width:34em;margin:15vh auto;padding:0 1em}
 input,button{font:inherit;padding:.4em .7em}</style>
 <h1>This page asks for a token</h1>
-<p>It can move a robot, so only people with the token may open it. The token stands in the terminal where
-<code>implicam acquire</code> runs, at the end of the address it prints. Came here by that very address? Reload.</p>
+<p>Only people with the token may open it, because {stake}. The token stands in the terminal where
+<code>{command}</code> runs, at the end of the address it prints. Came here by that very address? Reload.</p>
 <form method="get"><input name="token" type="password" autocomplete="off" autofocus aria-label="token">
 <button>Open</button></form></html>
 """
@@ -213,6 +213,7 @@ class Front:
     path such as "/report.html" to a file, which may come later. `token` is what opens the page; where `needs_token`
     says so and None is given, one is made. `origin`, where given, is what the page behind gets as Origin of every
     request: it may refuse all others, since a web page elsewhere can try all ports of this machine and find its own.
+    `command` and `stake` are for the words: what serves the page, and why not everyone may open it.
     Runs in one thread of its own and prints nothing.
     """
 
@@ -225,16 +226,18 @@ class Front:
         token: str | None,
         files: Mapping[str, Path],
         origin: str | None = None,
+        command: str = "implicam acquire",
+        stake: str = "it can move a robot",
     ) -> None:
         if token == "":
             raise UsageError(
                 "The token of the page is empty.",
-                why="Anyone could open the page, and the page can move a robot.",
+                why=f"Anyone could open the page, and {stake}.",
                 fix="Leave the token out (one is made where it is needed), or give a long one.",
             )
         self.host, self.port = host.strip("[]").lower(), port
         self._behind, self._files = behind, dict(files)
-        self._origin = origin
+        self._origin, self._command, self._stake = origin, command, stake
         self._token = secrets.token_urlsafe(16) if token is None and needs_token(host) else token
         self._clients: set[asyncio.Task[None]] = set()
         self._thread: threading.Thread | None = None
@@ -361,13 +364,11 @@ class Front:
             raise _RefusedError(
                 403,
                 "This address does not belong to the page: it answers on localhost and where it was told to listen.\n"
-                "Open the address that implicam acquire printed, or start it with --host and the name used here.",
+                f"Open the address that {self._command} printed.",
             )
         ours = {f"{scheme}://{hosts[0].lower()}" for scheme in ("http", "https")}
         if (head.is_websocket and not origins) or any(origin.lower() not in ours for origin in origins):
-            raise _RefusedError(
-                403, "Another web page asked for this. Only the page itself may, since it moves a robot."
-            )
+            raise _RefusedError(403, f"Another web page asked for this. Only the page itself may, since {self._stake}.")
 
     def _is_ours(self, name: str) -> bool:
         """Whether `name` (lower case, no brackets) is this machine, or where we listen; no DNS is asked."""
@@ -390,7 +391,8 @@ class Front:
             return None
         if given:
             await asyncio.sleep(WRONG_TOKEN_SECONDS)
-        return _Reply(401, TOKEN_PAGE.encode(), ("Content-Type: text/html; charset=utf-8",))
+        words = TOKEN_PAGE.replace("{stake}", self._stake).replace("{command}", self._command)
+        return _Reply(401, words.encode(), ("Content-Type: text/html; charset=utf-8",))
 
     async def _file(self, head: _Head) -> _Reply | None:
         """One of `files`; None where the path is not among them."""
@@ -414,7 +416,7 @@ class Front:
             async with asyncio.timeout(PATIENCE_SECONDS):
                 behind = await asyncio.open_connection(*self._behind, limit=CHUNK_BYTES)
         except (OSError, TimeoutError):
-            return _words(502, "The page behind this door does not answer. Is implicam acquire still running?")
+            return _words(502, f"The page behind this door does not answer. Is {self._command} still running?")
         try:
             return await self._exchange(head, length, (reader, writer), behind)
         finally:
