@@ -21,6 +21,7 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.dataset.boards import corner_name
+from implicam.detect.corner_noise import true_sd
 from implicam.detect.grid import Grid, grow_grid, join_grids
 from implicam.detect.model import Detected, DetectorBase, Inferred, View, nothing
 from implicam.detect.numbering import END, MORE, Numbering, Sides, find_numberings, find_sides
@@ -187,7 +188,8 @@ class Board(DetectorBase):
         if not fitting or (fitting[0] > 0 and len(ways[fitting[0]]) > 1):
             return nothing(self._explain_misfit(grids[0], ends[0]), outlines=(hull_of(grids[0].uv[grids[0].occupied]),))
         first = fitting[0]
-        grid, possible = grids[first], [self._name_corners(grids[first], way, view) for way in ways[first]]
+        grid = self._with_true_sd(grids[first])
+        possible = [self._name_corners(grid, way, view) for way in ways[first]]
         outline = (hull_of(grid.uv[grid.occupied]),)
         if len(possible) > 1:
             return nothing(
@@ -231,6 +233,14 @@ class Board(DetectorBase):
             uv = self._plane_of(grid).predict(np.argwhere(there).astype(np.float64)).uv
         uv = uv[order]
         return Detected(tuple(corner_name(view.shot, int(j)) for j in number[order]), uv, sd)
+
+    def _with_true_sd(self, grid: Grid) -> Grid:
+        """With the standard uncertainties that the corners show together."""
+        there = grid.occupied
+        corners, seen = grid.corners, grid.corners[there.ravel()]
+        sd = corners.sd.copy()
+        sd[there.ravel()] = true_sd(np.argwhere(there).astype(np.float64), seen, max(self.rows, self.columns) / 2)
+        return replace(grid, corners=replace(corners, sd=sd))
 
     def _plane_of(self, grid: Grid) -> BoardPlane:
         return BoardPlane.of(grid, max(self.rows, self.columns) / 2)

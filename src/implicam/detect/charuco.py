@@ -25,6 +25,7 @@ from implicam.detect.board import (
     parse_board_size,
 )
 from implicam.detect.corners import Corners, fit_corners
+from implicam.detect.corner_noise import true_sd
 from implicam.detect.grid import MAX_ASTRAY_SQUARES, MAX_RESIDUAL_HEIGHTS, Places, predict_places
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import resize, to_original_pixels
@@ -141,7 +142,8 @@ class Charuco(DetectorBase):
             seen = again if len(again.ids) > len(seen.ids) else seen
         if seen.reason:
             return nothing(seen.reason)
-        corners, there = self._fit_all_corners(picture, seen)
+        nodes = np.argwhere(np.ones((self.rows - 1, self.columns - 1), dtype=np.bool_)).astype(np.float64)
+        corners, there = self._fit_all_corners(picture, seen, nodes)
         number = np.flatnonzero(there)
         if len(number) < MIN_CORNERS:
             return nothing(
@@ -151,7 +153,7 @@ class Charuco(DetectorBase):
         return Detected(
             tuple(corner_name(view.shot, int(j)) for j in number),
             corners.uv[number],
-            corners.sd[number],
+            true_sd(nodes[number], corners[number], max(self.rows, self.columns) / 2),
             explain_missing(len(number), self._total),
             (hull_of(corners.uv[number]),),
         )
@@ -207,9 +209,8 @@ class Charuco(DetectorBase):
         off = _in_squares(middle[known] - places.uv, places)
         return bool(np.mean(np.abs(off).max(axis=1) > MAX_MARKER_OFF_SQUARES) < 0.2)
 
-    def _fit_all_corners(self, picture: Grey, seen: _Seen) -> tuple[Corners, NDArray[np.bool_]]:
-        """All corners of the board, fitted; and (n,) which of them are clear."""
-        nodes = np.argwhere(np.ones((self.rows - 1, self.columns - 1), dtype=np.bool_)).astype(np.float64)
+    def _fit_all_corners(self, picture: Grey, seen: _Seen, nodes: Floats) -> tuple[Corners, NDArray[np.bool_]]:
+        """All corners of the board, at nodes (n, 2), fitted; and (n,) which of them are clear."""
         start = np.full((len(nodes), 2), np.nan)
         start[seen.ids] = seen.uv
         there = np.isfinite(start[:, 0])

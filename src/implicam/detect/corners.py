@@ -48,7 +48,8 @@ class Corners:
 
     mean, height: (n,) grey halfway, and from there to bright; the height is negative where the square between the two
     steps given is dark. misfit: (n,) rms of the residuals as a part of the height. blur: (n,) pixels.
-    turned: (n,) radians, how far the edges are from the directions given.
+    turned: (n,) radians, how far the edges are from the directions given. edge_shift: (n, 2) pixels that what is left
+    at the edges, beyond what is left elsewhere, would move them by if all of it were of one sign.
     Everything is NaN where there is no corner to be fitted, or too near to the rim of the picture.
     """
 
@@ -59,6 +60,7 @@ class Corners:
     misfit: Floats
     blur: Floats
     turned: Floats
+    edge_shift: Floats
 
     @classmethod
     def unknown(cls, n: int) -> Corners:
@@ -67,7 +69,7 @@ class Corners:
         Args:
             n: How many.
         """
-        return cls(*(np.full((n, *more), np.nan) for more in ((2,), (2,), (), (), (), (), ())))
+        return cls(*(np.full((n, *more), np.nan) for more in ((2,), (2,), (), (), (), (), (), (2,))))
 
     def __getitem__(self, rows: Bools | NDArray[np.intp]) -> Corners:
         return Corners(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
@@ -214,7 +216,18 @@ class _Windows:
         sd = np.sqrt(np.where(good[:, None], variance, np.nan) + MIN_SD_PX**2)
         uv = np.where(good[:, None], self.corner + parameters[:, :2], np.nan)
         turned = np.abs(np.sin(parameters[:, 2:4] - self.angle)).max(axis=1)
-        return Corners(uv, sd, mean, height, misfit, np.exp(parameters[:, 4]), turned)
+        shift = np.column_stack([_shift_of_edges(residual, jacobian[..., k] * weight, weight) for k in range(2)])
+        return Corners(uv, sd, mean, height, misfit, np.exp(parameters[:, 4]), turned, shift)
+
+
+def _shift_of_edges(residual: Floats, slope: Floats, weight: Floats) -> Floats:
+    """(n,) pixels, from the residuals where the grey changes with a coordinate, (n, pixels) slope, and where not."""
+    steep = slope**2
+    flat = weight * (steep < 0.05 * steep.max(axis=1, keepdims=True))
+    total = np.maximum(steep.sum(axis=1), 1e-12)
+    there = np.sum(steep * residual**2, axis=1) / total
+    elsewhere = np.sum(flat * residual**2, axis=1) / np.maximum(flat.sum(axis=1), 1.0)
+    return np.asarray(np.sqrt(np.maximum(there - elsewhere, 0) * total / np.maximum((steep**2).sum(axis=1), 1e-24)))
 
 
 def _fit_lines(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats]:

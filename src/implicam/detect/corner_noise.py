@@ -1,0 +1,104 @@
+"""How far off corners are, learned from the picture itself: the board says by how much they contradict each other.
+
+What a fit leaves at one corner says too little, or too much, of its error: JPEG and a colour sensor's interpolation make
+the errors of neighbouring pixels alike, and leave patterns that do not move a corner. But a board is flat and a lens is
+smooth: where each corner must be follows from all the others (`projective.py`), and the ratio of their true errors to
+the stated ones has a marginal likelihood. It is found for all corners together; their own residuals say how they differ.
+
+Corners that all lie at the same phase of the pixels' grid are off together, and no neighbour tells it: then what is left
+at the edges counts as one common shift.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from implicam.dataset import Floats
+from implicam.detect.corners import Corners
+from implicam.detect.projective import Departure, ProjectiveProcess, fit_affine, project
+
+REACH_HALVES = 1.4
+"""Correlation length of what a lens does to a board, in halves of the board's longer side."""
+
+BENDS = (0.003, 0.03, 0.1, 0.3)
+"""How far lenses bend a board, in halves of its longer side: each is tried."""
+
+SLACK = 1e-6
+"""Of each corner about a smooth map, in halves of the board's longer side."""
+
+PRIOR_LOG_SD = 0.7
+"""Of the logarithm of the ratio, which is 1 where the corners say nothing."""
+
+LOG_RATIOS = np.linspace(-2.5, 5.0, 151)
+"""That are looked at."""
+
+MIN_CORNERS = 6
+"""Corners from which they can contradict each other: a homography takes four."""
+
+MIN_LOCKED = 0.5
+"""From 0, all phases alike, to 1, one phase: from which corners are off together."""
+
+
+HIDDEN_PART = 1.5
+"""A common shift over what is left at the edges: the fit has followed the shift, and leaves what it could not follow."""
+
+
+def true_sd(nodes: Floats, corners: Corners, half_length: float) -> Floats:
+    """The standard uncertainties of corners as the board shows them.
+
+    Args:
+        nodes: (n, 2) where the corners are on the board, in squares.
+        corners: n corners as fitted, none NaN.
+        half_length: Half the longer side of the board, in the same unit.
+
+    Returns:
+        (n, 2) pixels; as the fit states them where there are too few corners.
+    """
+    if len(nodes) < MIN_CORNERS:
+        return corners.sd
+    ratio = error_ratio(nodes, corners.uv, corners.sd, half_length)
+    locked = _find_locked(corners.uv)
+    if not locked.any():
+        return ratio * corners.sd
+    shift = HIDDEN_PART * np.median(corners.edge_shift, axis=0) * locked
+    return np.asarray(np.hypot(max(ratio, 1.0) * corners.sd, shift), dtype=np.float64)
+
+
+def error_ratio(nodes: Floats, uv: Floats, sd: Floats, half_length: float) -> float:
+    """How many times larger errors are than stated.
+
+    Args:
+        nodes: (n, 2) where points are on a flat board.
+        uv: (n, 2) pixels.
+        sd: (n, 2) as stated.
+        half_length: Half the longer side of the board, in the unit of `nodes`.
+
+    Returns:
+        The root of the mean of the squared ratio after the corners.
+    """
+    middle, origin = nodes.mean(axis=0), uv.mean(axis=0)
+    x = (nodes - middle) / half_length
+    scale = float(np.sqrt(np.sum((uv - origin) ** 2) / np.sum(x**2)))
+    y, stated = (uv - origin) / scale, sd / scale
+    usual = Departure(0.03, REACH_HALVES, SLACK)
+    process = ProjectiveProcess.condition(x, y, 4 * stated**2, fit_affine(x, y), usual, turns=8)
+    image, J = project(process.theta, x)
+    rest = ((y - image).ravel() + J @ process.theta) / stated.ravel()
+    J = J / stated.ravel()[:, None]
+    log_density = []
+    for bend in BENDS:
+        smooth = np.kron(usual._replace(bend=bend).kernel(2)(x, x), np.eye(2)) / np.outer(stated, stated)
+        # of a ratio c the covariance over the stated one is smooth + c^2: one decomposition serves all ratios
+        values, vectors = np.linalg.eigh(J @ process.prior @ J.T + smooth)
+        squares = (vectors.T @ rest) ** 2
+        variance = np.maximum(values, 0) + np.exp(2 * LOG_RATIOS)[:, None]
+        log_density.append(-0.5 * np.sum(squares / variance + np.log(variance), axis=1))
+    density = np.asarray(log_density) - 0.5 * (LOG_RATIOS / PRIOR_LOG_SD) ** 2
+    weight = np.exp(density - density.max())
+    return float(np.sqrt(np.sum(weight * np.exp(2 * LOG_RATIOS)) / np.sum(weight)))
+
+
+def _find_locked(uv: Floats) -> Floats:
+    """(2,) how far the corners lie at one phase of the pixels' grid, or of every second pixel; 0 where they do not."""
+    phases = np.abs(np.exp(1j * np.pi * np.multiply.outer([1, 2], uv)).mean(axis=1)).max(axis=0)
+    return np.where(phases > MIN_LOCKED, phases, 0.0)
