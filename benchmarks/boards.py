@@ -1,10 +1,11 @@
 """Checkerboards and ChArUco boards in rendered photographs: found, numbered, how exactly, how fast.
 
-    OPENBLAS_NUM_THREADS=1 python benchmarks/boards.py [--seeds 3] [-o benchmarks/results/boards.md]
+    OPENBLAS_NUM_THREADS=1 python benchmarks/boards.py [--seeds 3] [--pixels] [-o benchmarks/results/boards.md]
 
 Simulated bar6 rigs, six cameras of 1280 x 800 pixels, the 20 positions of moving_board, 8 bits, blur 0.7 px. A wrong
 number is a corner more than 1 px from where the true corner of its name is; the smallest squares are 7 px wide.
 Pictures per second of one core's own time: of `detect` in one thread.
+--pixels: instead, the same pictures saved as JPEG, or as a colour sensor records them and OpenCV interpolates.
 Last the corners that were not found but inferred: how many, how far off, and their NEES (2 is right).
 """
 
@@ -41,7 +42,46 @@ def outside(picture, uv, part):
     return np.ascontiguousarray(picture[:, cut:]), cut
 
 
-def measured(studios, shots, cut=0.0):
+def as_jpeg(quality):
+    def save(picture):
+        image = np.rint(255 * picture).astype(np.uint8)
+        _, packed = opencv().imencode(".jpg", image, [opencv().IMWRITE_JPEG_QUALITY, quality])
+        return opencv().imdecode(packed, opencv().IMREAD_GRAYSCALE).astype(np.float32) / np.float32(255)
+
+    return save
+
+
+def as_mosaic(method, gains=(0.6, 1.0, 0.7)):
+    """As a colour sensor without white balance records a grey scene; interpolated by OpenCV, or left as it is."""
+
+    def interpolate(picture):
+        raw = picture.copy()
+        raw[0::2, 0::2] *= gains[0]
+        raw[0::2, 1::2] *= gains[1]
+        raw[1::2, 0::2] *= gains[1]
+        raw[1::2, 1::2] *= gains[2]
+        raw = np.rint(255 * raw).astype(np.uint8)
+        if method is not None:
+            code = getattr(opencv(), f"COLOR_BayerRG2BGR{method}")
+            raw = opencv().cvtColor(opencv().cvtColor(raw, code), opencv().COLOR_BGR2GRAY)
+        return raw.astype(np.float32) / np.float32(255)
+
+    return interpolate
+
+
+PIXELS = {
+    "plain": lambda picture: picture,
+    "JPEG, quality 95": as_jpeg(95),
+    "JPEG, quality 85": as_jpeg(85),
+    "JPEG, quality 75": as_jpeg(75),
+    "colour sensor, bilinear": as_mosaic(""),
+    "colour sensor, edge-aware": as_mosaic("_EA"),
+    "colour sensor, variable gradients": as_mosaic("_VNG"),
+    "colour sensor, not interpolated": as_mosaic(None),
+}
+
+
+def measured(studios, shots, cut=0.0, became=PIXELS["plain"]):
     board, seen, found, numbered, wrong, pictures, seconds = Board(infer=True), 0, 0, 0, 0, 0, 0.0
     off, nees, hidden, hidden_nees = [], [], [np.zeros((0, 2))], [np.zeros(0)]
     for taken in studios:
@@ -50,7 +90,7 @@ def measured(studios, shots, cut=0.0):
         for c, camera in enumerate(taken.rig.cameras):
             for s in shots:
                 rows = taken.target.shots == taken.shots[s]
-                picture, left = taken.picture(c, s), 0
+                picture, left = became(taken.picture(c, s)), 0
                 if cut:
                     picture, left = outside(picture, uv[rows, c], cut)
                 seen += int((visible[rows, c] & (uv[rows, c, 0] >= left)).sum())
@@ -82,6 +122,7 @@ def measured(studios, shots, cut=0.0):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--pixels", action="store_true")
     parser.add_argument("-o", type=Path)
     options = parser.parse_args()
     opencv().setNumThreads(1)
@@ -95,9 +136,12 @@ def main():
         ("2 % noise, a third of the board outside", {"noise": 0.02}, range(0, 20, 4), 0.33),
         ("2 % noise, half of the board outside", {"noise": 0.02}, range(0, 20, 4), 0.5),
     ]
+    rows = [(name, how, shots, cut, PIXELS["plain"]) for name, how, shots, cut in cases]
+    if options.pixels:
+        rows = [(name, {"noise": 0.01}, range(0, 20, 6), 0.0, became) for name, became in PIXELS.items()]
     print(text, end="", flush=True)
-    for name, how, shots, cut in cases:
-        line = f"| {name} | {measured([studio(seed, **how) for seed in seeds], shots, cut)} |\n"
+    for name, how, shots, cut, became in rows:
+        line = f"| {name} | {measured([studio(seed, **how) for seed in seeds], shots, cut, became)} |\n"
         print(line, end="", flush=True)
         text += line
     if options.o:

@@ -30,6 +30,7 @@ HEAVY = ["viser", "plotly", "matplotlib", "torch", "gpytorch", "pyarrow", "cv2",
 MAKES = {
     "demo": {"implicam-demo"},
     "simulate": {"my-rig"},
+    "board": {"board.pdf"},
     "detect": set(),
     "label": set(),
     "calibrate": {"my-rig.implicam"},
@@ -183,6 +184,7 @@ def json_commands(made: Path) -> dict[str, list[str]]:
     rig, check, file = str(made / "rig"), str(made / "rig" / "check"), str(made / "rig.implicam")
     return {
         "simulate": ["simulate", "out", "--missing", "0.3", "--positions", "random", "--points", "10", "--check", "5"],
+        "board": ["board", "print", "--board", "6x9", "--square", "20"],
         "detect": ["detect", str(made / "photos"), "--no-overlays"],
         "calibrate": ["calibrate", rig, "-o", "out.implicam"],
         "measure": ["measure", file, check],

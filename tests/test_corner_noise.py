@@ -4,8 +4,8 @@ import functools
 
 import numpy as np
 import pytest
-from board_pictures import VIEW, checkered, corners_of, errors, noisy, photograph, rotated
 
+from board_pictures import VIEW, checkered, corners_of, errors, noisy, photograph, rotated
 from implicam.detect.board import Board
 from implicam.detect.corner_noise import error_ratio
 from implicam.images import opencv

@@ -30,6 +30,7 @@ app = typer.Typer(
 EXAMPLES = {
     "demo": "implicam demo",
     "simulate": "implicam simulate my-rig --positions random --points 157 --check 300",
+    "board": "implicam board print --board 8x11 --square 16 -o board.pdf",
     "detect": "implicam detect my-photos --target ball --radius 8",
     "label": "implicam label my-tank",
     "calibrate": "implicam calibrate my-rig -o my-rig.implicam",

@@ -16,6 +16,7 @@ import numpy as np
 import typer
 
 import implicam.cli.acquire
+import implicam.cli.board
 import implicam.cli.cameras
 import implicam.cli.compare
 import implicam.cli.design

@@ -4,6 +4,7 @@ run = detect_folder(Path("my-rig"), Ball())
 run.data, run.cameras, run.reasons
 """
 
+from implicam.detect.aprilgrid import AprilGrid
 from implicam.detect.ball import Ball, Template
 from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
@@ -16,6 +17,7 @@ from implicam.registry import Option
 
 __all__ = [
     "TARGETS",
+    "AprilGrid",
     "Ball",
     "Board",
     "Charuco",

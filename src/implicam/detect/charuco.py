@@ -24,17 +24,15 @@ from implicam.detect.board import (
     hull_of,
     parse_board_size,
 )
-from implicam.detect.corners import Corners, fit_corners
-from implicam.detect.corner_noise import true_sd
-from implicam.detect.grid import MAX_ASTRAY_SQUARES, MAX_RESIDUAL_HEIGHTS, Places, predict_places
+from implicam.detect.corner_noise import agreeing, true_sd
+from implicam.detect.dictionaries import check_dictionary, dictionary_of
+from implicam.detect.grid import predict_places
+from implicam.detect.marked import MIN_CORNERS, fit_marked_corners, in_squares
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import resize, to_original_pixels
-from implicam.errors import UsageError, did_you_mean
+from implicam.errors import UsageError
 from implicam.images import Grey, eight_bit, opencv
 from implicam.registry import Option
-
-MIN_CORNERS = 6
-"""Corners from which their neighbourhood can be checked."""
 
 MAX_MARKER_OFF_SQUARES = 0.3
 """Squares that a marker may be from where its neighbours put it; more than a fifth beyond, and it is another board."""
@@ -68,12 +66,7 @@ class Charuco(DetectorBase):
                 why="a marker lies inside of a square",
                 fix="measure the edges of both on the printed board",
             )
-        known = [name for name in dir(opencv().aruco) if name.startswith("DICT_")]
-        if self.dictionary not in known:
-            raise UsageError(
-                f"there is no dictionary {self.dictionary!r}{did_you_mean(self.dictionary, known)}.",
-                fix="use the name that OpenCV has for it, for example DICT_5X5_100",
-            )
+        check_dictionary(self.dictionary)
         if self.rows * self.columns // 2 > len(self._dictionary().bytesList):
             raise UsageError(
                 f"{self.dictionary} has too few markers for {self.rows} x {self.columns} squares.",
@@ -143,8 +136,14 @@ class Charuco(DetectorBase):
         if seen.reason:
             return nothing(seen.reason)
         nodes = np.argwhere(np.ones((self.rows - 1, self.columns - 1), dtype=np.bool_)).astype(np.float64)
-        corners, there = self._fit_all_corners(picture, seen, nodes)
-        number = np.flatnonzero(there)
+        start = np.full((len(nodes), 2), np.nan)
+        start[seen.ids] = seen.uv
+        bare = (1 - self.marker / self.square) / 2
+        parity = nodes.sum(axis=1).astype(np.intp)
+        corners, there = fit_marked_corners(picture, nodes, start, parity, bare=bare, rounds=self.rows + self.columns)
+        half, number = max(self.rows, self.columns) / 2, np.flatnonzero(there)
+        if len(number) >= MIN_CORNERS:
+            number = number[agreeing(nodes[number], corners[number], half)]
         if len(number) < MIN_CORNERS:
             return nothing(
                 f"{len(seen.ids)} markers of the board were read, and {len(number)} corners between them are clear: "
@@ -153,7 +152,7 @@ class Charuco(DetectorBase):
         return Detected(
             tuple(corner_name(view.shot, int(j)) for j in number),
             corners.uv[number],
-            true_sd(nodes[number], corners[number], max(self.rows, self.columns) / 2),
+            true_sd(nodes[number], corners[number], half),
             explain_missing(len(number), self._total),
             (hull_of(corners.uv[number]),),
         )
@@ -163,8 +162,7 @@ class Charuco(DetectorBase):
         return (self.rows - 1) * (self.columns - 1)
 
     def _dictionary(self) -> Any:
-        aruco = opencv().aruco
-        return aruco.getPredefinedDictionary(getattr(aruco, self.dictionary))
+        return dictionary_of(self.dictionary)
 
     def _read_markers(self, picture: Grey, scale: float) -> _Seen:
         """What OpenCV reads, and whether the markers lie as on this board."""
@@ -206,29 +204,8 @@ class Charuco(DetectorBase):
             return True
         nodes = np.array([of[int(name)] for name in names[known]], dtype=np.float64) / self.square
         places = predict_places(nodes, middle[known], nodes)
-        off = _in_squares(middle[known] - places.uv, places)
+        off = in_squares(middle[known] - places.uv, places)
         return bool(np.mean(np.abs(off).max(axis=1) > MAX_MARKER_OFF_SQUARES) < 0.2)
-
-    def _fit_all_corners(self, picture: Grey, seen: _Seen, nodes: Floats) -> tuple[Corners, NDArray[np.bool_]]:
-        """All corners of the board, at nodes (n, 2), fitted; and (n,) which of them are clear."""
-        start = np.full((len(nodes), 2), np.nan)
-        start[seen.ids] = seen.uv
-        there = np.isfinite(start[:, 0])
-        corners = Corners.unknown(len(nodes))
-        for _ in range(self.rows + self.columns):
-            before = there
-            if there.sum() < MIN_CORNERS:
-                break
-            places = predict_places(nodes[there], start[there], nodes)
-            near = np.linalg.norm(nodes[:, None] - nodes[there], axis=2).min(axis=1) < 1.5
-            start = np.where(near[:, None] & ~there[:, None], places.uv, start)
-            corners = fit_corners(picture, start, places.right, places.down, bare=(1 - self.marker / self.square) / 2)
-            there = _find_sound(corners, nodes)
-            there &= _find_in_place(corners, nodes, there)
-            start = np.where(there[:, None], corners.uv, np.nan)
-            if (there == before).all():
-                break
-        return corners, there
 
 
 class _Seen(NamedTuple):
@@ -241,30 +218,3 @@ class _Seen(NamedTuple):
 
 def _refuse(reason: str) -> _Seen:
     return _Seen(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), reason)
-
-
-def _find_sound(corners: Corners, nodes: Floats) -> NDArray[np.bool_]:
-    """Which corners (n,) look like corners: little left over, and bright and dark in turn as their neighbours."""
-    with np.errstate(invalid="ignore"):
-        good = (corners.misfit < MAX_RESIDUAL_HEIGHTS) & np.isfinite(corners.uv).all(axis=1)
-        signed = corners.height * (1 - 2 * (nodes.sum(axis=1) % 2))
-        if good.any():
-            middle = np.median(signed[good])
-            good &= signed * np.sign(middle) > 0.3 * abs(middle)
-    return np.asarray(good, dtype=np.bool_)
-
-
-def _find_in_place(corners: Corners, nodes: Floats, there: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which corners (n,) are where those that are `there` say; their own say left out."""
-    if there.sum() < MIN_CORNERS:
-        return np.zeros_like(there)
-    places = predict_places(nodes[there], corners.uv[there], nodes)
-    with np.errstate(invalid="ignore"):
-        off = np.abs(_in_squares(corners.uv - places.uv, places)).max(axis=1)
-    return np.asarray(off < MAX_ASTRAY_SQUARES / 2, dtype=np.bool_)
-
-
-def _in_squares(off: Floats, places: Places) -> Floats:
-    """Differences in pixels (n, 2) as parts of the steps right and down there."""
-    steps = np.stack([places.right, places.down], axis=2)
-    return np.asarray(np.einsum("nij,nj->ni", np.linalg.pinv(steps), off), dtype=np.float64)

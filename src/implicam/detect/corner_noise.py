@@ -1,12 +1,13 @@
 """How far off corners are, learned from the picture itself: the board says by how much they contradict each other.
 
-What a fit leaves at one corner says too little, or too much, of its error: JPEG and a colour sensor's interpolation make
-the errors of neighbouring pixels alike, and leave patterns that do not move a corner. But a board is flat and a lens is
-smooth: where each corner must be follows from all the others (`projective.py`), and the ratio of their true errors to
-the stated ones has a marginal likelihood. It is found for all corners together; their own residuals say how they differ.
+What a fit leaves at one corner says too little, or too much, of its error: JPEG and a colour sensor's interpolation
+make the errors of neighbouring pixels alike, and leave patterns that do not move a corner. But a board is flat and a
+lens is smooth: where each corner must be follows from all the others (`projective.py`), and the ratio of their true
+errors to the stated ones has a marginal likelihood. It is found for all corners together; their own residuals say how
+they differ.
 
-Corners that all lie at the same phase of the pixels' grid are off together, and no neighbour tells it: then what is left
-at the edges counts as one common shift.
+Corners that all lie at the same phase of the pixels' grid are off together, and no neighbour tells it: then what is
+left at the edges counts as one common shift.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.detect.corners import Corners
+from implicam.detect.corners import Bools, Corners
 from implicam.detect.projective import Departure, ProjectiveProcess, fit_affine, project
 
 REACH_HALVES = 1.4
@@ -39,8 +40,17 @@ MIN_LOCKED = 0.5
 """From 0, all phases alike, to 1, one phase: from which corners are off together."""
 
 
+JUDGING = Departure(0.1, REACH_HALVES, 1e-4)
+"""What a lens may do to a board before a corner contradicts the others."""
+
+MIN_CORNERS_TO_JUDGE, MAX_CONTRADICTION_SDS = 9, 6.0
+"""Corners from which one can be told to be wrong, and standard deviations from where the others put it."""
+
+MEDIAN_SQUARE = 1.386
+"""Median of the squared length of two normal variables."""
+
 HIDDEN_PART = 1.5
-"""A common shift over what is left at the edges: the fit has followed the shift, and leaves what it could not follow."""
+"""A common shift over what is left at the edges: the fit has followed what it could."""
 
 
 def true_sd(nodes: Floats, corners: Corners, half_length: float) -> Floats:
@@ -64,6 +74,32 @@ def true_sd(nodes: Floats, corners: Corners, half_length: float) -> Floats:
     return np.asarray(np.hypot(max(ratio, 1.0) * corners.sd, shift), dtype=np.float64)
 
 
+def agreeing(nodes: Floats, corners: Corners, half_length: float) -> Bools:
+    """Which corners are where all the others put them: something cut into the rest, or they are at the sheet's rim.
+
+    Args:
+        nodes: (n, 2) where the corners are on the board.
+        corners: n corners as fitted, none NaN.
+        half_length: Half the longer side of the board, in the unit of `nodes`.
+
+    Returns:
+        (n,) which agree; all where there are too few to tell.
+    """
+    keep = np.asarray(corners.misfit < max(3 * float(np.median(corners.misfit)), 0.1), dtype=np.bool_)
+    while keep.sum() > MIN_CORNERS_TO_JUDGE:
+        some = np.flatnonzero(keep)
+        x, y, stated = _normalised(nodes[some], corners.uv[some], corners.sd[some], half_length)
+        process = ProjectiveProcess.condition(x, y, stated**2, fit_affine(x, y), JUDGING, turns=8)
+        uv, covariance = process.leave_one_out()
+        square = np.einsum("ni,nij,nj->n", y - uv, np.linalg.inv(covariance), y - uv)
+        square = square / max(1.0, float(np.median(square)) / MEDIAN_SQUARE)  # a few bad ones do not excuse themselves
+        bad = square > max(MAX_CONTRADICTION_SDS**2, 0.5 * float(square.max()))
+        if not bad.any():
+            break
+        keep[some[bad]] = False
+    return keep
+
+
 def error_ratio(nodes: Floats, uv: Floats, sd: Floats, half_length: float) -> float:
     """How many times larger errors are than stated.
 
@@ -76,10 +112,7 @@ def error_ratio(nodes: Floats, uv: Floats, sd: Floats, half_length: float) -> fl
     Returns:
         The root of the mean of the squared ratio after the corners.
     """
-    middle, origin = nodes.mean(axis=0), uv.mean(axis=0)
-    x = (nodes - middle) / half_length
-    scale = float(np.sqrt(np.sum((uv - origin) ** 2) / np.sum(x**2)))
-    y, stated = (uv - origin) / scale, sd / scale
+    x, y, stated = _normalised(nodes, uv, sd, half_length)
     usual = Departure(0.03, REACH_HALVES, SLACK)
     process = ProjectiveProcess.condition(x, y, 4 * stated**2, fit_affine(x, y), usual, turns=8)
     image, J = project(process.theta, x)
@@ -96,6 +129,14 @@ def error_ratio(nodes: Floats, uv: Floats, sd: Floats, half_length: float) -> fl
     density = np.asarray(log_density) - 0.5 * (LOG_RATIOS / PRIOR_LOG_SD) ** 2
     weight = np.exp(density - density.max())
     return float(np.sqrt(np.sum(weight * np.exp(2 * LOG_RATIOS)) / np.sum(weight)))
+
+
+def _normalised(nodes: Floats, uv: Floats, sd: Floats, half_length: float) -> tuple[Floats, Floats, Floats]:
+    """Nodes and pixels about their middles, and standard uncertainties, in units in which the board is about 1 long."""
+    middle, origin = nodes.mean(axis=0), uv.mean(axis=0)
+    x = (nodes - middle) / half_length
+    scale = float(np.sqrt(np.sum((uv - origin) ** 2) / np.sum(x**2)))
+    return x, (uv - origin) / scale, sd / scale
 
 
 def _find_locked(uv: Floats) -> Floats:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from implicam.dataset.folder import DESCRIPTION, read_description
+from implicam.detect.aprilgrid import AprilGrid
 from implicam.detect.ball import Ball
 from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
@@ -35,7 +36,7 @@ class DetectorClass(Detector, Protocol):
 
 TARGETS: Registry[type[Any]] = Registry(
     "target",
-    {"ball": Ball, "board": Board, "charuco": Charuco, "dots": Dots},
+    {"ball": Ball, "board": Board, "charuco": Charuco, "aprilgrid": AprilGrid, "dots": Dots},
     "implicam.detectors",
     offers(DetectorClass),
 )

@@ -1,0 +1,88 @@
+"""The corners of a board whose markers say which is which: fitted as those of a checkerboard, and judged together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset import Floats
+from implicam.detect.corners import Bools, Corners, fit_corners
+from implicam.detect.grid import MAX_ASTRAY_SQUARES, MAX_RESIDUAL_HEIGHTS, Places, predict_places
+from implicam.images import Grey
+
+MIN_CORNERS = 6
+"""Corners from which their neighbourhood can be checked."""
+
+
+def fit_marked_corners(
+    picture: Grey,
+    nodes: Floats,
+    start: Floats,
+    parity: NDArray[np.intp],
+    *,
+    reach: float = 1.5,
+    bare: float = 1.0,
+    rounds: int = 20,
+) -> tuple[Corners, Bools]:
+    """Fit the corners that the markers place, and those of whose neighbours they do.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        nodes: (n, 2) row and column of all corners on the board; about a corner nothing else is printed within 1.
+        start: (n, 2) pixels where the markers put them, NaN where they do not.
+        parity: (n,) even where the corner is bright right below and right of it, or dark there, odd where not.
+        reach: How far, in rows or columns, a corner may be from one that is known, to be looked for.
+        bare: As `fit_corners` takes it.
+        rounds: Times that neighbours are added, at most.
+
+    Returns:
+        The corners; and (n,) which of them are clear and where the others put them.
+    """
+    there = np.isfinite(start[:, 0])
+    corners = Corners.unknown(len(nodes))
+    for _ in range(rounds):
+        before = there
+        if there.sum() < MIN_CORNERS:
+            break
+        places = predict_places(nodes[there], start[there], nodes)
+        near = np.linalg.norm(nodes[:, None] - nodes[there], axis=2).min(axis=1) < reach
+        start = np.where(near[:, None] & ~there[:, None], places.uv, start)
+        corners = fit_corners(picture, start, places.right, places.down, bare=bare)
+        there = _find_sound(corners, parity)
+        there &= _find_in_place(corners, nodes, there)
+        start = np.where(there[:, None], corners.uv, np.nan)
+        if (there == before).all():
+            break
+    return corners, there
+
+
+def in_squares(off: Floats, places: Places) -> Floats:
+    """Differences in pixels as parts of the steps right and down there.
+
+    Args:
+        off: (n, 2) pixels.
+        places: Where they are.
+    """
+    steps = np.stack([places.right, places.down], axis=2)
+    return np.asarray(np.einsum("nij,nj->ni", np.linalg.pinv(steps), off), dtype=np.float64)
+
+
+def _find_sound(corners: Corners, parity: NDArray[np.intp]) -> Bools:
+    """Which corners (n,) look like corners: little left over, and bright and dark in turn as their neighbours."""
+    with np.errstate(invalid="ignore"):
+        good = (corners.misfit < MAX_RESIDUAL_HEIGHTS) & np.isfinite(corners.uv).all(axis=1)
+        signed = corners.height * (1 - 2 * (parity % 2))
+        if good.any():
+            middle = np.median(signed[good])
+            good &= signed * np.sign(middle) > 0.3 * abs(middle)
+    return np.asarray(good, dtype=np.bool_)
+
+
+def _find_in_place(corners: Corners, nodes: Floats, there: Bools) -> Bools:
+    """Which corners (n,) are where those that are `there` say; their own say left out."""
+    if there.sum() < MIN_CORNERS:
+        return np.zeros_like(there)
+    places = predict_places(nodes[there], corners.uv[there], nodes)
+    with np.errstate(invalid="ignore"):
+        off = np.abs(in_squares(corners.uv - places.uv, places)).max(axis=1)
+    return np.asarray(off < MAX_ASTRAY_SQUARES / 2, dtype=np.bool_)
