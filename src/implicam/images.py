@@ -80,7 +80,7 @@ def read_picture(path: Path) -> Grey:
             why=f"{len(data):,} bytes, and no PNG, JPEG or TIFF",
             fix="export it again as PNG, JPEG or TIFF",
         )
-    return _to_grey(image, path)
+    return to_grey(image, path)
 
 
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
@@ -120,7 +120,16 @@ def _ends_jpeg(data: bytes) -> bool:
     return False
 
 
-def _to_grey(image: NDArray[Any], path: Path) -> Grey:
+def to_grey(image: NDArray[Any], path: Path) -> Grey:
+    """A decoded picture as grey from 0 to 1.
+
+    Args:
+        image: (height, width) or (height, width, channels) of 8 or 16 bits; blue, green, red.
+        path: Its file, for the message.
+
+    Raises:
+        ImageError: It has other numbers, or too many.
+    """
     cv2 = opencv()
     if image.dtype not in (np.uint8, np.uint16):
         raise ImageError(

@@ -167,6 +167,17 @@ def _by_camera(named: Iterable[_Named]) -> Pictures:
     return {camera: {shot: found[camera][shot] for shot in in_order(found[camera])} for camera in in_order(found)}
 
 
+def has_pictures(folder: Path, deepest: int) -> bool:
+    """Whether a folder holds a file named like a picture.
+
+    Args:
+        folder: Where to look.
+        deepest: How many folders down.
+    """
+    depths = range(deepest + 1)
+    return folder.is_dir() and any(next(_walk_pictures(folder, depth), None) is not None for depth in depths)
+
+
 def _walk_pictures(folder: Path, depth: int) -> Iterator[Path]:
     """The pictures so many folders down, behind links to folders on other disks too."""
     for place, folders, names in os.walk(folder, followlinks=True):

@@ -11,7 +11,15 @@ import typer
 from implicam.cli import show
 from implicam.cli.app import Json, command, command_line
 from implicam.cli.options import OptionsOfParts
-from implicam.detect import TARGETS, DetectionRun, detect_folder, detector_from_options, options_of
+from implicam.detect import (
+    TARGETS,
+    DetectionRun,
+    detect_films,
+    detect_folder,
+    detector_from_options,
+    films_of,
+    options_of,
+)
 from implicam.detect.folder import DETECTIONS
 from implicam.errors import UsageError
 from implicam.logs import LOG, log_to_file
@@ -22,7 +30,7 @@ def _options() -> dict[str, dict[str, inspect.Parameter]]:
 
 
 def _detect(
-    dataset: Annotated[Path, typer.Argument(help="A folder with the photographs in images/<camera>/<shot>.png.")],
+    dataset: Annotated[Path, typer.Argument(help="A folder with images/<camera>/<shot>.png, or films <camera>.mp4.")],
     target: Annotated[
         str | None, typer.Option(metavar="NAME", help=f"{', '.join(TARGETS)} (default: what dataset.toml says).")
     ] = None,
@@ -32,6 +40,28 @@ def _detect(
     pattern: Annotated[
         str | None, typer.Option(metavar="PATTERN", help='How their names tell camera and shot: "{shot}_{camera}".')
     ] = None,
+    films: Annotated[
+        str | None,
+        typer.Option(
+            "--films", metavar="FOLDER", help="Where <camera>.mp4 are in DATASET (default: films, or itself)."
+        ),
+    ] = None,
+    times: Annotated[
+        Path | None,
+        typer.Option("--times", metavar="FILE", help="Of films: a table camera,frame,time_s, by one clock."),
+    ] = None,
+    offsets: Annotated[
+        str | None,
+        typer.Option(
+            "--offsets",
+            metavar="LIST",
+            help="Of films: seconds to add, cam2=0.0374,...; 0 for none (default: found from the target's movement).",
+        ),
+    ] = None,
+    every: Annotated[int, typer.Option("--every", min=1, metavar="N", help="Of films: search every Nth picture.")] = 1,
+    frames: Annotated[
+        int | None, typer.Option("--frames", min=1, metavar="N", help="Of films: keep N instants that differ most.")
+    ] = None,
     overlays: Annotated[bool, typer.Option(help="Draw what was found, to check by eye.")] = True,
     restart: Annotated[bool, typer.Option("--restart", help="Forget what an earlier run found.")] = False,
     unit: Annotated[
@@ -40,15 +70,29 @@ def _detect(
     json: Json = False,
     **options: Any,
 ) -> None:
-    """Find the target in photographs: images -> observations.csv, each view with its uncertainty."""
+    """Find the target in photographs or films: images -> observations.csv, each view with its uncertainty."""
     if not dataset.is_dir():
-        raise UsageError(f"{dataset} is not a folder.", fix="give the folder that holds images/<camera>/<shot>.png")
+        raise UsageError(
+            f"{dataset} is not a folder.", fix="give the folder that holds images/<camera>/<shot>.png, or <camera>.mp4"
+        )
     detector = detector_from_options(target, dataset, **options)
+    found = films_of(dataset, films, pictures)
+    if not found and (times or offsets is not None or every > 1 or frames):
+        raise UsageError(
+            f"there are no films in {dataset}, and --times, --offsets, --every and --frames are for films.",
+            fix="put <camera>.mp4 into it, say where they are with --films, or leave these options out",
+        )
     with log_to_file(dataset / DETECTIONS / LOG, command_line()), show.progress(json) as progress:
-        run = detect_folder(
-            dataset, detector, unit=unit, pictures=pictures, pattern=pattern, overlays=overlays, restart=restart,
-            progress=progress,
-        )  # fmt: skip
+        if found:
+            run = detect_films(
+                dataset, detector, found, unit=unit, times=times, offsets=offsets, every=every, frames=frames,
+                overlays=overlays, restart=restart, progress=progress,
+            )  # fmt: skip
+        else:
+            run = detect_folder(
+                dataset, detector, unit=unit, pictures=pictures, pattern=pattern, overlays=overlays, restart=restart,
+                progress=progress,
+            )  # fmt: skip
     _print_result(run, json)
 
 
@@ -65,7 +109,7 @@ def _print_result(run: DetectionRun, json: bool) -> None:
              "sheets": [str(path) for path in run.sheets]}
         )  # fmt: skip
         return
-    points = sum(count.points for count in run.cameras)
+    points = int(run.data.observations.seen.sum())
     show.table(show.detection_table(run))
     show.line(f"{run.observations}: {points} views of {len(run.data)} points in {len(run.cameras)} cameras")
     if run.sheets:

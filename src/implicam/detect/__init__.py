@@ -9,6 +9,7 @@ from implicam.detect.ball import Ball, Template
 from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
 from implicam.detect.dots import Dots
+from implicam.detect.film import detect_films, films_of
 from implicam.detect.folder import Correct, DetectionRun, detect_folder
 from implicam.detect.model import Detected, Detector, DetectorBase, View
 from implicam.detect.registry import TARGETS, detector_from_options, options_of
@@ -31,8 +32,10 @@ __all__ = [
     "Template",
     "View",
     "correct_outlines",
+    "detect_films",
     "detect_folder",
     "detector_from_options",
+    "films_of",
     "options_of",
     "predict_outline_shift",
 ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,8 @@ class Dots(DetectorBase):
     View(camera, "") for every shot of the camera. polarity: "bright" dots, "dark" ones, or what most labels show.
     Where the layout has several shots (plates), a picture is searched for the points of its own.
     """
+
+    moves: ClassVar[bool] = False
 
     points: tuple[str, ...]
     known: KnownPositions

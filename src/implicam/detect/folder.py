@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -125,12 +125,12 @@ def detect_folder(
         results, notes = _settle(rig, detector, looked)
         data, more = _gather(rig, results)
         folder = rig.path / DETECTIONS
-        write_text(folder / SUMMARY_FILE, _summary_csv(rig, results))
+        write_text(folder / SUMMARY_FILE, summary_csv(results, rig.relative))
         more += _write_inferred(folder / INFERRED_FILE, results)
         if data is not None:
             data, said = (correct or detector.correct)(data)
             data, limit = limit_of_detection(rig.path, data)
-            more += [*said, *_write(rig, data), *rig.explain_missing_size(), *filter(None, [limit])]
+            more += [*said, *write_observations(rig, data), *rig.explain_missing_size(), *filter(None, [limit])]
         sheets, undrawn = draw_sheets(folder, results, progress, redraw=restart) if overlays else ((), ())
     if data is None:
         raise _nothing_found_error(rig, results, sheets)
@@ -139,8 +139,8 @@ def detect_folder(
         folder / SUMMARY_FILE,
         data,
         tuple(results),
-        tuple(_count_by_camera(results)),
-        tuple(_count_reasons(results)),
+        tuple(count_by_camera(results)),
+        tuple(count_reasons(results)),
         (*rig.notes, *notes, *more, *undrawn),
         looked.resumed,
         looked.seconds,
@@ -148,9 +148,9 @@ def detect_folder(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Rig:
-    """A dataset folder before it has observations, and its pictures by camera and shot."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RigFolder:
+    """A dataset folder before it has observations."""
 
     path: Path
     name: str
@@ -158,33 +158,27 @@ class _Rig:
     cameras: tuple[Camera, ...]
     extra: Mapping[str, Any]
     known: tuple[list[str], KnownPositions] | None
-    pictures: Mapping[View, Path]
     notes: tuple[str, ...]
 
-    @classmethod
-    def of(cls, path: Path, unit: str | None, pictures: str | None, pattern: str | None) -> _Rig:
-        described = read_description(path) if (path / DESCRIPTION).exists() else None
-        known = [camera.name for camera in described[2]] if described else []
-        found, read = pictures_of(path, pictures, pattern, known)
-        name, said, cameras, extra = described or _describe_folder(path, unit, found)
-        if unit not in (None, said):
-            raise UsageError(
-                f"{path / DESCRIPTION} is in {said!r}, not in {unit!r}.", fix="leave out --unit, or correct the file"
-            )
-        usable, notes = _choose_usable({camera.name for camera in cameras}, found, path)
-        return cls(path, name, said, cameras, extra, read_known(path), usable, (*read, *notes))
+    def with_sizes(self, sizes: Mapping[str, tuple[int, int]]) -> Self:
+        """With the image sizes that dataset.toml does not state.
 
-    def with_sizes(self, sizes: Mapping[str, tuple[int, int]]) -> _Rig:
-        """With the image sizes that dataset.toml does not state: those of most of the pictures."""
+        Args:
+            sizes: Camera -> width and height of most of its pictures.
+        """
         cameras = []
         for camera in self.cameras:
             width, height = sizes.get(camera.name, (None, None))
             cameras.append(replace(camera, width=camera.width or width, height=camera.height or height))
         return replace(self, cameras=tuple(cameras))
 
-    def showing(self, target: Mapping[str, Any]) -> _Rig:
+    def showing(self, target: Mapping[str, Any]) -> Self:
         """With [target] of dataset.toml as the detector describes it; UsageError where a person wrote otherwise. What
-        dataset.toml says of another kind of target stays."""
+        dataset.toml says of another kind of target stays.
+
+        Args:
+            target: Plain values; empty for nothing.
+        """
         if not target:
             return self
         check_size(target, self.unit)
@@ -212,14 +206,41 @@ class _Rig:
         ]
 
     def relative(self, path: Path) -> str:
-        """A file's name as a note gives it."""
+        """A file's name as a note gives it.
+
+        Args:
+            path: The file.
+        """
         return Path(os.path.relpath(path, self.path)).as_posix()
 
     def expected(self, view: View) -> int | None:
-        """How many known points belong to the shot; None where that is not known."""
+        """How many known points belong to the shot; None where that is not known.
+
+        Args:
+            view: A picture of the shot.
+        """
         if self.known is None:
             return None
         return int(np.count_nonzero(self.known[1].shots == view.shot)) or None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Rig(RigFolder):
+    """With its pictures by camera and shot."""
+
+    pictures: Mapping[View, Path]
+
+    @classmethod
+    def of(cls, path: Path, unit: str | None, pictures: str | None, pattern: str | None) -> Self:
+        described = read_description(path) if (path / DESCRIPTION).exists() else None
+        known = [camera.name for camera in described[2]] if described else []
+        found, read = pictures_of(path, pictures, pattern, known)
+        name, said, cameras, extra = describe_rig(path, unit, list(found))
+        usable, notes = _choose_usable({camera.name for camera in cameras}, found, path)
+        return cls(
+            path=path, name=name, unit=said, cameras=cameras, extra=extra, known=read_known(path), pictures=usable,
+            notes=(*read, *notes),
+        )  # fmt: skip
 
 
 def _same(said: Any, told: Any) -> bool:
@@ -255,14 +276,35 @@ def pictures_of(
     return sort_pictures(folder, cameras, ignored=(DETECTIONS, IMAGES))
 
 
-def _describe_folder(
-    path: Path, unit: str | None, found: Mapping[str, Mapping[str, Path]]
+def describe_rig(
+    path: Path, unit: str | None, found: Sequence[str]
 ) -> tuple[str, str, tuple[Camera, ...], dict[str, Any]]:
-    """The description of a dataset that has none: its cameras are the folders of pictures."""
+    """What dataset.toml says, or would say where there is none.
+
+    Args:
+        path: The folder.
+        unit: The length unit that was given.
+        found: The cameras of which there are pictures.
+
+    Returns:
+        Name, length unit, cameras and further entries.
+
+    Raises:
+        UsageError: The unit is not known, or not that of the file.
+        DatasetError: The file has a mistake.
+    """
+    if (path / DESCRIPTION).exists():
+        described = read_description(path)
+        if unit not in (None, described[1]):
+            raise UsageError(
+                f"{path / DESCRIPTION} is in {described[1]!r}, not in {unit!r}.",
+                fix="leave out --unit, or correct the file",
+            )
+        return described
     if unit is None:
         raise UsageError(
             f"{path} has no {DESCRIPTION}, so the length unit is not known.",
-            why=f"one is made from the folders of pictures, {list_some(list(found))}, but no picture says the unit",
+            why=f"one is made from the cameras' pictures, {list_some(found)}, but no picture says the unit",
             fix="add --unit mm (or another), or write dataset.toml yourself; see docs/formats.md",
         )
     return path.resolve().name, unit, tuple(Camera(name) for name in found), {}
@@ -399,8 +441,19 @@ def _order_names(results: Iterable[Result]) -> dict[str, None]:
     return dict.fromkeys(name for shot in in_order(shots) for name in in_order(shots[shot]))
 
 
-def _write(rig: _Rig, data: Dataset) -> list[str]:
-    """Write observations.csv, and dataset.toml where there is none; what a person wrote is kept beside it."""
+def write_observations(rig: RigFolder, data: Dataset) -> list[str]:
+    """Write observations.csv, and dataset.toml where there is none; what a person wrote is kept beside it.
+
+    Args:
+        rig: The folder of the dataset.
+        data: What was found.
+
+    Returns:
+        Notes.
+
+    Raises:
+        ImplicamError: A file cannot be written.
+    """
     files = folder_files(data)
     notes = _write_description(rig, files[DESCRIPTION])
     target, record = rig.path / VIEWS, rig.path / DETECTIONS / WRITTEN_FILE
@@ -417,7 +470,7 @@ def _write(rig: _Rig, data: Dataset) -> list[str]:
     return notes
 
 
-def _write_description(rig: _Rig, whole: str) -> list[str]:
+def _write_description(rig: RigFolder, whole: str) -> list[str]:
     """Write dataset.toml where there is none; where there is one, add what it does not say of the target."""
     path = rig.path / DESCRIPTION
     if not path.exists():
@@ -467,9 +520,15 @@ def _sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _summary_csv(rig: _Rig, results: Iterable[Result]) -> str:
+def summary_csv(results: Iterable[Result], relative: Callable[[Path], str]) -> str:
+    """A row per picture: how many points, and why not more.
+
+    Args:
+        results: One for each picture.
+        relative: The name of a file as the table gives it.
+    """
     rows = [
-        (r.view.camera, r.view.shot, rig.relative(r.path), str(len(r.found)), str(r.expected or ""), r.found.reason)
+        (r.view.camera, r.view.shot, relative(r.path), str(len(r.found)), str(r.expected or ""), r.found.reason)
         for r in results
     ]
     return csv_text(("camera", "shot", "file", "found", "expected", "reason"), rows)
@@ -494,14 +553,23 @@ def _write_inferred(path: Path, results: Iterable[Result]) -> list[str]:
     ]
 
 
-def _count_by_camera(results: Sequence[Result]) -> Iterator[Count]:
+def count_by_camera(results: Sequence[Result]) -> Iterator[Count]:
+    """How much was found, camera by camera.
+
+    Args:
+        results: One for each picture.
+    """
     for camera in dict.fromkeys(result.view.camera for result in results):
         points = [len(result.found) for result in results if result.view.camera == camera]
         yield Count(camera, len(points), sum(n > 0 for n in points), sum(points))
 
 
-def _count_reasons(results: Iterable[Result]) -> list[tuple[str, int]]:
-    """Reasons and how many pictures have them; those that differ in numbers only are one, told as the commonest."""
+def count_reasons(results: Iterable[Result]) -> list[tuple[str, int]]:
+    """Reasons and how many pictures have them; those that differ in numbers only are one, told as the commonest.
+
+    Args:
+        results: One for each picture.
+    """
     kinds: dict[str, Counter[str]] = {}
     for result in results:
         if result.found.reason:
@@ -519,7 +587,7 @@ def _nothing_found_error(rig: _Rig, results: Sequence[Result], sheets: Sequence[
             why=f"points.csv names {list_some(rig.known[0] if rig.known else [])}, and found were {list_some(found)}",
             fix="give pictures and points the same names, or move points.csv away to measure unknown points",
         )
-    reasons = "; ".join(f"{count} x {text}" for text, count in _count_reasons(results)[:3])
+    reasons = "; ".join(f"{count} x {text}" for text, count in count_reasons(results)[:3])
     return ImageError(
         f"nothing was found in any of the {len(results)} pictures of {rig.path}, so {VIEWS} is not written.",
         why=reasons or "the detector gave no reason",

@@ -24,7 +24,7 @@ from implicam.dataset.model import check_name
 from implicam.detect.model import Detected, Detector, View
 from implicam.errors import DatasetError, ImageError, ImplicamError, MissingExtraError
 from implicam.formatting import json_default
-from implicam.images import blank, read_picture
+from implicam.images import Grey, blank, read_picture
 from implicam.progress import Progress
 from implicam.threads import side_by_side
 
@@ -236,7 +236,7 @@ def detect_all(
 
         new = []
         for view, file in pictures.items():
-            entry = _find_entry(journal, view, file, options)
+            entry = find_entry(journal, view, file, options)
             if entry is None:
                 new.append((view, file))
             else:
@@ -247,7 +247,15 @@ def detect_all(
     return JournalResults(entries, problems, resumed, float(np.mean(seconds)) if seconds else float("nan"))
 
 
-def _find_entry(journal: Journal, view: View, path: Path, options: str) -> Entry | None:
+def find_entry(journal: Journal, view: View, path: Path, options: str) -> Entry | None:
+    """What the journal has of a picture, None where it has nothing that is possible.
+
+    Args:
+        journal: The journal.
+        view: Which picture it is.
+        path: Its file.
+        options: The detector's `digest`.
+    """
     try:
         entry = journal.entries.get(Key.of(view, path, options))
     except OSError:
@@ -261,8 +269,25 @@ def _look(path: Path, view: View, detector: Detector, journal: Journal, options:
         key = Key.of(view, path, options)
     except OSError as error:
         raise ImageError(f"{path} cannot be read", why=str(error)) from error
-    picture = read_picture(path)
+    return look_at(read_picture(path), path, key, detector, journal)
+
+
+def look_at(picture: Grey, path: Path, key: Key, detector: Detector, journal: Journal) -> Entry:
+    """Detect in a picture, and write it down.
+
+    Args:
+        picture: (height, width) grey.
+        path: Its file, for messages.
+        key: What the result depends on.
+        detector: What to look for.
+        journal: Where to write.
+
+    Raises:
+        ImageError: The picture is blank, or the detector fails.
+        ImplicamError: The journal cannot be written.
+    """
     height, width = picture.shape
+    view = View(key.camera, key.shot)
     empty = blank(picture)
     if empty:
         raise ImageError(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -114,7 +114,11 @@ class Detector(Protocol):
     are the options, `name: Annotated[type, Option(...)] = None`; `dataset` is the folder, and `described` the table
     `[target]` of dataset.toml, empty where that is of another target. A key of that table with the name of an option
     is its value where the option is not given.
+
+    moves: whether the target is shown at many places, with other points in each shot; a fixed one has the same points.
     """
+
+    moves: ClassVar[bool]
 
     def options(self) -> dict[str, Any]:
         """All that its results depend on, as plain values: other options, other results."""
@@ -152,7 +156,12 @@ class Detector(Protocol):
 
 
 class DetectorBase:
-    """What most detectors say of themselves: each picture speaks for itself, and nothing is to be corrected."""
+    """What most detectors say of themselves: each picture speaks for itself, and nothing is to be corrected.
+
+    moves: whether the target is shown at many places, with other points in each shot; a fixed one has the same points.
+    """
+
+    moves: ClassVar[bool] = True
 
     def describe(self) -> dict[str, Any]:
         """Nothing: dataset.toml needs no table [target] for it."""

@@ -17,16 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.errors import HardwareError
+from implicam.films import FILM_ENDINGS
 from implicam.hardware.protocol import Frame, Grey
 from implicam.images import opencv
 
 STREAM_PREFIXES = ("rtsp://", "rtsps://", "http://", "https://", "udp://")
-FILM_ENDINGS = (
-    ".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".mjpg", ".mjpeg", ".ts", ".mts", ".wmv", ".flv",
-    ".ogv", ".3gp", ".y4m",
-)  # fmt: skip
-"""Of files that are taken for films by their names."""
-
 STALE_DEVICE_PICTURES, STALE_STREAM_PICTURES = 1, 2
 """Pictures after the call that may have been exposed before it: the one on its way, and the one in a stream's decoder,
 which knows that a picture is whole when the next begins."""
