@@ -36,6 +36,7 @@ EXAMPLES = {
     "calibrate": "implicam calibrate my-rig -o my-rig.implicam",
     "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
     "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
+    "check": "implicam check my-rig.implicam my-rig/check --log checks.csv",
     "compare": "implicam compare my-rig --train 35,87 --seeds 3 -o compare.png",
     "report": "implicam report my-rig.implicam -o report.html",
     "convert": "implicam convert my-rig my-rig.csv",

@@ -18,12 +18,13 @@ import typer
 import implicam.cli.acquire
 import implicam.cli.board
 import implicam.cli.cameras
+import implicam.cli.check
 import implicam.cli.compare
 import implicam.cli.design
 import implicam.cli.detect
 import implicam.cli.label
 import implicam.cli.paper
-import implicam.cli.simulate  # noqa: F401  the eight register their commands
+import implicam.cli.simulate  # noqa: F401  these register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards

@@ -26,6 +26,7 @@ from implicam.rig_model.initialise import (
 )
 from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.linearise import iterate_linearisation
+from implicam.rig_model.movement import NUMBERS, Check, Evidence
 from implicam.rig_model.normal_equations import solve_normal
 from implicam.rig_model.posterior import Posterior, condition
 from implicam.rig_model.rig import FittedRig, Sensitivity
@@ -43,11 +44,14 @@ from implicam.rig_model.triangulate import locate
 __all__ = [
     "MAX_NAMED_IN_NOTE",
     "MIN_POINTS_PER_CAMERA",
+    "NUMBERS",
     "CameraModel",
     "CameraSettings",
     "CameraViews",
     "CentralCamera",
+    "Check",
     "Diagnosis",
+    "Evidence",
     "FitResult",
     "FittedRig",
     "Frame",

@@ -23,15 +23,19 @@ from scipy.special import chdtrc
 
 from implicam.geometry import Bools, Floats, rotation_from_vector, vector_from_rotation
 from implicam.gp.linalg import covariance_root
+from implicam.rig_model.camera import CentralCamera
 from implicam.rig_model.camera_model import CameraModel, apply_covariance_root
+from implicam.rig_model.general_camera import GeneralCamera
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
-from implicam.rig_model.triangulate import locate
+from implicam.rig_model.triangulate import locate, meet_lines
 
 NUMBERS = 7
 TURN, SHIFT, ZOOM = slice(0, 3), slice(3, 6), 6
 MAX_STEPS, MAX_TRIMMINGS = 25, 4
 MIN_POINTS_TO_START = 5
+AXIS_STEP_HALF_SIDES = 0.05
+"""How far beside the middle of its image a camera without a lens model is asked where right is."""
 CONVERGED_STEP_SDS = 1e-3
 MAX_EQUATIONS = 1200
 """Residuals that are used, some three quarters of the views: of more points a part is drawn, at random. The errors of
@@ -39,6 +43,8 @@ the calibration, which all points share, limit what more of them could tell."""
 PRIOR_SDS = np.array([0.5, 0.5, 0.5, 2.0, 2.0, 2.0, 0.3])
 """Of a movement before anything is seen: radians, standard deviations of the known positions, and a part of the focal
 length. So wide that they only keep a search from running away, and say how much a movement must explain."""
+MAX_STEP = 0.2 * PRIOR_SDS
+"""Of a search: what two cameras do not show of a movement must not carry it away."""
 WRONG_VIEW_P_VALUE = 1e-5
 """Of a point after the movement: below it the camera's view of it is a wrong detection."""
 MIN_FREEDOM_FOR_NOISE = 30
@@ -60,7 +66,7 @@ class Motion:
 
 class Stand(NamedTuple):
     """Where a camera stood when it was calibrated: its centre (3,), its axes (3, 3) right, down and forward in columns,
-    and the middle (2,) of its image."""
+    and the pixel (2,) about which it zooms."""
 
     centre: Floats
     axes: Floats
@@ -68,13 +74,18 @@ class Stand(NamedTuple):
 
     @classmethod
     def of(cls, model: CameraModel) -> Stand:
-        """From what it sees in the middle of its image, and beside it.
+        """From its lens and pose; of a camera that has no lens model, from what it sees in the middle of its image.
 
         Args:
             model: The camera.
         """
-        middle, side = model.image.centre, np.array([0.05 * model.image.half, 0.0])
-        centre, rays = model.camera.lines(np.stack([middle, middle + side, middle - side]))
+        camera = model.camera
+        if isinstance(camera, CentralCamera):
+            return cls(camera.pose.centre, camera.pose.rotation.T, np.array([camera.lens.cx, camera.lens.cy]))
+        if isinstance(camera, GeneralCamera) and not camera.mirrored:
+            return cls(camera.pose.centre, camera.pose.rotation.T, camera.centre)
+        middle, side = model.image.centre, np.array([AXIS_STEP_HALF_SIDES * model.image.half, 0.0])
+        centre, rays = camera.lines(np.stack([middle, middle + side, middle - side]))
         forward = rays[0] / np.linalg.norm(rays[0])
         right = rays[1] - rays[2]
         right = right - (right @ forward) * forward
@@ -215,6 +226,12 @@ class CheckedRig:
         found = locate(self.posterior, np.where(seen[..., None], self.uv, np.nan), self.noise, settings=self.settings)
         return found.xyz, seen & ~found.left_out
 
+    def meet(self) -> Floats:
+        """(n, 3) where the lines of sight meet best, however badly."""
+        found = [model.camera.lines(self.uv[:, c]) for c, model in enumerate(self.posterior.models)]
+        centres, directions = np.array([line[0] for line in found]), np.stack([line[1] for line in found], axis=1)
+        return meet_lines(centres, directions, self.seen)
+
     def equations(self, motions: Sequence[Motion], x: Floats, seen: Bools, unknowns: bool = True) -> Equations:
         """The linear model of what is left about positions and movements, eq. (M1).
 
@@ -292,7 +309,7 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
         motion = _start(rig, camera, x[apart], np.flatnonzero(apart))
         agree[:, camera] = rig.seen[:, camera]
     else:  # two cameras, or nearly: all that is known is where their lines of sight meet
-        x, agree = rig.locate(rig.seen)
+        x, agree = rig.meet(), rig.seen.copy()
     motions = [Motion()] * len(rig.stands)
     mine = slice(NUMBERS * camera, NUMBERS * (camera + 1))
     for _ in range(MAX_TRIMMINGS):
@@ -307,6 +324,7 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
             X, number = found.by_step[:, mine], stand.numbers(motion)
             information = X.T @ X + np.diag(prior)
             step = np.linalg.solve(information, X.T @ found.left - prior * number)
+            step = np.asarray(step / max(1.0, float(np.max(np.abs(step) / MAX_STEP))), dtype=np.float64)
             motion, x[rows] = stand.moved(motion, step), x[rows] + found.to_x
             if not np.isfinite(step).all() or not np.isfinite(x[rows]).all():
                 return None
@@ -322,7 +340,7 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
     left, by_step = found.whitened()
     X, number = by_step[:, mine], stand.numbers(motion)
     information = X.T @ X
-    cov = np.linalg.inv(information + np.diag(prior))
+    cov = np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
     step = cov @ (X.T @ left - prior * number)
     before = _chi_squared_unmoved(rig.select(rows), x[rows], agree[rows])
     after = float(left @ left - (X.T @ left) @ cov @ (X.T @ left))
@@ -443,12 +461,13 @@ def check_movement(rig: CheckedRig, *, level: float = 0.05, seed: int = 0) -> Ch
     if p_value < level:
         odds = np.array([one.log_odds for one in evidence]) / noise_ratio**2
         share = np.exp(odds - odds.max()) / np.sum(np.exp(odds - odds.max()))
-        candidates = tuple(one.camera for one, s in zip(evidence, share, strict=True) if s > 1 - SURE)
+        witnessed = np.sum(best.seen.sum(axis=1) >= 3) >= MIN_POINTS_TO_START  # else only a pair's relative pose shows
+        candidates = tuple(one.camera for one, s in zip(evidence, share, strict=True) if s > 1 - SURE or not witnessed)
         after = design.without(best.camera)
         several = after.tail(after.largest(left) / noise_ratio**2) < AFTER_LEVEL
         if several:
             candidates = ()
-        elif share[0] > SURE:
+        elif share[0] > SURE and witnessed:
             named, candidates = best, ()
     return Check(tuple(evidence), p_value, named, candidates, several, len(rows), noise_ratio, design, level)
 

@@ -17,6 +17,7 @@ from implicam.measurement import Measurement, SharedErrors
 from implicam.rig_model.alarm import Table, alarm_of
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
+from implicam.rig_model.movement import Check, CheckedRig, check_movement
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
@@ -90,10 +91,7 @@ class FittedRig:
         Raises:
             DatasetError: None of the cameras is one of the calibration, or one has images of another size.
         """
-        observations = observations_of(observations)
-        known = [name for name in self.trained.camera_names if name in observations.camera_names]
-        trained = self.trained.with_cameras(known) if known else self.trained
-        observations = match_cameras(trained, observations)
+        observations = self._matched(observations)
         uv, noise = self.views(observations)
         found = locate(self.posterior, uv, noise, self.labels, self.degrees, self.settings)
         seen = np.asarray(np.isfinite(uv).all(axis=2))
@@ -128,6 +126,12 @@ class FittedRig:
         own = uv[rows], noise[rows], found.xyz[rows], found.left_out[rows]
         return self.frame.scale * shared_errors(self.posterior, *own, self.labels, self.degrees, self.settings)
 
+    def _matched(self, observations: Observations | Dataset) -> Observations:
+        """What the cameras of the calibration saw."""
+        observations = observations_of(observations)
+        known = [name for name in self.trained.camera_names if name in observations.camera_names]
+        return match_cameras(self.trained.with_cameras(known) if known else self.trained, observations)
+
     def _agree(self, uv: Floats) -> NDArray[np.bool_]:
         """(n,) whether all views (n, C, 2) of each point agree, with the usual noise."""
         noise = np.broadcast_to([model.noise for model in self.posterior.models], uv.shape[:2])
@@ -159,6 +163,25 @@ class FittedRig:
                 uv[:, c] = observations.uv[:, k]
                 noise[:, c] = self._noise(observations, c, k)
         return uv, noise
+
+    def movement(self, observations: Observations | Dataset, *, level: float, seed: int = 0) -> Check | None:
+        """Whether a camera moved since the calibration, from what the cameras saw of points that nobody knows.
+
+        Args:
+            observations: What the cameras saw, by their names.
+            level: How often a rig that stands may raise an alarm.
+            seed: Of random numbers.
+
+        Returns:
+            What was found, lengths in those of the working frame; None where no two cameras saw enough.
+
+        Raises:
+            DatasetError: None of the cameras is one of the calibration, or one has images of another size.
+        """
+        uv, noise = self.views(self._matched(observations))
+        if self.degrees is not None:  # the sd of normal noise as wide
+            noise = noise * np.sqrt(self.degrees / (self.degrees - 2) if self.degrees > 2 else 3.0)
+        return check_movement(CheckedRig(self.posterior, uv, noise, self.settings), level=level, seed=seed)
 
     def predict(self, xyz: Floats) -> Floats:
         """Where all cameras see positions, in pixels without noise.

@@ -191,7 +191,7 @@ class _Seen:
 
     def solve(self, rows: NDArray[np.int64], seen: Bools) -> tuple[Floats, Floats, Floats]:
         """Positions, covariances and p-values of points from the views `seen` alone."""
-        start = _start(*self.lines(rows), seen)
+        start = meet_lines(*self.lines(rows), seen)
         found = _solve(self.posterior, start, self.uv[rows], self.noise[rows], seen, self.labels)
         if self.degrees is None:
             return found.xyz, found.cov, _p_value(found.chi2, seen.sum(axis=1))
@@ -355,8 +355,17 @@ def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen
     return x - known @ labels.unknowns.mean, cov + own + tied + tied.swapaxes(1, 2) + unknown
 
 
-def _start(centres: Floats, directions: Floats, seen: Bools) -> Floats:
-    """(n, 3) where the lines of sight meet best; NaN for fewer than two, or where they (nearly) coincide."""
+def meet_lines(centres: Floats, directions: Floats, seen: Bools) -> Floats:
+    """Where lines of sight meet best.
+
+    Args:
+        centres: (C, 3) of the cameras.
+        directions: (n, C, 3) unit vectors, NaN for none.
+        seen: (n, C) the lines to use.
+
+    Returns:
+        (n, 3), NaN for fewer than two lines, or where they (nearly) coincide.
+    """
     good = seen & np.isfinite(directions).all(axis=2)
     d = np.where(good[..., None], directions, 0)
     across = good[..., None, None] * np.eye(3) - d[..., :, None] * d[..., None, :]

@@ -1,0 +1,95 @@
+"""`implicam check`: does a calibration still hold?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from implicam.calibrators import load_calibration
+from implicam.cli import show
+from implicam.cli.app import Json, command, must_not_replace, read
+from implicam.cli.options import with_table_options
+from implicam.dataset import TableOptions
+from implicam.dataset.table_options import DOCUMENTED
+from implicam.formatting import decimal_number, number_with_sd
+from implicam.stability import NUMBER_NAMES, CalibrationCheck, CameraMovement, append_to_log, check_calibration
+
+
+@command("check")
+@with_table_options
+def check_command(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    dataset: Annotated[Path, typer.Argument(help="New views of 20 points or more; none of them need be known.")],
+    level: Annotated[
+        float, typer.Option("--level", metavar="P", help="How often a rig that stands may raise an alarm.")
+    ] = 0.05,
+    log: Annotated[Path | None, typer.Option("--log", metavar="CSV", help="Add the result to this history.")] = None,
+    table: TableOptions = DOCUMENTED,
+    json: Json = False,
+) -> None:
+    """Check whether a calibration still holds, from new views: did a camera move, which, how far?
+
+    No known point is needed; where there are some they are compared, too. Ends with 1 where it does not hold.
+    """
+    if log is not None:
+        must_not_replace(log, calibration, dataset)
+    fitted = load_calibration(calibration)
+    data = read(dataset, table)
+    with show.progress(json) as progress:
+        progress("checking", 0, 1)
+        found = check_calibration(fitted, data, level=level)
+        progress("checking", 1, 1)
+    if log is not None:
+        append_to_log(log, found, data.name)
+    if json:
+        show.emit_json(_as_json(found))
+        raise typer.Exit(int(not found.holds))
+    first, *others = found.sentences()
+    if found.holds:
+        show.line(first)
+    else:
+        show.alarm(first)
+    for sentence in others:
+        show.line(sentence)
+    if not found.holds:
+        show.table(_table(found, "if it alone moved", lambda one: map(number_with_sd, one.step, one.sd)))
+    show.table(_table(found, "named half the time", lambda one: map(_smallest, one.noticed)))
+    show.line("named half the time: the smallest movement, of this kind alone, that this check would name so often")
+    if log is not None:
+        show.line(f"{log}: one more check")
+    raise typer.Exit(int(not found.holds))
+
+
+def _table(found: CalibrationCheck, what: str, cells: Callable[[CameraMovement], Iterable[str]]) -> Any:
+    """A row for each camera, the likeliest to have moved first."""
+    units = ["deg"] * 3 + [found.length_unit] * 3 + ["%"]
+    headings = [what, *(f"{name}, {unit}" for name, unit in zip(NUMBER_NAMES, units, strict=True))]
+    return show.text_table(f"{found.points} points", headings, [[one.camera, *cells(one)] for one in found.cameras])
+
+
+def _smallest(noticed: float) -> str:
+    return "-" if np.isinf(noticed) else decimal_number(float(noticed), 2)
+
+
+def _as_json(found: CalibrationCheck) -> dict[str, Any]:
+    cameras = [
+        {"camera": one.camera}
+        | {
+            name: {"value": float(value), "sd": float(sd), "noticed": float(least) if np.isfinite(least) else None}
+            for name, value, sd, least in zip(NUMBER_NAMES, one.step, one.sd, one.noticed, strict=True)
+        }
+        for one in found.cameras
+    ]
+    known = found.known and {
+        "points": found.known.points, "p_value": found.known.p_value, "bias": found.known.bias.tolist(),
+        "bias_sd": found.known.bias_sd.tolist(),
+    }  # fmt: skip
+    return {
+        "verdict": found.verdict, "holds": found.holds, "p_value": found.p_value, "candidates": list(found.candidates),
+        "cameras": cameras, "known": known, "points": found.points, "noise_ratio": found.noise_ratio,
+        "length_unit": found.length_unit, "said": found.sentences(),
+    }  # fmt: skip

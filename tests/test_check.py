@@ -1,0 +1,173 @@
+"""Does a calibration still hold: cameras that move are named with how far, rigs that stand raise no alarm."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import implicam as ic
+from command_line import Cli, cli  # noqa: F401  a fixture
+from implicam.dataset import Dataset, Floats
+from implicam.errors import DatasetError, UsageError
+from implicam.geometry import Pose
+from implicam.rig_model.movement import Motion, Stand, see_moved
+from implicam.simulate import Rig, build_rig, random_positions, simulate
+from implicam.stability import NUMBER_NAMES, append_to_log
+
+NOTHING = np.zeros(7)
+
+
+def moved(rig: Rig, camera: int, step: Floats) -> Rig:
+    """A simulated rig with one camera turned (degrees) and shifted (mm) about its own axes, and zoomed (per cent)."""
+    before = rig.cameras[camera]
+    pose = before.camera_from_world
+    turn = Rotation.from_rotvec(np.radians(step[:3])).as_matrix().T @ pose.rotation
+    lens = replace(before.lens, fx=before.lens.fx * (1 + step[6] / 100), fy=before.lens.fy * (1 + step[6] / 100))
+    after = replace(
+        before, camera_from_world=Pose(turn, -turn @ (pose.centre + pose.rotation.T @ step[3:6])), lens=lens
+    )
+    return replace(rig, cameras=tuple(after if c == camera else one for c, one in enumerate(rig.cameras)))
+
+
+@cache
+def rig_and_calibration(name: str = "bar6", points: int = 157) -> tuple[Rig, ic.Calibration]:
+    rig = build_rig(name, seed=1, lens_error=0.5)
+    return rig, ic.ForwardGP().fit(simulate(rig, random_positions(rig, points, np.random.default_rng(1)), seed=1))
+
+
+def views(rig: Rig, seed: int, points: int = 50) -> Dataset:
+    return replace(simulate(rig, random_positions(rig, points, np.random.default_rng(seed)), seed=seed), known=None)
+
+
+def step_of(**numbers: float) -> Floats:
+    return np.array([numbers.get(name, 0.0) for name in NUMBER_NAMES])
+
+
+def test_slopes_of_a_moved_camera_are_its_differences() -> None:
+    _, calibration = rig_and_calibration()
+    fitted = calibration.map
+    model, points = fitted.posterior.models[2], fitted.frame.to_working(calibration.data.xyz[:6])
+    stand = Stand.of(model)
+    motion = stand.moved(Motion(), np.array([0.02, -0.03, 0.05, 0.1, -0.05, 0.2, 0.02]))
+    views_there = see_moved(model, stand, motion, points)
+    h = 1e-6
+    for i in range(7):
+        ahead, behind = (see_moved(model, stand, stand.moved(motion, s * h * np.eye(7)[i]), points).uv for s in (1, -1))
+        np.testing.assert_allclose(views_there.by_step[:, :, i], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-4)
+    for i in range(3):
+        ahead, behind = (see_moved(model, stand, motion, points + s * h * np.eye(3)[i]).uv for s in (1, -1))
+        np.testing.assert_allclose(views_there.by_point[:, :, i], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [step_of(tilt=0.05), step_of(right=0.4), step_of(pan=3.0, down=20.0), step_of(zoom=2.0), step_of(roll=-10.0)],
+    ids=["a little tilt", "a little shift", "knocked", "zoomed", "rolled"],
+)
+def test_a_camera_that_moved_is_named_with_how_far(step: Floats) -> None:
+    rig, calibration = rig_and_calibration()
+    found = ic.check_calibration(calibration, views(moved(rig, 3, step), 7))
+    assert found.verdict == "moved"
+    first = found.cameras[0]
+    assert first.camera == "cam4"
+    # about the true axes, which the calibration knows to some minutes of arc only
+    stand, true = Stand.of(calibration.map.posterior.models[3]), rig.cameras[3].camera_from_world.rotation
+    to_fitted = (true @ stand.axes).T
+    right = np.array([*(to_fitted @ step[:3]), *(to_fitted @ step[3:6]), step[6]])
+    error = first.step - right
+    assert error @ np.linalg.solve(first.cov, error) < 24.3  # 7 degrees of freedom, 0.1 %
+    assert "cam4 has moved" in found.sentences()[0]
+
+
+def test_wrong_detections_do_not_hide_it() -> None:
+    rig, calibration = rig_and_calibration()
+    data = views(moved(rig, 3, step_of(pan=0.1)), 8, points=60)
+    uv, rng = data.observations.uv.copy(), np.random.default_rng(0)
+    for i in range(0, 60, 5):  # one point in five has a wrong view
+        uv[i, rng.integers(6)] += rng.uniform(20, 200, 2)
+    found = ic.check_calibration(calibration, replace(data, observations=replace(data.observations, uv=uv)))
+    assert (found.verdict, found.cameras[0].camera) == ("moved", "cam4")
+    assert found.cameras[0].step[1] == pytest.approx(0.1, abs=4 * found.cameras[0].sd[1])
+
+
+def test_two_cameras_that_moved_are_no_single_one() -> None:
+    rig, calibration = rig_and_calibration()
+    both = moved(moved(rig, 3, step_of(pan=0.1)), 1, step_of(tilt=0.1))
+    assert ic.check_calibration(calibration, views(both, 9)).verdict == "several moved"
+
+
+def test_of_two_cameras_nobody_can_say_which() -> None:
+    rig, calibration = rig_and_calibration("stereo", 60)
+    found = ic.check_calibration(calibration, views(moved(rig, 1, step_of(tilt=0.5)), 10))
+    assert found.verdict == "one moved"
+    assert set(found.candidates) == set(calibration.camera_names)
+    assert "nobody can say which" in found.sentences()[0]
+
+
+def test_all_cameras_together_are_seen_by_known_points_alone() -> None:
+    rig, calibration = rig_and_calibration()
+    data = simulate(rig, random_positions(rig, 40, np.random.default_rng(11)), seed=11)
+    assert ic.check_calibration(calibration, data).verdict == "stands"
+    shifted = data.transformed(np.array([[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+    found = ic.check_calibration(calibration, shifted)
+    assert found.verdict == "biased"
+    assert found.known is not None
+    assert found.known.bias[0] == pytest.approx(-0.5, abs=4 * found.known.bias_sd[0])
+    unknown = ic.check_calibration(calibration, replace(shifted, known=None))
+    assert unknown.verdict == "stands"
+    assert "moved together looks the same" in unknown.sentences()[1]
+
+
+def test_what_cannot_be_checked_is_refused() -> None:
+    rig, calibration = rig_and_calibration()
+    with pytest.raises(UsageError, match="no cameras that could have moved"):
+        ic.check_calibration(ic.InverseGP().fit(rig_and_calibration("stereo", 60)[1].data), views(rig, 12))
+    with pytest.raises(UsageError, match="no probability"):
+        ic.check_calibration(calibration, views(rig, 12), level=5)
+    data = views(rig, 12, points=3)
+    uv = data.observations.uv.copy()
+    uv[:, 1:] = np.nan
+    with pytest.raises(DatasetError, match="no two cameras saw enough"):
+        ic.check_calibration(calibration, replace(data, observations=replace(data.observations, uv=uv)))
+
+
+def test_on_the_command_line_with_a_history(cli: Cli) -> None:
+    rig, calibration = rig_and_calibration()
+    calibration.save("rig.implicam")
+    ic.write_dataset(views(rig, 13), "stands.csv")
+    ic.write_dataset(views(moved(rig, 0, step_of(pan=0.2)), 13), "moved.csv")
+    ran = cli("check", "rig.implicam", "stands.csv", "--log", "checks.csv")
+    assert ran.code == 0, ran.err
+    assert "Nothing speaks against the calibration" in ran.out
+    ran = cli("check", "rig.implicam", "moved.csv", "--log", "checks.csv")
+    assert ran.code == 1
+    assert "cam1 has moved" in ran.out + ran.err
+    ran = cli("check", "rig.implicam", "moved.csv", "--json")
+    assert json.loads(ran.out)["cameras"][0]["camera"] == "cam1"
+    with open("checks.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["verdict"] for row in rows] == ["stands"] * 6 + ["moved"] * 6
+    assert float(rows[6]["pan"]) == pytest.approx(0.2, abs=4 * float(rows[6]["sd_pan"]))
+    Path("other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(DatasetError, match="no history of checks"):
+        append_to_log(Path("other.csv"), ic.check_calibration(calibration, views(rig, 13)), "x")
+    assert Path("other.csv").read_text() == "a,b\n1,2\n"
+
+
+@pytest.mark.slow
+def test_rigs_that_stand_raise_as_many_alarms_as_stated() -> None:
+    """200 trials on ten rigs; benchmarks/check.py has 1000."""
+    alarms = 0
+    for seed in range(10):
+        rig = build_rig("bar6", seed=seed, lens_error=0.5)
+        known = simulate(rig, random_positions(rig, 60, np.random.default_rng(seed)), seed=seed)
+        calibration = ic.ForwardGP().fit(known)
+        alarms += sum(not ic.check_calibration(calibration, views(rig, 1000 + 20 * seed + k)).holds for k in range(20))
+    assert 2 <= alarms <= 21  # 5 % of 200, with three standard deviations of the binomial and of the rigs
