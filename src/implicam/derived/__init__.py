@@ -15,7 +15,7 @@ from implicam.derived.features import (
     fit_plane,
     fit_sphere,
 )
-from implicam.derived.joint import JointPositions, joint
+from implicam.derived.joint_positions import JointPositions, joint
 from implicam.derived.quantities import Quantity, angle, distance, distances
 
 __all__ = [

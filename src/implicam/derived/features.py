@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
 from implicam.dataset import Floats
-from implicam.derived.joint import joint
+from implicam.derived.joint_positions import joint
 from implicam.derived.quantities import Quantity
 from implicam.errors import NumericalError, UsageError
 from implicam.geometry import rotation_from_vector, vector_from_rotation

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from implicam.dataset import Floats
-from implicam.derived.joint import JointPositions, find_measured_point, joint, joint_of_rows
+from implicam.derived.joint_positions import JointPositions, find_measured_point, joint, joint_of_rows
 from implicam.errors import UsageError
 from implicam.formatting import number_with_sd
 from implicam.measurement import Measurement

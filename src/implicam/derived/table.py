@@ -10,7 +10,7 @@ import numpy as np
 
 from implicam.dataset.folder import csv_text, format_cells
 from implicam.dataset.tables import check_width, split_lines
-from implicam.derived.joint import find_point
+from implicam.derived.joint_positions import find_point
 from implicam.derived.quantities import Quantity, distances
 from implicam.errors import DatasetError
 from implicam.measurement import Measurement

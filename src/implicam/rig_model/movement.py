@@ -3,7 +3,7 @@
 About every point its residuals are linear in where it is, in what is unknown of the cameras (`shared_errors` has the
 same unknowns), and in how one camera has moved since. Where the points are is projected out; the cameras' unknowns are
 integrated out with what the calibration knows of them; what is left is a linear model of the movement, whose
-likelihood says whether a camera moved, which, and how far; eqs. (M1) to (M4) of docs/method.md.
+likelihood says whether a camera moved, which, and how far; eqs. (M1) to (M3) of docs/method.md.
 
 A movement has seven numbers: a turn about the camera's own axes (right, down, forward), a shift along them, and a zoom.
 """
@@ -324,8 +324,8 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
             X, number = found.by_step[:, mine], stand.numbers(motion)
             information = X.T @ X + np.diag(prior)
             step = np.linalg.solve(information, X.T @ found.left - prior * number)
-            step = np.asarray(step / max(1.0, float(np.max(np.abs(step) / MAX_STEP))), dtype=np.float64)
-            motion, x[rows] = stand.moved(motion, step), x[rows] + found.to_x
+            step = step / max(1.0, float(np.max(np.abs(step) / MAX_STEP)))
+            motion, x[rows] = stand.moved(motion, np.asarray(step, dtype=np.float64)), x[rows] + found.to_x
             if not np.isfinite(step).all() or not np.isfinite(x[rows]).all():
                 return None
             if step @ information @ step < CONVERGED_STEP_SDS**2:
@@ -341,10 +341,10 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
     X, number = by_step[:, mine], stand.numbers(motion)
     information = X.T @ X
     cov = np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
-    step = cov @ (X.T @ left - prior * number)
+    step = np.asarray(cov @ (X.T @ left - prior * number), dtype=np.float64)
     before = _chi_squared_unmoved(rig.select(rows), x[rows], agree[rows])
     after = float(left @ left - (X.T @ left) @ cov @ (X.T @ left))
-    at = stand.moved(motion, step)
+    at = stand.moved(motion, np.asarray(step, dtype=np.float64))
     shrink = np.linalg.slogdet(np.eye(NUMBERS) + np.outer(PRIOR_SDS, PRIOR_SDS) * information)[1]
     gain = before - after
     return Evidence(camera, at, stand.numbers(at), cov, gain, 0.5 * (gain - shrink), x, agree)
@@ -357,9 +357,13 @@ def _start(rig: CheckedRig, camera: int, x: Floats, rows: NDArray[np.int64]) -> 
 
     def off(numbers: Floats) -> Floats:
         seen = see_moved(model, stand, stand.moved(Motion(), numbers * PRIOR_SDS), x).uv
-        return np.nan_to_num((uv - seen) / noise, nan=1e6).ravel()
+        return np.asarray(np.nan_to_num((uv - seen) / noise, nan=1e6).ravel(), dtype=np.float64)
 
-    found = least_squares(off, np.zeros(NUMBERS), loss="cauchy", f_scale=3.0, x_scale=1e-2, max_nfev=100)
+    def slope(numbers: Floats) -> Floats:  # of a step after the turn, which is near enough
+        by_step = see_moved(model, stand, stand.moved(Motion(), numbers * PRIOR_SDS), x).by_step
+        return np.asarray(np.nan_to_num(-by_step * PRIOR_SDS / noise[..., None]).reshape(-1, NUMBERS), dtype=np.float64)
+
+    found = least_squares(off, np.zeros(NUMBERS), slope, loss="cauchy", f_scale=3.0, x_scale=1e-2, max_nfev=100)
     return stand.moved(Motion(), found.x * PRIOR_SDS)
 
 
@@ -488,16 +492,31 @@ class Design:
         self.maxima = np.sort(self.gains(self.draws).max(axis=1) / self.scale) if together.shape[1] else np.zeros(1)
 
     def gains(self, seen: Floats) -> Floats:
-        """(k, C) what the movement of each camera gains, of k draws of what its basis sees."""
+        """What the movement of each camera gains.
+
+        Args:
+            seen: (k, sum of ranks) k draws of what the bases see, one after the other.
+
+        Returns:
+            (k, C).
+        """
         squares = np.concatenate([np.zeros((len(seen), 1)), np.cumsum(seen**2, axis=1)], axis=1)
         return np.asarray(np.diff(squares[:, self.ends], axis=1), dtype=np.float64)
 
     def largest(self, left: Floats) -> float:
-        """What the movement of one of the cameras gains of residuals (N,)."""
+        """What the movement of one of the cameras gains, at most.
+
+        Args:
+            left: (N,) residuals.
+        """
         return max(float(np.sum((basis.T @ left) ** 2)) for basis in self.bases)
 
     def tail(self, gain: float) -> float:
-        """The probability that chance gains as much."""
+        """The probability that chance gains as much.
+
+        Args:
+            gain: In units of the noise.
+        """
         return float((np.sum(self.maxima >= gain) + 1) / (len(self.maxima) + 1))
 
     def without(self, camera: int) -> Design:
