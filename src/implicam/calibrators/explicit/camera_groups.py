@@ -23,6 +23,7 @@ from implicam.calibrators.explicit.agreement import (
 from implicam.calibrators.explicit.boards import Boards, BoardView, renumbered, usable_cameras
 from implicam.calibrators.explicit.lenses import Choice, angles
 from implicam.calibrators.explicit.pixels import prior_of
+from implicam.calibrators.explicit.reversed import find_reversed
 from implicam.calibrators.explicit.zhang import (
     OneCamera,
     calibrate_camera,
@@ -31,6 +32,7 @@ from implicam.calibrators.explicit.zhang import (
 )
 from implicam.dataset import Names
 from implicam.errors import FitError
+from implicam.formatting import list_some
 from implicam.geometry import Bools, Floats, Pose
 from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera, Image
@@ -128,6 +130,7 @@ def _adjust_group(
     cameras that contradict each other, whichever came first, and call the other bad.
     """
     cameras = tuple(sorted(poses))
+    _check_numbering(boards, singles, cameras)
     half = np.array([boards.images[c].half for c in cameras])
     bundle = _bundle(boards, singles, poses, cameras)
     found = adjust_in_steps(bundle, half, one_noise=True, progress=progress)
@@ -384,6 +387,26 @@ def _culprits(bad: Sequence[Agreement]) -> list[int]:
     """The camera that is in all of two pairs or more, else all of them."""
     in_all = set(bad[0].pair).intersection(*(one.pair for one in bad))
     return sorted(in_all if len(bad) > 1 and in_all else {c for one in bad for c in one.pair})
+
+
+def _check_numbering(boards: Boards, singles: Mapping[int, OneCamera], cameras: tuple[int, ...]) -> None:
+    """FitError where two cameras count the corners of the same board from different ends."""
+    corners = np.concatenate([view.xyz for view in boards.views])
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    seen = {c: {view.board: view for view in boards.of_camera(c)} for c in cameras}
+    placed = {c: _placed(boards, c, singles[c]) for c in cameras}
+    for a, b in combinations(cameras, 2):
+        found = find_reversed(singles[a].camera, seen[a], placed[a], placed[b], middle)
+        if found is None or mirrored(singles[a].camera, seen[a], placed[a], placed[b]) < found.error:
+            continue
+        shots = [str(boards.shots[seen[a][k].rows[0]]) for k in found.boards]
+        raise FitError(
+            f"{boards.names[a]} and {boards.names[b]} count the corners of {len(shots)} of the {found.of} boards that "
+            f"both saw from different ends: {list_some(shots)}.",
+            why=f"counted {found.way} in one of the two, they fit; OpenCV's findChessboardCorners, among others, "
+            "begins at either end of a board that looks the same upside down",
+            fix="reverse these corners in one of the two; or find them with implicam detect, which counts from one end",
+        )
 
 
 def _check_mirrors(
