@@ -302,6 +302,34 @@ def test_page_draws_in_a_browser(tmp_path: Path, chromium: dict[str, Any]):
             browser.close()
 
 
+@pytest.mark.slow
+@pytest.mark.browser
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_cut_off_on_a_phone(tmp_path: Path, chromium: dict[str, Any], scheme: Any):
+    sync_api = pytest.importorskip("playwright.sync_api")
+    write_report(tmp_path / "report.html", report_data(name="a-name-" + 90 * "x"))
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(**chromium)
+        size = {"width": 390, "height": 844}
+        view = browser.new_context(viewport=size, is_mobile=True, has_touch=True, color_scheme=scheme).new_page()
+        view.goto((tmp_path / "report.html").as_uri())
+        view.wait_for_function("document.querySelectorAll('.js-plotly-plot .main-svg').length >= 3", timeout=60_000)
+        beyond = view.evaluate(
+            """() => [...document.querySelectorAll("body *")].filter((one) => {
+                const box = one.getBoundingClientRect();
+                const drawn = !one.closest("defs, clipPath, .gl-container");
+                return drawn && box.width && (box.right > innerWidth + 1 || box.left < -1);
+            }).map((one) => `${one.tagName} ${one.getAttribute("class")} ${one.textContent.slice(0, 40)}`)"""
+        )
+        assert beyond == []
+        assert view.evaluate("document.documentElement.scrollWidth") == 390
+        assert (
+            view.evaluate("getComputedStyle(document.querySelector('#regions td + td'), '::before').content")
+            == '"points"'
+        )
+        browser.close()
+
+
 def listen(view):
     """Errors the page makes, and what it requests, as they come."""
     told: list[str] = []

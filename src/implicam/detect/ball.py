@@ -272,12 +272,19 @@ class Ball(DetectorBase):
         ]
 
     def _find_balls(self, picture: Grey) -> list[Edge]:
-        """Different balls, the likeliest first."""
+        """Different balls, the likeliest first; only where there is none, those that their shadow has displaced."""
         bright = float(np.quantile(picture[::4, ::4], 0.999))
+        places = self._find_places(picture)
+        return self._fit_balls(picture, places, bright) or self._fit_balls(picture, places, bright, steep_first=True)
+
+    def _fit_balls(
+        self, picture: Grey, places: list[tuple[Floats, float]], bright: float, *, steep_first: bool = False
+    ) -> list[Edge]:
         rough: list[Rough] = []
-        for centre, radius in self._find_places(picture):
+        for centre, radius in places:
             if not any(_overlaps(centre, one) for one in rough):
-                one = find_rough_edge(picture, centre, radius, step=MIN_STEP_BRIGHTNESS * bright)
+                step = MIN_STEP_BRIGHTNESS * bright
+                one = find_rough_edge(picture, centre, radius, step=step, steep_first=steep_first)
                 if one is not None and not any(_overlaps(one.ellipse.centre, other) for other in rough):
                     rough.append(one)
         rough.sort(key=lambda one: -one.quality)

@@ -122,7 +122,9 @@ class Rough(NamedTuple):
     quality: float
 
 
-def find_rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float = 0.0) -> Rough | None:
+def find_rough_edge(
+    picture: Grey, centre: Floats, radius: float, *, step: float = 0.0, steep_first: bool = False
+) -> Rough | None:
     """Find the edge of a disc that is darker than what is around it, to a pixel or so.
 
     Args:
@@ -130,27 +132,31 @@ def find_rough_edge(picture: Grey, centre: Floats, radius: float, *, step: float
         centre: (2,) a pixel near the disc's middle.
         radius: The disc's radius in pixels, roughly.
         step: Least difference of grey between the disc and what is around it.
+        steep_first: Begin with the rises that are steep enough, and bear that most are so at the end only: for a centre
+            that is off. A shadow beside a ball draws the template towards itself; the near part of the ball's own edge
+            is then too near to be looked for, and the edge of the shadow is found there, which is less steep.
 
     Returns:
         The edge; None where there is none on most sides.
     """
+    least = 0.45 if steep_first else 0.6
     for _ in range(3):
         points, rise = _find_steepest_rise(picture, centre, radius)
         steep = rise > 0.6 * step
         if np.mean(steep) < 0.6:  # no ellipse can be better than that
             return None
-        found = _fit_robust_ellipse(points, steep, centre, radius)
+        found = _fit_robust_ellipse(points, steep if steep_first else np.ones_like(steep), centre, radius)
         if found is None or np.linalg.norm(found[0].centre - centre) > radius:
             return None
         ellipse, on_it = found
         part = float(np.mean(on_it & steep))
-        if part < 0.45 or ellipse.axes[1] < 0.55 * ellipse.axes[0]:
+        if part < least or ellipse.axes[1] < 0.55 * ellipse.axes[0]:
             return None
         moved = np.linalg.norm(ellipse.centre - centre)
         centre, radius = ellipse.centre, ellipse.radius
         if moved < 0.7:
             break
-    if part < 0.6:  # at the end: from a centre that is off, near parts of the edge are not looked for
+    if part < 0.6:
         return None
     return Rough(ellipse, part * float(np.median(rise)))
 
@@ -178,16 +184,15 @@ def _find_steepest_rise(picture: Grey, centre: Floats, radius: float) -> tuple[F
     return centre + r[places][:, None] * out, np.asarray(high - low, dtype=np.float64)
 
 
-def _fit_robust_ellipse(points: Floats, steep: Bools, centre: Floats, radius: float) -> tuple[Ellipse, Bools] | None:
+def _fit_robust_ellipse(points: Floats, first: Bools, centre: Floats, radius: float) -> tuple[Ellipse, Bools] | None:
     """The ellipse through most of the points, and (n,) which those are: iteratively reweighted, about the centre.
 
-    It begins with the steep rises alone. A shadow beside the ball draws the centre towards itself; where the ball's own
-    edge is then too near to be looked for, the edge of the shadow is found, which is less steep.
+    first: (n,) those to begin with.
     """
     p = (points - centre) / radius
     basis = np.column_stack([p[:, 0] ** 2, 2 * p[:, 0] * p[:, 1], p[:, 1] ** 2, p])
     pull = np.array([1.0, 0, 1, 0, 0])  # towards the circle we came from, gently
-    weight = steep.astype(np.float64)
+    weight = first.astype(np.float64)
     for _ in range(5):
         normal = (basis * weight[:, None]).T @ basis + 0.02 * len(p) * np.diag([1.0, 1, 1, 0.1, 0.1])
         solved = np.linalg.solve(normal, basis.T @ weight + 0.02 * len(p) * pull)
