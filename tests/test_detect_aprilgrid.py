@@ -15,7 +15,7 @@ cv2 = pytest.importorskip("cv2")
 SHAPE = (480, 640)
 
 
-def kalibr(rows, columns, *, border=2, turns=0, spacing=0.3, pixels=100):
+def kalibr(rows, columns, *, border=2, turns=0, spacing=0.3, pixels=100, first=0):
     """Kalibr's board, drawn with OpenCV's tags: tag 0 at the lower left; a tag is `pixels` wide."""
     tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     gap = round(spacing * pixels)
@@ -23,7 +23,9 @@ def kalibr(rows, columns, *, border=2, turns=0, spacing=0.3, pixels=100):
     sheet = np.full((rows * pitch + gap, columns * pitch + gap), 255, np.uint8)
     for i in range(rows):
         for j in range(columns):
-            tag = np.rot90(cv2.aruco.generateImageMarker(tags, i * columns + j, pixels, borderBits=border), turns)
+            tag = np.rot90(
+                cv2.aruco.generateImageMarker(tags, first + i * columns + j, pixels, borderBits=border), turns
+            )
             top = (rows - 1 - i) * pitch + gap
             sheet[top : top + pixels, j * pitch + gap : j * pitch + gap + pixels] = tag
     for i in range(rows + 1):
@@ -88,6 +90,21 @@ def test_a_board_of_another_generator_counts_from_its_own_tag_0():
     found = board.detect(photograph(paint(sheet, 8), h, fine=4), VIEW)
     assert numbers(found).tolist() == list(range(24))
     assert np.linalg.norm(errors(found, truth(board, h, upwards=False)), axis=1).max() < 0.1
+
+
+def test_the_second_of_several_boards_begins_at_another_tag():
+    """Multical #2, swatbotics/apriltag #21: boards whose tags begin at 48, or 30."""
+    h = rotated(0.3, 56, tilt=(0.02, 0.02))
+    picture = photograph(paint(*kalibr(4, 5, first=48)), h, fine=4)
+    found = BOARD.detect(picture, VIEW)
+    assert len(found) == 0
+    assert "--first" in found.reason
+    assert "48 to 67" in found.reason
+    board = AprilGrid(4, 5, 88.0, 26.4, first=48)
+    found = board.detect(picture, VIEW)
+    assert len(found) >= 75
+    assert np.linalg.norm(errors(found, truth(board, h)), axis=1).max() < 0.2
+    assert board.describe()["first"] == 48
 
 
 def test_part_of_a_board_is_numbered_by_its_tags():

@@ -52,6 +52,18 @@ def test_usual_names_tell_camera_and_shot(tmp_path, names, cameras):
     assert found.notes[0].startswith("the pictures are in one folder")
 
 
+def test_pictures_of_one_camera_alone_may_be_the_most(tmp_path):
+    """Mrcal #38: some frames for each lens, a few in the middle that both cameras saw."""
+    names = [f"frame{k:05d}-cam0.jpg" for k in range(7)] + [f"frame{k:05d}-cam1.jpg" for k in range(5, 12)]
+    assert [len(shots) for shots in read(tmp_path, *names).values()] == [7, 7]
+
+
+def test_camera_and_shot_twice_in_a_name(tmp_path):
+    """Depthai #761: right/right_p3_3.png, left/left_p3_3.png."""
+    names = [f"{side}/{side}_p{k}_{k}.png" for side in ("left", "right") for k in range(3)]
+    assert read(tmp_path, *names) == {"left": ["p0_0", "p1_1", "p2_2"], "right": ["p0_0", "p1_1", "p2_2"]}
+
+
 @pytest.mark.parametrize(
     "names",
     [

@@ -37,7 +37,8 @@ SHOT_WORDS = frozenset({
 """Words after which a number is that of a shot."""
 
 MIN_SHARED_PART = 0.5
-"""The part of the pictures whose shot another camera has too, from which names count as read rightly."""
+"""The part of the pictures whose shot another camera has too, from which names count as read rightly where no word
+says which is the camera. Where one does, pictures of one camera alone, for its lens, may be the most."""
 
 MIN_ALIKE_PART = 2 / 3
 """The part of the names that must be made alike; the others are left out."""
@@ -48,6 +49,10 @@ FEWER_TIMES, MAX_CAMERAS_BY_COUNT = 3, 16
 Pictures = dict[str, dict[str, Path]]
 
 _FIELD = re.compile(r"[^\W\d_]+|\d+")
+
+
+SAID = 3
+"""Evidence of a reading where a word says which field is the camera."""
 
 
 class SortedPictures(NamedTuple):
@@ -350,7 +355,7 @@ def _weigh(rows: Sequence[Sequence[str]], group: Sequence[int]) -> int:
     values = {row[k].casefold() for row in rows}
     before = {row[k - 1].casefold() for row in rows} if k else set()
     if values <= SIDE_WORDS or (rows[0][k].isdigit() and before and before <= CAMERA_WORDS):
-        return 3
+        return SAID
     if not rows[0][k].isdigit():
         return 2
     return 0 if before and before <= SHOT_WORDS else 1
@@ -376,7 +381,7 @@ def _by_ends(loose: Sequence[Path]) -> list[_Named]:
 def _choose(readings: Sequence[_Reading]) -> list[_Named]:
     """The one way in which cameras share shots; empty where there is none, or more than one."""
     good = [one for one in readings if len({n.camera for n in one.named}) > 1]
-    good = [one for one in good if _shared_part(one.named) >= MIN_SHARED_PART]
+    good = [one for one in good if _shared_part(one.named) >= (MIN_SHARED_PART if one.evidence < SAID else 1e-9)]
     best = max((one.evidence for one in good), default=0)
     good = [one for one in good if one.evidence == best]
     if len(good) == 2 and best == 1:

@@ -58,7 +58,8 @@ class AprilGrid(DetectorBase):
 
     Corners are numbered along the rows of corners, two to a tag, from the outermost corner of tag 0: the lowest left
     one of a board of Kalibr, the top left one of generators that begin there. dictionary: OpenCV's name of the tags.
-    border: bits that the black border of a tag is wide, 0 to try what is usual.
+    border: bits that the black border of a tag is wide, 0 to try what is usual. first: the number of the first tag; the
+    text here calls it tag 0.
     """
 
     rows: int
@@ -67,6 +68,7 @@ class AprilGrid(DetectorBase):
     spacing: float
     dictionary: str = "DICT_APRILTAG_36h11"
     border: int = 0
+    first: int = 0
 
     def __post_init__(self) -> None:
         if min(self.rows, self.columns) < 1 or max(self.rows, self.columns) > 50 or self.rows * self.columns < 2:
@@ -83,9 +85,9 @@ class AprilGrid(DetectorBase):
                 fix="measure both on the printed board: --tag 88 --spacing 26.4 where tagSpacing is 0.3",
             )
         check_dictionary(self.dictionary)
-        if self.rows * self.columns > len(dictionary_of(self.dictionary).bytesList):
+        if self.first < 0 or self.first + self.rows * self.columns > len(dictionary_of(self.dictionary).bytesList):
             raise UsageError(
-                f"{self.dictionary} has too few tags for {self.rows} x {self.columns}.",
+                f"{self.dictionary} has too few tags for {self.rows} x {self.columns}, the first of them {self.first}.",
                 fix="use the dictionary that the board was printed with",
             )
         if self.border not in (0, *BORDERS):
@@ -101,6 +103,7 @@ class AprilGrid(DetectorBase):
         tag: Annotated[float | None, Option("edge of a tag's black square, in the dataset's unit", "LENGTH", 0)] = None,
         spacing: Annotated[float | None, Option("between two tags (default 0.3 of a tag)", "LENGTH", 0)] = None,
         dictionary: Annotated[str | None, Option("OpenCV's name, such as DICT_APRILTAG_36h11")] = None,
+        first: Annotated[int | None, Option("number of the first tag, where it is not 0", "N", 0)] = None,
         border: Annotated[
             int | None, Option("bits of a tag's black border, 1 or 2 (default: what fits)", "N", 1)
         ] = None,
@@ -114,6 +117,7 @@ class AprilGrid(DetectorBase):
             tag: Edge of a tag's black square in the dataset's unit.
             spacing: Between two tags in the dataset's unit; None for 0.3 of a tag, which the picture must bear out.
             dictionary: OpenCV's name of the tags' dictionary; None for the default of the class.
+            first: The number of the first tag; None for 0.
             border: Bits that a tag's black border is wide; None to try.
 
         Raises:
@@ -123,7 +127,7 @@ class AprilGrid(DetectorBase):
         if not tag:
             raise UsageError("an AprilGrid needs --tag.", fix="measure the edge of a tag's black square")
         gap = float(spacing) if spacing else USUAL_SPACING * float(tag)
-        return cls(rows, columns, float(tag), gap, str(dictionary or cls.dictionary), int(border or 0))
+        return cls(rows, columns, float(tag), gap, str(dictionary or cls.dictionary), int(border or 0), int(first or 0))
 
     def options(self) -> dict[str, Any]:
         """All that the results depend on."""
@@ -132,7 +136,7 @@ class AprilGrid(DetectorBase):
     def describe(self) -> dict[str, Any]:
         """The board as [target] has it."""
         kind = {"kind": "aprilgrid", **asdict(self)}
-        return {key: value for key, value in kind.items() if key != "border" or value}
+        return {key: value for key, value in kind.items() if key not in ("border", "first") or value}
 
     def detect(self, picture: Grey, view: View) -> Detected:
         """Find the corners of the tags in one picture.
@@ -186,6 +190,7 @@ class AprilGrid(DetectorBase):
     def _read_tags(self, picture: Grey) -> _Tags:
         """The tags that OpenCV reads, with the border and in the size of the picture with which it reads the most."""
         best, total = _Tags.none(), self.rows * self.columns
+        others: set[int] = set()
         cv2 = opencv()
         bits = int(dictionary_of(self.dictionary).markerSize)
         for scale in (1.0, 2.0) if picture.size <= MAX_SEARCH_PIXELS else (1.0,):
@@ -196,16 +201,23 @@ class AprilGrid(DetectorBase):
                 outlines, ids, _ = cv2.aruco.ArucoDetector(dictionary_of(self.dictionary), how).detectMarkers(image)
                 if ids is None:
                     continue
-                own = np.flatnonzero(ids.ravel() < total)
+                ids = ids.ravel().astype(np.intp) - self.first
+                own = np.flatnonzero((ids >= 0) & (ids < total))
+                others |= {int(number) + self.first for number in np.delete(ids, own)}
                 if len(own) > len(best.ids):
                     uv = np.array([outlines[k].reshape(4, 2) for k in own], dtype=np.float64).reshape(-1, 2)
                     there = to_original_pixels(uv, image, picture).reshape(-1, 4, 2)
-                    best = _Tags(ids.ravel()[own].astype(np.intp), there, border, bits)
+                    best = _Tags(ids[own], there, border, bits)
             if len(best.ids) >= 0.8 * total:
                 break
+        if len(best.ids) < len(others):
+            return best._replace(
+                reason=f"tags {min(others)} to {max(others)} were read, and the board has {self.first} to "
+                f"{self.first + total - 1}. Give --first, the number of its first tag, or the size that it has."
+            )
         if len(best.ids) == 0:
             return best._replace(
-                reason=f"no tag of {self.dictionary} with a number below {total} was read. Show the board sharp and "
+                reason=f"no tag of {self.dictionary} was read. Show the board sharp and "
                 "near (a tag needs twenty pixels), and check that it was printed from these tags."
             )
         if len(np.unique(best.ids)) < len(best.ids):

@@ -138,7 +138,7 @@ def _aprilgrid(board: AprilGrid) -> Print:
     black = [np.column_stack([j * pitch, i * pitch, np.full(len(i), gap), np.full(len(i), gap)])]
     for number in range(board.rows * board.columns):
         row, column = divmod(number, board.columns)
-        image = aruco.generateImageMarker(dictionary, number, bits, borderBits=border)
+        image = aruco.generateImageMarker(dictionary, board.first + number, bits, borderBits=border)
         corner = np.array([gap + column * pitch, gap + (board.rows - 1 - row) * pitch])
         black.append(_moved(_cells(image, board.tag / bits), corner))
     words = (
@@ -148,6 +148,7 @@ def _aprilgrid(board: AprilGrid) -> Print:
     told = f"--target aprilgrid --board {board.rows}x{board.columns} --tag {board.tag:g} --spacing {gap:g}"
     if board.dictionary != AprilGrid.dictionary:
         told += f" --dictionary {board.dictionary}"
+    told += f" --first {board.first}" if board.first else ""
     size = np.array([board.columns, board.rows]) * pitch + gap
     return Print(np.concatenate(black), size, gap / 2, (words, told))
 
