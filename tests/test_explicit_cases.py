@@ -17,6 +17,7 @@ from implicam.calibrators.explicit.boards import boards_of
 from implicam.calibrators.explicit.camera_groups import CameraGroup, calibrate_largest_group
 from implicam.calibrators.explicit.zhang import calibrate_camera
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
+from implicam.dataset.boards import corner_positions
 from implicam.errors import FitError
 from implicam.geometry import Pose, poses_from_rays, resect_any_pixels, rotation_from_vector, vector_from_rotation
 from implicam.lenses import BrownConrady
@@ -34,10 +35,16 @@ def with_uv(data: Dataset, uv: np.ndarray, cameras: tuple[Camera, ...] | None = 
     return replace(data, observations=seen)
 
 
-def held(seed: int, count: int = 11, moved: float = 0.0, noise: float = 0.05) -> Dataset:
-    """Boards of 3 x 6 corners, 40 mm, that both cameras saw; moved: sd of what they moved by between pictures."""
+CHECKERBOARD = {"kind": "board", "rows": 3, "columns": 6, "square": 40.0}
+
+
+def held(
+    seed: int, count: int = 11, moved: float = 0.0, noise: float = 0.05, target: dict[str, object] = CHECKERBOARD
+) -> Dataset:
+    """Boards that both cameras saw, of 3 x 6 corners, 40 mm; moved: sd of what they moved by between pictures."""
     rng = np.random.default_rng(seed)
-    flat = np.column_stack([np.tile(np.arange(6), 3), np.repeat(np.arange(3), 6), np.zeros(18)]) * 40.0
+    flat = corner_positions(target)
+    flat, n = np.column_stack([flat, np.zeros(len(flat))]), len(flat)
     uv: list[np.ndarray] = []
     while len(uv) < count:
         turn = rotation_from_vector(rng.normal(scale=0.35, size=3))
@@ -49,12 +56,12 @@ def held(seed: int, count: int = 11, moved: float = 0.0, noise: float = 0.05) ->
             for pose, xyz in zip(POSES, (there, there + shift), strict=True)
         ]
         if all(((pixels > 0) & (pixels < np.array(SIZE) - 1)).all() for pixels in both):
-            uv.append(np.stack(both, axis=1) + rng.normal(scale=noise, size=(18, 2, 2)))
-    names = np.array([f"b{k + 1:02d}-c{i + 1:03d}" for k in range(count) for i in range(18)])
+            uv.append(np.stack(both, axis=1) + rng.normal(scale=noise, size=(n, 2, 2)))
+    names = np.array([f"b{k + 1:02d}-c{i + 1:03d}" for k in range(count) for i in range(n)])
     cameras = tuple(Camera(name, *SIZE) for name in ("cam1", "cam2"))
     all_uv = np.concatenate(uv)
     seen = Observations(names, cameras, all_uv, np.full(all_uv.shape, np.nan))
-    return Dataset("held", "mm", seen, None, {"target": {"kind": "board", "rows": 3, "columns": 6, "square": 40.0}})
+    return Dataset("held", "mm", seen, None, {"target": target})
 
 
 def in_the_room(count: int, seed: int, noise: float = 0.2, sd: float = 0.0) -> Dataset:
@@ -276,6 +283,23 @@ def test_two_pictures_exchanged_among_eleven() -> None:
     assert {row // 18 for row, _, _ in found.wrong} == {0, 1}
     assert not found.doubts
     assert pose_error(found) < 20
+
+
+# other boards than checkerboards
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        {"kind": "charuco", "rows": 4, "columns": 7, "square": 40.0, "marker": 30.0},
+        {"kind": "aprilgrid", "rows": 2, "columns": 3, "tag": 60.0, "spacing": 18.0},
+    ],
+)
+def test_corners_are_where_their_board_has_them(target) -> None:
+    """[target] as detect writes it is all that it takes; a wrong layout would leave many pixels."""
+    found = calibrate_largest_group(boards_of(held(4, target=target)), "brown-conrady")
+    np.testing.assert_allclose(found.bundle.noise, 0.05, rtol=0.15)
+    assert pose_error(found) < 22  # of six degrees of freedom: one in a thousand
 
 
 # mirrors
