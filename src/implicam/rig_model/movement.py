@@ -156,19 +156,46 @@ def _cross_matrices(a: Floats) -> Floats:
 class Equations(NamedTuple):
     """Residuals of points, whitened, without what their positions explain, eq. (M1): left (N,); by_step (N, 7 C) of a
     step of all cameras' movements; half (N, q) of what is unknown of the cameras; owner (N,) the point of each; to_x
-    (n, 3) the step of the positions, if all else is as it is."""
+    (n, 3) the step of the positions, if all else is as it is; volume: twice the logarithm of what the density of the
+    pixels is divided by before, with nothing known of the positions."""
 
     left: Floats
     by_step: Floats
     half: Floats
     owner: NDArray[np.int64]
     to_x: Floats
+    volume: float
 
-    def whitened(self) -> tuple[Floats, Floats]:
-        """Left and by_step with the cameras' unknowns integrated out, eq. (M2)."""
+    def whitened(self) -> Whitened:
+        """With the cameras' unknowns integrated out, eq. (M2)."""
         factor = np.linalg.cholesky(np.eye(len(self.left)) + self.half @ self.half.T)
         found = solve_triangular(factor, np.column_stack([self.left, self.by_step]), lower=True)
-        return found[:, 0], found[:, 1:]
+        return Whitened(found[:, 0], found[:, 1:], self.volume + 2 * float(np.sum(np.log(np.diag(factor)))))
+
+
+class Whitened(NamedTuple):
+    """Independent standard residuals: left (N,), by_step (N, 7 C), and the volume with that of the cameras' unknowns.
+
+    A movement may carry views to where less is known of the cameras; the volume keeps that from counting for it."""
+
+    left: Floats
+    by_step: Floats
+    volume: float
+
+    @property
+    def deviance(self) -> float:
+        """Minus twice the log likelihood, up to a constant."""
+        return float(self.left @ self.left) + self.volume
+
+    def gain(self, camera: int) -> float:
+        """How much a movement of one camera lowers chi-squared, to first order; whatever else is true, a chi-squared
+        variable if nothing moved.
+
+        Args:
+            camera: Its number.
+        """
+        basis = _basis(self.by_step[:, NUMBERS * camera : NUMBERS * (camera + 1)])
+        return float(np.sum((basis.T @ self.left) ** 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,11 +271,13 @@ class CheckedRig:
         n, C = seen.shape
         q = max(part.stop for _, part in self.roots) if unknowns else 0
         r, D, J, A = (np.zeros((n, C, 2, *shape)) for shape in ((), (3,), (NUMBERS * C,), (q,)))
+        volume = 0.0
         for c, model in enumerate(self.posterior.models):
             rows = np.flatnonzero(seen[:, c])
             root, part = self.roots[c]
             views = see_moved(model, self.stands[c], motions[c], x[rows], root if unknowns else None)
             weight = 1 / np.sqrt(self.noise[rows, c] ** 2 + views.rest)
+            volume -= 4 * float(np.sum(np.log(weight)))
             r[rows, c] = weight[:, None] * (self.uv[rows, c] - views.uv)
             D[rows, c] = weight[:, None, None] * views.by_point
             J[rows, c, :, NUMBERS * c : NUMBERS * (c + 1)] = weight[:, None, None] * views.by_step
@@ -261,7 +290,8 @@ class CheckedRig:
         rest = Q[:, :, 3:].swapaxes(1, 2)
         use = np.arange(2 * C - 3) < (pairs.sum(axis=1) - 3)[:, None]
         to_x = np.linalg.solve(R[:, :3], Q[:, :, :3].swapaxes(1, 2) @ r)[..., 0]
-        return Equations((rest @ r)[use][:, 0], (rest @ J)[use], (rest @ A)[use], np.nonzero(use)[0], to_x)
+        volume += 2 * float(np.sum(np.log(np.abs(np.diagonal(R[:, :3], axis1=1, axis2=2)))))
+        return Equations((rest @ r)[use][:, 0], (rest @ J)[use], (rest @ A)[use], np.nonzero(use)[0], to_x, volume)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +303,7 @@ class Evidence:
         motion: The most probable movement.
         step: (7,) the same about and along its axes.
         cov: (7, 7) its covariance.
-        gain: How much the movement lowers chi-squared.
+        gain: How much a movement lowers chi-squared, to first order about none.
         log_odds: Of the movement against none, but for the odds before.
         x: (n, 3) where the points are after it.
         seen: (n, C) the views that it was found from.
@@ -337,17 +367,18 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
         if not len(wrong):
             break
         agree[wrong, camera] = False
-    left, by_step = found.whitened()
-    X, number = by_step[:, mine], stand.numbers(motion)
+    there = found.whitened()
+    X, number = there.by_step[:, mine], stand.numbers(motion)
     information = X.T @ X
     cov = np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
-    step = np.asarray(cov @ (X.T @ left - prior * number), dtype=np.float64)
-    before = _chi_squared_unmoved(rig.select(rows), x[rows], agree[rows])
-    after = float(left @ left - (X.T @ left) @ cov @ (X.T @ left))
-    at = stand.moved(motion, np.asarray(step, dtype=np.float64))
-    shrink = np.linalg.slogdet(np.eye(NUMBERS) + np.outer(PRIOR_SDS, PRIOR_SDS) * information)[1]
-    gain = before - after
-    return Evidence(camera, at, stand.numbers(at), cov, gain, 0.5 * (gain - shrink), x, agree)
+    last = np.asarray(cov @ (X.T @ there.left - prior * number), dtype=np.float64)
+    here = _unmoved(rig.select(rows), x[rows], agree[rows])
+    if here is None:
+        return None
+    at = stand.moved(motion, last)
+    lowered = here.deviance - there.deviance + float((X.T @ there.left) @ cov @ (X.T @ there.left))
+    log_odds = 0.5 * (lowered - _log_shrink(X) - float(np.sum(prior * stand.numbers(at) ** 2)))
+    return Evidence(camera, at, stand.numbers(at), cov, here.gain(camera), log_odds, x, agree)
 
 
 def _start(rig: CheckedRig, camera: int, x: Floats, rows: NDArray[np.int64]) -> Motion:
@@ -379,17 +410,17 @@ def _contradicting(found: Equations) -> NDArray[np.int64]:
     return np.array(wrong, dtype=np.int64)
 
 
-def _chi_squared_unmoved(rig: CheckedRig, x: Floats, seen: Bools) -> float:
+def _unmoved(rig: CheckedRig, x: Floats, seen: Bools) -> Whitened | None:
+    """The equations if nothing moved, with the positions that suit the views best; None where there are none."""
     motions = [Motion()] * len(rig.stands)
     for _ in range(MAX_STEPS):
         found = rig.equations(motions, x, seen, unknowns=False)
         x = x + found.to_x
         if not np.isfinite(x).all():
-            return float("inf")
+            return None
         if np.abs(found.to_x).max() < 1e-9:
             break
-    left = rig.equations(motions, x, seen).whitened()[0]
-    return float(left @ left)
+    return rig.equations(motions, x, seen).whitened()
 
 
 # ---- what to conclude
@@ -453,7 +484,7 @@ def check_movement(rig: CheckedRig, *, level: float = 0.05, seed: int = 0) -> Ch
     best = evidence[0]
     motions = [best.motion if c == best.camera else Motion() for c in range(len(rig.stands))]
     rows = np.flatnonzero(best.seen.any(axis=1))
-    left, by_step = rig.select(rows).equations(motions, best.x[rows], best.seen[rows]).whitened()
+    left, by_step, _ = rig.select(rows).equations(motions, best.x[rows], best.seen[rows]).whitened()
     everything = _basis(by_step)
     freedom = len(left) - everything.shape[1]
     rest = left - everything @ (everything.T @ left)
