@@ -385,7 +385,7 @@ def of_damaged_known(case, name, rng):
     try:
         data, rig = damaged_known(case, name, rng)
         calibration = ForwardGP().fit(data)
-        notes = calibration.notes()
+        notes = calibration.notes
         verdict = judge(calibration)
         row |= {"verdict": verdict.word, "reasons": verdict.reasons, "notes": notes}
         table = case.table(positions(case.rig, 100, grid=False, rng=rng), rng, rig)

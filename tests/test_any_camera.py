@@ -84,7 +84,7 @@ def test_v_from_below_is_a_mirror_image_and_said_to_be_one() -> None:
     rms, measured = error_on_new(sheet(upside_down), upside_down)
     assert rms < 2.7
     assert measured >= 198
-    assert any("mirrored" in note for note in ForwardGP().fit(sheet(upside_down)).notes())
+    assert any("mirrored" in note for note in ForwardGP().fit(sheet(upside_down)).notes)
 
 
 def odd_rig(unusual: Unusual, points: int = 40, seed: int = 5, spec: str = "bar4") -> tuple[Dataset, Dataset]:
@@ -111,18 +111,18 @@ def test_odd_cameras_measure_as_well_as_ordinary_ones(unusual: Unusual) -> None:
     assert found.rmse_over_limit < 1.5
     assert found.nees.value < 5
     asked = "is an axis of the known positions negated, or are two exchanged (left-handed)?"
-    assert any(asked in note for note in calibration.notes()) == (unusual.mirror == "all")
+    assert any(asked in note for note in calibration.notes) == (unusual.mirror == "all")
 
 
 def test_the_kind_is_told_stored_and_found_again(tmp_path: Path) -> None:
     known, new = odd_rig(Unusual(mirror="cam2"))
     calibration = ForwardGP().fit(known)
-    told = [note for note in calibration.notes() if note.startswith("cam2")]
+    told = [note for note in calibration.notes if note.startswith("cam2")]
     assert len(told) == 1
     assert "mirror" in told[0]
     calibration.save(tmp_path / "rig.implicam")
     again = load_calibration(tmp_path / "rig.implicam")
-    assert again.notes() == calibration.notes()
+    assert again.notes == calibration.notes
     np.testing.assert_array_equal(again.measure(new.observations).xyz, calibration.measure(new.observations).xyz)
     cameras = again.state()[0]["cameras"]
     assert [one["mirrored"] for one in cameras] == [False, True, False, False]
@@ -142,7 +142,7 @@ def test_ordinary_cameras_are_called_ordinary() -> None:
     known, _ = odd_rig(Unusual(), points=25)
     calibration = ForwardGP().fit(known)
     assert {model.family for model in calibration.posterior.models} == {"ordinary"}
-    assert calibration.notes() == []
+    assert calibration.notes == []
 
 
 def test_a_camera_that_saw_nonsense_does_not_take_the_rig_down() -> None:
@@ -154,7 +154,7 @@ def test_a_camera_that_saw_nonsense_does_not_take_the_rig_down() -> None:
 
     calibration = ForwardGP().fit(with_pixels(known, nonsense))
     assert calibration.camera_names == ("cam1", "cam3", "cam4")
-    assert any(note.startswith("cam2 is not calibrated") for note in calibration.notes())
+    assert any(note.startswith("cam2 is not calibrated") for note in calibration.notes)
     assert evaluate(calibration, new, regions=False).coverage.overall.nees.value < 5
 
 
@@ -210,7 +210,7 @@ def test_a_parallel_projection_is_found_in_spite_of_wrong_views() -> None:
 def test_stating_the_size_of_the_images_is_the_cure_that_the_note_names() -> None:
     """Case spreadsheets: at most 2.3 mm is right; without the size the lens's middle must be learned, and is told."""
     known = sheet()
-    assert any("state the size of its images (--size)" in note for note in ForwardGP().fit(known).notes())
+    assert any("state the size of its images (--size)" in note for note in ForwardGP().fit(known).notes)
     sized = read_dataset(SHEETS / "known.csv", unit="m", size=(1920, 1080))
-    assert ForwardGP().fit(sized).notes() == []
+    assert ForwardGP().fit(sized).notes == []
     assert error_on_new(sized)[0] <= 2.3

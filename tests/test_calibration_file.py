@@ -88,7 +88,7 @@ def test_round_trip(original: InverseGPCalibration, saved: Path) -> None:
     assert same(asked(original), asked(restored))
     assert restored.calibrator == original.calibrator
     assert restored.unused == original.unused
-    assert restored.residuals() == original.residuals()
+    assert restored.residuals == original.residuals
     a, b = arrays_from_dataset(original.data), arrays_from_dataset(restored.data)
     assert a.keys() == b.keys()
     assert all(x.dtype.kind == b[name].dtype.kind and x.tobytes() == b[name].tobytes() for name, x in a.items())
@@ -116,7 +116,7 @@ def test_the_readable_part_says_what_formats_md_promises(original: InverseGPCali
     assert table["workspace"]["lowest"] == original.data.xyz.min(axis=0).tolist()
     assert table["workspace"]["highest"] == original.data.xyz.max(axis=0).tolist()
     assert set(table["versions"]) == {"implicam", "python", "numpy", "scipy"}
-    assert table["residuals"] == original.residuals()
+    assert table["residuals"] == original.residuals
     assert table["options"]["kernel"] == "squared-exponential"
     assert table["known_points"] == len(original.data)
     assert table["format_version"] == FORMAT_VERSION

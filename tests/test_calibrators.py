@@ -293,8 +293,8 @@ def test_saved_and_loaded_it_measures_the_same(case: Case, tmp_path: Path) -> No
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
     assert loaded.method == case.method
     assert loaded.unused == calibration.unused
-    assert loaded.residuals() == calibration.residuals()
-    assert loaded.notes() == calibration.notes()
+    assert loaded.residuals == calibration.residuals
+    assert loaded.notes == calibration.notes
     loaded.save(tmp_path / "again.implicam")
     assert (tmp_path / "again.implicam").read_bytes() == (tmp_path / "rig.implicam").read_bytes()
 
@@ -307,8 +307,8 @@ def test_each_point_that_is_not_used_is_listed_with_its_reason(case: Case) -> No
     assert str(data.points[11]) in unused  # no method can use a point that nobody saw
     assert set(unused) <= {str(data.points[i]) for i in (2, 9, 11)}
     assert all(unused.values())
-    assert calibration.residuals()["points_used"] == len(data) - len(unused)
-    assert calibration.residuals()["points_unused"] == len(unused)
+    assert calibration.residuals["points_used"] == len(data) - len(unused)
+    assert calibration.residuals["points_unused"] == len(unused)
 
 
 @every_case
@@ -342,7 +342,7 @@ def test_without_known_positions_there_is_nothing_to_learn(case: Case) -> None:
 @every_case
 def test_residuals_are_plain_and_predict_the_real_error(case: Case) -> None:
     calibration, held_out = fitted(case), complete(sets()[1])
-    residuals = calibration.residuals()
+    residuals = calibration.residuals
     error = calibration.measure(held_out.observations).xyz - held_out.truth.xyz
     for i, axis in enumerate("xyz"):
         promised, real = residuals["leave_one_out_rms"][axis], np.sqrt(np.mean(error[:, i] ** 2))
@@ -353,7 +353,7 @@ def test_residuals_are_plain_and_predict_the_real_error(case: Case) -> None:
 
 def notes(calibration: Calibration) -> list[str]:
     """All but mlp's first, which it always gives: what its error bars are worth."""
-    return calibration.notes()[calibration.method == "mlp" :]
+    return calibration.notes[calibration.method == "mlp" :]
 
 
 @every_case
@@ -682,11 +682,11 @@ def test_side_by_side_limits_the_blas_and_lets_go_again() -> None:
 
 def test_a_wrong_known_point_is_named() -> None:
     data = simulated("bar6", points=150, seed=3)
-    assert not any("far from what all others" in note for note in InverseGP().fit(data).notes())
+    assert not any("far from what all others" in note for note in InverseGP().fit(data).notes)
     xyz = data.xyz.copy()
     xyz[17] += 20.0
     wrong = replace(data, known=replace(data.positions, xyz=xyz))
-    notes = InverseGP().fit(wrong).notes()
+    notes = InverseGP().fit(wrong).notes
     assert any(f"1 known point far from what all others predict: {data.points[17]} (" in note for note in notes), notes
 
 
@@ -694,5 +694,5 @@ def test_a_slanted_plane_is_noted():
     rig = build_rig("bar6", seed=2, frame="random", cameras="2R")
     boards = simulate(rig, moving_board(rig, positions=2), seed=2)
     both, one = InverseGP().fit(boards), InverseGP().fit(boards.select(boards.shots == "board01"))
-    assert not any("lie in one plane" in note for note in both.notes())
-    assert any("lie in one plane" in note for note in one.notes())
+    assert not any("lie in one plane" in note for note in both.notes)
+    assert any("lie in one plane" in note for note in one.notes)

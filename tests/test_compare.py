@@ -107,6 +107,7 @@ class Told:
             observations.points, xyz, cov, np.full(n, 2), np.full(n, np.nan), np.full(n, ""), self.data.length_unit
         )
 
+    @property
     def notes(self) -> list[str]:
         return []
 

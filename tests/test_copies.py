@@ -52,9 +52,9 @@ def test_a_fit_uses_each_row_once(method: ic.ForwardGP | ic.Explicit | ic.Invers
     data = twice(once)
     one, copied = method.fit(once), method.fit(data)
     assert copied.data is data
-    assert copied.residuals()["points_used"] == 20
+    assert copied.residuals["points_used"] == 20
     assert len(copied.unused) == 20
-    assert "copies of others" in " ".join(copied.notes())
+    assert "copies of others" in " ".join(copied.notes)
     new = rig(40, seed=1).observations
     a, b = one.measure(new), copied.measure(new)
     np.testing.assert_allclose(a.xyz, b.xyz, rtol=1e-9)
@@ -86,7 +86,7 @@ def test_cameras_copied_are_one_and_named() -> None:
     assert list(names[~find_copies(data).cameras]) == ["k0", "k3", "k6", "k9"]
     calibration = ic.ForwardGP().fit(data)
     assert calibration.camera_names == ("k0", "k3", "k6", "k9")
-    assert any("k1" in note and "those of k0" in note for note in calibration.notes())
+    assert any("k1" in note and "those of k0" in note for note in calibration.notes)
     assert calibration.data.observations.camera_names == tuple(names)
 
 
@@ -96,7 +96,7 @@ def test_other_methods_use_a_copied_camera_once(method: ic.Explicit | ic.Inverse
     calibration, once = method.fit(data), method.fit(data.with_cameras(["k0", "k3", "k6", "k9"]))
     calibration.save(tmp_path / "c.implicam")
     again = ic.load_calibration(tmp_path / "c.implicam")
-    assert "those of k0" in " ".join(again.notes())
+    assert "those of k0" in " ".join(again.notes)
     for other in (calibration, again):
         np.testing.assert_allclose(other.measure(data.observations).cov, once.measure(data.observations).cov, rtol=1e-6)
 

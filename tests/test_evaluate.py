@@ -202,7 +202,7 @@ def test_notes_of_the_calibration_come_along() -> None:
     data = board()
     calibration = InverseGP().fit(data.select(data.shots != "board03"))
     evaluation = evaluate(calibration, data)
-    assert evaluation.notes == tuple(calibration.notes())
+    assert evaluation.notes == tuple(calibration.notes)
     assert set(evaluation.data.shots) == {"board03"}
 
 
@@ -285,7 +285,7 @@ def test_each_shot_is_left_out_as_a_whole() -> None:
     assert sorted(evaluation.data.points) == sorted(data.points)
     np.testing.assert_array_equal(evaluation.measurement.points, evaluation.data.points)
     assert evaluation.how == "each of 6 shots left out in turn"
-    assert evaluation.notes == tuple(InverseGP().fit(data).notes())
+    assert evaluation.notes == tuple(InverseGP().fit(data).notes)
     assert evaluation.coverage.overall.cluster_kind == "shots"
     assert evaluation.coverage.overall.clusters == 6
 

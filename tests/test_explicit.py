@@ -161,7 +161,7 @@ def test_corners_that_are_wrong_are_listed() -> None:
         listed[row[view.point], names.index(view.camera)] = True
     assert (listed & wrong).sum() > 0.98 * wrong.sum()
     assert (listed & ~wrong).sum() < 0.003 * data.observations.seen.sum()
-    assert any("far from where the others predict" in note for note in calibration.notes())
+    assert any("far from where the others predict" in note for note in calibration.notes)
 
 
 # into the world
@@ -275,13 +275,13 @@ def test_cameras_that_hardly_meet_have_error_bars_that_say_so() -> None:
 def test_a_wrong_square_is_told_with_its_size() -> None:
     rig, data = pair()
     known = points(rig, 40, 5)
-    assert not any("contradict" in note for note in on_boards().fit(known).notes())
+    assert not any("contradict" in note for note in on_boards().fit(known).notes)
     target = data.extra["target"]
 
     def with_square(factor: float) -> Dataset:
         return replace(data, extra={"target": {**target, "square": target["square"] * factor}})
 
-    notes = Explicit(boards=with_square(1.01)).fit(known).notes()
+    notes = Explicit(boards=with_square(1.01)).fit(known).notes
     (told,) = [note for note in notes if "contradict each other" in note]
     assert float(told.split("known points are ")[1].split(" times")[0]) == pytest.approx(1 / 1.01, abs=2e-3)
     with pytest.raises(FitError, match="contradict each other") as caught:
@@ -319,7 +319,7 @@ def test_corners_of_a_board_share_its_declared_error() -> None:
 
 def test_boards_alone_hold_nothing_out() -> None:
     calibration = from_boards_alone()
-    assert calibration.residuals()["held_out"] == "the corners of the boards are measured"
+    assert calibration.residuals["held_out"] == "the corners of the boards are measured"
     with pytest.raises(UsageError, match="made without known points"):
         calibration.refit(calibration.data)
     with pytest.raises(UsageError, match="align 'icp' is for boards"):
@@ -386,7 +386,7 @@ def test_boards_alone_are_measured_in_the_frame_of_the_first_camera() -> None:
     distance = np.einsum("ni,nij,nj->n", error, np.linalg.inv(measured.cov), error)
     assert np.mean(distance) < 6
     assert np.sqrt(np.mean(error**2)) < 1.0
-    assert "in the frame of cam1" in calibration.notes()[0]
+    assert "in the frame of cam1" in calibration.notes[0]
     np.testing.assert_allclose(calibration.centres()["cam1"], 0, atol=1e-9)
     assert calibration.data.known is not None
 
@@ -438,7 +438,7 @@ def test_declared_errors_of_the_known_points_are_used() -> None:
     others = points(rig, 100, 6)
     told = Explicit().fit(known)
     silent = Explicit().fit(replace(known, known=replace(known.positions, sd=np.full(known.xyz.shape, np.nan))))
-    assert told.residuals()["noise_px"]["cam2"] < 0.5 * silent.residuals()["noise_px"]["cam2"]
+    assert told.residuals["noise_px"]["cam2"] < 0.5 * silent.residuals["noise_px"]["cam2"]
     error = told.measure(others.observations)
     distance = error.xyz - others.truth.xyz
     squares = np.einsum("ni,nij,nj->n", distance, np.linalg.inv(error.cov), distance)
@@ -466,7 +466,7 @@ def test_precise_boards_do_not_spoil_the_noise_of_other_views() -> None:
     boards = simulate_boards(rig, each_and_pairs(rig, 8, 5), seed=3)
     ball = replace(rig, cameras=tuple(replace(camera, noise_sd=0.2) for camera in rig.cameras))
     calibration = Explicit(boards=boards).fit(points(ball, 30, 5))
-    noise = calibration.residuals()["noise_px"]
+    noise = calibration.residuals["noise_px"]
     assert all(sd > 0.03 for sd in noise.values())
     others = points(ball, 200, 6)
     _, found = calibration.map.views(others.observations)
@@ -489,8 +489,8 @@ def test_a_calibration_from_boards_is_saved_whole(tmp_path: Path) -> None:
     others = points(rig, 30, 6).observations
     np.testing.assert_array_equal(loaded.measure(others).xyz, calibration.measure(others).xyz)
     np.testing.assert_array_equal(loaded.measure(others).cov, calibration.measure(others).cov)
-    assert loaded.residuals() == calibration.residuals()
-    assert loaded.notes() == calibration.notes()
+    assert loaded.residuals == calibration.residuals
+    assert loaded.notes == calibration.notes
     assert loaded.calibrator.boards is not None
     for name, array in arrays_from_dataset(data).items():
         np.testing.assert_array_equal(arrays_from_dataset(loaded.calibrator.boards)[name], array)
@@ -655,7 +655,7 @@ def test_imported_cameras_measure_with_the_noise_of_the_pixels(tmp_path: Path) -
     error = measured.xyz - others.truth.xyz
     squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(measured.cov), error)
     assert np.mean(squares) == pytest.approx(3, abs=3 * np.sqrt(6 / 300))
-    assert "calibrated elsewhere" in loaded.notes()[0]
+    assert "calibrated elsewhere" in loaded.notes[0]
     assert evaluate(loaded, others).coverage.overall.n == 300
     unstated = replace(others.observations, sd=np.full(others.observations.uv.shape, np.nan))
     np.testing.assert_allclose(loaded.measure(unstated).sd[whole], 1.5 * measured.sd[whole], rtol=0.02)

@@ -125,7 +125,7 @@ def test_pixels_of_any_shape_cost_nothing(ratio: float) -> None:
 def test_pixels_that_are_not_square_are_told_and_exported(tmp_path: Path) -> None:
     calibration = Explicit().fit(stretched(1.333))
     assert [choice.pixels for choice in calibration.fitted.choices] == ["stretched"] * 3
-    assert sum("its pixels are not square, fy / fx = 1.33" in note for note in calibration.notes()) == 3
+    assert sum("its pixels are not square, fy / fx = 1.33" in note for note in calibration.notes) == 3
     for camera in rig_of(calibration)[0].cameras:
         assert camera.lens.fy / camera.lens.fx == pytest.approx(1.333, abs=0.004)
     calibration.save(tmp_path / "rig.implicam")
@@ -134,7 +134,7 @@ def test_pixels_that_are_not_square_are_told_and_exported(tmp_path: Path) -> Non
     assert loaded.fitted.choices == calibration.fitted.choices
     usual = Explicit().fit(stretched(1.0))
     assert [choice.pixels for choice in usual.fitted.choices] == ["square"] * 3
-    assert not any("square" in note for note in usual.notes())
+    assert not any("square" in note for note in usual.notes)
 
 
 def test_a_file_of_before_has_square_pixels() -> None:
@@ -209,10 +209,10 @@ def test_neither_camera_is_to_blame() -> None:
     turned = replace(data, observations=Observations(seen.points, seen.cameras[::-1], seen.uv[:, ::-1], seen.sd))
     b = Explicit().fit(turned)
     for calibration in (a, b):
-        (note,) = [note for note in calibration.notes() if "contradict" in note]
+        (note,) = [note for note in calibration.notes if "contradict" in note]
         assert "alone 0.042 px, together 0.5 px" in note
         assert "not of the same instants" in note
-        noise = calibration.residuals()["noise_px"]
+        noise = calibration.residuals["noise_px"]
         assert noise["cam1"] == pytest.approx(noise["cam2"])
     lenses = [{c.name: c.lens for c in rig_of(calibration)[0].cameras} for calibration in (a, b)]
     for name in ("cam1", "cam2"):
@@ -331,7 +331,7 @@ def test_known_points_in_a_mirror() -> None:
         Explicit().fit(flipped(data, [1, 2], 0))
     assert "width - 1 - u" in caught.value.fix
     one = Explicit().fit(flipped(data, [1], 0))
-    assert "cam2 is not calibrated, and its views are not used: its pictures are mirrored" in one.notes()[0]
+    assert "cam2 is not calibrated, and its views are not used: its pictures are mirrored" in one.notes[0]
     assert len(one.fitted.cameras) == 2
     with pytest.raises(FitError, match="as in a mirror"):  # a left-handed world
         Explicit().fit(replace(data, known=replace(data.positions, xyz=data.xyz * [1, 1, -1])))
@@ -360,7 +360,7 @@ def test_separate_intrinsics() -> None:
     """Truth: f 900, baseline 120 along x, cam2 turned 8 degrees, the frame that of cam1."""
     boards, points = (read_dataset(CASES / "separate-intrinsics" / name) for name in ("boards", "points"))
     calibration = Explicit(boards=boards).fit(points)
-    assert "the lens is from boards that no other camera saw" in calibration.notes()[0]
+    assert "the lens is from boards that no other camera saw" in calibration.notes[0]
     centres = calibration.centres()
     np.testing.assert_allclose(centres["cam1"], [0, 0, 0], atol=6)
     np.testing.assert_allclose(centres["cam2"], [120, 0, 0], atol=16)  # two of its standard deviations along z

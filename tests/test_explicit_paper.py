@@ -149,7 +149,7 @@ def test_a_saved_one_measures_the_same(variant: str, tmp_path: Path) -> None:
     assert isinstance(loaded, ExplicitCalibration)
     assert loaded.calibrator.preset == variant
     assert loaded.fitted.reprojection == calibration(variant).fitted.reprojection
-    assert loaded.notes() == calibration(variant).notes()
+    assert loaded.notes == calibration(variant).notes
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_a_camera_that_no_pair_leads_to_is_left_out_with_the_reason() -> None:
     uv = boards().observations.uv.copy()
     uv[np.isfinite(uv).all(axis=2).sum(axis=1) > 1, 3] = np.nan
     alone = replace(boards(), observations=replace(boards().observations, uv=uv, sd=np.full(uv.shape, np.nan)))
-    notes = calibrator("explicit:paper", boards=alone).fit(points(30, 5)).notes()
+    notes = calibrator("explicit:paper", boards=alone).fit(points(30, 5)).notes
     assert any("cam5 is not calibrated" in note and "no chain of pairs" in note for note in notes)
 
 
@@ -236,7 +236,7 @@ def test_a_fisheye_calibration_that_fails_names_camera_and_reason(monkeypatch: p
         raise cv2.error("fabs(norm_u1) > 0")
 
     monkeypatch.setattr(cv2.fisheye, "calibrate", fails)
-    notes = calibrator("explicit:paper", boards=boards()).fit(points(30, 5)).notes()
+    notes = calibrator("explicit:paper", boards=boards()).fit(points(30, 5)).notes
     for name in ("cam4", "cam5"):
         assert any(f"{name} is not calibrated" in note and "cv2.fisheye.calibrate fails" in note for note in notes)
     wide = build_rig("bar6", seed=2, lens_error=0.0, cameras="cam4,cam5")

@@ -219,8 +219,8 @@ def test_a_fifth_of_wrong_detections_is_found_out() -> None:
     assert rejected[good].sum() <= 0.01 * good.sum()
     residuals = [view.residual for view in calibration.rejected]
     assert residuals == sorted(residuals, reverse=True)
-    assert calibration.residuals()["views_rejected"] == len(residuals)
-    (note,) = (note for note in calibration.notes() if "contradict" in note)
+    assert calibration.residuals["views_rejected"] == len(residuals)
+    (note,) = (note for note in calibration.notes if "contradict" in note)
     assert note.startswith(f"{len(residuals)} of {o.seen.sum()} views contradict the others")
     measured, clean = calibration.measure(others().observations), fitted().measure(others().observations)
     assert in_sds(measured, truth(others())).max() < 5
@@ -253,7 +253,7 @@ def test_a_known_position_that_is_wrong_is_told_from_wrong_images() -> None:
     xyz[full] += [15.0, -10.0, 12.0]
     calibration = ForwardGP().fit(with_positions(data, xyz))
     assert {view.point for view in calibration.rejected} == {str(data.points[full])}
-    assert any(f"Most views of {data.points[full]} " in note for note in calibration.notes())
+    assert any(f"Most views of {data.points[full]} " in note for note in calibration.notes)
     assert [unused.point for unused in calibration.unused] == [str(data.points[full])]
     measured = calibration.measure(data.observations.select([full]))
     assert in_sds(measured, truth(data)[[full]]).max() < 4.5
@@ -287,7 +287,7 @@ def test_a_camera_that_saw_too_little_is_named_and_the_rest_calibrates(saw: str)
 
     calibration = ForwardGP().fit(with_views(data, hide))
     assert calibration.camera_names == tuple(name for name in names if name != names[1])
-    assert any(note.startswith(f"{names[1]} is not calibrated") for note in calibration.notes())
+    assert any(note.startswith(f"{names[1]} is not calibrated") for note in calibration.notes)
     measured = calibration.measure(others().observations)
     assert (measured.views == 3).all()
     assert in_sds(measured, truth(others())).max() < 5
@@ -380,7 +380,7 @@ def test_a_known_view_stated_as_worse_weighs_less_in_the_fit() -> None:
     assert len(told.rejected) <= 2
     measured = told.measure(others().observations)
     assert in_sds(measured, truth(others())).max() < 5
-    noise_px = told.residuals()["noise_px"]
+    noise_px = told.residuals["noise_px"]
     assert all(0.14 < value < 0.28 for value in noise_px.values())  # 0.2 px, of a usual view
 
 

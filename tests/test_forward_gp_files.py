@@ -50,7 +50,7 @@ def test_a_shot_that_is_off_is_found_and_noted() -> None:
     q, _ = np.linalg.qr(np.vander(t, 3))
     assert of_shot @ axis == pytest.approx(-moved * (1 - np.sum(q[3] ** 2)), abs=0.15)
     assert np.linalg.norm(of_shot - (of_shot @ axis) * axis) < 0.1
-    assert any("The shots contradict each other" in note for note in calibration.notes())
+    assert any("The shots contradict each other" in note for note in calibration.notes)
     assert not calibration.rejected
 
 
@@ -148,8 +148,8 @@ def test_a_saved_calibration_measures_the_same_bits(kind: str, tmp_path: Path) -
         if x is not None:
             np.testing.assert_array_equal(x, y)
     assert (loaded.posterior.unknowns is not None) == (kind == "estimated shots")
-    assert loaded.notes() == calibration.notes()
-    assert loaded.residuals() == calibration.residuals()
+    assert loaded.notes == calibration.notes
+    assert loaded.residuals == calibration.residuals
     assert loaded.rejected == calibration.rejected
     assert loaded.unused == calibration.unused
 

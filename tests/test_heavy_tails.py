@@ -230,7 +230,7 @@ def test_heavy_tails_are_found_and_measured_with(
         inside.append(distance < chi2.ppf(0.95, 3))
         assert np.mean(measured.reason != "") < 0.02
         assert np.mean(measured.consistency < 1e-3) < 0.01
-        (note,) = (note for note in calibration.notes() if "heavy tails" in note)
+        (note,) = (note for note in calibration.notes if "heavy tails" in note)
         assert "px" in note
     assert 0.915 < np.mean(np.concatenate(inside)) < 0.98
     assert np.mean(errors) < better
@@ -311,7 +311,7 @@ def test_it_is_saved(tmp_path: Path) -> None:
     assert isinstance(again, ForwardGPCalibration)
     assert again.fitted.tails is not None
     assert again.fitted.tails.degrees == calibration.fitted.tails.degrees
-    assert again.notes() == calibration.notes()
+    assert again.notes == calibration.notes
     some = with_noise(others("bar6"), 1).observations.select(np.arange(30))
     np.testing.assert_array_equal(again.measure(some).xyz, calibration.measure(some).xyz)
     np.testing.assert_array_equal(again.measure(some).cov, calibration.measure(some).cov)

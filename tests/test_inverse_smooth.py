@@ -134,7 +134,7 @@ def test_a_slab_of_two_thousandths_does_not_measure_the_volume() -> None:
     assert not measured.measured[off > 4].any()
     assert all(r.startswith("pixels unlike any it has learned") for r in measured.reason[~measured.measured])
     assert (measured.reason[measured.measured] == "").all()
-    assert any("nearly in one plane" in note for note in calibration.notes())
+    assert any("nearly in one plane" in note for note in calibration.notes)
 
 
 def test_in_its_slab_it_measures() -> None:
@@ -158,7 +158,7 @@ def test_points_within_the_volume_are_all_measured_and_a_wrong_match_is_not() ->
     uv[3, 1] += [60.0, -40.0]
     measured = calibration.measure(replace(complete.observations, uv=uv, extra={}))
     assert list(np.flatnonzero(~measured.measured)) == [3]
-    assert not any("plane" in note for note in calibration.notes())
+    assert not any("plane" in note for note in calibration.notes)
 
 
 def test_farness_is_that_of_the_farthest_known_point_and_knows_no_units() -> None:
@@ -218,4 +218,4 @@ def test_the_fewest_points_are_fitted(n: int) -> None:
     calibration = InverseGP().fit(known.select(np.flatnonzero(known.observations.seen.all(axis=1))[:n]))
     measured = calibration.measure(others.observations)
     assert (np.linalg.eigvalsh(measured.cov[measured.measured]) > 0).all()
-    assert np.isfinite(calibration.residuals()["leave_one_out_mean_sd"]["x"])
+    assert np.isfinite(calibration.residuals["leave_one_out_mean_sd"]["x"])

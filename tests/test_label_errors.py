@@ -286,7 +286,7 @@ def test_dots_that_are_off_are_found_noted_and_judged_by() -> None:
     assert errors is not None
     sd = np.sqrt(np.trace(calibration.known_position_covariance(np.zeros((1, 3)))[0]) / 3) / rig().units_per_mm
     assert sd == pytest.approx(DOTS, rel=0.25)
-    assert any("Single known positions" in note and "State sd_x, sd_y, sd_z" in note for note in calibration.notes())
+    assert any("Single known positions" in note and "State sd_x, sd_y, sd_z" in note for note in calibration.notes)
     by_truth = evaluate(calibration, others(), regions=False)
     by_labels = evaluate(calibration, moved(others(), DOTS, 6), regions=False)
     for judged in (by_truth, by_labels):
@@ -377,7 +377,7 @@ def test_boards_that_are_too_few_widen_the_bars_between_them() -> None:
     inner = data.shots == "board02"
     calibration = ForwardGP().fit(data.select(~inner))
     assert calibration.fitted.plane_sd is not None
-    assert any(note.startswith("2 shots cannot contradict each other") for note in calibration.notes())
+    assert any(note.startswith("2 shots cannot contradict each other") for note in calibration.notes)
     size = SHOT_SD * calibration.frame.scale
     measured = calibration.measure(data.observations)
     own = calibration.known_position_covariance(data.xyz)
@@ -396,7 +396,7 @@ def test_levels_of_one_target_widen_the_bars_between_them() -> None:
     data = simulate(one, Target("target", names, np.full(len(box), "target"), pose.apply(box)), seed=8)
     calibration = ForwardGP().fit(data)
     assert calibration.fitted.plane_sd is not None
-    assert any(note.startswith("3 levels of one target") for note in calibration.notes())
+    assert any(note.startswith("3 levels of one target") for note in calibration.notes)
     between = pose.apply(np.array([[0.0, 0, 30], [5, 20, -30]]) * one.units_per_mm)
     own = np.sqrt(np.linalg.eigvalsh(calibration.known_position_covariance(between))[:, -1])
     assert (own > 0.9 * LEVEL_SD * calibration.frame.scale).all()

@@ -136,7 +136,7 @@ def test_auto_goes_on_without_a_broken_package_and_says_so(bring: Bring, cli: Cl
     bring(double_sphere="no_such_lens:DoubleSphere", kannala_brandt="math:pi")
     made = Explicit(lens="auto").fit(data(30, 1))
     assert {choice.lens for choice in made.fitted.choices} <= {"brown-conrady", "kannala-brandt"}
-    notes = " ".join(made.notes())
+    notes = " ".join(made.notes)
     assert "the lens 'double-sphere' of the package no_such_lens cannot be imported" in notes
     assert "the package math brings a lens 'kannala-brandt', a name that is taken" in notes
     write_dataset(data(30, 1), tmp_path / "rig")
@@ -159,9 +159,7 @@ def test_a_lens_that_fails_is_named_with_its_package_and_auto_goes_on_without(br
     bring()
     LENSES.register("kannala-brandt-2", make_dataclass("Failing", [], bases=(Failing,), frozen=True, namespace=NAMED))
     made = Explicit(lens="auto").fit(data(30, 1))
-    assert "lens kannala-brandt-2 was not tried for any camera: the lens 'kannala-brandt-2' of" in " ".join(
-        made.notes()
-    )
+    assert "lens kannala-brandt-2 was not tried for any camera: the lens 'kannala-brandt-2' of" in " ".join(made.notes)
     with pytest.raises(PartError, match=r"the lens 'kannala-brandt-2' of the package .* fails") as failed:
         Explicit(lens="kannala-brandt-2").fit(data(30, 1))
     assert "AttributeError" in failed.value.why

@@ -406,12 +406,12 @@ def test_the_coverage_it_states_is_what_it_says(n: int) -> None:
     errors, sds = of_kept(calibration)
     assert len(errors) == max(1, round(0.15 * n))
     inside = np.mean(np.abs(errors / sds) < 1.959964)
-    residuals = calibration.residuals()
+    residuals = calibration.residuals
     assert residuals["held_out_in_95"] == pytest.approx(inside)
     assert residuals["held_out_points"] == len(errors)
     np.testing.assert_allclose(list(residuals["leave_one_out_rms"].values()), np.sqrt(np.mean(errors**2, axis=0)))
     np.testing.assert_allclose(list(residuals["leave_one_out_mean_sd"].values()), sds.mean(axis=0))
-    note = calibration.notes()[0]
+    note = calibration.notes[0]
     assert "dropout spread, not a measurement uncertainty" in note
     assert f"{100 * inside:.0f} % lie inside their 95 % bars" in note
     assert (f"the {len(errors)} known points" if len(errors) > 1 else "the one known point") in note
@@ -434,7 +434,7 @@ def test_without_dropout_the_bars_are_the_errors_of_the_points_kept() -> None:
     calibration = fitted(157, dropout=0.0)
     errors, sds = of_kept(calibration)
     np.testing.assert_allclose(sds, np.broadcast_to(np.sqrt(np.mean(errors**2, axis=0)), sds.shape))
-    assert "are the rms errors of the 24 known points kept" in calibration.notes()[0]
+    assert "are the rms errors of the 24 known points kept" in calibration.notes[0]
 
 
 @pytest.mark.parametrize("dropout", [-0.1, 0.91, 1.0, np.nan, np.inf])
@@ -487,7 +487,7 @@ def test_points_that_cannot_be_used_are_left_out_and_none_is_kept_for_stopping(t
     expected = MLP().fit(complete)
     np.testing.assert_array_equal(calibration.measure(o).xyz, expected.measure(o).xyz)
     calibration.save(tmp_path / "rig.implicam")
-    assert load_calibration(tmp_path / "rig.implicam").residuals() == calibration.residuals()
+    assert load_calibration(tmp_path / "rig.implicam").residuals == calibration.residuals
 
 
 def spoiled(name: str, change: Callable[[np.ndarray], np.ndarray]) -> tuple[Dataset, dict[str, Any], dict[str, Any]]:

@@ -233,7 +233,7 @@ def test_positions_in_another_order_are_no_matter_of_more_points() -> None:
             method().fit(data)
     calibration = ic.InverseGP().fit(data)
     assert ic.judge(calibration).word == "not usable"  # the error bars are right, and as wide as the volume
-    assert any("tell little of any coordinate" in note for note in calibration.notes())
+    assert any("tell little of any coordinate" in note for note in calibration.notes)
 
 
 def test_a_camera_that_was_knocked_half_way() -> None:
@@ -260,7 +260,7 @@ def test_positions_from_a_tape_measure() -> None:
     xyz = random_points(30)
     taped = xyz + 8 * np.random.default_rng(2).normal(size=xyz.shape)
     calibration = ic.ForwardGP().fit(dataset(views(ring(), xyz)[:, ::3], taped))
-    assert any("Single known positions" in note for note in calibration.notes())
+    assert any("Single known positions" in note for note in calibration.notes)
     assert ic.judge(calibration).word == "usable"
     new = random_points(150, 5)
     judged = ic.evaluate(calibration, dataset(views(ring(), new, 6)[:, ::3], new)).coverage.overall

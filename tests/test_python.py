@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import re
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -244,3 +247,90 @@ def test_a_table_of_pandas_that_cannot_be_read_says_which_row() -> None:
         )
     with pytest.raises(UsageError, match="from_arrays"):
         Dataset.from_dataframe(np.zeros((3, 4)))
+
+
+def test_every_public_thing_has_an_example_in_its_help() -> None:
+    """`pytest --doctest-modules` runs them."""
+    public = {name: getattr(ic, name) for name in ic.__all__}
+    assert not [name for name, thing in public.items() if callable(thing) and ">>>" not in (thing.__doc__ or "")]
+
+
+def test_modules_that_are_calls() -> None:
+    trials = ic.compare(rig(), ["forward-gp"], [20], seeds=1)
+    assert [trial.method for trial in trials] == ["forward-gp"]
+    assert ic.compare.summarise(trials)
+    assert "dataset" in inspect.signature(ic.detect).parameters
+    assert issubclass(ic.detect.Ball, ic.detect.DetectorBase)
+    with pytest.raises(UsageError, match="is not a folder"):
+        ic.detect("nowhere", "ball")
+    assert len(ic.suggest(fitted(), count=2, candidates=100, judged=30).targets) == 2
+
+
+def test_a_report_in_one_call(tmp_path: Path) -> None:
+    pytest.importorskip("plotly")
+    calibration = ic.ForwardGP().fit(rig().select(range(25)))
+    evaluation = ic.report(calibration, tmp_path / "report.html", data=rig().select(range(25, 40)))
+    assert "forward-gp" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert isinstance(evaluation, ic.Evaluation)
+
+
+def test_detect_in_one_call(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    v, u = np.mgrid[:120, :160]
+    for k, shot in enumerate(("a", "b", "c")):
+        picture = np.where(np.hypot(u - 60 - 9 * k, v - 50 - 7 * k) < 8, 20, 220).astype(np.uint8)
+        picture = cv2.GaussianBlur(picture, (0, 0), 1)
+        (tmp_path / "images" / "cam1").mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(tmp_path / "images" / "cam1" / f"{shot}.png"), picture)
+    run = ic.detect(tmp_path, "ball", unit="mm", overlays=False)
+    assert len(run.data) == 3
+    assert ic.detect(tmp_path, ic.detect.Ball(), overlays=False).resumed == 3
+    assert len(repr(run).splitlines()) <= 10
+    with pytest.raises(UsageError, match="its options already"):
+        ic.detect(tmp_path, ic.detect.Ball(), bright=True)
+    with pytest.raises(UsageError, match="no films"):
+        ic.detect(tmp_path, "ball", offsets="0")
+
+
+def test_notes_and_residuals_are_values() -> None:
+    assert isinstance(fitted().notes, list)
+    assert fitted().residuals["points_used"] == 40
+
+
+def test_a_calibration_in_another_unit_and_frame() -> None:
+    found = fitted().in_unit("m").measure(rig())
+    np.testing.assert_allclose(found.xyz * 1000, measured().xyz, atol=2e-3 * measured().sd.max())
+    np.testing.assert_allclose(found.sd * 1000, measured().sd, rtol=1e-3)
+    turned, expected = fitted().transformed(POSE).measure(rig()), measured().transformed(POSE)
+    np.testing.assert_allclose(turned.xyz, expected.xyz, atol=0.02 * expected.sd.max())
+    scale = np.abs(expected.cov).max()
+    np.testing.assert_allclose(turned.cov, expected.cov, atol=0.05 * scale)
+    with pytest.raises(DatasetError, match="no known size"):
+        fitted().in_unit("furlong")
+
+
+def test_everything_has_a_figure() -> None:
+    pytest.importorskip("plotly")
+    pixels = Dataset.from_arrays(rig().observations.uv, cameras=["<b>left", "right"], size=(2048, 1536))
+    for thing in (rig(), fitted(), measured(), pixels):
+        figure = thing.plot()
+        assert len(figure.data) >= 1
+        assert "<b>left" not in figure.to_json().replace("\\u003c", "<")
+    assert len(pixels.plot().data) == 2
+    assert any("known" in (trace.name or "") for trace in fitted().plot().data)
+    nothing = measured().select([])
+    assert nothing.plot() is not None
+
+
+def test_the_notebook_of_the_documentation_runs() -> None:
+    pytest.importorskip("plotly")
+    notebook = json.loads((Path(__file__).parents[1] / "docs" / "python.ipynb").read_text(encoding="utf-8"))
+    (cell,) = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    source = "".join(cell["source"])
+    assert sum(bool(line.strip()) for line in source.splitlines()) <= 10
+    body, _, last = source.rpartition("\n")
+    names: dict[str, Any] = {}
+    exec(body, names)
+    figure = eval(last, names)
+    assert type(figure).__name__ == "Figure"
+    assert hasattr(figure, "_repr_mimebundle_") or hasattr(figure, "_ipython_display_")

@@ -99,6 +99,7 @@ class AffineCalibration(CalibrationBase):
         no_p_value = np.full(n, np.nan)
         return Measurement(observations.points, xyz, cov, seen.sum(axis=1), no_p_value, reasons, self.data.length_unit)
 
+    @property
     def notes(self) -> list[str]:
         """The contract asks for this one."""
         return lattice_note(self.data, self.method)

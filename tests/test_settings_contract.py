@@ -445,7 +445,7 @@ def test_settings_that_do_nothing_are_told() -> None:
         assert ic.ExplicitSettings.from_table(tomllib.loads(settings_text(fit))) == settings
         states = {one["name"]: one["in_force"] for one in settings_table(fit)["settings"]}
         assert (states[used], states[idle]) == (True, False)
-        notes[preset] = fit.notes()
+        notes[preset] = fit.notes
     assert notes["paper"] == ["first", "The preset paper has no use for the settings point_folds."]
     assert notes["joint"] == ["first", "The preset joint has no use for the settings wide_from_degrees."]
 
@@ -461,5 +461,5 @@ def test_what_inverse_gp_calls_idle_changes_nothing(preset: str) -> None:
     a, b = (calibration.measure(known().observations) for calibration in (fit, usual))
     np.testing.assert_array_equal(a.xyz, b.xyz)
     np.testing.assert_array_equal(a.cov, b.cov)
-    (told,) = set(fit.notes()) - set(usual.notes())
+    (told,) = set(fit.notes) - set(usual.notes)
     assert told == f"The preset {preset} has no use for the settings {', '.join(sorted(doubled))}."

@@ -16,6 +16,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same to Python, and a test compares
+    from implicam.active import suggest as suggest
     from implicam.calibrators import METHODS as METHODS
     from implicam.calibrators import MLP as MLP
     from implicam.calibrators import Calibration as Calibration
@@ -74,6 +75,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     __version__: str
 
 _NAMES = {
+    "implicam.active": ("suggest",),
     "implicam.calibrators": (
         "METHODS", "MLP", "Calibration", "Explicit", "ExplicitCalibration", "ExplicitSettings", "ForwardGP",
         "ForwardGPCalibration", "ForwardGPSettings", "InverseGP", "InverseGPCalibration", "InverseGPSettings",

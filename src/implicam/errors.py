@@ -29,6 +29,13 @@ class ImplicamError(Exception):
         what: What happened.
         why: The cause, where it is known.
         fix: What the reader can do about it.
+
+    >>> import implicam as ic
+    >>> error = ic.ImplicamError("the light is out.", why="no camera sees anything", fix="switch it on")
+    >>> print(error)
+    the light is out.
+      why: no camera sees anything
+      fix: switch it on
     """
 
     def __init__(self, what: str, *, why: str = "", fix: str = "") -> None:
@@ -45,39 +52,102 @@ class ImplicamError(Exception):
 
 
 class DatasetError(ImplicamError):
-    """A file or a value in a dataset is wrong; names the file, the line and the value."""
+    """A file or a value in a dataset is wrong; names the file, the line and the value.
+
+    >>> import implicam as ic
+    >>> try:
+    ...     ic.read_dataset("nowhere")
+    ... except ic.DatasetError as error:
+    ...     print(error.what)
+    nowhere does not exist.
+    """
 
 
 class ImageError(ImplicamError):
-    """A photograph cannot be read, or is not what the rig records; names the file."""
+    """A photograph cannot be read, or is not what the rig records; names the file.
+
+    >>> import implicam as ic
+    >>> from pathlib import Path
+    >>> from implicam.images import read_picture
+    >>> try:
+    ...     read_picture(Path("nowhere.png"))
+    ... except ic.ImageError as error:
+    ...     print(error.what)
+    nowhere.png cannot be read.
+    """
 
 
 class FitError(ImplicamError):
-    """A calibration cannot be computed from these data."""
+    """A calibration cannot be computed from these data.
+
+    >>> import implicam as ic
+    >>> few = ic.simulated("stereo", points=30, seed=1).select(range(3))
+    >>> try:
+    ...     ic.ForwardGP().fit(few)
+    ... except ic.FitError as error:
+    ...     print(error.what)
+    3 usable known points; forward-gp needs at least 8.
+    """
 
 
 class CalibrationFileError(ImplicamError):
-    """A calibration file is damaged, unsafe or from a newer version; nothing in it was run."""
+    """A calibration file is damaged, unsafe or from a newer version; nothing in it was run.
+
+    >>> import implicam as ic
+    >>> try:
+    ...     ic.load_calibration("nowhere.implicam")
+    ... except ic.CalibrationFileError as error:
+    ...     print(error.what)
+    nowhere.implicam does not exist.
+    """
 
 
 class NumericalError(ImplicamError):
-    """A matrix that must be positive definite is not, or a number that must be finite is not."""
+    """A matrix that must be positive definite is not, or a number that must be finite is not.
+
+    >>> import implicam as ic
+    >>> issubclass(ic.NumericalError, ic.ImplicamError)
+    True
+    """
 
 
 class MissingExtraError(ImplicamError):
-    """An optional library is not installed."""
+    """An optional library is not installed.
+
+    >>> import implicam as ic
+    >>> issubclass(ic.MissingExtraError, ic.ImplicamError)
+    True
+    """
 
 
 class HardwareError(ImplicamError):
-    """A camera, a trigger or a robot does not answer, or does not do what it was told; nothing was lost."""
+    """A camera, a trigger or a robot does not answer, or does not do what it was told; nothing was lost.
+
+    >>> import implicam as ic
+    >>> issubclass(ic.HardwareError, ic.ImplicamError)
+    True
+    """
 
 
 class UsageError(ImplicamError):
-    """Options or arguments that do not go together."""
+    """Options or arguments that do not go together.
+
+    >>> import implicam as ic
+    >>> try:
+    ...     ic.calibrator("forward")
+    ... except ic.UsageError as error:
+    ...     print(error.what)
+    method 'forward' is not known (did you mean 'forward-gp'?).
+    """
 
 
 class PartError(UsageError):
-    """A lens, a robot or another part that another package brings is missing or broken; names the package."""
+    """A lens, a robot or another part that another package brings is missing or broken; names the package.
+
+    >>> import implicam as ic
+    >>> issubclass(ic.PartError, ic.UsageError)
+    True
+    """
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

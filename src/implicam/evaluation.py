@@ -63,6 +63,13 @@ class Evaluation:
         how: What was held out, in words.
         against: What `true_xyz` is, in words.
         notes: What should be known before the numbers are trusted.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig.select(range(20)))
+    >>> evaluation = ic.evaluate(calibration, rig.select(range(20, 30)))
+    >>> evaluation.method, evaluation.true_xyz.shape
+    ('forward-gp', (10, 3))
     """
 
     method: str
@@ -86,6 +93,12 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
 
     Raises:
         DatasetError: There are no known positions, the length units differ, or all points were used in the fit.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig.select(range(20)))
+    >>> ic.evaluate(calibration, rig.select(range(20, 30))).coverage.overall.n
+    10
     """
     _ = data.positions
     if data.length_unit != calibration.data.length_unit:
@@ -130,6 +143,11 @@ def cross_validate(fit: Fits, data: Dataset, k: int, *, seed: int = 0, progress:
     Raises:
         FitError: A fit without a fold fails.
         DatasetError: There are fewer positions than folds, or fewer than two folds.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> ic.cross_validate(ic.ForwardGP().fit, rig, 3).coverage.overall.n
+    30
     """
     how = f"{k}-fold cross-validation (seed {seed})"
     data, how = _each_once(data, how)
@@ -147,6 +165,13 @@ def leave_out_shots(fit: Fits, data: Dataset, *, progress: Progress = silent) ->
     Raises:
         FitError: A fit without a shot fails.
         DatasetError: There is only one shot.
+
+    >>> import implicam as ic
+    >>> from dataclasses import replace
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> shots = replace(rig, known=replace(rig.known, shots=[f"s{i % 3}" for i in range(30)]))
+    >>> ic.leave_out_shots(ic.ForwardGP().fit, shots).coverage.overall.n
+    30
     """
     data, more = _each_once(data, "")
     rounds = list(data.leave_out_shots())
@@ -208,7 +233,7 @@ def _judge(
     against = "the simulated truth"
     if truth is None:
         against = f"the known positions{_whose_errors(data, labels)}"
-    notes = (*dict.fromkeys((*data.notes, *calibration.data.notes, *calibration.notes())),)
+    notes = (*dict.fromkeys((*data.notes, *calibration.data.notes, *calibration.notes)),)
     return Evaluation(calibration.method, data, measurement, true_xyz, known_xyz, coverage, how, against, notes)
 
 

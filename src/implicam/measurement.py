@@ -18,6 +18,7 @@ from implicam.dataset.units import metres_per
 from implicam.errors import UsageError, did_you_mean, import_extra
 from implicam.files import write_text
 from implicam.formatting import decimal_number, number_with_sd
+from implicam.plotted import Plotted
 
 MEASURED_COLUMNS = (
     "point", "x", "y", "z", "sd_x", "sd_y", "sd_z", "cov_xy", "cov_xz", "cov_yz", "views", "consistency", "reason",
@@ -87,6 +88,13 @@ class MeasuredPoint:
         reason: Why it was not measured, or which views were left out.
         length_unit: Of the position.
         share_calibration: Share of the variance that more known points could remove.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> point = calibration.measure(rig)[0]
+    >>> point.xyz.shape, point.cov.shape, point.views
+    ((3,), (3, 3), 2)
     """
 
     point: str
@@ -118,7 +126,7 @@ class MeasuredPoint:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measurement:
+class Measurement(Plotted):
     """Positions of n points, in the world frame and length unit of the calibration.
 
     `measurement[0]`, `measurement["p0001"]` and iteration give a `MeasuredPoint` each.
@@ -139,6 +147,13 @@ class Measurement:
         columns: Further columns of the data that were measured, (n,) text each, which measured.csv repeats.
         shared: What the errors of the points have in common; None where the method, or a table that was read, cannot
             say.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> len(measured), measured[0].views, len(measured.select([0, 1]))
+    (30, 2, 2)
     """
 
     points: Names

@@ -116,6 +116,10 @@ class Verdict:
         word: "usable", "doubtful" or "not usable".
         reasons: Sentences with their cures, the gravest first.
         held_out: Known points that were held out; None where none could be.
+
+    >>> import implicam as ic
+    >>> ic.Verdict("usable", ()).word
+    'usable'
     """
 
     word: str
@@ -136,6 +140,12 @@ def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
     Args:
         calibration: The calibration.
         progress: Called before each fit.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> isinstance(ic.judge(calibration), ic.Verdict)
+    True
     """
     held_out, failed = _held_out(calibration, progress)
     sds = list(_of_stated_sds(calibration))

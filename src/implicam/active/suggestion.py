@@ -35,7 +35,7 @@ class Suggestion:
 
 def suggest(
     calibration: Calibration,
-    workspace: Workspace | None,
+    workspace: Workspace | None = None,
     *,
     count: int = 5,
     rule: Acquisition | None = None,
@@ -61,6 +61,12 @@ def suggest(
 
     Raises:
         UsageError: The method cannot say what one more point would add, or the cameras do not see the workspace.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> len(ic.suggest(calibration, count=2, candidates=200, judged=50).targets)
+    2
     """
     if not can_design_experiments(calibration):
         raise design_error(calibration.method)

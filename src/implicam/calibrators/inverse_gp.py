@@ -82,6 +82,11 @@ class InverseGP(CalibratorBase):
     shortest_lengthscale: bound of every lengthscale, in standard deviations of the pixels. Optics are smooth across
     the image, so by default it is the extent of the pixels themselves (docs/decisions/0004-lattices.md).
     settings: all priors and thresholds; a calibration file carries them, so that a refit years later is the same fit.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> ic.InverseGP().fit(rig).measure(rig).xyz.shape
+    (30, 3)
     """
 
     kernel: str = field(default="squared-exponential", metadata=option(" or ".join(SHAPES)))
@@ -221,6 +226,11 @@ class InverseGPCalibration(CalibrationBase):
 
     hyperparameters: of the three of `plain` and `paper`; smoothness and basis: of the one of `smooth`; mixing (3, 3):
     of coregionalised outputs, the three are of `positions @ mixing`.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> ic.InverseGP().fit(rig).method
+    'inverse-gp'
     """
 
     calibrator: InverseGP
@@ -410,6 +420,7 @@ class InverseGPCalibration(CalibrationBase):
         ]
         return self.calibrator._fitted(data, partial(_train, starts=starts, anew=anew), progress)
 
+    @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         flat = flat_note(self.data) or self._thin_note()

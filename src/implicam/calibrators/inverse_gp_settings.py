@@ -13,7 +13,12 @@ from implicam.calibrators.every_camera import EveryCameraSettings
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class InverseGPSettings(EveryCameraSettings):
-    """The settings of `InverseGP(settings=...)`."""
+    """The settings of `InverseGP(settings=...)`.
+
+    >>> import implicam as ic
+    >>> ic.InverseGP(settings=ic.InverseGPSettings()).settings == ic.InverseGPSettings()
+    True
+    """
 
     # priors of the smooth map
     axis_lengthscale_prior_median_sds: float = 6.0

@@ -52,6 +52,10 @@ class MLP(CalibratorBase):
 
     With dropout = 0 there is no spread, and the error bars are the rms errors of the points kept for early stopping.
     settings: all thresholds; a calibration file carries them, so that a refit years later is the same fit.
+
+    >>> import implicam as ic
+    >>> ic.MLP().method
+    'mlp'
     """
 
     seed: int = 0
@@ -157,7 +161,12 @@ def _split(n: int, seed: int, share: float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MLPCalibration(CalibrationBase):
-    """A trained network, and which of the usable known points (n,) were kept for early stopping."""
+    """A trained network, and which of the usable known points (n,) were kept for early stopping.
+
+    >>> import implicam as ic
+    >>> ic.MLPCalibration.method
+    'mlp'
+    """
 
     calibrator: MLP
     data: Dataset
@@ -238,6 +247,7 @@ class MLPCalibration(CalibrationBase):
         """Share of the held-out coordinates within their 95 % interval."""
         return float(np.mean(np.abs(self._held_out_errors) <= INTERVAL_95_SDS * self._held_out_sds))
 
+    @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration: always what its error bars are worth."""
         return [

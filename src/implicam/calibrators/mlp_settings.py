@@ -13,7 +13,12 @@ from implicam.calibrators.every_camera import EveryCameraSettings
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class MLPSettings(EveryCameraSettings):
-    """The settings of `MLP(settings=...)`."""
+    """The settings of `MLP(settings=...)`.
+
+    >>> import implicam as ic
+    >>> ic.MLP(settings=ic.MLPSettings()).settings == ic.MLPSettings()
+    True
+    """
 
     # training
     held_out_share: float = 0.15

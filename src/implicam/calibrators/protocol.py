@@ -26,6 +26,7 @@ from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import FitError, UsageError
 from implicam.formatting import decimal_number
 from implicam.measurement import Measurement
+from implicam.plotted import Plotted
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig, Sensitivity
 from implicam.settings import Settings
@@ -102,7 +103,14 @@ class CheckPlan(NamedTuple):
 
 
 class Calibration(Protocol):
-    """A fitted map of a rig, and the data it was fitted from."""
+    """A fitted map of a rig, and the data it was fitted from.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> calibration.method, len(calibration.rejected), calibration.notes
+    ('forward-gp', 0, [])
+    """
 
     method: ClassVar[str]
 
@@ -168,6 +176,7 @@ class Calibration(Protocol):
             path: Of the file.
         """
 
+    @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
 
@@ -418,7 +427,7 @@ def _is_dataset(field: Field[Any]) -> bool:
     return bool(field.metadata.get("is_dataset", False))
 
 
-class CalibrationBase:
+class CalibrationBase(Plotted):
     """What most calibrations do alike; to be inherited, or written anew."""
 
     calibrator: Calibrator
@@ -459,10 +468,46 @@ class CalibrationBase:
         """
         return self.calibrator.fit(data, progress)
 
+    @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         return []
 
+    def in_unit(self, unit: str) -> Any:
+        """The calibration that measures in another length unit: fitted again to the known points in that unit.
+
+        Args:
+            unit: For example "m".
+
+        Raises:
+            DatasetError: The unit has no known length.
+            UsageError: It was not fitted to known points alone.
+        """
+        return self._refitted(self.data.in_unit(unit))
+
+    def transformed(self, pose: Any) -> Any:
+        """The calibration that measures in another frame of the world: fitted again to the known points in that frame.
+
+        Args:
+            pose: What takes a position to the other frame: SciPy's Rotation, or a rigid 4 x 4 matrix (a translation in
+                the length unit).
+
+        Raises:
+            UsageError: It is no rotation and no rigid matrix, or it was not fitted to known points alone.
+        """
+        return self._refitted(self.data.transformed(pose))
+
+    def _refitted(self, data: Dataset) -> Any:
+        others = [f.name for f in fields(self.calibrator) if _is_dataset(f) and getattr(self.calibrator, f.name)]  # type: ignore[arg-type]
+        if data.known is None or others:
+            raise UsageError(
+                f"this calibration by {self.calibrator.method} cannot be moved.",
+                why="it was fitted from boards or imported, not from known points alone",
+                fix="move what it measures: measurement.in_unit(...), measurement.transformed(...)",
+            )
+        return self.refit(data)
+
+    @property
     def residuals(self) -> dict[str, Any]:
         """The summary as plain values, as it stands in the calibration file."""
         return self.summary().as_table()  # type: ignore[attr-defined,no-any-return]

@@ -69,6 +69,10 @@ def calibrator(name: str, **options: Any) -> Calibrator:
 
     Raises:
         UsageError: the method, the variant or an option is not known.
+
+    >>> import implicam as ic
+    >>> ic.calibrator("forward-gp") == ic.ForwardGP()
+    True
     """
     (made, _), variant = CALIBRATORS.find(name)
     known = [field.name for field in fields(made)]
@@ -190,6 +194,14 @@ def load_calibration(path: str | Path) -> Calibration:
 
     Raises:
         CalibrationFileError: It cannot be used, and what is wrong with it.
+
+    >>> import implicam as ic
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "rig.implicam"
+    >>> ic.ForwardGP().fit(ic.simulated("stereo", points=30, seed=1)).save(path)
+    >>> ic.load_calibration(path).method
+    'forward-gp'
     """
     contents = calibration_file.read(path)
     if contents.method not in CALIBRATORS:

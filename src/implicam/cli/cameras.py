@@ -120,7 +120,7 @@ def import_command(
     calibration = calibration_of(rig, cameras[0].stem, noise)
     calibration.save(output)
     if json:
-        show.emit_json({"calibration": str(output), "cameras": len(rig.cameras), "notes": calibration.notes()})
+        show.emit_json({"calibration": str(output), "cameras": len(rig.cameras), "notes": calibration.notes})
         return
     show.line(f"{output}: {len(rig.cameras)} cameras, lengths in {rig.length_unit}")
-    show.notes(calibration.notes())
+    show.notes(calibration.notes)

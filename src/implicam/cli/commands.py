@@ -153,7 +153,7 @@ def _any_given(method: str | None, options: Mapping[str, Any]) -> bool:
 def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path | None, json: bool) -> None:
     summary = calibration.summary()
     unused = [asdict(unused) for unused in calibration.unused]
-    notes = [*calibration.data.notes, *calibration.notes()]
+    notes = [*calibration.data.notes, *calibration.notes]
     if json:
         show.emit_json(
             {"calibration": None if output is None else str(output), "verdict": verdict.as_table(),
@@ -368,9 +368,9 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
 
 
 def _write_report(evaluation: Evaluation, path: Path) -> None:
-    from implicam.report import report_of, write_report
+    from implicam.report.call import report
 
-    write_report(path, report_of(evaluation, f"{evaluation.data.name}, measured with {evaluation.method}"))
+    report(evaluation, path)
 
 
 @command("report")
@@ -387,12 +387,11 @@ def report_command(
     refuse_folder(output)
     must_not_replace(output, calibration, dataset)
     fitted = load_calibration(calibration)
+    from implicam.report.call import report
+
     with show.progress(json) as progress:
-        if dataset is None:
-            evaluation = cross_validate(fitted.refit, fitted.data, min(10, len(fitted.data)), progress=progress)
-        else:
-            evaluation = evaluate(fitted, read(dataset, table))
-    _write_report(evaluation, output)
+        data = None if dataset is None else read(dataset, table)
+        evaluation = report(fitted, output, data=data, progress=progress)
     if json:
         show.emit_json({"report": str(output), "how": evaluation.how})
     else:

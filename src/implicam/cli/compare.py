@@ -5,18 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from implicam.calibrators import calibrator_from_name, compared_names, library_of
+from implicam.calibrators import calibrator_from_name
 from implicam.cli import show
 from implicam.cli.app import Cameras, Json, LeaveOut, Without, check_figure, command, must_be_shot, read
 from implicam.cli.compare_table import compare_failures, compare_table
 from implicam.cli.options import with_table_options
-from implicam.compare import Split, Trial, as_json, compare_on, plane_splits, random_splits, shot_splits, summarise
+from implicam.compare import (
+    Split,
+    Trial,
+    as_json,
+    available_methods,
+    compare_on,
+    plane_splits,
+    random_splits,
+    shot_splits,
+    summarise,
+    usual_sizes,
+)
 from implicam.dataset import Dataset, TableOptions
 from implicam.dataset.table_options import DOCUMENTED
 from implicam.errors import UsageError
@@ -77,13 +87,9 @@ def compare_command(
 
 def _available_methods() -> list[str]:
     """All methods and the variants worth showing, as far as their libraries are installed."""
-    available = []
-    for name in compared_names():
-        library = library_of(name)
-        if library is None or find_spec(library[0]) is not None:
-            available.append(name)
-        else:
-            show.note(f'left out {name}: pip install "implicam[{library[1]}]" to add it')
+    available, missing = available_methods()
+    for name, extra in missing:
+        show.note(f'left out {name}: pip install "implicam[{extra}]" to add it')
     return available
 
 
@@ -109,7 +115,7 @@ MOST_ON_LATTICE = 200
 
 def _sizes(text: str | None, n: int) -> list[int]:
     if text is None:
-        return sorted({min(n - 1, max(5, round(n * share))) for share in (0.1, 0.2, 0.5, 0.9)})
+        return usual_sizes(n)
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:

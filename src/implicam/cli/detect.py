@@ -11,17 +11,9 @@ import typer
 from implicam.cli import show
 from implicam.cli.app import Json, command, command_line
 from implicam.cli.options import OptionsOfParts
-from implicam.detect import (
-    TARGETS,
-    DetectionRun,
-    detect_films,
-    detect_folder,
-    detector_from_options,
-    films_of,
-    options_of,
-)
+from implicam.detect import TARGETS, DetectionRun, call, detector_from_options, options_of
+from implicam.detect.call import must_be_dataset_folder
 from implicam.detect.folder import DETECTIONS
-from implicam.errors import UsageError
 from implicam.logs import LOG, log_to_file
 
 
@@ -71,28 +63,13 @@ def _detect(
     **options: Any,
 ) -> None:
     """Find the target in photographs or films: images -> observations.csv, each view with its uncertainty."""
-    if not dataset.is_dir():
-        raise UsageError(
-            f"{dataset} is not a folder.", fix="give the folder that holds images/<camera>/<shot>.png, or <camera>.mp4"
-        )
-    detector = detector_from_options(target, dataset, **options)
-    found = films_of(dataset, films, pictures)
-    if not found and (times or offsets is not None or every > 1 or frames):
-        raise UsageError(
-            f"there are no films in {dataset}, and --times, --offsets, --every and --frames are for films.",
-            fix="put <camera>.mp4 into it, say where they are with --films, or leave these options out",
-        )
+    must_be_dataset_folder(dataset)
+    detector = detector_from_options(target, dataset, **options)  # before a log is written there
     with log_to_file(dataset / DETECTIONS / LOG, command_line()), show.progress(json) as progress:
-        if found:
-            run = detect_films(
-                dataset, detector, found, unit=unit, times=times, offsets=offsets, every=every, frames=frames,
-                overlays=overlays, restart=restart, progress=progress,
-            )  # fmt: skip
-        else:
-            run = detect_folder(
-                dataset, detector, unit=unit, pictures=pictures, pattern=pattern, overlays=overlays, restart=restart,
-                progress=progress,
-            )  # fmt: skip
+        run = call.detect(
+            dataset, detector, unit=unit, pictures=pictures, pattern=pattern, films=films, times=times, offsets=offsets,
+            every=every, frames=frames, overlays=overlays, restart=restart, progress=progress,
+        )  # fmt: skip
     _print_result(run, json)
 
 

@@ -54,6 +54,13 @@ def assess(
 
     Raises:
         UsageError: An array has the wrong shape.
+
+    >>> import implicam as ic
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(1)
+    >>> coverage = ic.assess(rng.normal(size=(200, 3)), np.tile(np.eye(3), (200, 1, 1)))
+    >>> coverage.overall.n
+    200
     """
     e = np.asarray(errors, dtype=np.float64)
     if e.ndim != 2 or e.shape[1] != 3:

@@ -134,6 +134,12 @@ class Coverage:
     Attributes:
         rows: One per region, the first over all points.
         reasons: The number of a point, and why its covariance was not judged.
+
+    >>> import implicam as ic
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(1)
+    >>> ic.assess(rng.normal(size=(200, 3)), np.tile(np.eye(3), (200, 1, 1))).overall.n
+    200
     """
 
     rows: tuple[Summary, ...]

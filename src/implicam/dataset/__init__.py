@@ -86,6 +86,14 @@ def read_dataset(
     Raises:
         DatasetError: If something is wrong, or the data state another unit; names file, line, value and cure.
         UsageError: If the options contradict the data.
+
+    >>> import implicam as ic
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> folder = Path(tempfile.mkdtemp()) / "rig"
+    >>> ic.write_dataset(ic.simulated("stereo", points=30, seed=1), folder)
+    >>> len(ic.read_dataset(folder))
+    30
     """
     path = Path(path)
     options = TableOptions(unit, first_pixel, v_up, size_text(size))
@@ -149,6 +157,14 @@ def write_dataset(
 
     Raises:
         DatasetError: If this form cannot hold the dataset, or the folder must not be replaced.
+
+    >>> import implicam as ic
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> path = Path(tempfile.mkdtemp()) / "rig.csv"
+    >>> ic.write_dataset(ic.simulated("stereo", points=30, seed=1), path)
+    >>> path.exists()
+    True
     """
     path = Path(path)
     suffix = path.suffix.lower()

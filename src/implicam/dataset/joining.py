@@ -20,6 +20,11 @@ def join(first: Dataset, second: Dataset) -> Dataset:
 
     Raises:
         DatasetError: The two do not belong together, or a point has the same name in both.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> len(ic.join(rig.select(range(10)), rig.select(range(10, 30))))
+    30
     """
     if first.cameras != second.cameras or first.length_unit != second.length_unit:
         raise DatasetError(

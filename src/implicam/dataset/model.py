@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from implicam.dataset.plain import to_plain
 from implicam.dataset.units import metres_per
 from implicam.errors import DatasetError, did_you_mean
+from implicam.plotted import Plotted
 
 Floats = NDArray[np.float64]
 Names = NDArray[np.str_]
@@ -50,7 +51,12 @@ TRUE_VIEW_COLUMNS = ("true_u", "true_v", "outlier")
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera's name and image size in pixels; None where the size is not known."""
+    """A camera's name and image size in pixels; None where the size is not known.
+
+    >>> import implicam as ic
+    >>> ic.Camera("cam1", 1280, 800).width
+    1280
+    """
 
     name: str
     width: int | None = None
@@ -93,6 +99,11 @@ class Observations:
 
     Raises:
         DatasetError: If a name, a pixel or an uncertainty is not possible.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> rig.observations.uv.shape, rig.observations.seen.all().item()
+    ((30, 2, 2), True)
     """
 
     points: Names
@@ -173,6 +184,11 @@ class KnownPositions:
 
     Raises:
         DatasetError: If a name, a position or an uncertainty is not possible.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> rig.known.xyz.shape, rig.known.shots.shape
+    ((30, 3), (30,))
     """
 
     shots: Names
@@ -235,7 +251,7 @@ class Truth:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Dataset:
+class Dataset(Plotted):
     """Observations, the known positions of the same points, and the length unit.
 
     Attributes:
@@ -247,6 +263,12 @@ class Dataset:
         notes: What was corrected in reading, such as marks for missing views; not written to files.
         columns: Further columns of points without known positions as text, (n,) each, such as a frame; where positions
             are known, these are columns of `known`.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> data = ic.Dataset.from_arrays(rig.observations.uv, rig.xyz, cameras=["left", "right"])
+    >>> len(data), data.camera_names
+    (30, ('left', 'right'))
     """
 
     name: str

@@ -146,6 +146,13 @@ def fit_plane(measurement: Measurement, points: Sequence[str | int]) -> Plane:
     Raises:
         UsageError: There are too few points, or they lie on a line; or as for `distance`.
         NumericalError: The search did not converge.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> type(ic.fit_plane(measured, list(range(12)))).__name__
+    'Plane'
     """
     found = _enough(measurement, points, 3, "a plane")
     centre = found.x.mean(axis=0)
@@ -189,6 +196,17 @@ def fit_sphere(measurement: Measurement, points: Sequence[str | int]) -> Sphere:
     Raises:
         UsageError: There are too few points, or they lie in a plane; or as for `distance`.
         NumericalError: The search did not converge.
+
+    >>> import implicam as ic
+    >>> from dataclasses import replace
+    >>> import numpy as np
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> ways = np.random.default_rng(1).normal(size=(12, 3))
+    >>> ball = replace(measured.select(range(12)), xyz=50 * ways / np.linalg.norm(ways, axis=1)[:, None])
+    >>> round(ic.fit_sphere(ball, range(12)).radius.value)
+    50
     """
     found = _enough(measurement, points, 4, "a sphere")
     _refuse_degenerate(_spread(found.x)[0], 2, "a sphere lie in a plane")
@@ -220,6 +238,18 @@ def fit_cylinder(measurement: Measurement, points: Sequence[str | int]) -> Cylin
     Raises:
         UsageError: There are too few points; or as for `distance`.
         NumericalError: The points do not fix a cylinder, or the search did not converge.
+
+    >>> import implicam as ic
+    >>> from dataclasses import replace
+    >>> import numpy as np
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> turn = np.linspace(0, 6, 16)
+    >>> rod = np.stack([30 * np.cos(turn), 30 * np.sin(turn), 20 * turn], axis=1)
+    >>> measured = replace(measured.select(range(16)), xyz=rod)
+    >>> round(ic.fit_cylinder(measured, range(16)).radius.value)
+    49
     """
     found = _enough(measurement, points, 5, "a cylinder")
     middle = found.x.mean(axis=0)
@@ -267,6 +297,18 @@ def fit_motion(measurement: Measurement, before: Sequence[str | int], after: Seq
     Raises:
         UsageError: There are too few pairs, or they lie on a line; or as for `distance`.
         NumericalError: The search did not converge.
+
+    >>> import implicam as ic
+    >>> from dataclasses import replace
+    >>> import numpy as np
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> xyz = measured.xyz[:12].copy()
+    >>> xyz[6:] = xyz[:6] + [5.0, 0.0, 0.0]
+    >>> moved = replace(measured.select(range(12)), xyz=xyz)
+    >>> type(ic.fit_motion(moved, range(6), range(6, 12))).__name__
+    'Motion'
     """
     if len(before) != len(after):
         raise UsageError(

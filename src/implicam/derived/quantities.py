@@ -33,6 +33,10 @@ class Quantity:
         sd: Its standard uncertainty.
         unit: Of both.
         note: What else to know of it; empty where nothing.
+
+    >>> import implicam as ic
+    >>> ic.Quantity(10.0, 0.1, "mm")
+    10.00 ± 0.10 mm
     """
 
     value: float
@@ -71,6 +75,14 @@ def distance(measurement: Measurement, a: str | int, b: str | int) -> Quantity:
 
     Raises:
         UsageError: A point is not there or was not measured, both are one, or what their errors share is not known.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> length = ic.distance(measured, 0, 1)
+    >>> length.unit, length.sd > 0
+    ('mm', True)
     """
     return distances(measurement, [(a, b)])[0]
 
@@ -87,6 +99,13 @@ def distances(measurement: Measurement, pairs: Sequence[tuple[str | int, str | i
 
     Raises:
         UsageError: As for `distance`.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> len(ic.distances(measured, [(0, 1), (2, 3)]))
+    2
     """
     rows = np.array([[find_measured_point(measurement, point) for point in pair] for pair in pairs], dtype=np.int64)
     rows = rows.reshape(len(pairs), 2)
@@ -137,6 +156,13 @@ def angle(measurement: Measurement, a: str | int, vertex: str | int, b: str | in
     Raises:
         UsageError: A point is not there, was not measured or coincides with the vertex, or the method does not say what
             errors share.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> ic.angle(measured, 0, 1, 2).value > 0
+    True
     """
     points = joint(measurement, (a, vertex, b))
     p, q = points.xyz[0] - points.xyz[1], points.xyz[2] - points.xyz[1]

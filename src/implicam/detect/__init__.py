@@ -2,8 +2,12 @@
 
 run = detect_folder(Path("my-rig"), Ball())
 run.data, run.cameras, run.reasons
+
+The module can be called: `ic.detect("my-photos", "ball", radius=8)` (`call.detect`).
 """
 
+from implicam.callable_module import make_callable
+from implicam.detect import call
 from implicam.detect.aprilgrid import AprilGrid
 from implicam.detect.ball import Ball, Template
 from implicam.detect.board import Board
@@ -39,3 +43,5 @@ __all__ = [
     "options_of",
     "predict_outline_shift",
 ]
+
+make_callable(__name__, call.detect)

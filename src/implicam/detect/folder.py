@@ -63,7 +63,7 @@ class Count(NamedTuple):
     points: int
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DetectionRun:
     """The result of `detect_folder`.
 
@@ -83,6 +83,13 @@ class DetectionRun:
     resumed: int
     seconds_per_picture: float
     sheets: tuple[Path, ...]
+
+    def __repr__(self) -> str:
+        """What was found, in a few lines; `notes` and `reasons` say more."""
+        shown = [f"  {c.camera}: in {c.found} of {c.pictures} pictures" for c in self.cameras[:MAX_NAMES]]
+        shown += [f"  ... and {len(self.cameras) - len(shown)} cameras more"] if len(self.cameras) > len(shown) else []
+        views, notes = int(self.data.observations.seen.sum()), f"  {len(self.notes)} notes"
+        return "\n".join([f"{views} views of {len(self.data)} points: {self.observations}", *shown, notes])
 
 
 def detect_folder(

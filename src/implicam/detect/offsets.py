@@ -59,9 +59,10 @@ not quite true: more); and the coefficient of the division model, with half of t
 PIECES = 24
 """Parts of the film whose errors are taken as independent of each other."""
 
-JUMP_SDS, MAX_NOISE = 5.0, 3.0
-"""Offsets of parts of a film that differ by so many standard deviations say that pictures are missing; and the largest
-residual, in standard deviations of the detections, of a part that fits."""
+JUMP_SDS, MAX_NOISE, CLEARLY = 5.0, 3.0, 3.0
+"""Offsets of parts of a film that differ by so many standard deviations say that pictures are missing; the largest
+residual, in standard deviations of the detections, of a part that fits; and how many times larger it must be at the
+offset of the whole film."""
 
 MAX_SCANNED = 300
 """Places that the search for an offset compares; the fit compares all."""
@@ -286,15 +287,21 @@ class _Pair:
         """OffsetError where parts of the film have other offsets, each with no more residual than `noise`."""
         times = self._times[fit.rows]
         edges = np.quantile(times, np.linspace(0, 1, 4))
+        distances = _Epipolar(self, fit.rows, float(fit.values[0])).distances(fit.values)
         parts = []
         for low, high in pairwise(edges):
             scale, offset = self.search(float(fit.values[0]), (low, high))
             own = self.fit(offset, (low, high)) if scale < TOO_LITTLE else None
             if own is not None and own.scale <= noise:
-                parts.append(((low + high) / 2, float(own.values[0]), math.sqrt(self._covariance(own)[0, 0])))
+                whole = _robust_scale(distances[(times >= low) & (times <= high)])
+                sd = math.sqrt(self._covariance(own)[0, 0])
+                parts.append(((low + high) / 2, float(own.values[0]), sd, whole > CLEARLY * own.scale))
         least = 0.3 * min(self.a.period, self.b.period)  # what is lost are whole pictures
-        for (t, x, x_sd), (u, y, y_sd) in combinations(parts, 2):
-            if abs(y - x) > max(least, JUMP_SDS * math.hypot(x_sd, y_sd, DRIFT_SD * (u - t))):
+        for (t, x, x_sd, x_better), (u, y, y_sd, y_better) in combinations(parts, 2):
+            # a part that moves simply may fit at other offsets as well: then it fits at that of the whole film, too
+            if (x_better or y_better) and abs(y - x) > max(
+                least, JUMP_SDS * math.hypot(x_sd, y_sd, DRIFT_SD * (u - t))
+            ):
                 raise _cannot(
                     names,
                     f"it changes by {abs(y - x) * 1e3:.0f} ms between {t:.3g} and {u:.3g} s of the film of "
@@ -401,8 +408,12 @@ class _Epipolar:
         b = self._b.apply(self._pair._b_at(self.rows, values[0], values[1]), values[3])
         return a, b
 
-    def _distances(self, values: Floats) -> Floats:
-        """Sampson's distances in standard deviations of the detections."""
+    def distances(self, values: Floats) -> Floats:
+        """Sampson's distances in standard deviations of the detections.
+
+        Args:
+            values: Offset, drift, two distortions, nine of F.
+        """
         a, b = self._homogeneous(values)
         f = values[4:].reshape(3, 3)
         to_b, to_a = a @ f.T, b @ f
@@ -421,7 +432,7 @@ class _Epipolar:
         for _ in range(4):
             weighted = design * weights[:, None]
             values[4:] = np.linalg.eigh(weighted.T @ weighted)[1][:, 0]
-            distance = self._distances(values)
+            distance = self.distances(values)
             scale = _robust_scale(distance)
             spread = np.abs(design @ values[4:]) / np.maximum(np.abs(distance), 1e-12)
             weights = 1 / np.maximum(spread, 1e-12) / (1 + np.square(distance / (3 * scale + 1e-12)))
@@ -435,7 +446,7 @@ class _Epipolar:
             values[3] / DISTORTION_SD,
             (np.linalg.norm(values[4:]) - 1) / 1e-3,
         ]
-        return np.concatenate([self._distances(values) / scale, prior])
+        return np.concatenate([self.distances(values) / scale, prior])
 
     def solve(self) -> tuple[Floats, float]:
         """The values that make the distances least, and their robust scale."""
@@ -448,7 +459,7 @@ class _Epipolar:
             )  # fmt: skip
             values = found.x * units
             values[4:] /= np.linalg.norm(values[4:])
-            before, scale = scale, max(_robust_scale(self._distances(values)), 1e-6)
+            before, scale = scale, max(_robust_scale(self.distances(values)), 1e-6)
             if abs(scale - before) < 0.02 * before:
                 break
         return values, scale

@@ -78,6 +78,11 @@ def simulated(rig: str = "bar6", *, points: int | None = None, seed: int = 0, ca
 
     Raises:
         UsageError: There is no such rig or camera, or a number is out of range.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> len(rig), rig.length_unit
+    (30, 'mm')
     """
     built = build_rig(rig, seed=seed, cameras=cameras)
     rng = np.random.default_rng([seed, 17])

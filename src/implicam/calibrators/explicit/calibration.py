@@ -69,6 +69,11 @@ class Explicit(CalibratorBase):
     paper's own pipeline with OpenCV, to compare with (paper_preset.py); `paper-bundle`, the same with a joint
     adjustment at its end. seed changes nothing: no part of this method is left to chance. settings: all priors and
     thresholds; a calibration file carries them, so that a refit years later is the same fit.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> ic.Explicit().fit(rig).measure(rig).xyz.shape
+    (30, 3)
     """
 
     lens: str = field(default=AUTO, metadata=option(f"auto, {', '.join(LENSES)}"))
@@ -205,7 +210,14 @@ class Explicit(CalibratorBase):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ExplicitCalibration(RigCalibration):
-    """Cameras with lens models and poses, and the covariance of all of it."""
+    """Cameras with lens models and poses, and the covariance of all of it.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.Explicit().fit(rig)
+    >>> sorted(calibration.cameras)
+    ['cam1', 'cam2']
+    """
 
     calibrator: Explicit
     data: Dataset
@@ -275,6 +287,7 @@ class ExplicitCalibration(RigCalibration):
             )
         return self.calibrator.fit(data, progress)
 
+    @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         return [*self.fitted.notes, *self.calibrator.idle_settings_note()]

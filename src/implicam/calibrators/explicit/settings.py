@@ -10,7 +10,12 @@ from implicam.rig_model import CameraSettings, RigModelSettings
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ExplicitSettings(CameraSettings):
-    """The settings of `Explicit(settings=...)`."""
+    """The settings of `Explicit(settings=...)`.
+
+    >>> import implicam as ic
+    >>> ic.Explicit(settings=ic.ExplicitSettings()).settings == ic.ExplicitSettings()
+    True
+    """
 
     # what the pixels of a camera are like
     stretched_log_aspect_prior_sd: float = 0.35

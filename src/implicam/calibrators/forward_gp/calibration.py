@@ -58,6 +58,13 @@ class ForwardGP(CalibratorBase):
 
     seed changes nothing: no part of this method is left to chance. settings: all priors and thresholds; a calibration
     file carries them, so that a refit years later is the same fit.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> measured = calibration.measure(rig)
+    >>> measured.xyz.shape, measured.cov.shape
+    ((30, 3), (30, 3, 3))
     """
 
     lens: str = field(default=AUTO, metadata=option("auto, central or none"))
@@ -115,7 +122,14 @@ class ForwardGP(CalibratorBase):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ForwardGPCalibration(RigCalibration):
-    """A fitted rig."""
+    """A fitted rig.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> calibration = ic.ForwardGP().fit(rig)
+    >>> calibration.camera_names, calibration.predict(rig.xyz).shape
+    (('cam1', 'cam2'), (30, 2, 2))
+    """
 
     calibrator: ForwardGP
     data: Dataset
@@ -196,6 +210,7 @@ class ForwardGPCalibration(RigCalibration):
             return self.calibrator.fit(data, progress)
         return self.calibrator._fit(data, progress, self)
 
+    @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         return [

@@ -32,6 +32,10 @@ class ForwardGPSettings(RigModelSettings):
     """The settings of `ForwardGP(settings=...)`; names and units as in `RigModelSettings`.
 
     Pairs are of the image, in half its longer side, and of the log distance.
+
+    >>> import implicam as ic
+    >>> ic.ForwardGP(settings=ic.ForwardGPSettings(error_bar_level=0.9)).settings.error_bar_level
+    0.9
     """
 
     # kinds of cameras, eqs. (3) and (K1): sds of p, q, tilt and centre, and odds, as of `CameraKind`

@@ -1,0 +1,56 @@
+"""`implicam.report(...)`: what `implicam report` does, as one call."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from implicam.calibrators import Calibration
+from implicam.dataset import Dataset
+from implicam.evaluation import Evaluation, cross_validate, evaluate
+from implicam.files import refuse_folder
+from implicam.progress import Progress, silent
+from implicam.report.data import report_of
+from implicam.report.html_page import write_report
+
+FOLDS = 10
+"""Of the cross-validation of a calibration without other known points."""
+
+
+def report(
+    what: Evaluation | Calibration,
+    path: str | Path = "report.html",
+    *,
+    data: Dataset | None = None,
+    title: str = "",
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Evaluation:
+    """Write one page that a stranger understands: how good the measurement is, and whether its error bars are true.
+
+    ic.report(calibration, "report.html", data=others)
+
+    Args:
+        what: An evaluation; or a calibration, which is evaluated.
+        path: The page to write; it is replaced.
+        data: Known points to judge a calibration by; None for its own, by 10-fold cross-validation.
+        title: Of the page.
+        seed: Of the folds.
+        progress: Told how far it is.
+
+    Returns:
+        The evaluation that the page shows.
+
+    Raises:
+        MissingExtraError: Plotly or Jinja2 is not installed.
+        ImplicamError: The page cannot be written.
+    """
+    refuse_folder(Path(path))
+    if isinstance(what, Evaluation):
+        evaluation = what
+    elif data is not None:
+        evaluation = evaluate(what, data)
+    else:
+        evaluation = cross_validate(what.refit, what.data, min(FOLDS, len(what.data)), seed=seed, progress=progress)
+    title = title or f"{evaluation.data.name}, measured with {evaluation.method}"
+    write_report(path, report_of(evaluation, title))
+    return evaluation
