@@ -57,13 +57,15 @@ def detect(
     """
     path = Path(dataset)
     must_be_dataset_folder(path)
-    named = target is None or isinstance(target, str)
-    detector = detector_from_options(target, path, **options) if named else target
-    if not named and options:
+    if target is None or isinstance(target, str):
+        detector = detector_from_options(target, path, **options)
+    elif options:
         raise UsageError(
             f"a detector has its options already, and {', '.join(options)} were given too.",
             fix="give them to the detector, or name the target",
         )
+    else:
+        detector = target
     found = films_of(path, films, pictures)
     if found:
         return detect_films(

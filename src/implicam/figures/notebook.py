@@ -94,7 +94,7 @@ def _centres(calibration: Any) -> dict[str, Floats]:
 def _pixels(data: Dataset) -> Any:
     """A panel for each camera: where it saw the points."""
     go = graph_objects()
-    traces, buttons = [], []
+    traces, buttons = list[Any](), list[dict[str, Any]]()
     for k, camera in enumerate(data.cameras):
         uv = data.observations.uv[:, k]
         seen = np.isfinite(uv[:, 0])
@@ -105,8 +105,10 @@ def _pixels(data: Dataset) -> Any:
                 hovertemplate="%{text}<br>u %{x:.2f}, v %{y:.2f}<extra></extra>",
             )
         )  # fmt: skip
-        size = (camera.width, camera.height)
-        axes = {} if None in size else {"xaxis.range": [-0.5, size[0] - 0.5], "yaxis.range": [size[1] - 0.5, -0.5]}
+        width, height = camera.width, camera.height
+        axes: dict[str, list[float]] = {}
+        if width is not None and height is not None:
+            axes = {"xaxis.range": [-0.5, width - 0.5], "yaxis.range": [height - 0.5, -0.5]}
         shown = [i == k for i in range(len(data.cameras))]
         buttons.append({"label": plain(camera.name), "method": "update", "args": [{"visible": shown}, axes]})
     figure = go.Figure(traces, layout())
