@@ -41,6 +41,9 @@ MIN_SCALE_LIMIT_PX, MAX_SCALE_LIMIT_PX = 1.5, 16.0
 MAX_WITHIN_PX = 40.0
 """Pixels: no click means a dot that is farther off, nor one that is as far as the next one may be."""
 
+FAR_FROM_HIDDEN = 0.3
+"""Of the diagonal of the drawing: how far a dot that cannot be seen makes others less likely to be proposed."""
+
 TURNS: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = tuple(
     (row, other)
     for row in ((1, 0), (-1, 0), (0, 1), (0, -1))
@@ -258,7 +261,8 @@ class Labelling:
         """The dot whose label would tell most beside those there are; None where each has one.
 
         That is the one of the largest leverage in an affine map, among those that can be seen, as far as is known. The
-        first three are the corners of the drawing, which people find; depths come after them.
+        first three are the corners of the drawing, which people find; depths come after them. What lies near dots that
+        cannot be seen is less likely to be seen.
 
         Args:
             view: One of `pictures`.
@@ -276,11 +280,19 @@ class Labelling:
         leverage = np.einsum("ni,ij,nj->n", features, np.linalg.inv(normal), features)
         seen = set(guess.found) | set(guess.unsure) if guess.dots else set(names)
         skipped = self._skipped.get(view, set())
+        if skipped and not guess.dots:
+            leverage = leverage * self._distance_from(xyz[:, self.axes(view)[:2]], [name in skipped for name in names])
         for choice in (seen - skipped, seen, set(names)):
             left = [k for k, name in enumerate(names) if name in choice and name not in marks]
             if left:
                 return names[left[int(np.argmax(np.round(leverage[left], 6)))]]
         return None
+
+    def _distance_from(self, xy: Floats, some: list[bool]) -> Floats:
+        """(n,) how far dots are from some of them, as a part of `FAR_FROM_HIDDEN` of the drawing, at most 1."""
+        apart = np.linalg.norm(xy[:, None] - xy[some], axis=2).min(axis=1)
+        whole = float(np.linalg.norm(np.ptp(xy, axis=0)))
+        return np.asarray(np.clip(apart / (FAR_FROM_HIDDEN * whole or 1.0), 0, 1), dtype=np.float64)
 
     def guess(self, view: View) -> Guess:
         """Where the other dots are, by the labels there are: nothing with fewer than four.
