@@ -68,7 +68,13 @@ def test_slopes_of_a_moved_camera_are_its_differences() -> None:
 
 @pytest.mark.parametrize(
     "step",
-    [step_of(tilt=0.05), step_of(right=0.4), step_of(pan=3.0, down=20.0), step_of(zoom=2.0), step_of(roll=-10.0)],
+    [
+        step_of(tilt=0.05),
+        pytest.param(step_of(right=0.4), marks=pytest.mark.slow),
+        step_of(pan=3.0, down=20.0),
+        pytest.param(step_of(zoom=2.0), marks=pytest.mark.slow),
+        pytest.param(step_of(roll=-10.0), marks=pytest.mark.slow),
+    ],
     ids=["a little tilt", "a little shift", "knocked", "zoomed", "rolled"],
 )
 def test_a_camera_that_moved_is_named_with_how_far(step: Floats) -> None:
@@ -163,11 +169,11 @@ def test_on_the_command_line_with_a_history(cli: Cli) -> None:
 
 @pytest.mark.slow
 def test_rigs_that_stand_raise_as_many_alarms_as_stated() -> None:
-    """200 trials on ten rigs; benchmarks/check.py has 1000."""
+    """60 trials on five rigs; benchmarks/check.py has more."""
     alarms = 0
-    for seed in range(10):
+    for seed in range(5):
         rig = build_rig("bar6", seed=seed, lens_error=0.5)
         known = simulate(rig, random_positions(rig, 60, np.random.default_rng(seed)), seed=seed)
         calibration = ic.ForwardGP().fit(known)
-        alarms += sum(not ic.check_calibration(calibration, views(rig, 1000 + 20 * seed + k)).holds for k in range(20))
-    assert 2 <= alarms <= 21  # 5 % of 200, with three standard deviations of the binomial and of the rigs
+        alarms += sum(not ic.check_calibration(calibration, views(rig, 1000 + 20 * seed + k)).holds for k in range(12))
+    assert alarms <= 9  # 5 % of 60, and more than three standard deviations
