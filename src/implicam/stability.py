@@ -77,6 +77,13 @@ class KnownPointsTest:
 class CalibrationCheck:
     """Whether a calibration still holds.
 
+    >>> import implicam as ic
+    >>> rig = ic.simulated("bar6", points=60, seed=1)
+    >>> known, later = rig.split(30, seed=0)
+    >>> check = ic.check_calibration(ic.ForwardGP().fit(known), later)
+    >>> check.verdict, check.holds
+    ('stands', True)
+
     Attributes:
         verdict: `stands`, `moved` (the first of `cameras`), `one moved` (of `candidates`), `several moved` or `biased`.
         p_value: That chance alone makes the views disagree as a movement would.
@@ -142,6 +149,12 @@ def describe_movement(moved: CameraMovement, unit: str) -> str:
 
 def check_calibration(calibration: Calibration, data: Dataset, *, level: float = 0.05) -> CalibrationCheck:
     """Check whether a calibration still holds.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("bar6", points=60, seed=1)
+    >>> known, later = rig.split(30, seed=0)
+    >>> ic.check_calibration(ic.ForwardGP().fit(known), later).holds
+    True
 
     Args:
         calibration: Of `forward-gp` or `explicit`.

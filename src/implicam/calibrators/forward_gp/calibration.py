@@ -213,9 +213,10 @@ class ForwardGPCalibration(RigCalibration):
     @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
+        calibrated = self.data.observations.with_cameras(self.camera_names).cameras
         return [
             *describe_point_copies(self.data),
-            *(kind_notes(self.fitted, self.used.cameras) if self.calibrator.lens == AUTO else ()),
+            *(kind_notes(self.fitted, calibrated) if self.calibrator.lens == AUTO else ()),
             *self.diagnosis.notes(),
             *self._label_notes(),
             *self._plane_notes(),
