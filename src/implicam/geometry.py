@@ -124,6 +124,18 @@ def rotation_from_vector(vector: ArrayLike) -> Floats:
     return np.asarray(Rotation.from_rotvec(np.asarray(vector, dtype=np.float64)).as_matrix(), dtype=np.float64)
 
 
+def cross_matrices(a: Floats) -> Floats:
+    """What vectors make of another one by the cross product: `cross_matrices(a) @ v` is a x v.
+
+    Args:
+        a: (n, 3).
+
+    Returns:
+        (n, 3, 3).
+    """
+    return np.asarray(np.cross(a[:, None], np.eye(3)).swapaxes(1, 2), dtype=np.float64)
+
+
 def vector_from_rotation(rotation: ArrayLike) -> Floats:
     """Rotation vectors of rotation matrices.
 

@@ -19,7 +19,7 @@ from implicam.dataset import Floats
 from implicam.derived.joint_positions import joint
 from implicam.derived.quantities import Quantity
 from implicam.errors import NumericalError, UsageError
-from implicam.geometry import rotation_from_vector, vector_from_rotation
+from implicam.geometry import cross_matrices, rotation_from_vector, vector_from_rotation
 from implicam.measurement import Measurement
 
 MAX_STEPS = 100
@@ -326,7 +326,7 @@ def fit_motion(measurement: Measurement, before: Sequence[str | int], after: Seq
         turned = (x[:, :3] - middle) @ rotation.T
         minus = np.broadcast_to(-np.eye(3), (len(x), 3, 3))
         by_x = np.concatenate([np.broadcast_to(-rotation, (len(x), 3, 3)), -minus], axis=2)
-        return Equations(x[:, 3:] - place - turned, np.concatenate([_cross_matrices(turned), minus], axis=2), by_x)
+        return Equations(x[:, 3:] - place - turned, np.concatenate([cross_matrices(turned), minus], axis=2), by_x)
 
     def move(state: tuple[Floats, Floats], step: Floats) -> tuple[Floats, Floats]:
         return rotation_from_vector(step[:3]) @ state[0], state[1] + step[3:]
@@ -405,11 +405,6 @@ def _across(direction: Floats) -> Floats:
 def _tilted(direction: Floats, step: Floats) -> Floats:
     tilted = direction + _across(direction) @ step
     return np.asarray(tilted / np.linalg.norm(tilted), dtype=np.float64)
-
-
-def _cross_matrices(a: Floats) -> Floats:
-    """(n, 3, 3) what each a (n, 3) makes of a vector by the cross product, a x v."""
-    return np.asarray(np.cross(a[:, None], np.eye(3)).swapaxes(1, 2), dtype=np.float64)
 
 
 def _length_with_sd(vector: Floats, cov: Floats) -> tuple[float, float]:

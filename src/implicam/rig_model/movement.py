@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
-from implicam.geometry import Bools, Floats, rotation_from_vector, vector_from_rotation
+from implicam.geometry import Bools, Floats, cross_matrices, rotation_from_vector, vector_from_rotation
 from implicam.gp.linalg import covariance_root
 from implicam.rig_model.camera import CentralCamera
 from implicam.rig_model.camera_model import CameraModel, apply_covariance_root
@@ -141,16 +141,11 @@ def see_moved(
     rows = model.rows(before)
     grown = 1 + motion.zoom
     by_point = grown * slope @ motion.rotation.T
-    by_turn = by_point @ _cross_matrices(off) @ stand.axes
+    by_turn = by_point @ cross_matrices(off) @ stand.axes
     about = uv - stand.middle
     by_step = np.concatenate([by_turn, -by_point @ stand.axes, about[..., None]], axis=2)
     half = np.zeros((len(points), 2, 0)) if root is None else grown * apply_covariance_root(rows, root)
     return MovedViews(stand.middle + grown * about, by_point, by_step, half, grown**2 * rows.rest)
-
-
-def _cross_matrices(a: Floats) -> Floats:
-    """(n, 3, 3) what each a (n, 3) makes of a vector by the cross product, a x v."""
-    return np.asarray(np.cross(a[:, None], np.eye(3)).swapaxes(1, 2), dtype=np.float64)
 
 
 class Equations(NamedTuple):
