@@ -22,6 +22,7 @@ from implicam.derived import joint
 from implicam.errors import DatasetError, UsageError
 from implicam.files import write_text
 from implicam.formatting import decimal_number, number_with_sd
+from implicam.geometry import cross_matrices
 from implicam.rig_model import NUMBERS, Check, Evidence
 
 STANDS, MOVED, ONE_MOVED, SEVERAL, BIASED = "stands", "moved", "one moved", "several moved", "biased"
@@ -31,6 +32,8 @@ NUMBER_NAMES = ("tilt", "pan", "roll", "right", "down", "forward", "zoom")
 along these (length unit), and the zoom (per cent)."""
 MAX_KNOWN_POINTS = 400
 """Known points that are compared; of more, evenly many."""
+MIN_KNOWN_POINTS = 4
+"""To see a shift, a turn and a growth."""
 LOG_COLUMNS = (
     "time", "dataset", "points", "p_value", "verdict", "camera",
     *(name for number in NUMBER_NAMES for name in (number, f"sd_{number}")), "p_value_known",
@@ -62,7 +65,8 @@ class KnownPointsTest:
 
     Attributes:
         points: How many.
-        p_value: That errors as large, all together, are chance; what errors share is taken into account.
+        p_value: That chance alone makes the known points look as shifted, turned and grown; what errors share is taken
+            into account.
         bias: (3,) mean error, in the length unit.
         bias_sd: (3,) what its standard uncertainty is if the calibration holds.
     """
@@ -218,18 +222,23 @@ def _in_units(one: Evidence, names: Sequence[str], scale: float, found: Check) -
 
 
 def _known_points_test(calibration: RigCalibration, data: Dataset) -> KnownPointsTest | None:
+    """A few numbers that a bias shows in, and not all errors together: of many points these would tell a noise that is
+    stated a few per cent too small from chance."""
     measured = calibration.measure(data.observations)
     rows = np.flatnonzero(measured.measured & np.isfinite(data.xyz).all(axis=1))
-    if not len(rows):
+    if len(rows) < MIN_KNOWN_POINTS:
         return None
     rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MAX_KNOWN_POINTS)).astype(int))]
     points = joint(measured, [int(i) for i in rows])
     sd = np.nan_to_num(data.known.sd[rows]) if data.known is not None else np.zeros((len(rows), 3))
     cov = points.cov + np.diag(sd.ravel() ** 2)
-    error = (measured.xyz - data.xyz)[rows].ravel()
-    p = float(chdtrc(len(error), error @ np.linalg.solve(cov, error)))
-    mean = np.tile(np.eye(3), len(rows)) / len(rows)
-    return KnownPointsTest(len(rows), p, mean @ error, np.sqrt(np.diagonal(mean @ cov @ mean.T)))
+    error, off = (measured.xyz - data.xyz)[rows].ravel(), points.xyz - points.xyz.mean(axis=0)
+    # what a world that shifted, turned or grew would do to them: (3 n, 7)
+    pattern = np.concatenate([np.tile(np.eye(3), (len(rows), 1, 1)), cross_matrices(off), off[:, :, None]], axis=2)
+    fitted = np.linalg.pinv(pattern.reshape(len(error), -1))
+    found, of_found = fitted @ error, fitted @ cov @ fitted.T
+    p = float(chdtrc(len(found), found @ np.linalg.solve(of_found, found)))
+    return KnownPointsTest(len(rows), p, found[:3], np.sqrt(np.diagonal(of_found)[:3]))
 
 
 def append_to_log(path: Path, check: CalibrationCheck, name: str, *, now: datetime | None = None) -> None:
