@@ -582,7 +582,7 @@ def test_a_visit(served: Any, folder: Path, scenes: Any, chromium: Any, phone: b
         page.get_by_role("button", name="Finish").click()
         page.get_by_text("Closed. Every label is saved").wait_for(timeout=10_000)
         browser.close()
-    out, _ = process.communicate(timeout=20)
+    out, _ = process.communicate(timeout=90)  # a machine that is busy takes its time
     assert process.returncode == 0
     assert "cam1: 6 labels" in out
     assert f"next: implicam detect {folder} --target dots" in out
@@ -601,7 +601,7 @@ def test_a_kill_loses_nothing_and_ctrl_c_ends_it(served: Any, folder: Path, scen
         {"camera": "cam1", "shot": "", "point": names[0], "u": uv["cam1"][0][0], "v": uv["cam1"][0][1], "within": 4},
     )
     process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=20)
+    out, _ = process.communicate(timeout=90)  # a machine that is busy takes its time
     assert process.returncode == 0
     assert "cam1: 1 label, 5 more needed" in out
     assert list(Labelling.open(folder).marks(VIEW)) == [names[0]]
