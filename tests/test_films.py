@@ -366,20 +366,20 @@ def test_pictures_that_were_lost_without_a_trace_are_noticed(lost: int) -> None:
 def test_the_stated_uncertainty_of_offsets_holds(cameras: tuple[str, int, int]) -> None:
     rig, one, other = cameras
     z = []
-    for seed in range(40):
+    for seed in range(16):
         offset = float(np.random.default_rng(seed + 500).uniform(-1, 1))
         first = track(0, wander(seed + 10), rig, seed=seed, rate=60, number=one)
         second = track(1, wander(seed + 10), rig, seed=seed, offset=offset, number=other)
         found = find_offset(first, second)
         z.append(error_of(found, offset) / found.sd)
     inside = int(np.sum(np.abs(z) < 1.96))
-    assert inside >= 34, z  # binomial(40, 0.95): fewer in 1.4 % of such tests
-    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
+    assert inside >= 13, z  # binomial(16, 0.95): fewer in 0.7 % of such tests
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.5
 
 
 @pytest.mark.slow
 def test_movements_of_two_targets_are_not_taken_for_one() -> None:
-    for seed in range(8):
+    for seed in range(3):
         for rig in ("stereo", "bar6"):
             first, second = track(0, wander(seed + 10), rig, seed=seed), track(1, wander(seed + 300), rig, seed=seed)
             with pytest.raises(OffsetError):
