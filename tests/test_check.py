@@ -18,7 +18,7 @@ from implicam.dataset import Dataset, Floats
 from implicam.errors import DatasetError, UsageError
 from implicam.geometry import Pose
 from implicam.rig_model.movement import Motion, Stand, see_moved
-from implicam.simulate import Rig, build_rig, random_positions, simulate
+from implicam.simulate import Rig, Target, build_rig, random_positions, simulate
 from implicam.stability import NUMBER_NAMES, append_to_log
 
 NOTHING = np.zeros(7)
@@ -129,6 +129,31 @@ def test_all_cameras_together_are_seen_by_known_points_alone() -> None:
     unknown = ic.check_calibration(calibration, replace(shifted, known=None))
     assert unknown.verdict == "stands"
     assert "moved together looks the same" in unknown.sentences()[1]
+
+
+@pytest.mark.parametrize("along", [50.0, 0.0], ids=["a line", "one place"])
+def test_known_points_that_fill_no_volume_show_no_bias_that_is_not_there(along: float) -> None:
+    """A turn about their line moves none of them, and where they stand in one place no growth does."""
+    rig, calibration = rig_and_calibration()
+    names = np.array([f"q{i}" for i in range(12)])
+    places = calibration.data.xyz.mean(axis=0) + along * np.outer(np.linspace(-1, 1, 12), [1, 0.2, 0.1])
+    p_values = []
+    for seed in range(6):
+        data = simulate(rig, Target("line", names, names, places), seed=seed)
+        known = ic.check_calibration(calibration, data).known
+        assert known is not None
+        p_values.append(known.p_value)
+    assert min(p_values) > 0.05 / 6 / 5
+
+
+def test_cameras_of_which_nothing_can_be_said_are_named() -> None:
+    rig, calibration = rig_and_calibration()
+    data = views(rig, 14)
+    uv = data.observations.uv.copy()
+    uv[:, 4] = np.nan
+    found = ic.check_calibration(calibration, replace(data, observations=replace(data.observations, uv=uv)))
+    assert found.not_judged == ("cam5",)
+    assert any("Of cam5 nothing can be said" in sentence for sentence in found.sentences())
 
 
 def test_what_cannot_be_checked_is_refused() -> None:

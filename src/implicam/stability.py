@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import orth
 from scipy.special import chdtrc
 
 from implicam.calibrators import Calibration
@@ -34,6 +35,8 @@ MAX_KNOWN_POINTS = 400
 """Known points that are compared; of more, evenly many."""
 MIN_KNOWN_POINTS = 4
 """To see a shift, a turn and a growth."""
+MIN_RELATIVE_SPREAD = 1e-6
+"""Of known points across a line, over their extent: with less a turn about it moves none of them."""
 LOG_COLUMNS = (
     "time", "dataset", "points", "p_value", "verdict", "camera",
     *(name for number in NUMBER_NAMES for name in (number, f"sd_{number}")), "p_value_known",
@@ -97,6 +100,7 @@ class CalibrationCheck:
         points: How many points were used.
         noise_ratio: Sd of what is left, whatever moved, over what the views state.
         length_unit: Of shifts.
+        not_judged: Names of cameras that saw too little to say anything of them.
     """
 
     verdict: str
@@ -107,6 +111,7 @@ class CalibrationCheck:
     points: int
     noise_ratio: float
     length_unit: str
+    not_judged: tuple[str, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -132,6 +137,8 @@ class CalibrationCheck:
             found.append(f"{self.known.points} known points: mean error {bias} {unit}, p = {p}.")
         else:
             found.append(UNSEEN)
+        if self.not_judged:
+            found.append(f"Of {', '.join(self.not_judged)} nothing can be said: too few of the points were seen there.")
         return found
 
 
@@ -190,6 +197,7 @@ def check_calibration(calibration: Calibration, data: Dataset, *, level: float =
     names, scale = calibration.map.camera_names, calibration.map.frame.scale
     cameras = tuple(_in_units(one, names, scale, found) for one in found.evidence)
     candidates = tuple(names[c] for c in found.candidates)
+    judged = {one.camera for one in cameras}
     return CalibrationCheck(
         _verdict(found, known, share),
         found.p_value,
@@ -199,6 +207,7 @@ def check_calibration(calibration: Calibration, data: Dataset, *, level: float =
         found.points,
         found.noise_ratio,
         calibration.data.length_unit,
+        tuple(name for name in names if name not in judged),
     )
 
 
@@ -232,13 +241,15 @@ def _known_points_test(calibration: RigCalibration, data: Dataset) -> KnownPoint
     points = joint(measured, [int(i) for i in rows])
     sd = np.nan_to_num(data.known.sd[rows]) if data.known is not None else np.zeros((len(rows), 3))
     cov = points.cov + np.diag(sd.ravel() ** 2)
-    error, off = (measured.xyz - data.xyz)[rows].ravel(), points.xyz - points.xyz.mean(axis=0)
-    # what a world that shifted, turned or grew would do to them: (3 n, 7)
+    error, off = (measured.xyz - data.xyz)[rows].ravel(), data.xyz[rows] - data.xyz[rows].mean(axis=0)
+    off = off / max(np.abs(off).max(), np.finfo(float).tiny)
+    # what a world that shifted, turned or grew would do to them, (3 n, 7): fewer ways where they lie on a line
     pattern = np.concatenate([np.tile(np.eye(3), (len(rows), 1, 1)), cross_matrices(off), off[:, :, None]], axis=2)
-    fitted = np.linalg.pinv(pattern.reshape(len(error), -1))
-    found, of_found = fitted @ error, fitted @ cov @ fitted.T
-    p = float(chdtrc(len(found), found @ np.linalg.solve(of_found, found)))
-    return KnownPointsTest(len(rows), p, found[:3], np.sqrt(np.diagonal(of_found)[:3]))
+    ways = orth(pattern.reshape(len(error), -1), rcond=MIN_RELATIVE_SPREAD)
+    found = ways.T @ error
+    p = float(chdtrc(len(found), found @ np.linalg.solve(ways.T @ cov @ ways, found)))
+    mean = np.tile(np.eye(3), len(rows)) / len(rows)
+    return KnownPointsTest(len(rows), p, mean @ error, np.sqrt(np.diagonal(mean @ cov @ mean.T)))
 
 
 def append_to_log(path: Path, check: CalibrationCheck, name: str, *, now: datetime | None = None) -> None:

@@ -90,6 +90,7 @@ def _as_json(found: CalibrationCheck) -> dict[str, Any]:
     }  # fmt: skip
     return {
         "verdict": found.verdict, "holds": found.holds, "p_value": found.p_value, "candidates": list(found.candidates),
+        "not_judged": list(found.not_judged),
         "cameras": cameras, "known": known, "points": found.points, "noise_ratio": found.noise_ratio,
         "length_unit": found.length_unit, "said": found.sentences(),
     }  # fmt: skip

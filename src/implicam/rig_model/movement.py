@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import orth, solve_triangular
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
@@ -51,6 +51,8 @@ MIN_FREEDOM_FOR_NOISE = 30
 """Degrees of freedom from which the noise is learned from what is left."""
 SURE, AFTER_LEVEL = 0.95, 0.01
 """Probability from which one camera is named, and that of another movement besides below which none is."""
+MIN_RELATIVE_COLUMN = 1e-7
+"""Of what a number of a movement does besides the others: with less it does nothing of its own."""
 MAX_NOTICED_SDS, NOTICE_DRAWS = 30.0, 500
 DRAWS = 4000
 
@@ -343,9 +345,10 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
         rows = np.flatnonzero(alive)
         if not agree[:, camera].any():
             return None
+        part = rig.select(rows)
         for _ in range(MAX_STEPS):
             motions[camera] = motion
-            found = rig.select(rows).equations(motions, x[rows], agree[rows], unknowns=False)
+            found = part.equations(motions, x[rows], agree[rows], unknowns=False)
             X, number = found.by_step[:, mine], stand.numbers(motion)
             information = X.T @ X + np.diag(prior)
             step = np.linalg.solve(information, X.T @ found.left - prior * number)
@@ -356,7 +359,7 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
             if step @ information @ step < CONVERGED_STEP_SDS**2:
                 break
         motions[camera] = motion
-        found = rig.select(rows).equations(motions, x[rows], agree[rows])
+        found = part.equations(motions, x[rows], agree[rows])
         wrong = rows[_contradicting(found)]
         wrong = wrong[agree[wrong, camera] & (agree[wrong].sum(axis=1) >= 3)]
         if not len(wrong):
@@ -367,7 +370,7 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
     information = X.T @ X
     cov = np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
     last = np.asarray(cov @ (X.T @ there.left - prior * number), dtype=np.float64)
-    here = _unmoved(rig.select(rows), x[rows], agree[rows])
+    here = _unmoved(part, x[rows], agree[rows])
     if here is None:
         return None
     at = stand.moved(motion, last)
@@ -590,10 +593,9 @@ def _log_shrink(part: Floats) -> float:
 
 
 def _basis(columns: Floats) -> Floats:
-    """(N, k) orthonormal, of what columns (N, m) span."""
+    """(N, k) orthonormal, of what columns (N, m) of different units span."""
     sizes = np.linalg.norm(columns, axis=0)
-    U, singular, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
-    return U[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)]
+    return np.asarray(orth(columns / np.where(sizes > 0, sizes, 1.0), rcond=MIN_RELATIVE_COLUMN), dtype=np.float64)
 
 
 def _choose(seen: Bools, rng: np.random.Generator) -> NDArray[np.int64]:
