@@ -79,6 +79,12 @@ Cameras = Annotated[
 Without = Annotated[
     str | None, typer.Option("--without", metavar="LIST", help="Leave these cameras out, separated by commas.")
 ]
+Pictures = Annotated[
+    str | None, typer.Option("--pictures", metavar="FOLDER", help="Where they are in DATASET (default images).")
+]
+Pattern = Annotated[
+    str | None, typer.Option(metavar="PATTERN", help='How their names tell camera and shot: "{shot}_{camera}".')
+]
 LeaveOut = Annotated[
     str | None, typer.Option("--leave-out", metavar="shot", help="Hold each shot (a board, a plane) out in turn.")
 ]

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from implicam.cli import show
-from implicam.cli.app import Json, command, command_line
+from implicam.cli.app import Json, Pattern, Pictures, command, command_line
 from implicam.cli.options import OptionsOfParts
 from implicam.detect import TARGETS, DetectionRun, call, detector_from_options, options_of
 from implicam.detect.call import must_be_dataset_folder
@@ -26,12 +26,8 @@ def _detect(
     target: Annotated[
         str | None, typer.Option(metavar="NAME", help=f"{', '.join(TARGETS)} (default: what dataset.toml says).")
     ] = None,
-    pictures: Annotated[
-        str | None, typer.Option("--pictures", metavar="FOLDER", help="Where they are in DATASET (default images).")
-    ] = None,
-    pattern: Annotated[
-        str | None, typer.Option(metavar="PATTERN", help='How their names tell camera and shot: "{shot}_{camera}".')
-    ] = None,
+    pictures: Pictures = None,
+    pattern: Pattern = None,
     films: Annotated[
         str | None,
         typer.Option(

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from implicam.cli import show
-from implicam.cli.app import Json, command
+from implicam.cli.app import Json, Pattern, Pictures, command
 from implicam.detect.labelling import Labelling
 from implicam.detect.labels import LABELS_FILE, MIN_LABELS
 
@@ -25,12 +25,8 @@ def label_command(
     labels: Annotated[
         Path | None, typer.Option(metavar="FILE", help=f"What is written (default DATASET/{LABELS_FILE}).")
     ] = None,
-    pictures: Annotated[
-        str | None, typer.Option("--pictures", metavar="FOLDER", help="Where they are in DATASET (default images).")
-    ] = None,
-    pattern: Annotated[
-        str | None, typer.Option(metavar="PATTERN", help='How their names tell camera and shot: "{shot}_{camera}".')
-    ] = None,
+    pictures: Pictures = None,
+    pattern: Pattern = None,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free.", rich_help_panel=_PAGE)] = 8091,
     token: Annotated[
         str | None, typer.Option("--token", help="What the page asks for (default: a new one).", rich_help_panel=_PAGE)

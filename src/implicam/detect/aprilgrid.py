@@ -16,17 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
-from implicam.dataset.boards import aprilgrid_corners, corner_name
-from implicam.detect.board import (
-    MAX_SEARCH_PIXELS,
-    explain_missing,
-    explain_unusable,
-    hull_of,
-    parse_board_size,
-)
-from implicam.detect.corner_noise import agreeing, true_sd
+from implicam.dataset.boards import aprilgrid_corners
+from implicam.detect.board import MAX_SEARCH_PIXELS, explain_unusable, parse_board_size
 from implicam.detect.dictionaries import check_dictionary, dictionary_of
-from implicam.detect.marked import MIN_CORNERS, fit_marked_corners
+from implicam.detect.marked import fit_marked_corners, report_corners
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import resize, to_original_pixels
 from implicam.errors import UsageError
@@ -164,22 +157,11 @@ class AprilGrid(DetectorBase):
         rows, columns = np.divmod(np.arange(len(nodes)), 2 * self.columns)
         pitch = (1 + self.spacing / self.tag) / unit
         corners, there = fit_marked_corners(picture, nodes, start, rows + columns, reach=1.5 * pitch)
-        half = max(np.ptp(nodes, axis=0)) / 2
-        number = np.flatnonzero(there)
-        if len(number) >= MIN_CORNERS:
-            number = number[agreeing(nodes[number], corners[number], float(half))]
-        if len(number) < MIN_CORNERS:
-            return nothing(
-                f"{len(seen.ids)} tags of the board were read, and {len(number)} corners of tags are clear: too few. "
-                "Show more of the board, sharper or nearer."
-            )
-        return Detected(
-            tuple(corner_name(view.shot, int(j)) for j in number),
-            corners.uv[number],
-            true_sd(nodes[number], corners[number], float(half)),
-            explain_missing(len(number), len(nodes)),
-            (hull_of(corners.uv[number]),),
-        )
+        return report_corners(
+            corners, there, nodes, float(max(np.ptp(nodes, axis=0)) / 2), view.shot,
+            lambda count: f"{len(seen.ids)} tags of the board were read, and {count} corners of tags are clear: too "
+            "few. Show more of the board, sharper or nearer.",
+        )  # fmt: skip
 
     def _nodes(self, upwards: bool) -> Floats:
         """(n, 2) row, downwards, and column of the corners by their numbers, in edges of a tag."""

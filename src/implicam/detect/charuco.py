@@ -16,18 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
-from implicam.dataset.boards import corner_name
-from implicam.detect.board import (
-    MAX_SEARCH_PIXELS,
-    explain_missing,
-    explain_unusable,
-    hull_of,
-    parse_board_size,
-)
-from implicam.detect.corner_noise import agreeing, true_sd
+from implicam.detect.board import MAX_SEARCH_PIXELS, explain_unusable, parse_board_size
 from implicam.detect.dictionaries import check_dictionary, dictionary_of
 from implicam.detect.grid import predict_places
-from implicam.detect.marked import MIN_CORNERS, fit_marked_corners, in_squares
+from implicam.detect.marked import MIN_CORNERS, fit_marked_corners, in_squares, report_corners
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import resize, to_original_pixels
 from implicam.errors import UsageError
@@ -141,21 +133,11 @@ class Charuco(DetectorBase):
         bare = (1 - self.marker / self.square) / 2
         parity = nodes.sum(axis=1).astype(np.intp)
         corners, there = fit_marked_corners(picture, nodes, start, parity, bare=bare, rounds=self.rows + self.columns)
-        half, number = max(self.rows, self.columns) / 2, np.flatnonzero(there)
-        if len(number) >= MIN_CORNERS:
-            number = number[agreeing(nodes[number], corners[number], half)]
-        if len(number) < MIN_CORNERS:
-            return nothing(
-                f"{len(seen.ids)} markers of the board were read, and {len(number)} corners between them are clear: "
-                "too few. Show more of the board, sharper or nearer."
-            )
-        return Detected(
-            tuple(corner_name(view.shot, int(j)) for j in number),
-            corners.uv[number],
-            true_sd(nodes[number], corners[number], half),
-            explain_missing(len(number), self._total),
-            (hull_of(corners.uv[number]),),
-        )
+        return report_corners(
+            corners, there, nodes, max(self.rows, self.columns) / 2, view.shot,
+            lambda count: f"{len(seen.ids)} markers of the board were read, and {count} corners between them are "
+            "clear: too few. Show more of the board, sharper or nearer.",
+        )  # fmt: skip
 
     @property
     def _total(self) -> int:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
+from implicam.dataset.boards import corner_name
+from implicam.detect.board import explain_missing, hull_of
+from implicam.detect.corner_noise import agreeing, true_sd
 from implicam.detect.corners import Bools, Corners, fit_corners
 from implicam.detect.grid import MAX_ASTRAY_SQUARES, MAX_RESIDUAL_HEIGHTS, Places, predict_places
+from implicam.detect.model import Detected, nothing
 from implicam.images import Grey
 
 MIN_CORNERS = 6
@@ -54,6 +60,36 @@ def fit_marked_corners(
         if (there == before).all():
             break
     return corners, there
+
+
+def report_corners(
+    corners: Corners, there: Bools, nodes: Floats, half_length: float, shot: str, too_few: Callable[[int], str]
+) -> Detected:
+    """The corners of a board with their true uncertainty, without those that the others contradict.
+
+    Args:
+        corners: (n,) all corners of the board.
+        there: (n,) which of them were found.
+        nodes: (n, 2) row and column of each, in the unit of the length.
+        half_length: Half the longer side of the board.
+        shot: Corners are named after it.
+        too_few: Why nothing is given where so many are too few.
+
+    Returns:
+        The corners in the order of their numbers, or the reason why they cannot be given.
+    """
+    number = np.flatnonzero(there)
+    if len(number) >= MIN_CORNERS:
+        number = number[agreeing(nodes[number], corners[number], half_length)]
+    if len(number) < MIN_CORNERS:
+        return nothing(too_few(len(number)))
+    return Detected(
+        tuple(corner_name(shot, int(j)) for j in number),
+        corners.uv[number],
+        true_sd(nodes[number], corners[number], half_length),
+        explain_missing(len(number), len(nodes)),
+        (hull_of(corners.uv[number]),),
+    )
 
 
 def in_squares(off: Floats, places: Places) -> Floats:
