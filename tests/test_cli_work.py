@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 import tomllib
@@ -395,6 +396,9 @@ def test_info_shows_the_readable_part(made: Path, cli: Cli) -> None:
     ran = cli("info", made / "rig.implicam")
     assert 'method = "forward-gp"' in ran.out
     assert "known_points = 40" in ran.out
+    sha256 = hashlib.sha256((made / "rig.implicam").read_bytes()).hexdigest()
+    assert ran.out.startswith(f'sha256 = "{sha256}"')
+    assert cli("info", made / "rig.implicam", "--json").json["sha256"] == sha256
     damaged = Path("damaged.implicam")
     damaged.write_bytes((made / "rig.implicam").read_bytes()[:-100])
     assert cli("info", damaged).code == 1
@@ -406,6 +410,7 @@ def test_report_of_a_calibration_alone_and_with_points(made: Path, cli: Cli) -> 
     assert ran.code == 0
     assert "report.html: 10-fold cross-validation" in ran.out
     assert "10-fold" in Path("report.html").read_text()
+    assert hashlib.sha256((made / "rig.implicam").read_bytes()).hexdigest() in Path("report.html").read_text()
     assert cli("report", made / "rig.implicam", made / "rig" / "check", "-o", "b.html").code == 0
     assert "30 points not used in the fit" in Path("b.html").read_text()
 

@@ -12,6 +12,7 @@ with the cure; an older one is converted in `_UPGRADES`.
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import platform
 import zipfile
@@ -106,7 +107,13 @@ def save(calibration: Savable, path: str | Path, verdict: Mapping[str, Any] | No
     Raises:
         ImplicamError: The file cannot be written.
     """
-    path = Path(path)
+    members = _members_of(calibration, verdict)
+    with replacing(Path(path)) as temporary:
+        write_zip(temporary, members)
+
+
+def _members_of(calibration: Savable, verdict: Mapping[str, Any] | None) -> dict[str, bytes]:
+    """What a calibration file holds: name -> content."""
     method_table, method_arrays = calibration.state()
     arrays = {_DATA + name: array for name, array in arrays_from_dataset(calibration.data).items()}
     arrays |= {_METHOD + name: array for name, array in method_arrays.items()}
@@ -118,8 +125,31 @@ def save(calibration: Savable, path: str | Path, verdict: Mapping[str, Any] | No
         "arrays_sha256": hashlib.sha256(content).hexdigest(),
         "options": method_table,
     }
-    with replacing(path) as temporary:
-        write_zip(temporary, {TOML: toml_text(table).encode(), ARRAYS: content})
+    return {TOML: toml_text(table).encode(), ARRAYS: content}
+
+
+def checksum(calibration: Savable | str | Path) -> str:
+    """The SHA-256 of a calibration file, as `sha256sum` prints it: the same data give the same on one machine.
+
+    Args:
+        calibration: The file; or a calibration, for that of the file which `calibration.save` writes.
+
+    Returns:
+        64 hexadecimal digits.
+
+    Raises:
+        CalibrationFileError: The file cannot be read.
+    """
+    if isinstance(calibration, str | Path):
+        try:
+            return hashlib.sha256(Path(calibration).read_bytes()).hexdigest()
+        except OSError as error:
+            raise CalibrationFileError(
+                f"{calibration} cannot be read.", why=str(error), fix="check its name and its permissions"
+            ) from error
+    content = io.BytesIO()
+    write_zip(content, _members_of(calibration, None))
+    return hashlib.sha256(content.getvalue()).hexdigest()
 
 
 def _description(calibration: Savable) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from implicam import calibration_file
 from implicam.calibrators import Calibration, ForwardGP, ForwardGPCalibration, InverseGP
 from implicam.compare import Trial, trial_from_evaluation
 from implicam.dataset import Dataset, folder_files, write_dataset
@@ -130,7 +131,8 @@ def run(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Demo:
     )  # fmt: skip
     calibration.save(demo.calibration)
     evaluation.measurement.write_csv(demo.measured)
-    write_report(demo.report, report_of(evaluation, "implicam demo: a simulated six-camera rig"))
+    checksum = calibration_file.checksum(demo.calibration)
+    write_report(demo.report, report_of(evaluation, "implicam demo: a simulated six-camera rig", checksum))
     return demo
 
 

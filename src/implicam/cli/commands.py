@@ -299,7 +299,7 @@ def _evaluate(
             else:
                 evaluation = leave_out_shots(fit, data, progress=progress)
     if report is not None:
-        _write_report(evaluation, report)
+        _write_report(evaluation, report, "" if dataset is None else calibration_file.checksum(file))
     _tell_evaluation(evaluation, report, json)
 
 
@@ -367,10 +367,10 @@ def _tell_evaluation(evaluation: Evaluation, report: Path | None, json: bool) ->
     show.notes(evaluation.notes)
 
 
-def _write_report(evaluation: Evaluation, path: Path) -> None:
+def _write_report(evaluation: Evaluation, path: Path, checksum: str) -> None:
     from implicam.report.call import report
 
-    report(evaluation, path)
+    report(evaluation, path, checksum=checksum)
 
 
 @command("report")
@@ -391,7 +391,8 @@ def report_command(
 
     with show.progress(json) as progress:
         data = None if dataset is None else read(dataset, table)
-        evaluation = report(fitted, output, data=data, progress=progress)
+        sha256 = calibration_file.checksum(calibration)
+        evaluation = report(fitted, output, data=data, checksum=sha256, progress=progress)
     if json:
         show.emit_json({"report": str(output), "how": evaluation.how})
     else:
@@ -443,7 +444,7 @@ def info_command(
     if settings:
         show.emit_json(settings_table(loaded)) if json else show.line(settings_text(loaded))
         return
-    table = calibration_file.describe(calibration)
+    table = {"sha256": calibration_file.checksum(calibration), **calibration_file.describe(calibration)}
     cameras = loaded.cameras.values() if isinstance(loaded, RigCalibration) else ()
     table["fitted_cameras"] = [camera.as_table() for camera in cameras]
     if json:

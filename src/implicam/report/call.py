@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from implicam import calibration_file
 from implicam.calibrators import Calibration
 from implicam.dataset import Dataset
 from implicam.evaluation import Evaluation, cross_validate, evaluate
@@ -22,6 +23,7 @@ def report(
     *,
     data: Dataset | None = None,
     title: str = "",
+    checksum: str = "",
     seed: int = 0,
     progress: Progress = silent,
 ) -> Evaluation:
@@ -34,6 +36,7 @@ def report(
         path: The page to write; it is replaced.
         data: Known points to judge a calibration by; None for its own, by 10-fold cross-validation.
         title: Of the page.
+        checksum: The SHA-256 of the calibration file, for the page; of a calibration it is found out.
         seed: Of the folds.
         progress: Told how far it is.
 
@@ -51,6 +54,8 @@ def report(
         evaluation = evaluate(what, data)
     else:
         evaluation = cross_validate(what.refit, what.data, min(FOLDS, len(what.data)), seed=seed, progress=progress)
+    if not (checksum or isinstance(what, Evaluation)):
+        checksum = calibration_file.checksum(what)
     title = title or f"{evaluation.data.name}, measured with {evaluation.method}"
-    write_report(path, report_of(evaluation, title))
+    write_report(path, report_of(evaluation, title, checksum))
     return evaluation

@@ -90,12 +90,13 @@ class ReportData:
         return [(str(self.measurement.points[i]), reason) for i, reason in reasons]
 
 
-def report_of(evaluation: Evaluation, title: str) -> ReportData:
+def report_of(evaluation: Evaluation, title: str, checksum: str = "") -> ReportData:
     """What a report says of an evaluation.
 
     Args:
         evaluation: As `evaluate` or `cross_validate` gives it.
         title: Of the page.
+        checksum: The SHA-256 of the calibration file; empty where there is none.
     """
     data = evaluation.data
     facts = (
@@ -105,6 +106,7 @@ def report_of(evaluation: Evaluation, title: str) -> ReportData:
         ("Known points", str(len(evaluation.known_xyz))),
         ("Judged on", evaluation.how),
         ("Length unit", data.length_unit),
+        *([("Calibration file, SHA-256", checksum)] if checksum else []),
     )
     return ReportData(
         title,

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from implicam import calibration_file
 from implicam.active import Loop, PredictedCovariance, Step, Target
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
@@ -312,9 +313,8 @@ class SessionController:
             words = f"{self.loop.points} points. Saved: {path}"
             try:
                 if len(calibration.data) >= MIN_REPORTED_POINTS:
-                    write_report(
-                        report, report_of(_evaluate(calibration), f"{self.session.name}: a guided calibration")
-                    )
+                    title = f"{self.session.name}: a guided calibration"
+                    write_report(report, report_of(_evaluate(calibration), title, calibration_file.checksum(path)))
                     words += f" and {report}"
             except ImplicamError as error:
                 words += f". No report: {error.what}"
