@@ -62,8 +62,8 @@ class Folding(KannalaBrandt):
     """With strong distortion it answers beyond its fold, with another point's pixels."""
 
     @cached_property
-    def _critical_angle(self) -> float:
-        return super()._critical_angle if self.k1 > -0.2 else 3.0
+    def critical_angle(self) -> float:
+        return super().critical_angle if self.k1 > -0.2 else 3.0
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ class Blind(KannalaBrandt):
     """With strong distortion it sees nothing, which is an answer."""
 
     @cached_property
-    def _critical_angle(self) -> float:
-        return super()._critical_angle if self.k1 > -0.2 else 0.0
+    def critical_angle(self) -> float:
+        return super().critical_angle if self.k1 > -0.2 else 0.0
 
 
 def test_a_lens_may_see_nothing_where_its_parameters_are_past_the_usual() -> None:

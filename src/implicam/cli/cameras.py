@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from implicam.calibration_file import checksum
 from implicam.calibrators import Calibration, load_calibration
 from implicam.calibrators.explicit import calibration_of, rig_of
 from implicam.calibrators.undistortion import PinholeView, pinhole_maps
@@ -14,11 +15,13 @@ from implicam.cli import show
 from implicam.cli.app import Json, command, must_be_calibration, must_be_folder, must_not_replace
 from implicam.cli.options import Options, OptionsOfParts, options_of_fields
 from implicam.dataset.table_options import TableOptions
+from implicam.deploy import write_onnx
 from implicam.errors import UsageError, did_you_mean
 from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, export_cameras, import_cameras
 from implicam.exchange.pixel_maps import MAPS_FORMAT, write_maps
 
-NAMES = (*FORMATS, MAPS_FORMAT)
+ONNX_FORMAT = "onnx"
+NAMES = (*FORMATS, MAPS_FORMAT, ONNX_FORMAT)
 
 
 def _map_options() -> Options:
@@ -26,7 +29,7 @@ def _map_options() -> Options:
 
 
 def _export(
-    calibration: Annotated[Path, typer.Argument(help="A calibration by explicit, or by forward-gp.")],
+    calibration: Annotated[Path, typer.Argument(help="A calibration; of onnx also by inverse-gp.")],
     to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(NAMES)}.")],
     output: Annotated[
         Path,
@@ -35,10 +38,10 @@ def _export(
     json: Json = False,
     **options: Any,
 ) -> None:
-    """Write the cameras for another program: lenses and places, as far as its format holds them; or pixel maps that
-    make pinholes of them, with the sd of the maps."""
+    """Write the cameras for another program: lenses and places, as far as its format holds them; pixel maps that make
+    pinholes of them, with the sd of the maps; or all that was learned, as a graph of ONNX."""
     must_not_replace(output, calibration)
-    if to not in (*FORMATS, MAPS_FORMAT):
+    if to not in NAMES:
         raise UsageError(
             f"there is no format {to!r}{did_you_mean(to, NAMES)}.", fix=f"choose one of {', '.join(NAMES)}"
         )
@@ -50,6 +53,10 @@ def _export(
         raise UsageError(
             f"--{min(given).replace('_', '-')} is an option of {MAPS_FORMAT}, and {to} has none.", fix="leave it out"
         )
+    if to == ONNX_FORMAT:
+        notes = write_onnx(load_calibration(calibration), output, checksum(calibration))
+        _tell(to, output, "a graph of ONNX, float64", notes, json)
+        return
     rig, lost = rig_of(load_calibration(calibration))
     notes = [*lost, *export_cameras(rig, to, output)]
     if json:
@@ -60,6 +67,14 @@ def _export(
 
 
 export_command = command("export")(OptionsOfParts(_export, "output", _map_options))
+
+
+def _tell(to: str, output: Path, what: str, notes: list[str], json: bool) -> None:
+    if json:
+        show.emit_json({"format": to, "file": str(output), "notes": notes})
+        return
+    show.line(f"{output}: {what}")
+    show.notes(notes)
 
 
 def _with_size(given: dict[str, Any]) -> dict[str, Any]:

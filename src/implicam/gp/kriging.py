@@ -348,19 +348,30 @@ class Kriging:
     def _by_hyperparameters(self, X: Floats, H: Floats) -> Floats:
         """(k, d + 1, m) derivatives of the mean by [log lengthscale, log rho]: `dk a - (k P + ...) dA a`."""
         own, new = self.X / self.kernel.lengthscale, X / self.kernel.lengthscale
-        shape = SHAPES[self.kernel.shape]
+        d, m = own.shape[1], self.Y.shape[1]
+        back, coefficients = self.constants_by_hyperparameters()
+        correlation, slope = SHAPES[self.kernel.shape](squared_distances(new, own))
+        found = -(correlation @ back + H @ coefficients).reshape(len(X), d + 1, m)
+        found[:, :d] += _weighted_squares(slope, new, own, self.a)
+        return np.asarray(found)
+
+    def constants_by_hyperparameters(self) -> tuple[Floats, Floats]:
+        """What the derivatives of the mean by [log lengthscale, log rho] have in common at all places.
+
+        Returns:
+            (n, (d + 1) m) and (p, (d + 1) m): minus the correlations with the known inputs times the first, minus the
+            functions of the mean times the second, is what the known outputs answer to a change.
+        """
+        own = self.X / self.kernel.lengthscale
         (n, d), m = own.shape, self.Y.shape[1]
         among = np.empty((n, d + 1, m))
-        among[:, :d] = _weighted_squares(shape(squared_distances(own, own))[1], own, own, self.a)
+        among[:, :d] = _weighted_squares(SHAPES[self.kernel.shape](squared_distances(own, own))[1], own, own, self.a)
         among[:, d] = self.noise_variance * self.a
         flat = among.reshape(n, -1)
         whiteH, white = solve_lower(self.L, self.H), solve_lower(self.L, flat)
         coefficients = np.linalg.solve(self.G.T, solve_lower(self.G, whiteH.T @ white))
         back = np.linalg.solve(self.L.T, white - whiteH @ coefficients)
-        correlation, slope = shape(squared_distances(new, own))
-        found = -(correlation @ back + H @ coefficients).reshape(len(X), d + 1, m)
-        found[:, :d] += _weighted_squares(slope, new, own, self.a)
-        return np.asarray(found)
+        return np.asarray(back), np.asarray(coefficients)
 
     def leave_one_out(self) -> tuple[Floats, Floats]:
         """Each output predicted from all others: `(P Y)_i / P_ii` and `1 / P_ii`.

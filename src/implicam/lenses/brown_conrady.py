@@ -107,7 +107,7 @@ class BrownConrady:
         radius = np.hypot(*distorted.T)
         # Decentring pushes some pixels beyond the radial polynomial's reach: start them just inside its fold.
         within = np.minimum(radius, 0.999 * self._reach)
-        undistorted = invert_odd_polynomial(within, self._radial, self._critical_radius)
+        undistorted = invert_odd_polynomial(within, self._radial, self.critical_radius)
         xy = distorted * divide(undistorted, radius, 1.0)[:, None]
         for _ in range(20):  # decentring is small: Newton's method from the radial answer
             xy = xy - solve_2x2(self._distort_slope(xy), self._distort(xy) - distorted)
@@ -165,13 +165,14 @@ class BrownConrady:
         return self.k1, self.k2, self.k3
 
     @cached_property
-    def _critical_radius(self) -> float:
+    def critical_radius(self) -> float:
+        """Tangent of the angle to the axis up to which the radial distortion grows; infinite where it always does."""
         return first_turning_point(self._radial)
 
     @cached_property
     def _reach(self) -> float:
         """The largest radius in the image plane, without decentring."""
-        turn = self._critical_radius
+        turn = self.critical_radius
         return float(odd_polynomial(np.array(turn), self._radial)) if np.isfinite(turn) else turn
 
     def _plane_from_point(self, points: Floats) -> tuple[Floats, Bools]:
@@ -179,7 +180,7 @@ class BrownConrady:
         front = points[:, 2] > 0
         xy = points[:, :2] / np.where(front, points[:, 2], np.nan)[:, None]
         xy[~(np.abs(xy).max(axis=1) < MAX_FOCAL_LENGTHS_OFF_AXIS)] = np.nan
-        valid = np.hypot(*xy.T) < self._critical_radius
+        valid = np.hypot(*xy.T) < self.critical_radius
         # Decentring can fold the image a little before the radial polynomial turns back: there the determinant is zero.
         slope = self._distort_slope(xy)
         valid &= slope[:, 0, 0] * slope[:, 1, 1] > slope[:, 0, 1] ** 2

@@ -135,7 +135,7 @@ class KannalaBrandt:
         """
         bent = plane_from_pixel(self, uv)
         radius = np.hypot(*bent.T)
-        theta = invert_odd_polynomial(radius, self._radial, self._critical_angle)
+        theta = invert_odd_polynomial(radius, self._radial, self.critical_angle)
         rays = np.column_stack([bent * divide(np.sin(theta), radius, 1.0)[:, None], np.cos(theta)])
         return check_rays(self, rays, uv)
 
@@ -196,13 +196,14 @@ class KannalaBrandt:
         return self.k1, self.k2, self.k3, self.k4
 
     @cached_property
-    def _critical_angle(self) -> float:
+    def critical_angle(self) -> float:
+        """The angle to the axis, in radians, up to which the lens has an answer."""
         return min(first_turning_point(self._radial), float(np.pi))
 
     def _polar(self, points: Floats) -> _Polar:
         r = np.hypot(points[:, 0], points[:, 1])
         theta = np.arctan2(r, points[:, 2])
-        valid = (theta < self._critical_angle) & points.any(axis=1)
+        valid = (theta < self.critical_angle) & points.any(axis=1)
         xyz = points
         if not valid.all():
             xyz = np.where(valid[:, None], points, np.nan)

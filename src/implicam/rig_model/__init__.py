@@ -39,7 +39,7 @@ from implicam.rig_model.training_data import (
     relative_noise,
     stated_noise,
 )
-from implicam.rig_model.triangulate import locate
+from implicam.rig_model.triangulate import Labels, locate
 
 __all__ = [
     "MAX_NAMED_IN_NOTE",
@@ -59,6 +59,7 @@ __all__ = [
     "Hyperparameters",
     "Image",
     "InitialCamera",
+    "Labels",
     "Posterior",
     "Prior",
     "RigModelSettings",

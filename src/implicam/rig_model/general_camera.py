@@ -148,14 +148,14 @@ class GeneralCamera:
         bent, by_there, by_lens = self._lens.pixel_and_slopes(there)
         uv, y, w = self._image(bent)
         sign = np.array([-1.0 if self.mirrored else 1.0, 1.0])
-        B, by_p, by_q = self._pixels
+        B, by_p, by_q = self.pixel_shape
         by_y = self.focal * B
         # y by m: (I - y tilt^T) / w
         by_m = (by_y @ (np.eye(2) - y[:, :, None] * self.tilt)) / w[:, None, None] * sign
         slope = by_m @ by_there
         by_k = by_m @ by_lens[:, :, 4:]
         rho = self.rho
-        by_across, by_rho = self._translation_slopes()
+        by_across, by_rho = self.translation_slopes()
         out = np.empty((n, 2, self.size))
         away = y @ by_y.T
         out[:, :, 0] = away
@@ -184,7 +184,7 @@ class GeneralCamera:
         Returns:
             The camera's centre (3,) and unit directions (n, 3) in the working frame, NaN for none.
         """
-        y = np.linalg.solve(self.focal * self._pixels[0], (uv - self.centre).T).T
+        y = np.linalg.solve(self.focal * self.pixel_shape[0], (uv - self.centre).T).T
         w = 1 - y @ self.tilt
         m = y / np.where(w > 0, w, np.nan)[:, None]
         if self.mirrored:
@@ -262,7 +262,8 @@ class GeneralCamera:
         return CentralCamera(lens, self.pose)
 
     @cached_property
-    def _pixels(self) -> tuple[Floats, Floats, Floats]:
+    def pixel_shape(self) -> tuple[Floats, Floats, Floats]:
+        """B = exp([[p, q], [q, -p]]) of eq. (2), and its derivatives by p and q, (2, 2) each."""
         return _pixel_shape(self.shape)
 
     @cached_property
@@ -275,9 +276,9 @@ class GeneralCamera:
         w = 1 + m @ self.tilt
         w = np.where(w > 0, w, np.nan)
         y = m / w[:, None]
-        return self.centre + self.focal * (y @ self._pixels[0].T), y, w
+        return self.centre + self.focal * (y @ self.pixel_shape[0].T), y, w
 
-    def _translation_slopes(self) -> tuple[Floats, Floats]:
+    def translation_slopes(self) -> tuple[Floats, Floats]:
         """How the translation depends on where the origin is across the axis (3, 2), and on rho (3,)."""
         rho = self.rho
         direction = self.pose.translation * rho

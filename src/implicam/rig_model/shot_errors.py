@@ -104,7 +104,7 @@ class Shots:
         return np.concatenate([shifts, tilts], axis=2)
 
     @cached_property
-    def _reach(self) -> float:
+    def reach(self) -> float:
         """The distance over which the label of a shot holds; zero where shots overlap."""
         apart = self._outside(self.centre)
         np.fill_diagonal(apart, np.inf)
@@ -122,9 +122,9 @@ class Shots:
         """
         outside = self._outside(points)
         nearest = np.argmin(outside, axis=1)
-        if self._reach == 0:
+        if self.reach == 0:
             return nearest, np.zeros(len(points)), np.zeros(len(points))
-        holds = np.exp(-0.5 * (outside.min(axis=1) / self._reach) ** 2)
+        holds = np.exp(-0.5 * (outside.min(axis=1) / self.reach) ** 2)
         return nearest, holds, 1 - holds**2
 
     def label_slope(self, points: Floats, sd: Floats) -> Floats:

@@ -1,0 +1,5 @@
+"""Calibrations for programs without Python: ONNX graphs (`onnx_file`), and a table with a C++ header (`cpp_table`)."""
+
+from implicam.deploy.onnx_file import write_onnx
+
+__all__ = ["write_onnx"]
