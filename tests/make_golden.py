@@ -34,7 +34,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import implicam as ic
-from implicam.calibration_file import FORMAT_VERSION
+from implicam.calibration_file import FORMAT_WITHOUT_REPAIRS
 from implicam.simulate import Rig, Unusual, build_rig, moving_board, random_positions, simulate
 
 GOLDEN = Path(__file__).parent / "data" / "golden"
@@ -206,7 +206,7 @@ def write() -> None:
 
 def write_files() -> None:
     for rig, name in FILES:
-        path = GOLDEN / f"v{FORMAT_VERSION}-{rig}-{name}.implicam"
+        path = GOLDEN / f"v{FORMAT_WITHOUT_REPAIRS}-{rig}-{name}.implicam"
         if path.exists():
             print(f"{path.name} is there, and stays")
             continue

@@ -68,6 +68,8 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.measurement import Measurement as Measurement
     from implicam.simulate import simulated as simulated
     from implicam.stability import CalibrationCheck as CalibrationCheck
+    from implicam.stability import CalibrationRepair as CalibrationRepair
+    from implicam.stability import CalibrationWatch as CalibrationWatch
     from implicam.stability import check_calibration as check_calibration
     from implicam.verdict import Verdict as Verdict
     from implicam.verdict import judge as judge
@@ -95,7 +97,7 @@ _NAMES = {
     "implicam.evaluation": ("Evaluation", "cross_validate", "evaluate", "leave_out_shots"),
     "implicam.measurement": ("MeasuredPoint", "Measurement"),
     "implicam.simulate": ("simulated",),
-    "implicam.stability": ("CalibrationCheck", "check_calibration"),
+    "implicam.stability": ("CalibrationCheck", "CalibrationRepair", "CalibrationWatch", "check_calibration"),
     "implicam.verdict": ("Verdict", "judge"),
 }  # fmt: skip
 """Module -> the public names it has."""

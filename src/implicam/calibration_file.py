@@ -5,8 +5,9 @@ depend on the calibration only: no dates, so the same fit gives the same file. R
 checked before memory is spent, the arrays against a SHA-256, every shape and sign against the data, and whatever does
 not fit is a CalibrationFileError.
 
-Format versions: 2 (this one): cameras of forward-gp say which model, lens and kind they are. A newer version is refused
-with the cure; an older one is converted in `_UPGRADES`.
+Format versions: 2: cameras of forward-gp say which model, lens and kind they are. 3: a camera has moved since
+(`repairs`); a file without one is still written as 2. A newer version is refused with the cure; an older one is
+converted in `_UPGRADES`.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from implicam.dataset.tables import parse_toml
 from implicam.errors import CalibrationFileError, ImplicamError, PartError
 from implicam.files import max_inflated_bytes, npz_bytes, read_npz, read_zip, replacing, toml_text, write_zip
 
-FORMAT_VERSION = 2
+FORMAT_VERSION, FORMAT_WITHOUT_REPAIRS = 3, 2
 MAX_BYTES = 1 << 31
 TOML, ARRAYS = "calibration.toml", "arrays.npz"
 PIXEL_CONVENTION = "(u, v) = (column, row); (0, 0) is the centre of the top-left pixel"
@@ -55,7 +56,10 @@ def _upgrade_1(table: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
     arrays[_METHOD + "lengthscale"] = np.tile(arrays[_METHOD + "lengthscale"], (len(sizes), 1))
 
 
-_UPGRADES: dict[int, Callable[[dict[str, Any], dict[str, NDArray[Any]]], None]] = {1: _upgrade_1}
+_UPGRADES: dict[int, Callable[[dict[str, Any], dict[str, NDArray[Any]]], None]] = {
+    1: _upgrade_1,
+    2: lambda table, arrays: None,
+}
 """Format version -> a function that turns its table and arrays into those of the next."""
 
 
@@ -120,6 +124,7 @@ def _members_of(calibration: Savable, verdict: Mapping[str, Any] | None) -> dict
     content = npz_bytes(arrays)
     judged = {} if verdict is None else {"verdict": dict(verdict)}
     table = {
+        "format_version": FORMAT_VERSION if method_table.get("repairs") else FORMAT_WITHOUT_REPAIRS,
         **_description(calibration),
         **judged,
         "arrays_sha256": hashlib.sha256(content).hexdigest(),
@@ -157,7 +162,6 @@ def _description(calibration: Savable) -> dict[str, Any]:
     known = data.xyz
     workspace = {"lowest": known.min(axis=0).tolist(), "highest": known.max(axis=0).tolist()} if len(known) else {}
     return {
-        "format_version": FORMAT_VERSION,
         "method": calibration.method,
         "dataset": data.name,
         "length_unit": data.length_unit,

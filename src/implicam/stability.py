@@ -8,8 +8,9 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +19,21 @@ from scipy.special import chdtrc
 
 from implicam.calibrators import Calibration
 from implicam.calibrators.protocol import RigCalibration
-from implicam.dataset import Dataset, Floats
+from implicam.dataset import Dataset, Floats, Observations
 from implicam.derived import joint
 from implicam.errors import DatasetError, UsageError
 from implicam.files import write_text
 from implicam.formatting import decimal_number, number_with_sd
 from implicam.geometry import cross_matrices
-from implicam.rig_model import NUMBERS, Check, Evidence
+from implicam.rig_model import NUMBERS, Check, Evidence, errors_with_and_without, find_repair
 
 STANDS, MOVED, ONE_MOVED, SEVERAL, BIASED = "stands", "moved", "one moved", "several moved", "biased"
 UNSEEN = "A rig whose cameras all moved together looks the same to itself: only known points could show it."
 NUMBER_NAMES = ("tilt", "pan", "roll", "right", "down", "forward", "zoom")
 """Of a movement: turns about the camera's axes that point right, down and forward in its picture (degrees), shifts
 along these (length unit), and the zoom (per cent)."""
+MIN_POINTS_TO_WATCH = 20
+"""Before a check of a stream."""
 MAX_KNOWN_POINTS = 400
 """Known points that are compared; of more, evenly many."""
 MIN_KNOWN_POINTS = 4
@@ -40,7 +43,9 @@ MIN_RELATIVE_SPREAD = 1e-6
 LOG_COLUMNS = (
     "time", "dataset", "points", "p_value", "verdict", "camera",
     *(name for number in NUMBER_NAMES for name in (number, f"sd_{number}")), "p_value_known",
+    "length_unit",
 )  # fmt: skip
+_LOG_HEAD = ",".join(LOG_COLUMNS) + "\n"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +57,12 @@ class CameraMovement:
         step: (7,) as `NUMBER_NAMES` has them: degrees, the calibration's length unit, per cent.
         sd: (7,) their standard uncertainties.
         cov: (7, 7) their covariance.
-        noticed: (7,) what each alone would have to be for the camera to be named half the time.
     """
 
     camera: str
     step: Floats
     sd: Floats
     cov: Floats
-    noticed: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,48 @@ class KnownPointsTest:
 
 
 @dataclass(frozen=True, eq=False)
+class CalibrationRepair:
+    """A calibration after one camera has moved, and what that costs: medians over the points that showed the movement
+    of the standard uncertainty of a position (root of the mean over the axes, length unit).
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("bar6", points=60, seed=1)
+    >>> known, later = rig.split(30, seed=0)
+    >>> uv = later.observations.uv.copy()
+    >>> uv[:, 2] += [6.0, -4.0]  # as if cam3 had turned
+    >>> moved = ic.Dataset.from_arrays(uv, cameras=rig.cameras)
+    >>> repair = ic.check_calibration(ic.ForwardGP().fit(known), moved).repair()
+    >>> repair.moved.camera, repair.sd < repair.sd_without
+    ('cam3', True)
+
+    Attributes:
+        calibration: With the camera where it stands now.
+        moved: How it moved.
+        sd_unmoved: If it had not moved.
+        sd: As it is.
+        sd_without: Without the camera; NaN where the others see too little.
+    """
+
+    calibration: RigCalibration
+    moved: CameraMovement
+    sd_unmoved: float
+    sd: float
+    sd_without: float
+
+    def sentence(self) -> str:
+        """What was done and what it costs, in words."""
+        unit = self.calibration.data.length_unit
+        least = min(x for x in (self.sd_unmoved, self.sd, self.sd_without) if np.isfinite(x))
+        digits = max(0, 2 - int(np.floor(np.log10(least))))
+        unmoved, now, without = (f"{x:.{digits}f}" for x in (self.sd_unmoved, self.sd, self.sd_without))
+        left = f" (without the camera {without})" if np.isfinite(self.sd_without) else ""
+        return (
+            f"With {self.moved.camera} where it stands now, a position has a standard uncertainty of {now} {unit}"
+            f"{left}; {unmoved} if it had not moved."
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class CalibrationCheck:
     """Whether a calibration still holds.
 
@@ -94,13 +139,17 @@ class CalibrationCheck:
     Attributes:
         verdict: `stands`, `moved` (the first of `cameras`), `one moved` (of `candidates`), `several moved` or `biased`.
         p_value: That chance alone makes the views disagree as a movement would.
-        cameras: Of each camera how it moved if it alone did, the likeliest first.
+        cameras: Of each camera how it moved if it alone did, the likeliest first; none where hardly two views agree.
         candidates: Names of the cameras of which one moved.
         known: The comparison with known points; None where there are none.
         points: How many points were used.
         noise_ratio: Sd of what is left, whatever moved, over what the views state.
         length_unit: Of shifts.
         not_judged: Names of cameras that saw too little to say anything of them.
+        found: The same in the working frame of the calibration, with all that it was found from.
+        units: (7,) degrees, length units and per cent of a unit there.
+        calibration: That was checked.
+        dataset: Name of the data.
     """
 
     verdict: str
@@ -111,21 +160,66 @@ class CalibrationCheck:
     points: int
     noise_ratio: float
     length_unit: str
-    not_judged: tuple[str, ...] = ()
+    not_judged: tuple[str, ...]
+    found: Check = field(repr=False)
+    units: Floats = field(repr=False)
+    calibration: RigCalibration = field(repr=False)
+    dataset: str = ""
+
+    @cached_property
+    def noticed(self) -> dict[str, Floats]:
+        """Camera -> (7,) what each number of `NUMBER_NAMES` alone would have to be for the camera to be named half the
+        time; infinite where none would do."""
+        pairs = zip(self.cameras, self.found.evidence, strict=True)
+        return {one.camera: self.found.noticed[seen.camera] * self.units for one, seen in pairs}
 
     @property
     def holds(self) -> bool:
         """Whether nothing speaks against the calibration."""
         return self.verdict == STANDS
 
+    def repair(self) -> CalibrationRepair:
+        """The calibration with the camera that moved where it stands now, from the same views.
+
+        Returns:
+            It, and what the movement costs.
+
+        Raises:
+            UsageError: No single camera is known to have moved, or the calibration cannot be repaired.
+        """
+        one = self.found.named
+        if one is None:
+            raise UsageError(
+                f"there is no camera to put right: the verdict is {self.verdict!r}.",
+                why="only of a single camera that moved can the others say where it stands now",
+                fix="go on measuring with it" if self.holds else "calibrate again with known points",
+            )
+        moved = self.cameras[0]
+        told = (
+            f"{moved.camera} {describe_movement(moved, self.length_unit)}, as {self.points} points of "
+            f"{self.dataset!r} showed"
+        )
+        repair = find_repair(self.found, one, told)
+        after = self.calibration.with_repair(repair)
+        rig = self.found.rig
+        sizes = errors_with_and_without(rig, after.map.posterior, one)
+        scale = self.calibration.map.frame.scale
+        usual = [float(np.nanmedian(size)) * scale if np.isfinite(size).any() else float("nan") for size in sizes]
+        return CalibrationRepair(after, moved, *usual)
+
     def sentences(self) -> list[str]:
         """What was found, in words."""
-        first, unit = self.cameras[0], self.length_unit
+        unit, names = self.length_unit, self.calibration.camera_names
+        doubtful = ", ".join(names[c] for c in self.found.contradicting)
+        if 2 * len(self.found.contradicting) > len(names):
+            doubtful = "most cameras"
+        moved = self.cameras[0] if self.verdict == MOVED else None
         said = {
             STANDS: f"Nothing speaks against the calibration (p = {decimal_number(self.p_value, 2)}).",
-            MOVED: f"{first.camera} has moved: {describe_movement(first, unit)}.",
+            MOVED: "" if moved is None else f"{moved.camera} has moved: {describe_movement(moved, unit)}.",
             ONE_MOVED: f"One of {' and '.join(self.candidates)} has moved; from these views nobody can say which.",
-            SEVERAL: "The rig is not as it was calibrated, and no single camera's movement explains it: several moved.",
+            SEVERAL: "The rig is not as it was calibrated, and no single camera's movement explains it: several moved"
+            + (f", or many views of {doubtful} are wrong detections." if doubtful else "."),
             BIASED: "The views agree with each other, but not with the known points: all cameras moved together, or "
             "the known points did.",
         }[self.verdict]
@@ -181,33 +275,117 @@ def check_calibration(calibration: Calibration, data: Dataset, *, level: float =
     """
     if not 0 < level < 1:
         raise UsageError(f"a level of {level!r} is no probability.", fix="give one above 0 and below 1")
-    if not isinstance(calibration, RigCalibration):
-        raise UsageError(
-            f"a calibration by {calibration.method} has no cameras that could have moved.",
-            why="it maps the pixels of all cameras to a position, and cannot ask whether the views agree",
-            fix="calibrate with forward-gp or explicit",
-        )
+    rig = _require_cameras(calibration)
     share = level / 2 if data.known is not None else level
-    found = calibration.map.movement(data, level=share)
+    found = rig.map.movement(data, level=share)
     if found is None:
         raise DatasetError(
             "no two cameras saw enough of the same points.", fix="show the cameras more points, 20 or more that all see"
         )
-    known = None if data.known is None else _known_points_test(calibration, data)
+    known = None if data.known is None else _known_points_test(rig, data)
+    return _conclude(rig, found, known, share, data.name)
+
+
+class CalibrationWatch:
+    """Watches whether a calibration still holds, while points come in.
+
+    Every few points the last ones are checked as `check_calibration` does, at a level so low that a rig that stands
+    raises a false alarm once in `points_per_false_alarm` points or less often.
+
+    >>> import implicam as ic
+    >>> rig = ic.simulated("bar6", points=90, seed=1)
+    >>> known, later = rig.split(30, seed=0)
+    >>> watch = ic.CalibrationWatch(ic.ForwardGP().fit(known), window=40, every=20)
+    >>> [watch.add(later.select([i])) for i in range(60)].count(None)
+    60
+
+    Args:
+        calibration: Of `forward-gp` or `explicit`.
+        window: Points that a check uses: more notice less, later.
+        every: Points from one check to the next.
+        points_per_false_alarm: How rare false alarms are to be.
+
+    Raises:
+        UsageError: The method has no cameras that could move, or a number makes no sense.
+    """
+
+    def __init__(
+        self, calibration: Calibration, *, window: int = 60, every: int = 10, points_per_false_alarm: int = 10_000
+    ) -> None:
+        if not 1 <= every <= window or points_per_false_alarm <= every:
+            raise UsageError(
+                f"a watch of {window} points, every {every}, one false alarm in {points_per_false_alarm}, cannot be.",
+                why="a check takes the points since the last one and more, and false alarms must be rarer than checks",
+                fix="leave the numbers at their defaults: 60, 10, 10 000",
+            )
+        self.calibration = _require_cameras(calibration)
+        self.window, self.every, self.level = window, every, every / points_per_false_alarm
+        self.points = 0
+        self.last: CalibrationCheck | None = None
+        cameras = len(self.calibration.camera_names)
+        self._uv, self._noise = np.zeros((0, cameras, 2)), np.zeros((0, cameras))
+        self._since = 0
+
+    def add(self, data: Dataset | Observations) -> CalibrationCheck | None:
+        """Add points as they come.
+
+        Args:
+            data: What the cameras saw of one or more; names of points do not matter here, and positions are not used.
+
+        Returns:
+            The check that raised an alarm; None where there is none.
+
+        Raises:
+            DatasetError: None of the cameras is one of the calibration, or one has images of another size.
+        """
+        uv, noise = self.calibration.map.matched_views(data)
+        alarm = None
+        for start in range(0, len(uv), self.every):
+            part = slice(start, start + self.every)
+            self._uv = np.concatenate([self._uv, uv[part]])[-self.window :]
+            self._noise = np.concatenate([self._noise, noise[part]])[-self.window :]
+            self.points += len(uv[part])
+            self._since += len(uv[part])
+            if self._since >= self.every and len(self._uv) >= min(self.window, MIN_POINTS_TO_WATCH):
+                self._since = 0
+                found = self.calibration.map.movement_in_views(self._uv, self._noise, level=self.level)
+                self.last = None if found is None else _conclude(self.calibration, found, None, self.level, "stream")
+                alarm = self.last if self.last is not None and not self.last.holds else alarm
+        return alarm
+
+
+def _require_cameras(calibration: Calibration) -> RigCalibration:
+    if isinstance(calibration, RigCalibration):
+        return calibration
+    raise UsageError(
+        f"a calibration by {calibration.method} has no cameras that could have moved.",
+        why="it maps the pixels of all cameras to a position, and cannot ask whether the views agree",
+        fix="calibrate with forward-gp or explicit",
+    )
+
+
+def _conclude(
+    calibration: RigCalibration, found: Check, known: KnownPointsTest | None, level: float, dataset: str
+) -> CalibrationCheck:
     names, scale = calibration.map.camera_names, calibration.map.frame.scale
-    cameras = tuple(_in_units(one, names, scale, found) for one in found.evidence)
-    candidates = tuple(names[c] for c in found.candidates)
+    units = np.array([*[np.degrees(1.0)] * 3, *[scale] * 3, 100.0])
+    assert len(units) == NUMBERS
+    cameras = tuple(_in_units(one, names, units, found.noise_ratio) for one in found.evidence)
     judged = {one.camera for one in cameras}
     return CalibrationCheck(
-        _verdict(found, known, share),
+        _verdict(found, known, level),
         found.p_value,
         cameras,
-        candidates,
+        tuple(names[c] for c in found.candidates),
         known,
         found.points,
         found.noise_ratio,
         calibration.data.length_unit,
-        tuple(name for name in names if name not in judged),
+        tuple(name for name in names if name not in judged) if judged else (),
+        found,
+        units,
+        calibration,
+        dataset,
     )
 
 
@@ -221,13 +399,9 @@ def _verdict(found: Check, known: KnownPointsTest | None, level: float) -> str:
     return BIASED if known is not None and known.p_value < level else STANDS
 
 
-def _in_units(one: Evidence, names: Sequence[str], scale: float, found: Check) -> CameraMovement:
-    units = np.array([*[np.degrees(1.0)] * 3, *[scale] * 3, 100.0])
-    assert len(units) == NUMBERS
-    cov = one.cov * np.outer(units, units) * max(found.noise_ratio**2, 1.0)
-    return CameraMovement(
-        names[one.camera], one.step * units, np.sqrt(np.diagonal(cov)), cov, found.noticed[one.camera] * units
-    )
+def _in_units(one: Evidence, names: Sequence[str], units: Floats, noise_ratio: float) -> CameraMovement:
+    cov = one.cov * np.outer(units, units) * max(noise_ratio**2, 1.0)
+    return CameraMovement(names[one.camera], one.step * units, np.sqrt(np.diagonal(cov)), cov)
 
 
 def _known_points_test(calibration: RigCalibration, data: Dataset) -> KnownPointsTest | None:
@@ -252,6 +426,25 @@ def _known_points_test(calibration: RigCalibration, data: Dataset) -> KnownPoint
     return KnownPointsTest(len(rows), p, mean @ error, np.sqrt(np.diagonal(mean @ cov @ mean.T)))
 
 
+def read_log(path: Path) -> list[dict[str, str]]:
+    """A history of checks.
+
+    Args:
+        path: The table, as `append_to_log` writes it.
+
+    Returns:
+        A row for each check and camera, column -> text.
+
+    Raises:
+        DatasetError: The file is something else.
+    """
+    text = path.read_text(encoding="utf-8", errors="replace")
+    rows = list(csv.DictReader(io.StringIO(text)))
+    if not text.startswith(_LOG_HEAD) or any(None in row or None in row.values() for row in rows):
+        raise DatasetError(f"{path} is no history of checks.", fix="give another name for it")
+    return rows
+
+
 def append_to_log(path: Path, check: CalibrationCheck, name: str, *, now: datetime | None = None) -> None:
     """Add a check to a history: a row for each camera.
 
@@ -265,15 +458,29 @@ def append_to_log(path: Path, check: CalibrationCheck, name: str, *, now: dateti
         DatasetError: The file is something else.
         ImplicamError: It cannot be written.
     """
-    head = ",".join(LOG_COLUMNS) + "\n"
-    before = path.read_text(encoding="utf-8") if path.is_file() else head
-    if not before.startswith(head):
-        raise DatasetError(f"{path} is no history of checks.", fix="give another name for it")
+    before = _LOG_HEAD
+    if path.is_file():
+        read_log(path)
+        before = path.read_text(encoding="utf-8")
     at = (now or datetime.now(UTC)).isoformat(timespec="seconds")
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     known = "" if check.known is None else repr(check.known.p_value)
-    for camera in check.cameras:
+    unknown = np.full(NUMBERS, np.nan)
+    nothing = [CameraMovement(name, unknown, unknown, np.diag(unknown)) for name in check.calibration.camera_names]
+    for camera in check.cameras or nothing:
         numbers = [repr(float(value)) for pair in zip(camera.step, camera.sd, strict=True) for value in pair]
-        rows.writerow([at, name, check.points, repr(check.p_value), check.verdict, camera.camera, *numbers, known])
+        rows.writerow(
+            [
+                at,
+                name,
+                check.points,
+                repr(check.p_value),
+                check.verdict,
+                camera.camera,
+                *numbers,
+                known,
+                check.length_unit,
+            ]
+        )
     write_text(path, before + text.getvalue())

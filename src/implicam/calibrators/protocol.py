@@ -8,9 +8,9 @@ follow "A calibrator" in CONTRIBUTING.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import Field, asdict, dataclass, field, fields
+from dataclasses import Field, asdict, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
@@ -28,7 +28,16 @@ from implicam.formatting import decimal_number
 from implicam.measurement import Measurement
 from implicam.plotted import Plotted
 from implicam.progress import Progress, silent
-from implicam.rig_model import FittedRig, Sensitivity
+from implicam.rig_model import (
+    NUMBERS,
+    FittedRig,
+    Motion,
+    Posterior,
+    Repair,
+    Sensitivity,
+    all_repaired,
+    white_unknowns,
+)
 from implicam.settings import Settings
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -522,12 +531,51 @@ class CalibrationBase(Plotted):
 
 
 class RigCalibration(CalibrationBase):
-    """A calibration whose cameras are a `FittedRig`: it measures and predicts as that does."""
+    """A calibration whose cameras are a `FittedRig`: it measures and predicts as that does.
+
+    Attributes:
+        repairs: Movements of cameras since it was fitted, in the order of time.
+    """
+
+    repairs: tuple[Repair, ...]
 
     @property
-    def map(self) -> FittedRig:
-        """The cameras, and how they measure."""
+    def fitted_map(self) -> FittedRig:
+        """The cameras as they were fitted, and how they measure."""
         raise NotImplementedError
+
+    @cached_property
+    def map(self) -> FittedRig:
+        """The cameras as they stand now, and how they measure."""
+        fitted = self.fitted_map
+        return fitted.after(self.repairs) if self.repairs else fitted
+
+    def with_repair(self, repair: Repair) -> Self:
+        """The calibration after one of its cameras has moved.
+
+        Args:
+            repair: The movement, as `find_repair` has it from a check of this calibration.
+
+        Raises:
+            UsageError: It does not measure by the covariance of its cameras.
+        """
+        return replace(self, repairs=(*self.repairs, repair))  # type: ignore[type-var]
+
+    def _repair_notes(self) -> list[str]:
+        return [
+            f"After the calibration {one.told}. It measures from there; what is said of its own known points is of "
+            "the rig as it was."
+            for one in self.repairs
+        ]
+
+    def _refitted(self, data: Dataset) -> Any:
+        if self.repairs:
+            raise UsageError(
+                "this calibration cannot be moved: a camera moved after its known points had been seen.",
+                why="it would be fitted again to the rig as it was",
+                fix="move what it measures: measurement.in_unit(...), measurement.transformed(...)",
+            )
+        return super()._refitted(data)
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -617,6 +665,67 @@ def solvable() -> Iterator[None]:
             why=str(error),
             fix="add known points elsewhere in the volume, and look for wrong ones",
         ) from error
+
+
+def repairs_state(repairs: Sequence[Repair]) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """What a calibration file carries of movements since the fit; nothing where there are none.
+
+    Args:
+        repairs: The movements.
+
+    Returns:
+        A readable table, and arrays.
+    """
+    table = {"repairs": [{"camera": one.camera, "told": one.told} for one in repairs]} if repairs else {}
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, one in enumerate(repairs):
+        arrays |= {
+            f"repair/{number}/rotation": one.motion.rotation,
+            f"repair/{number}/shift_zoom": np.append(one.motion.shift, one.motion.zoom),
+            f"repair/{number}/shared": one.shared,
+            f"repair/{number}/own": one.own,
+            f"repair/{number}/distances": one.distances,
+        }
+    return table, arrays
+
+
+def repairs_from_state(table: Mapping[str, Any], arrays: Arrays, posterior: Posterior) -> tuple[Repair, ...]:
+    """The inverse of `repairs_state`.
+
+    Args:
+        table: Of a calibration file.
+        arrays: Of it.
+        posterior: Of the cameras as they were fitted.
+
+    Returns:
+        The movements.
+
+    Raises:
+        KeyError, ValueError, TypeError: Something is missing or does not fit.
+    """
+    found: list[Repair] = []
+    for number, one in enumerate(table.get("repairs", [])):
+        camera, told = one["camera"], one["told"]
+        if not isinstance(camera, int) or not 0 <= camera < len(posterior.models) or not isinstance(told, str):
+            raise ValueError("a repair names a camera that is not there, or says nothing")
+        rotation = finite_column(arrays, f"repair/{number}/rotation", (3, 3))
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise ValueError("the turn of a repair is no rotation")
+        *shift, zoom = finite_column(arrays, f"repair/{number}/shift_zoom", (4,)).tolist()
+        if zoom <= -1:
+            raise ValueError("the zoom of a repair leaves no picture")
+        distances = finite_column(arrays, f"repair/{number}/distances", (2,), positive=True)
+        made = Repair(
+            camera,
+            Motion(rotation, np.array(shift), zoom),
+            finite_column(arrays, f"repair/{number}/shared", (white_unknowns(posterior), NUMBERS)),
+            finite_column(arrays, f"repair/{number}/own", (NUMBERS, NUMBERS)),
+            distances,
+            told,
+        )
+        posterior = all_repaired(posterior, [made])
+        found.append(made)
+    return tuple(found)
 
 
 def finite_column(arrays: Arrays, name: str, shape: tuple[int, ...], *, positive: bool = False) -> NDArray[np.float64]:

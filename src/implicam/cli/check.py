@@ -11,12 +11,27 @@ import typer
 
 from implicam.calibrators import load_calibration
 from implicam.cli import show
-from implicam.cli.app import Json, command, must_not_replace, read
+from implicam.cli.app import Json, check_figure, command, must_not_replace, read
 from implicam.cli.options import with_table_options
 from implicam.dataset import TableOptions
 from implicam.dataset.table_options import DOCUMENTED
+from implicam.errors import UsageError
+from implicam.figures.check_history import check_history_figure
 from implicam.formatting import decimal_number, number_with_sd
-from implicam.stability import NUMBER_NAMES, CalibrationCheck, CameraMovement, append_to_log, check_calibration
+from implicam.stability import (
+    BIASED,
+    MOVED,
+    NUMBER_NAMES,
+    ONE_MOVED,
+    SEVERAL,
+    STANDS,
+    CalibrationCheck,
+    CalibrationRepair,
+    CameraMovement,
+    append_to_log,
+    check_calibration,
+    read_log,
+)
 
 
 @command("check")
@@ -28,6 +43,13 @@ def check_command(
         float, typer.Option("--level", metavar="P", help="How often a rig that stands may raise an alarm.")
     ] = 0.05,
     log: Annotated[Path | None, typer.Option("--log", metavar="CSV", help="Add the result to this history.")] = None,
+    repair: Annotated[
+        Path | None,
+        typer.Option("--repair", metavar="FILE", help="Write the calibration with the camera where it stands now."),
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option("--figure", metavar="FILE", help="Draw the history: .png, .pdf or .svg; with --log.")
+    ] = None,
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
@@ -35,8 +57,12 @@ def check_command(
 
     No known point is needed; where there are some they are compared, too. Ends with 1 where it does not hold.
     """
-    if log is not None:
-        must_not_replace(log, calibration, dataset)
+    if figure is not None and log is None:
+        raise UsageError("--figure draws a history of checks, and there is none.", fix="name one: --log checks.csv")
+    if figure is not None:
+        check_figure(figure)
+    for made in filter(None, (log, repair, figure)):
+        must_not_replace(made, calibration, dataset)
     fitted = load_calibration(calibration)
     data = read(dataset, table)
     with show.progress(json) as progress:
@@ -45,9 +71,27 @@ def check_command(
         progress("checking", 1, 1)
     if log is not None:
         append_to_log(log, found, data.name)
+    if log is not None and figure is not None:
+        check_history_figure(read_log(log)).savefig(figure, dpi=150)
+    repaired = None
+    if repair is not None and found.verdict == MOVED:
+        repaired = found.repair()
+        repaired.calibration.save(repair)
     if json:
-        show.emit_json(_as_json(found))
+        show.emit_json(_as_json(found) | {"repair": None if repaired is None else _repair_as_json(repaired)})
         raise typer.Exit(int(not found.holds))
+    _tell(found)
+    if log is not None:
+        show.line(f"{log}: one more check{'' if figure is None else f', drawn in {figure}'}")
+    if repaired is not None:
+        show.line(repaired.sentence())
+        show.line(f"{repair}: the calibration as the rig stands now")
+    elif repair is not None:
+        show.line(f"{repair} is not written: {_NO_REPAIR[found.verdict]}")
+    raise typer.Exit(int(not found.holds))
+
+
+def _tell(found: CalibrationCheck) -> None:
     first, *others = found.sentences()
     if found.holds:
         show.line(first)
@@ -55,13 +99,20 @@ def check_command(
         show.alarm(first)
     for sentence in others:
         show.line(sentence)
-    if not found.holds:
+    if not found.holds and found.cameras:
         show.table(_table(found, "if it alone moved", lambda one: map(number_with_sd, one.step, one.sd)))
-    show.table(_table(found, "named half the time", lambda one: map(_smallest, one.noticed)))
-    show.line("named half the time: the smallest movement, of this kind alone, that this check would name so often")
-    if log is not None:
-        show.line(f"{log}: one more check")
-    raise typer.Exit(int(not found.holds))
+    if found.cameras:
+        show.table(_table(found, "named half the time", lambda one: map(_smallest, found.noticed[one.camera])))
+        show.line("named half the time: the smallest movement, of this kind alone, that this check would name so often")
+
+
+_NO_REPAIR = {
+    STANDS: "there is nothing to repair",
+    ONE_MOVED: "show the cameras points that three of them see, or calibrate again with known points",
+    SEVERAL: "one camera that moved can be put right by the others; calibrate again with known points",
+    BIASED: "no camera's movement explains it; calibrate again with known points",
+}
+"""Verdict of a check -> why no calibration is written."""
 
 
 def _table(found: CalibrationCheck, what: str, cells: Callable[[CameraMovement], Iterable[str]]) -> Any:
@@ -75,12 +126,20 @@ def _smallest(noticed: float) -> str:
     return "-" if np.isinf(noticed) else decimal_number(float(noticed), 2)
 
 
+def _repair_as_json(repaired: CalibrationRepair) -> dict[str, Any]:
+    without = repaired.sd_without
+    return {
+        "camera": repaired.moved.camera, "sd_unmoved": repaired.sd_unmoved, "sd": repaired.sd,
+        "sd_without": without if np.isfinite(without) else None, "said": repaired.sentence(),
+    }  # fmt: skip
+
+
 def _as_json(found: CalibrationCheck) -> dict[str, Any]:
     cameras = [
         {"camera": one.camera}
         | {
             name: {"value": float(value), "sd": float(sd), "noticed": float(least) if np.isfinite(least) else None}
-            for name, value, sd, least in zip(NUMBER_NAMES, one.step, one.sd, one.noticed, strict=True)
+            for name, value, sd, least in zip(NUMBER_NAMES, one.step, one.sd, found.noticed[one.camera], strict=True)
         }
         for one in found.cameras
     ]
@@ -91,6 +150,7 @@ def _as_json(found: CalibrationCheck) -> dict[str, Any]:
     return {
         "verdict": found.verdict, "holds": found.holds, "p_value": found.p_value, "candidates": list(found.candidates),
         "not_judged": list(found.not_judged),
-        "cameras": cameras, "known": known, "points": found.points, "noise_ratio": found.noise_ratio,
+        "cameras": cameras, "known": known, "points": found.points,
+        "noise_ratio": found.noise_ratio if np.isfinite(found.noise_ratio) else None,
         "length_unit": found.length_unit, "said": found.sentences(),
     }  # fmt: skip

@@ -4,8 +4,9 @@ From data to a fitted rig, in the order of the modules: `training_data` (known p
 `initialise` (a camera from no guess), `camera`, `general_camera`, `field` and `camera_model` (what a camera is),
 `normal_equations`, `schur`, `tied`, `posterior` and `linearise` (what is known of all cameras), `leave_one_out` and
 `diagnostics` (views that contradict the others), `shot_errors`, `level_errors`, `position_errors` and `heavy_tails`
-(how positions and pixels are off), `fit_result`; then `rig`, `triangulate`, `wrong_views` and `alarm` (measuring). All
-of it by what `settings` take for usual and for clear. The mathematics: docs/method.md.
+(how positions and pixels are off), `fit_result`; then `rig`, `triangulate`, `wrong_views` and `alarm` (measuring),
+`movement` and `repair` (cameras that moved since). All of it by what `settings` take for usual and for clear. The
+mathematics: docs/method.md.
 """
 
 from implicam.rig_model.camera import (
@@ -26,9 +27,10 @@ from implicam.rig_model.initialise import (
 )
 from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.linearise import iterate_linearisation
-from implicam.rig_model.movement import NUMBERS, Check, Evidence
+from implicam.rig_model.movement import NUMBERS, Check, Evidence, Motion
 from implicam.rig_model.normal_equations import solve_normal
 from implicam.rig_model.posterior import Posterior, condition
+from implicam.rig_model.repair import Repair, all_repaired, errors_with_and_without, find_repair, white_unknowns
 from implicam.rig_model.rig import FittedRig, Sensitivity
 from implicam.rig_model.settings import CameraSettings, RigModelSettings
 from implicam.rig_model.training_data import (
@@ -60,13 +62,18 @@ __all__ = [
     "Image",
     "InitialCamera",
     "Labels",
+    "Motion",
     "Posterior",
     "Prior",
+    "Repair",
     "RigModelSettings",
     "Sensitivity",
     "TrainingData",
+    "all_repaired",
     "apply_covariance_root",
     "condition",
+    "errors_with_and_without",
+    "find_repair",
     "image_of",
     "iterate_linearisation",
     "lens_only_model",
@@ -77,4 +84,5 @@ __all__ = [
     "start_rig",
     "stated_noise",
     "update_inliers",
+    "white_unknowns",
 ]

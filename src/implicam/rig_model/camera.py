@@ -6,7 +6,7 @@ Both see points (n, 3) of the working frame (world, centred and scaled; calibrat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -129,6 +129,25 @@ class CentralCamera:
         lens = type(self.lens)(*(lens_parameters(self.lens) + step[:-6]).tolist())
         turn = rotation_from_vector(step[-6:-3])
         return CentralCamera(lens, Pose(turn @ self.pose.rotation, self.pose.translation + step[-3:]))
+
+    def in_frame(self, pose: Pose) -> CentralCamera:
+        """The camera that sees of a point what this one sees of `pose.apply(point)`.
+
+        Args:
+            pose: From the new frame to that of this camera.
+        """
+        return CentralCamera(self.lens, self.pose @ pose)
+
+    def zoomed(self, factor: float, middle: Floats) -> CentralCamera:
+        """The camera whose picture is larger.
+
+        Args:
+            factor: By how much.
+            middle: (2,) the pixel that stays where it is.
+        """
+        lens = self.lens
+        cx, cy = (middle + factor * (np.array([lens.cx, lens.cy]) - middle)).tolist()
+        return CentralCamera(replace(lens, fx=factor * lens.fx, fy=factor * lens.fy, cx=cx, cy=cy), self.pose)
 
     def prior(self, image: Image, widest: float, settings: CameraSettings = DEFAULT_SETTINGS) -> Prior:
         """The prior of the lens, eq. (3); of the pose there is none.
@@ -276,6 +295,27 @@ class ProjectiveCamera:
             The new camera.
         """
         return ProjectiveCamera(self.P + step.reshape(3, 4))
+
+    def in_frame(self, pose: Pose) -> ProjectiveCamera:
+        """The camera that sees of a point what this one sees of `pose.apply(point)`.
+
+        Args:
+            pose: From the new frame to that of this camera.
+        """
+        return ProjectiveCamera(
+            np.column_stack([self.P[:, :3] @ pose.rotation, self.P @ np.append(pose.translation, 1.0)])
+        )
+
+    def zoomed(self, factor: float, middle: Floats) -> ProjectiveCamera:
+        """The camera whose picture is larger.
+
+        Args:
+            factor: By how much.
+            middle: (2,) the pixel that stays where it is.
+        """
+        grow = np.diag([factor, factor, 1.0])
+        grow[:2, 2] = (1 - factor) * middle
+        return ProjectiveCamera(grow @ self.P)
 
     def prior(self, image: Image, widest: float, settings: RigModelSettings = DEFAULT_SETTINGS) -> Prior:
         """Roughly what the linear resection found; and the scale of P, which no pixel shows, stays what it is.

@@ -122,6 +122,23 @@ class GeneralCamera:
         """
         return replace(self, shape=shape, tilt=tilt)
 
+    def in_frame(self, pose: Pose) -> GeneralCamera:
+        """The camera that sees of a point what this one sees of `pose.apply(point)`.
+
+        Args:
+            pose: From the new frame to that of this camera.
+        """
+        return replace(self, pose=self.pose @ pose)
+
+    def zoomed(self, factor: float, middle: Floats) -> GeneralCamera:
+        """The camera whose picture is larger.
+
+        Args:
+            factor: By how much.
+            middle: (2,) the pixel that stays where it is.
+        """
+        return replace(self, focal=factor * self.focal, centre=middle + factor * (self.centre - middle))
+
     def pixel(self, points: Floats) -> Floats:
         """Where the camera sees points.
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import orth, solve_triangular
 from scipy.optimize import least_squares
-from scipy.special import chdtrc
+from scipy.special import chdtrc, fdtrc
 
 from implicam.geometry import Bools, Floats, cross_matrices, rotation_from_vector, vector_from_rotation
 from implicam.gp.linalg import covariance_root
@@ -51,10 +51,14 @@ MIN_FREEDOM_FOR_NOISE = 30
 """Degrees of freedom from which the noise is learned from what is left."""
 SURE, AFTER_LEVEL = 0.95, 0.01
 """Probability from which one camera is named, and that of another movement besides below which none is."""
+MAX_LEFT_OUT_SHARE, MIN_LEFT_OUT = 0.3, 5
+"""Of the views of a camera, as wrong detections: with more of them the camera itself is in doubt."""
 MIN_RELATIVE_COLUMN = 1e-7
 """Of what a number of a movement does besides the others: with less it does nothing of its own."""
 MAX_NOTICED_SDS, NOTICE_DRAWS = 30.0, 500
 DRAWS = 4000
+MIN_DRAWS_ABOVE = 200
+"""For a probability from the draws: 7 % off, and where there are fewer, gains of several cameras hardly coincide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,12 +320,17 @@ class Evidence:
     seen: Bools
 
 
-def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
+Unmoved = dict[bytes, "Whitened | None"]
+"""Views in use -> the equations if nothing moved, which are those of every camera that may have moved."""
+
+
+def find_movement(rig: CheckedRig, camera: int, unmoved: Unmoved | None = None) -> Evidence | None:
     """The most probable movement of one camera, if the others stand.
 
     Args:
         rig: The cameras and what they saw.
         camera: The number of the one that may have moved.
+        unmoved: What was found before, of other cameras of the same rig; it is added to.
 
     Returns:
         The movement; None where nothing can be said.
@@ -331,21 +340,30 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
     others[:, camera] = False
     x, agree = rig.locate(others)
     apart = np.isfinite(x).all(axis=1) & rig.seen[:, camera]
-    motion = Motion()
-    if apart.sum() >= MIN_POINTS_TO_START:
+    motion, started = Motion(), bool(apart.sum() >= MIN_POINTS_TO_START)
+    if started:
         motion = _start(rig, camera, x[apart], np.flatnonzero(apart))
         agree[:, camera] = rig.seen[:, camera]
     else:  # two cameras, or nearly: all that is known is where their lines of sight meet
         x, agree = rig.meet(), rig.seen.copy()
     motions = [Motion()] * len(rig.stands)
     mine = slice(NUMBERS * camera, NUMBERS * (camera + 1))
-    for _ in range(MAX_TRIMMINGS):
+    for trimming in range(MAX_TRIMMINGS):
         alive = np.isfinite(x).all(axis=1) & (agree.sum(axis=1) >= 2)
         agree = agree & alive[:, None]
         rows = np.flatnonzero(alive)
+        part = rig.select(rows)
+        motions[camera] = motion
+        if started or trimming:  # a few wrong views would draw the movement to where most of the others look wrong
+            kept = agree[rows]
+            kept[:, camera] = part.seen[:, camera]
+            wrong = _contradicting(part.equations(motions, x[rows], kept))
+            kept[wrong[kept[wrong].sum(axis=1) >= 3], camera] = False
+            if trimming and np.array_equal(kept, agree[rows]):
+                break
+            agree[rows] = kept
         if not agree[:, camera].any():
             return None
-        part = rig.select(rows)
         for _ in range(MAX_STEPS):
             motions[camera] = motion
             found = part.equations(motions, x[rows], agree[rows], unknowns=False)
@@ -358,19 +376,17 @@ def find_movement(rig: CheckedRig, camera: int) -> Evidence | None:
                 return None
             if step @ information @ step < CONVERGED_STEP_SDS**2:
                 break
-        motions[camera] = motion
-        found = part.equations(motions, x[rows], agree[rows])
-        wrong = rows[_contradicting(found)]
-        wrong = wrong[agree[wrong, camera] & (agree[wrong].sum(axis=1) >= 3)]
-        if not len(wrong):
-            break
-        agree[wrong, camera] = False
+    motions[camera] = motion
+    found = part.equations(motions, x[rows], agree[rows])
     there = found.whitened()
     X, number = there.by_step[:, mine], stand.numbers(motion)
     information = X.T @ X
     cov = np.asarray(np.linalg.inv(information + np.diag(prior)), dtype=np.float64)
     last = np.asarray(cov @ (X.T @ there.left - prior * number), dtype=np.float64)
-    here = _unmoved(part, x[rows], agree[rows])
+    unmoved, key = {} if unmoved is None else unmoved, agree.tobytes()
+    if key not in unmoved:
+        unmoved[key] = _unmoved(part, x[rows], agree[rows])
+    here = unmoved[key]
     if here is None:
         return None
     at = stand.moved(motion, last)
@@ -434,10 +450,12 @@ class Check:
         named: The camera that moved, where that is clear.
         candidates: Cameras of which one moved, where it is not clear which.
         several: The rig is not as it was, and no movement of one camera explains it.
+        contradicting: Cameras of which many views contradict those of the others, whichever one moved.
         points: How many points were used.
         noise_ratio: Sd of what is left, whatever moved, over what is stated.
-        design: How the views depend on movements.
+        design: How the views depend on movements; None where they do not agree on any point.
         level: How often a rig that stands raises an alarm.
+        rig: The cameras, and the points that were used.
     """
 
     evidence: tuple[Evidence, ...]
@@ -445,16 +463,20 @@ class Check:
     named: Evidence | None
     candidates: tuple[int, ...]
     several: bool
+    contradicting: tuple[int, ...]
     points: int
     noise_ratio: float
-    design: Design
+    design: Design | None
     level: float
+    rig: CheckedRig
 
     @cached_property
     def noticed(self) -> Floats:
         """(C, 7) the smallest movement of each camera, by each of its numbers alone, that would be named in half of all
         cases; infinite where none would be."""
-        return self.design.noticed(self.level)
+        return (
+            np.full((len(self.rig.stands), NUMBERS), np.inf) if self.design is None else self.design.noticed(self.level)
+        )
 
     @property
     def alarm(self) -> bool:
@@ -475,9 +497,13 @@ def check_movement(rig: CheckedRig, *, level: float = 0.05, seed: int = 0) -> Ch
     """
     rng = np.random.default_rng(seed)
     rig = rig.select(_choose(rig.seen, rng))
-    evidence = [found for c in range(len(rig.stands)) if (found := find_movement(rig, c)) is not None]
-    if not evidence:
-        return None
+    unmoved: Unmoved = {}
+    evidence = [found for c in range(len(rig.stands)) if (found := find_movement(rig, c, unmoved)) is not None]
+    every = tuple(range(len(rig.stands)))
+    if not evidence:  # too few views, or hardly two that agree
+        if np.sum(rig.seen.sum(axis=1) >= 2) < MIN_POINTS_TO_START:
+            return None
+        return Check((), 0.0, None, (), True, every, len(rig.seen), np.nan, None, level, rig)
     evidence.sort(key=lambda one: -one.log_odds)
     best = evidence[0]
     motions = [best.motion if c == best.camera else Motion() for c in range(len(rig.stands))]
@@ -490,8 +516,12 @@ def check_movement(rig: CheckedRig, *, level: float = 0.05, seed: int = 0) -> Ch
     design = Design(by_step, freedom if freedom >= MIN_FREEDOM_FOR_NOISE else None, rng)
     gains = np.array([one.gain for one in evidence]) / noise_ratio**2
     p_value = design.tail(gains.max())
-    named, candidates, several = None, tuple[int, ...](), False
-    if p_value < level:
+    named, candidates = None, tuple[int, ...]()
+    counts = rig.seen.sum(axis=0)
+    lost = counts - best.seen.sum(axis=0)
+    contradicting = tuple(map(int, np.flatnonzero(lost > np.maximum(MAX_LEFT_OUT_SHARE * counts, MIN_LEFT_OUT))))
+    several = bool(contradicting)  # a camera that was knocked away looks like one of wrong detections
+    if p_value < level and not several:
         odds = np.array([one.log_odds for one in evidence]) / noise_ratio**2
         share = np.exp(odds - odds.max()) / np.sum(np.exp(odds - odds.max()))
         witnessed = np.sum(best.seen.sum(axis=1) >= 3) >= MIN_POINTS_TO_START  # else only a pair's relative pose shows
@@ -502,7 +532,9 @@ def check_movement(rig: CheckedRig, *, level: float = 0.05, seed: int = 0) -> Ch
             candidates = ()
         elif share[0] > SURE and witnessed:
             named, candidates = best, ()
-    return Check(tuple(evidence), p_value, named, candidates, several, len(rows), noise_ratio, design, level)
+    return Check(
+        tuple(evidence), p_value, named, candidates, several, contradicting, len(rows), noise_ratio, design, level, rig
+    )
 
 
 class Design:
@@ -541,12 +573,17 @@ class Design:
         return max(float(np.sum((basis.T @ left) ** 2)) for basis in self.bases)
 
     def tail(self, gain: float) -> float:
-        """The probability that chance gains as much.
+        """The probability that chance gains as much: from the draws, or where few of them do, at most the sum of those
+        of all cameras.
 
         Args:
             gain: In units of the noise.
         """
-        return float((np.sum(self.maxima >= gain) + 1) / (len(self.maxima) + 1))
+        ranks = np.diff(self.ends)
+        ranks = ranks[ranks > 0]
+        each = chdtrc(ranks, gain) if self.freedom is None else fdtrc(ranks, self.freedom, gain / ranks)
+        above = int(np.sum(self.maxima >= gain))
+        return float(above / len(self.maxima)) if above >= MIN_DRAWS_ABOVE else float(min(1.0, np.sum(each)))
 
     def without(self, camera: int) -> Design:
         """Of the other cameras, after this one has moved as it suits the views best.

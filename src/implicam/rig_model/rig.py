@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple
 
@@ -19,6 +19,7 @@ from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
 from implicam.rig_model.movement import Check, CheckedRig, check_movement
 from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.repair import Repair, all_repaired
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
 from implicam.rig_model.triangulate import Labels, Located, locate, shared_errors
@@ -146,6 +147,20 @@ class FittedRig:
         """(n, C, 2) where the calibrated cameras see points (n, 3) of the working frame."""
         return np.stack([model.predict(points)[0] for model in self.posterior.models], axis=1)
 
+    def matched_views(self, observations: Observations | Dataset) -> tuple[Floats, Floats]:
+        """`views` of observations that may have other cameras besides.
+
+        Args:
+            observations: What the cameras saw, by their names; or a dataset that has it.
+
+        Returns:
+            Pixels (n, C, 2) and noise (n, C).
+
+        Raises:
+            DatasetError: None of the cameras is one of the calibration, or one has images of another size.
+        """
+        return self.views(self._matched(observations))
+
     def views(self, observations: Observations) -> tuple[Floats, Floats]:
         """Pixels and noise of the C calibrated cameras.
 
@@ -178,10 +193,34 @@ class FittedRig:
         Raises:
             DatasetError: None of the cameras is one of the calibration, or one has images of another size.
         """
-        uv, noise = self.views(self._matched(observations))
+        return self.movement_in_views(*self.matched_views(observations), level=level, seed=seed)
+
+    def movement_in_views(self, uv: Floats, noise: Floats, *, level: float, seed: int = 0) -> Check | None:
+        """The same from `views`.
+
+        Args:
+            uv: (n, C, 2) pixels of the calibrated cameras, NaN where not seen.
+            noise: (n, C) sd of each view, pixels.
+            level: How often a rig that stands may raise an alarm.
+            seed: Of random numbers.
+
+        Returns:
+            What was found, lengths in those of the working frame; None where no two cameras saw enough.
+        """
         if self.degrees is not None:  # the sd of normal noise as wide
             noise = noise * np.sqrt(self.degrees / (self.degrees - 2) if self.degrees > 2 else 3.0)
         return check_movement(CheckedRig(self.posterior, uv, noise, self.settings), level=level, seed=seed)
+
+    def after(self, repairs: Sequence[Repair]) -> FittedRig:
+        """The rig after movements of its cameras.
+
+        Args:
+            repairs: In the order of time.
+        """
+        posterior, labels = all_repaired(self.posterior, repairs), self.labels
+        if labels is not None and labels.unknowns is not None:
+            labels = labels._replace(unknowns=posterior.unknowns)
+        return replace(self, posterior=posterior, labels=labels)
 
     def predict(self, xyz: Floats) -> Floats:
         """Where all cameras see positions, in pixels without noise.

@@ -43,6 +43,8 @@ from implicam.calibrators.protocol import (
     RigCalibration,
     option,
     per_axis,
+    repairs_from_state,
+    repairs_state,
     solvable,
 )
 from implicam.dataset import Dataset, Observations
@@ -54,7 +56,7 @@ from implicam.lenses import LENSES
 from implicam.measurement import Measurement
 from implicam.mistakes import explain_fit_error
 from implicam.progress import Progress, silent
-from implicam.rig_model import FittedRig
+from implicam.rig_model import FittedRig, Repair
 from implicam.threads import blas_threads
 
 
@@ -222,12 +224,13 @@ class ExplicitCalibration(RigCalibration):
     calibrator: Explicit
     data: Dataset
     fitted: Fitted
+    repairs: tuple[Repair, ...] = ()
 
     method: ClassVar[str] = "explicit"
 
     @cached_property
-    def map(self) -> FittedRig:
-        """The cameras, and how they measure."""
+    def fitted_map(self) -> FittedRig:
+        """The cameras as they were fitted, and how they measure."""
         fitted = self.fitted
         return FittedRig(
             fitted.trained,
@@ -238,6 +241,23 @@ class ExplicitCalibration(RigCalibration):
             misfit_adds=True,
             settings=self.calibrator.settings.rig_model,
         )
+
+    def with_repair(self, repair: Repair) -> ExplicitCalibration:
+        """The calibration after one of its cameras has moved.
+
+        Args:
+            repair: The movement.
+
+        Raises:
+            UsageError: It is one of the paper's presets, which know nothing of how sure their cameras are.
+        """
+        if self.fitted.inflation is not None:
+            raise UsageError(
+                f"a calibration of the preset {self.calibrator.preset} cannot be repaired.",
+                why="it keeps no covariance of its cameras, by which the movement's error would be known",
+                fix="calibrate with forward-gp, or explicit without a preset",
+            )
+        return super().with_repair(repair)
 
     def measure(self, observations: Observations | Dataset) -> Measurement:
         """Measure each point with the views it has, two or more: by maximum likelihood; with the paper's presets by
@@ -290,7 +310,7 @@ class ExplicitCalibration(RigCalibration):
     @property
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
-        return [*self.fitted.notes, *self.calibrator.idle_settings_note()]
+        return [*self._repair_notes(), *self.fitted.notes, *self.calibrator.idle_settings_note()]
 
     def summary(self) -> FitSummary:
         """Leave-one-out errors of the known points; of each camera the lens model and the noise."""
@@ -309,7 +329,8 @@ class ExplicitCalibration(RigCalibration):
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The options with all settings; and per camera lens, pose and covariance, in the working frame."""
         table, arrays = saved.state(self.fitted, self.calibrator.boards)
-        return self.calibrator.as_table() | table, arrays
+        moved, moved_arrays = repairs_state(self.repairs)
+        return self.calibrator.as_table() | table | moved, arrays | moved_arrays
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ExplicitCalibration:
@@ -331,7 +352,7 @@ class ExplicitCalibration(RigCalibration):
         calibrator = Explicit.from_table({"preset": JOINT, **table}, boards=boards)  # files had none before
         if (calibrator.preset == JOINT) != (fitted.inflation is None):
             raise ValueError(f"a calibration of the preset {calibrator.preset} cannot measure like this one")
-        return cls(calibrator, data, fitted)
+        return cls(calibrator, data, fitted, repairs_from_state(table, arrays, fitted.posterior))
 
 
 def _columns(values: Floats, power: int) -> list[float]:

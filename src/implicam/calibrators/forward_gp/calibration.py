@@ -27,6 +27,8 @@ from implicam.calibrators.protocol import (
     finite_column,
     option,
     per_axis,
+    repairs_from_state,
+    repairs_state,
     solvable,
 )
 from implicam.dataset import Dataset, remove_copies
@@ -41,6 +43,7 @@ from implicam.rig_model.diagnostics import Diagnosis
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.level_errors import find_uncertain_planes
 from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.repair import Repair
 from implicam.rig_model.rig import FittedRig
 from implicam.rig_model.shot_errors import Shots
 from implicam.rig_model.training_data import Frame
@@ -135,6 +138,7 @@ class ForwardGPCalibration(RigCalibration):
     data: Dataset
     frame: Frame
     fitted: FitResult
+    repairs: tuple[Repair, ...] = ()
 
     method: ClassVar[str] = "forward-gp"
 
@@ -149,8 +153,8 @@ class ForwardGPCalibration(RigCalibration):
         return self.fitted.posterior
 
     @cached_property
-    def map(self) -> FittedRig:
-        """The cameras, and how they measure."""
+    def fitted_map(self) -> FittedRig:
+        """The cameras as they were fitted, and how they measure."""
         tails = self.fitted.tails
         return FittedRig(
             self.used.observations,
@@ -215,6 +219,7 @@ class ForwardGPCalibration(RigCalibration):
         """What the user should know before trusting this calibration; empty where all is well."""
         calibrated = self.data.observations.with_cameras(self.camera_names).cameras
         return [
+            *self._repair_notes(),
             *describe_point_copies(self.data),
             *(kind_notes(self.fitted, calibrated) if self.calibrator.lens == AUTO else ()),
             *self.diagnosis.notes(),
@@ -294,7 +299,8 @@ class ForwardGPCalibration(RigCalibration):
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """The options with all settings; and per camera lens, field, weights and covariance, in the working frame."""
         table, arrays = saved.state(self.fitted, self.data.observations.camera_names)
-        return self.calibrator.as_table() | table, arrays | {"frame": self.frame.as_array()}
+        moved, moved_arrays = repairs_state(self.repairs)
+        return self.calibrator.as_table() | table | moved, arrays | moved_arrays | {"frame": self.frame.as_array()}
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ForwardGPCalibration:
@@ -315,4 +321,4 @@ class ForwardGPCalibration(RigCalibration):
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = remove_copies(data)
         fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, calibrator.settings)
-        return cls(calibrator, data, working, fitted)
+        return cls(calibrator, data, working, fitted, repairs_from_state(table, arrays, fitted.posterior))
