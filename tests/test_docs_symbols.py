@@ -39,7 +39,7 @@ CONSTANTS = "## Constants"
 
 SUFFIXES = {
     "log",
-    "avi", "cti", "csv", "db", "html", "implicam", "jpg", "json", "jsonl", "md", "npz", "parquet", "png", "tif", "toml",
+    "avi", "cpp", "cti", "csv", "db", "hpp", "html", "implicam", "jpg", "json", "jsonl", "md", "npz", "parquet", "onnx", "png", "table", "tif", "toml",
     "txt", "xml", "yaml", "yml",
 }  # fmt: skip
 """What files end in that the documentation names."""
@@ -56,8 +56,8 @@ VARIABLES = {
 OTHERS = {"cv2", "scipy", "numpy", "functools"}
 """Libraries that the documentation names."""
 
-NOT_OURS = {"MyMethod", "FileStorage", "sd_x", "sd_y", "sd_z"}
-"""Names in examples that the reader is to write, columns of files, and what other programs call things."""
+NOT_OURS = {"MyMethod", "FileStorage", "sd_x", "sd_y", "sd_z", "message", "accuracy", "calibration_sha256"}
+"""Names in examples that the reader is to write, columns of files, and what C++ and other programs call things."""
 
 GONE: dict[str, set[str]] = {}
 """Decision -> names and files of its time that are no longer there. Mend the page rather than add to this."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,16 +14,15 @@ import pytest
 
 import implicam as ic
 from command_line import Cli, cli  # noqa: F401
-from forward_gp_cases import declared_fit, dots_fit, with_positions
+from deployed_rigs import RIGS, boards, covariances, forward_gp
 from implicam import calibration_file
 from implicam.calibrators import Calibration
 from implicam.calibrators.inverse_gp import InverseGPCalibration
 from implicam.calibrators.protocol import RigCalibration
 from implicam.errors import UsageError
 from implicam.geometry import Pose
-from implicam.lenses import KannalaBrandt
 from implicam.rig_model import CentralCamera
-from implicam.simulate import Rig, Unusual, build_rig, moving_board, random_positions, simulate
+from implicam.simulate import Rig, Unusual, build_rig, random_positions, simulate
 from toy_lens import Equisolid
 
 pytest.importorskip("onnx")
@@ -32,8 +30,6 @@ onnxruntime = pytest.importorskip("onnxruntime")
 
 from implicam.deploy import write_onnx  # noqa: E402
 from implicam.deploy.onnx_cameras import forward_graph  # noqa: E402
-
-REAL = Path(__file__).parent / "data" / "real"
 
 WORKSPACE_PART, PART_OF_PLAIN = 1e-9, 1e-8
 """What a position or its sd may differ by, over the extent of the known positions. Python's own answers differ by a
@@ -90,49 +86,6 @@ def test_inverse_gp(options: dict[str, str], tmp_path: Path) -> None:
     assert found["xyz"].dtype == np.float64
 
 
-def forward_gp(unusual: Unusual, lens: str = "auto") -> RigCalibration:
-    rig = build_rig("stereo", seed=5, unusual=unusual)
-    return ic.ForwardGP(lens=lens).fit(simulate(rig, random_positions(rig, 60, np.random.default_rng(5)), seed=5))
-
-
-def fisheyes() -> Rig:
-    """105 degrees off the axis at the left and right."""
-    rig, wide = build_rig("stereo", seed=5), KannalaBrandt(350.0, 350.0, 640.0, 400.0)
-    return replace(rig, cameras=tuple(replace(camera, lens=wide) for camera in rig.cameras))
-
-
-def of_fisheyes(make: ic.ForwardGP | ic.Explicit) -> RigCalibration:
-    rig = fisheyes()
-    made: RigCalibration = make.fit(simulate(rig, random_positions(rig, 60, np.random.default_rng(5)), seed=5))
-    return made
-
-
-def boards() -> RigCalibration:
-    """Boards on a slide, each of them off by some tenths of a mm, which nothing says: labels that are estimated."""
-    rig = build_rig("bar6", seed=4, cameras="2R")
-    data = simulate(rig, moving_board(rig, corners=(4, 5), positions=6, step=40.0), seed=4)
-    _, shot = np.unique(data.shots, return_inverse=True)
-    moved = data.xyz + 0.3 * rig.units_per_mm * np.random.default_rng(6).normal(size=(6, 3))[shot]
-    return ic.ForwardGP().fit(with_positions(data, moved, np.nan))
-
-
-RIGS: dict[str, Callable[[], RigCalibration]] = {
-    "perspective": lambda: forward_gp(Unusual()),
-    "fisheye": lambda: of_fisheyes(ic.ForwardGP()),
-    "tilted": lambda: forward_gp(Unusual(tilt=12.0)),
-    "mirror": lambda: forward_gp(Unusual(mirror="all")),
-    "other pixels": lambda: forward_gp(Unusual(aspect=1.3)),
-    "window": lambda: forward_gp(Unusual(window=25.0)),
-    "no lens": lambda: forward_gp(Unusual(window=25.0), "none"),
-    "central": lambda: forward_gp(Unusual(), "central"),
-    "explicit brown-conrady": lambda: of_fisheyes(ic.Explicit(lens="brown-conrady")),
-    "explicit kannala-brandt": lambda: of_fisheyes(ic.Explicit(lens="kannala-brandt")),
-    "declared errors": declared_fit,
-    "dots": dots_fit,
-    "a real tank": lambda: ic.ForwardGP().fit(ic.read_dataset(REAL / "two-sided-tank")),
-}
-
-
 def around(made: RigCalibration, seed: int = 0) -> np.ndarray:
     """Positions in the workspace, near it, and far away, behind the cameras too."""
     low, high = made.data.xyz.min(axis=0), made.data.xyz.max(axis=0)
@@ -140,16 +93,6 @@ def around(made: RigCalibration, seed: int = 0) -> np.ndarray:
     near = rng.uniform(low - 0.3 * size, high + 0.3 * size, (200, 3))
     far = rng.uniform(low - 20 * size, high + 20 * size, (100, 3))
     return np.concatenate([near, far, made.data.xyz[:20], [[np.nan, 0, 0]]])
-
-
-def covariances(made: RigCalibration, xyz: np.ndarray) -> list[np.ndarray]:
-    """Per camera (n, 2, 2), eq. (19)."""
-    found = []
-    with np.errstate(invalid="ignore"):
-        for of in made.sensitivities(xyz):
-            every = of.half @ of.half.swapaxes(1, 2) + (of.rest + of.noise)[:, :, None] * np.eye(of.rest.shape[1])
-            found += [every[:, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] for i in range(len(of.cameras))]
-    return found
 
 
 FAST = {"perspective", "mirror", "no lens", "explicit brown-conrady", "explicit kannala-brandt"}

@@ -15,13 +15,15 @@ from implicam.cli import show
 from implicam.cli.app import Json, command, must_be_calibration, must_be_folder, must_not_replace
 from implicam.cli.options import Options, OptionsOfParts, options_of_fields
 from implicam.dataset.table_options import TableOptions
-from implicam.deploy import write_onnx
+from implicam.deploy import write_cpp, write_onnx
+from implicam.deploy.cpp_table import EXAMPLE_FILE, HEADER_FILE, TABLE_FILE
 from implicam.errors import UsageError, did_you_mean
 from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, export_cameras, import_cameras
 from implicam.exchange.pixel_maps import MAPS_FORMAT, write_maps
 
-ONNX_FORMAT = "onnx"
-NAMES = (*FORMATS, MAPS_FORMAT, ONNX_FORMAT)
+ONNX_FORMAT, CPP_FORMAT = "onnx", "cpp"
+WRITE_FOLDERS = (*FOLDERS, MAPS_FORMAT, CPP_FORMAT)
+NAMES = (*FORMATS, MAPS_FORMAT, ONNX_FORMAT, CPP_FORMAT)
 
 
 def _map_options() -> Options:
@@ -33,13 +35,15 @@ def _export(
     to: Annotated[str, typer.Option("--to", metavar="NAME", help=f"One of {', '.join(NAMES)}.")],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", help=f"The file to write; for {', '.join((*FOLDERS, MAPS_FORMAT))} a folder."),
+        typer.Option(
+            "--output", "-o", help=f"The file to write; for {', '.join((*FOLDERS, MAPS_FORMAT, CPP_FORMAT))} a folder."
+        ),
     ],
     json: Json = False,
     **options: Any,
 ) -> None:
     """Write the cameras for another program: lenses and places, as far as its format holds them; pixel maps that make
-    pinholes of them, with the sd of the maps; or all that was learned, as a graph of ONNX."""
+    pinholes of them, with the sd of the maps; or all that was learned: a graph of ONNX, a table with a C++ header."""
     must_not_replace(output, calibration)
     if to not in NAMES:
         raise UsageError(
@@ -56,6 +60,12 @@ def _export(
     if to == ONNX_FORMAT:
         notes = write_onnx(load_calibration(calibration), output, checksum(calibration))
         _tell(to, output, "a graph of ONNX, float64", notes, json)
+        return
+    if to == CPP_FORMAT:
+        must_be_folder(output)
+        with show.progress(json) as progress:
+            notes = write_cpp(load_calibration(calibration), output, checksum(calibration), progress)
+        _tell(to, output, f"{HEADER_FILE}, {TABLE_FILE} and {EXAMPLE_FILE}, for C++17", notes, json)
         return
     rig, lost = rig_of(load_calibration(calibration))
     notes = [*lost, *export_cameras(rig, to, output)]

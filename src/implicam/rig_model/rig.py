@@ -316,6 +316,11 @@ class FittedRig:
         usual, stated = self.posterior.models[number].noise, float(np.nan_to_num(self._stated[self.cameras[number]]))
         return float(np.sqrt(max(usual**2 - stated**2, 0.0))) if self.misfit_adds else 0.0
 
+    @property
+    def usual_stated_noise(self) -> Floats:
+        """(C,) of the calibrated cameras, what their own views stated for noise, in pixels; NaN where they did not."""
+        return self._stated[list(self.cameras)]
+
     @cached_property
     def _stated(self) -> Floats:
         return stated_noise(self.trained)
