@@ -31,7 +31,10 @@ from implicam.simulate import random_positions, simulate
 COMPILERS = [name for name in ("g++", "clang++") if shutil.which(name)]
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C++ compiler (g++ or clang++)")
 
-WARNINGS = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pthread")
+WARNINGS = (
+    "-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wsign-conversion", "-Wshadow", "-Wold-style-cast",
+    "-Wfloat-equal", "-Werror", "-pthread",
+)  # fmt: skip
 SANITIZERS = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 TEMPLATES = Path(cpp_table.__file__).parent / "templates"
 OK, DOUBTFUL, NOT_SEEN, TOO_FEW, CONTRADICT, NO_POSITION, OUTSIDE, NOT_TABULATED, OUTSIDE_IMAGE, WRONG_INPUT = range(10)

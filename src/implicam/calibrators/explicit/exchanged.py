@@ -39,7 +39,7 @@ def rig_of(calibration: Calibration) -> tuple[Rig, list[str]]:
         raise UsageError(
             f"{calibration.method} has no cameras that could be exported.",
             why="it learns the map from pixels to positions as a whole",
-            fix="calibrate the same data with --method explicit",
+            fix="calibrate the same data with --method explicit; or, by inverse-gp, --to onnx",
         )
     notes, cameras = [], []
     for camera in calibration.cameras.values():
@@ -47,7 +47,7 @@ def rig_of(calibration: Calibration) -> tuple[Rig, list[str]]:
             raise UsageError(
                 f"{camera.name} {camera.note}, and no camera file can say so.",
                 why="other programs know lenses that see the world as it is",
-                fix="turn its pictures over, or calibrate the same data with --method explicit",
+                fix="calibrate the same data with --method explicit; or --to onnx or --to cpp, which hold every camera",
             )
         notes += [f"{camera.name}: {camera.note}"] if camera.note else []
         cameras.append(ExplicitCamera(camera.name, camera.width, camera.height, camera.lens, camera.camera_from_world))

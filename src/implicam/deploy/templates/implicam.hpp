@@ -409,7 +409,7 @@ class Rig {
     if (!read(sections, "rules", {7}, values)) return false;
     min_p_ = values[0];
     disagree_p_ = values[1];
-    misfit_adds_ = values[2] != 0;
+    misfit_adds_ = values[2] > 0;
     accuracy_ = {values[3], values[4], values[5], values[6]};
     if (!read(sections, "sensors", {C, 7}, values, true)) return false;
     std::string rest = text(*names);
