@@ -17,8 +17,9 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --constraint
 demo: $(VENV)/.demo
 	$(BIN)/implicam demo
 
-# A process for each core, so one thread each; a file in one process, because its tests share rigs and fits.
-PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --durations 10 --durations-min 5
+# A process for each core, so one thread each; a file in one process, because its tests share rigs and fits. Bytecode
+# is kept, whatever the environment says: commands in processes of their own would compile everything again.
+PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto --durations 10 --durations-min 5
 
 test: $(VENV)/.dev
 	$(PYTEST) --dist loadfile -m "not slow"

@@ -6,7 +6,11 @@ import shutil
 from collections import Counter
 from typing import Any
 
+import hypothesis
 import pytest
+
+hypothesis.settings.register_profile("any machine", deadline=None)  # on a busy one an example may take a second
+hypothesis.settings.load_profile("any machine")
 
 CPU_SECONDS_OF_A_TEST = 20.0
 CPU_SECONDS_OF_A_FILE = 40.0

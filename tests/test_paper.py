@@ -45,12 +45,12 @@ from implicam.simulate import ball_grid, build_rig, moving_board, random_positio
 ROOT = Path(__file__).parents[1]
 TINY = Plan(
     name="tiny",
-    shares=(80, 50, 30),
+    shares=(80, 30),
     runs=dict.fromkeys(METHODS, 2),
-    random_shares=(50,),
+    random_shares=(30,),
     random_runs=dict.fromkeys(METHODS, 2),
     subsets=1,
-    additions=4,
+    additions=2,
     repeats=dict.fromkeys(METHODS, 2),
     lot=dict.fromkeys(METHODS, 2),
     boards=(2, 3),
@@ -596,7 +596,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Source, Any]:
         pytest.importorskip(library)
     folder = tmp_path_factory.mktemp("paper")
     source = Source.of(measured(folder / "mine"), 0)
-    return folder / "out", source, reproduce(EXPERIMENTS, folder / "out", source, TINY, jobs=2)
+    return folder / "out", source, reproduce(EXPERIMENTS, folder / "out", source, TINY, jobs=1)
 
 
 def test_measured_data_of_another_rig_run_through(done: tuple[Path, Source, Any]) -> None:

@@ -7,9 +7,13 @@ recipes.
 
 from __future__ import annotations
 
+import importlib.metadata
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from importlib.metadata import EntryPoint, entry_points
+from functools import lru_cache
+from importlib.metadata import EntryPoint, EntryPoints
 from typing import Any, NamedTuple, TypeVar
 
 from implicam.errors import PartError, UsageError, did_you_mean
@@ -39,6 +43,28 @@ class Option(NamedTuple):
     def told(self) -> str:
         """The help, now."""
         return self.help() if callable(self.help) else self.help
+
+
+def entry_points(**by: Any) -> EntryPoints:
+    """Those of importlib.metadata, which reads the files of all packages whenever it is asked: 3 ms. Here they are read
+    again when a package has come or gone.
+
+    Args:
+        by: What to select: group, name.
+    """
+    return _all_entry_points(tuple((path, _changed(path)) for path in sys.path)).select(**by)
+
+
+@lru_cache(maxsize=1)
+def _all_entry_points(places: tuple[tuple[str, int], ...]) -> EntryPoints:
+    return importlib.metadata.entry_points()  # type: ignore[return-value]  # typed as that of Python 3.9
+
+
+def _changed(path: str) -> int:
+    try:
+        return os.stat(path or ".").st_mtime_ns
+    except OSError:
+        return 0
 
 
 class Registry(Mapping[str, Part]):

@@ -17,7 +17,7 @@ from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from implicam.calibrators import CALIBRATORS, Calibration, HasPositionProcesses, PredictsPixels
 from implicam.calibrators.position_processes import PositionProcesses
@@ -27,7 +27,7 @@ from implicam.rig_model import Sensitivity
 
 Bools = NDArray[np.bool_]
 
-ELLIPSOID_95_SCALE = float(np.sqrt(chi2.ppf(0.95, 3)))
+ELLIPSOID_95_SCALE = float(np.sqrt(chdtri(3, 0.05)))
 """The 95 % ellipsoid of a position, in units of the ellipsoid of one standard deviation."""
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
-from scipy.stats import qmc
 
 from implicam.active.design_model import are_on_image
 from implicam.calibrators import PredictsPixels
@@ -242,6 +241,8 @@ class Workspace:
 
     def _sample_inside(self, n: int, seed: int | list[int]) -> Floats:
         """(n, 3) points of a scrambled Sobol sequence inside."""
+        from scipy.stats import qmc  # late: it takes a second of every command's start
+
         sequence = qmc.Sobol(3, rng=np.random.default_rng(seed))
         found, axes = np.zeros((0, 3)), np.eye(3)
         while len(found) < n:

@@ -24,12 +24,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     verbose = not {"--verbose", "-v"}.isdisjoint(given)
     given = [word for word in given if word not in ("--debug", "--verbose", "-v")]
     from implicam.cli.commands import app  # late: `import implicam.cli` stays cheap
-    from implicam.cli.options import load_options
+    from implicam.cli.options import load_options, only_command
 
     try:
         with log_to_stream(sys.stderr) if verbose else nullcontext():
             load_options(app, given or _words_to_complete())
-            app(given, prog_name="implicam")
+            only_command(app, given)(given, prog_name="implicam")
     except ImplicamError as error:
         _fail(str(error), 2 if isinstance(error, UsageError) else 1, debug)
     except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import typer
+from typer.main import get_group
 
 from implicam.calibrators import CALIBRATORS, Calibrator, calibrator, every_option, method_for, options_of
 from implicam.dataset import TableOptions, read_dataset
@@ -59,6 +61,17 @@ def load_options(app: typer.Typer, words: Sequence[str]) -> None:
     for command in app.registered_commands:
         if command.name == name and isinstance(command.callback, OptionsOfParts):
             command.callback.load()
+
+
+def only_command(app: typer.Typer, words: Sequence[str]) -> Callable[..., Any]:
+    """The command line with nothing but the command that its first word names, and all of it where that is none: Typer
+    reads the options of every command it is given, which is most of the time of a short command."""
+    named = [command for command in app.registered_commands if command.name == next(iter(words), None)]
+    if not named:
+        return app
+    alone = copy.copy(app)
+    alone.registered_commands = named
+    return get_group(alone)
 
 
 def options_of_calibrators() -> Options:

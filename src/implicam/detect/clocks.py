@@ -9,7 +9,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from implicam.dataset import Floats
 from implicam.dataset.tables import NumberColumn, read_columns, read_table
@@ -161,7 +161,7 @@ def _adjust(tracks: Sequence[Track], told: Mapping[tuple[int, int], Offset]) -> 
         clocks[name] = Clock(name, float(o), float(d), middle[k], float(so), float(sdrift))
     misfit = float(np.square(design @ values - target).sum())
     free = len(target) - len(values)
-    if free and chi2.sf(misfit, free) < LOOP_P:
+    if free and chdtrc(free, misfit) < LOOP_P:
         ratio = math.sqrt(misfit / free)
         clocks = {
             name: Clock(c.camera, c.offset, c.drift, c.around, c.sd * ratio, c.drift_sd * ratio)

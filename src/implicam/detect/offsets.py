@@ -25,8 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
-from scipy.signal import correlate
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from implicam.dataset import Floats
 from implicam.detect.tracks import MAX_GAP_PERIODS, Track, spline
@@ -359,19 +358,15 @@ def _correlate(a: Floats, b: Floats) -> tuple[Floats, Rows]:
     filled = [np.where(np.isfinite(v), v, 0) for v in (a, b)]
     filled = [v / math.sqrt(max(float((v**2).sum() / m.sum()), 1e-300)) for v, m in zip(filled, masks, strict=True)]
 
-    def over_lags(x: Floats, y: Floats) -> Floats:
-        # row l: the sum over i of x[i] y[i + l]
-        return np.asarray(correlate(y, x, mode="full", method="fft"), np.float64)
-
     lags = np.arange(-(len(a) - 1), len(b))
-    count = np.maximum(over_lags(*masks), 0)
+    count = np.maximum(_over_lags(*masks), 0)
     n = np.maximum(count, 1e-9)
     blocks = np.zeros((len(lags), 4, 4))
     for i in range(2):
         for j in range(2):
-            blocks[:, i, j] = over_lags(filled[0][:, i] * filled[0][:, j], masks[1]) / n
-            blocks[:, 2 + i, 2 + j] = over_lags(masks[0], filled[1][:, i] * filled[1][:, j]) / n
-            blocks[:, i, 2 + j] = over_lags(filled[0][:, i], filled[1][:, j]) / n
+            blocks[:, i, j] = _over_lags(filled[0][:, i] * filled[0][:, j], masks[1]) / n
+            blocks[:, 2 + i, 2 + j] = _over_lags(masks[0], filled[1][:, i] * filled[1][:, j]) / n
+            blocks[:, i, 2 + j] = _over_lags(filled[0][:, i], filled[1][:, j]) / n
     blocks[:, 2:, :2] = blocks[:, :2, 2:].transpose(0, 2, 1)
     blocks += 1e-3 * np.eye(4)
     log_det = [np.linalg.slogdet(part)[1] for part in (blocks[:, :2, :2], blocks[:, 2:, 2:], blocks)]
@@ -381,12 +376,19 @@ def _correlate(a: Floats, b: Floats) -> tuple[Floats, Rows]:
     return np.where(count >= fewest, independent * information - 2, np.nan), lags
 
 
+def _over_lags(x: Floats, y: Floats) -> Floats:
+    """Row l: the sum over i of x[i] y[i + l], from as far back as there is anything."""
+    from scipy.signal import correlate  # late: it takes a second of every command's start
+
+    return np.asarray(correlate(y, x, mode="full", method="fft"), np.float64)
+
+
 def _correlation_length(filled: Sequence[Floats], masks: Sequence[Floats]) -> float:
     """In how many steps velocities become others."""
     lengths = []
     for v, m in zip(filled, masks, strict=True):
-        own = sum(correlate(v[:, k], v[:, k], mode="full", method="fft") for k in range(2))
-        count = correlate(m, m, mode="full", method="fft")
+        own = _over_lags(v[:, 0], v[:, 0]) + _over_lags(v[:, 1], v[:, 1])
+        count = _over_lags(m, m)
         middle = len(v) - 1
         rho = own[middle:] / np.maximum(count[middle:], 1) / (own[middle] / count[middle])
         below = np.flatnonzero(rho < 0.3)
@@ -499,7 +501,7 @@ class _Epipolar:
         k = len(without)
         jackknife = without.T @ without * (k - 1) / k + inverse @ of_priors @ inverse
         # a normal interval of this variance is as wide as Student's with k - 1 degrees of freedom
-        wider = (student.ppf(0.975, max(k - 1, 1)) / 1.96) ** 2
+        wider = (stdtrit(max(k - 1, 1), 0.975) / 1.96) ** 2
         plain = inverse * np.mean(weights[:n] * np.square(residuals[:n])) * n / max(n - 13, 1)
         larger = jackknife if jackknife[0, 0] * wider > plain[0, 0] else plain / wider
         covariance = wider * larger[:2, :2] * np.outer(units[:2], units[:2])

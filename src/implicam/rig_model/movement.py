@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -400,12 +400,16 @@ def _start(rig: CheckedRig, camera: int, x: Floats, rows: NDArray[np.int64]) -> 
     model, stand = rig.posterior.models[camera], rig.stands[camera]
     uv, noise = rig.uv[rows, camera], rig.noise[rows, camera, None]
 
+    @lru_cache(maxsize=1)  # the slope is asked for where the residuals were last
+    def look(numbers: bytes) -> MovedViews:
+        return see_moved(model, stand, stand.moved(Motion(), np.frombuffer(numbers) * PRIOR_SDS), x)
+
     def off(numbers: Floats) -> Floats:
-        seen = see_moved(model, stand, stand.moved(Motion(), numbers * PRIOR_SDS), x).uv
+        seen = look(numbers.tobytes()).uv
         return np.asarray(np.nan_to_num((uv - seen) / noise, nan=1e6).ravel(), dtype=np.float64)
 
     def slope(numbers: Floats) -> Floats:  # of a step after the turn, which is near enough
-        by_step = see_moved(model, stand, stand.moved(Motion(), numbers * PRIOR_SDS), x).by_step
+        by_step = look(numbers.tobytes()).by_step
         return np.asarray(np.nan_to_num(-by_step * PRIOR_SDS / noise[..., None]).reshape(-1, NUMBERS), dtype=np.float64)
 
     found = least_squares(off, np.zeros(NUMBERS), slope, loss="cauchy", f_scale=3.0, x_scale=1e-2, max_nfev=100)

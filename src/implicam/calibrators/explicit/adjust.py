@@ -21,6 +21,7 @@ from implicam.calibrators.explicit.settings import DEFAULT_SETTINGS, ExplicitSet
 from implicam.geometry import Bools, Floats, Pose, rotation_from_vector
 from implicam.progress import Progress, silent
 from implicam.rig_model import CentralCamera, Prior, solve_normal
+from implicam.rig_model.camera import cross
 
 LOST_SQUARED_RESIDUAL = 1e4
 """Squared residual of a corner that the lens has no pixel for."""
@@ -365,7 +366,7 @@ def _whitened(bundle: Bundle, c: int, robust: bool) -> tuple[Floats, Floats, Flo
         weight = weight / np.sqrt(1 + squares / bundle.settings.cauchy_scale_sds**2)
     there = np.isfinite(seen.uv).all(axis=1) & np.isfinite(seen.by_parameters).all(axis=(1, 2))
     weight = np.where(there, weight, 0)[:, None]
-    by_board = np.concatenate([np.cross(turned[:, None, :], seen.by_point), seen.by_point], axis=2)
+    by_board = np.concatenate([cross(turned[:, None, :], seen.by_point), seen.by_point], axis=2)
     blocks = (stack.uv - seen.uv, seen.by_parameters, by_board)
     if not there.all():
         blocks = (np.nan_to_num(blocks[0]), np.nan_to_num(blocks[1]), np.nan_to_num(blocks[2]))
@@ -388,7 +389,7 @@ def _slacks(bundle: Bundle, c: int, by_board: Floats) -> Iterator[tuple[Floats, 
         middle = turned.mean(axis=0)
         radius = max(float(np.sqrt(np.mean(np.sum((turned - middle) ** 2, axis=1)))), 1e-9)
         flat = by_board[rows].reshape(-1, 6)
-        about = flat[:, :3] - np.cross(middle, flat[:, 3:])  # turned about its middle, not about its first corner
+        about = flat[:, :3] - cross(middle, flat[:, 3:])  # turned about its middle, not about its first corner
         Q, size, _ = np.linalg.svd(bundle.slack * np.column_stack([about / radius, flat[:, 3:]]), full_matrices=False)
         yield Q, size
 

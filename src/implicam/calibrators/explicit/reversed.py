@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.calibrators.explicit.boards import BoardView
-from implicam.calibrators.explicit.zhang import median_error
 from implicam.geometry import Floats, Pose
 from implicam.rig_model import CentralCamera
 
@@ -72,10 +71,16 @@ def find_reversed(
         return None
     turns = {way: _turn(np.array(signs), middle) for way, signs in WAYS.items()}
 
+    each = [(seen[k], other[k] @ turn) for k in common for turn in turns.values()]
+    in_other = np.concatenate([pose.apply(view.xyz) for view, pose in each])
+    uv = np.concatenate([view.uv for view, _ in each])
+    ends = np.cumsum([len(view.uv) for view, _ in each])[:-1]
+
     def errors(camera_from_other: Pose) -> Floats:
         """(boards, ways) pixels that the corners are off."""
-        poses = [[camera_from_other @ other[k] @ turn for turn in turns.values()] for k in common]
-        return np.array([[median_error(camera, seen[k], p) for p in of] for k, of in zip(common, poses, strict=True)])
+        off = np.linalg.norm(camera.pixel(camera_from_other.apply(in_other)) - uv, axis=1)
+        parts = np.split(np.nan_to_num(off, nan=np.inf), ends)
+        return np.array([np.median(part) for part in parts]).reshape(len(common), len(turns))
 
     best = np.full((len(common), len(turns)), np.inf)
     step = -(-len(common) // MAX_REFERENCES)

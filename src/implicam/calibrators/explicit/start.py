@@ -127,19 +127,20 @@ def _with_pixels(starts: Sequence[_Candidate], scene: Scene) -> list[_Candidate]
     def fitted(pixels: Pixels, start: _Candidate) -> _Candidate:
         return _refined(start.camera, pixels, start.inliers, scene)
 
+    judged = _Evidence(scene)
     found = [fitted(usual, starts[0]), fitted(widest, starts[0])]
-    simple, free = _evidence(found, scene)
+    simple, free = judged.of(found)
     if free < simple - settings.max_usual_gain_nats:
         return found[:1]
     found = [found[0], *(fitted(pixels, starts[0]) for pixels in between), found[1]]
-    evidence = _evidence(found, scene)
+    evidence = judged.of(found)
     best = found[int(np.argmax(evidence))]
     found = [one for one, log in zip(found, evidence, strict=True) if log > max(evidence) - settings.max_lacking_nats]
     for i, one in enumerate(found):  # an unusual lens has optima that are not the best
         others = [start for start in (best, *starts[1:]) if start is not one]
         tries = [one, *(fitted(one.pixels, start) for start in others)]
-        found[i] = tries[int(np.argmax(_evidence(tries, scene)))]
-    order = np.argsort(_evidence(found, scene), kind="stable")[::-1]
+        found[i] = tries[int(np.argmax(judged.of(tries)))]
+    order = np.argsort(judged.of(found), kind="stable")[::-1]
     return [found[i] for i in order]
 
 
@@ -166,12 +167,23 @@ def _refined(
     return _Candidate(InitialCamera(camera, prior, inliers), camera, pixels)
 
 
-def _evidence(found: list[_Candidate], scene: Scene) -> list[float]:
-    """Log marginal likelihood of each, by Laplace's method at its best noise, on the views that all of them keep."""
-    common = np.logical_and.reduce([one.inliers for one in found])
-    if common.sum() < MIN_POINTS_PER_CAMERA:
-        common = found[-1].inliers
-    return [_log_evidence(one, scene.select(common)) for one in found]
+class _Evidence:
+    """Judges candidates on the same views; what it has judged it knows."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.known: dict[tuple[int, bytes], tuple[_Candidate, float]] = {}
+
+    def of(self, found: list[_Candidate]) -> list[float]:
+        """Log marginal likelihood of each, by Laplace's method at its best noise, on the views that all keep."""
+        common = np.logical_and.reduce([one.inliers for one in found])
+        if common.sum() < MIN_POINTS_PER_CAMERA:
+            common = found[-1].inliers
+        for one in found:
+            key = (id(one), common.tobytes())  # it is kept in the value, so that no other can have its id
+            if key not in self.known:
+                self.known[key] = (one, _log_evidence(one, self.scene.select(common)))
+        return [self.known[id(one), common.tobytes()][1] for one in found]
 
 
 def _log_evidence(one: _Candidate, scene: Scene) -> float:
