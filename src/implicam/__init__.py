@@ -73,6 +73,9 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.stability import check_calibration as check_calibration
     from implicam.verdict import Verdict as Verdict
     from implicam.verdict import judge as judge
+    from implicam.verification import CalibratedLength as CalibratedLength
+    from implicam.verification import Verification as Verification
+    from implicam.verification import verify as verify
 
     __version__: str
 
@@ -99,6 +102,7 @@ _NAMES = {
     "implicam.simulate": ("simulated",),
     "implicam.stability": ("CalibrationCheck", "CalibrationRepair", "CalibrationWatch", "check_calibration"),
     "implicam.verdict": ("Verdict", "judge"),
+    "implicam.verification": ("CalibratedLength", "Verification", "verify"),
 }  # fmt: skip
 """Module -> the public names it has."""
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}

@@ -37,6 +37,7 @@ EXAMPLES = {
     "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
     "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
     "check": "implicam check my-rig.implicam my-rig/check --log checks.csv",
+    "verify": "implicam verify my-rig.implicam my-rig/lengths --mpe '0.5 + L/500'",
     "compare": "implicam compare my-rig --train 35,87 --seeds 3 -o compare.png",
     "report": "implicam report my-rig.implicam -o report.html",
     "convert": "implicam convert my-rig my-rig.csv",

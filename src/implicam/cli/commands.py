@@ -24,7 +24,8 @@ import implicam.cli.design
 import implicam.cli.detect
 import implicam.cli.label
 import implicam.cli.paper
-import implicam.cli.simulate  # noqa: F401  these register their commands
+import implicam.cli.simulate
+import implicam.cli.verify  # noqa: F401  these register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards

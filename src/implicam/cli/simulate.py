@@ -13,10 +13,12 @@ import typer
 from implicam.cli import show
 from implicam.cli.app import Json, Seed, command, must_be_folder
 from implicam.dataset import folder_files, write_dataset
+from implicam.dataset.folder import csv_text, format_cells
 from implicam.errors import UsageError
 from implicam.files import toml_text
 from implicam.simulate import (
     Optics,
+    Rig,
     Unusual,
     as_boards,
     ball_grid,
@@ -26,8 +28,13 @@ from implicam.simulate import (
     moving_board,
     random_positions,
     record,
+    simulate,
+    step_gauge,
     write_rig,
 )
+
+GAUGE_U = 5e-6
+"""Expanded uncertainty (k = 2) of a step gauge, over its length."""
 
 
 class Target(StrEnum):
@@ -69,7 +76,12 @@ def simulate_command(
     each: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every camera alone.")] = 10,
     pairs: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every two neighbours.")] = 4,
     check: Annotated[
-        int, typer.Option(min=0, metavar="N", help="Also write so many random positions to OUT/check.")
+        int,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Also write so many random positions to OUT/check, and a step gauge to OUT/lengths.",
+        ),
     ] = 0,
     cameras: Annotated[
         str | None, typer.Option(metavar="LIST", help="2R, 2R2W, 2R4W, or names separated by commas.")
@@ -147,6 +159,7 @@ def simulate_command(
             target_points = random_positions(built, check, np.random.default_rng([shots, 2]))
             parts["check"] = record(built, target_points, seed=shots + 1_000_003, missing=missing, optics=optics)
             files |= {f"check/{name}": text for name, text in folder_files(parts["check"].data).items()}
+            files |= {f"lengths/{name}": text for name, text in _lengths(built, shots).items()}
 
         def photographs(folder: Path) -> None:
             for part, one in parts.items():
@@ -166,6 +179,17 @@ def simulate_command(
         show.line(f"{out / 'images'}: {pictures} photographs{' with those of check' if check else ''}")
     if check:
         show.line(f"{out / 'check'}: {check} random positions to judge by")
+        show.line(f"{out / 'lengths'}: a step gauge on seven lines, for implicam verify")
+
+
+def _lengths(rig: Rig, seed: int) -> dict[str, str]:
+    """The files of a dataset that shows a step gauge, whose positions are not known, and of its certificate."""
+    gauge, lengths = step_gauge(rig)
+    data = replace(simulate(rig, gauge, seed=seed + 2_000_003), known=None)
+    expanded = GAUGE_U * max(one.length for one in lengths)
+    scale = 1 + np.random.default_rng([seed, 3]).normal(0, GAUGE_U / 2)
+    rows = [[one.line, one.a, one.b, *format_cells(np.array([one.length * scale, expanded]))] for one in lengths]
+    return {**folder_files(data), "lengths.csv": csv_text(("line", "a", "b", "length", "U"), rows)}
 
 
 def _grid(text: str) -> tuple[int, int, int]:

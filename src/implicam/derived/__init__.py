@@ -16,10 +16,11 @@ from implicam.derived.features import (
     fit_sphere,
 )
 from implicam.derived.joint_positions import JointPositions, joint
-from implicam.derived.quantities import Quantity, angle, distance, distances
+from implicam.derived.quantities import JointDistances, Quantity, angle, distance, distances, joint_distances
 
 __all__ = [
     "Cylinder",
+    "JointDistances",
     "JointPositions",
     "Motion",
     "Plane",
@@ -33,4 +34,5 @@ __all__ = [
     "fit_plane",
     "fit_sphere",
     "joint",
+    "joint_distances",
 ]

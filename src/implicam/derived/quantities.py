@@ -107,15 +107,21 @@ def distances(measurement: Measurement, pairs: Sequence[tuple[str | int, str | i
     >>> len(ic.distances(measured, [(0, 1), (2, 3)]))
     2
     """
+    rows = _numbers_of_pairs(measurement, pairs)
+    found: list[Quantity] = []
+    for start in range(0, len(rows), PAIRS_PER_CHUNK):
+        found += _distances(measurement, rows[start : start + PAIRS_PER_CHUNK])
+    return found
+
+
+def _numbers_of_pairs(measurement: Measurement, pairs: Sequence[tuple[str | int, str | int]]) -> NDArray[np.int64]:
+    """(n, 2) numbers of points that were measured, the two of a pair different."""
     rows = np.array([[find_measured_point(measurement, point) for point in pair] for pair in pairs], dtype=np.int64)
     rows = rows.reshape(len(pairs), 2)
     for a, b in rows[rows[:, 0] == rows[:, 1]]:
         name = str(measurement.points[a])
         raise UsageError(f"a distance is between two points, and {name!r} is one.", fix=f"give another beside {b}")
-    found: list[Quantity] = []
-    for start in range(0, len(rows), PAIRS_PER_CHUNK):
-        found += _distances(measurement, rows[start : start + PAIRS_PER_CHUNK])
-    return found
+    return rows
 
 
 def _distances(measurement: Measurement, pairs: NDArray[np.int64]) -> list[Quantity]:
@@ -139,6 +145,53 @@ def _distances(measurement: Measurement, pairs: NDArray[np.int64]) -> list[Quant
         Quantity(float(d), float(u), points.length_unit, note if n else "")
         for d, u, n in zip(length, sd, near, strict=True)
     ]
+
+
+@dataclass(frozen=True, eq=False)
+class JointDistances:
+    """Distances between measured points with what their errors share.
+
+    Attributes:
+        values: (n,) the distances.
+        cov: (n, n) their covariance.
+        unit: The length unit.
+    """
+
+    values: Floats
+    cov: Floats
+    unit: str
+
+
+def joint_distances(measurement: Measurement, pairs: Sequence[tuple[str | int, str | int]]) -> JointDistances:
+    """Distances of pairs of points with the covariance of all of them: for tests of many lengths together.
+
+    Args:
+        measurement: As a calibration gave it.
+        pairs: n names or numbers of points.
+
+    Raises:
+        UsageError: As for `distance`.
+
+    >>> import implicam as ic
+    >>> from implicam.derived import joint_distances
+    >>> rig = ic.simulated("stereo", points=30, seed=1)
+    >>> measured = ic.ForwardGP().fit(rig).measure(rig)
+    >>> joint_distances(measured, [(0, 1), (2, 3)]).cov.shape
+    (2, 2)
+    """
+    numbers = _numbers_of_pairs(measurement, pairs)
+    rows, at = np.unique(numbers, return_inverse=True)
+    points = joint_of_rows(measurement, rows)
+    a, b = at.reshape(numbers.shape).T
+    step = points.xyz[b] - points.xyz[a]
+    length = np.linalg.norm(step, axis=1)
+    along = step / np.maximum(length, np.finfo(float).tiny)[:, None]
+    slope = np.zeros((len(numbers), len(rows), 3))  # of each distance by each coordinate
+    each = np.arange(len(numbers))
+    slope[each, a], slope[each, b] = -along, along
+    shared = slope.reshape(len(numbers), -1) @ points.shared.reshape(3 * len(rows), -1)
+    own = np.einsum("nki,kij->nkj", slope, np.linalg.cholesky(points.own)).reshape(len(numbers), -1)
+    return JointDistances(length, np.asarray(shared @ shared.T + own @ own.T), points.length_unit)
 
 
 def angle(measurement: Measurement, a: str | int, vertex: str | int, b: str | int) -> Quantity:

@@ -23,7 +23,15 @@ from implicam.simulate.photographs import BALL_RADIUS_MM, Optics, Recorded, Stud
 from implicam.simulate.placements import SPECS, Placement, named_placement
 from implicam.simulate.rig_file import read_placement
 from implicam.simulate.rigs import CAMERA_SETS, Box, Rig, Unusual, build_rig, placement_of
-from implicam.simulate.targets import Target, ball_grid, held_boards, moving_board, random_positions
+from implicam.simulate.targets import (
+    GaugeLength,
+    Target,
+    ball_grid,
+    held_boards,
+    moving_board,
+    random_positions,
+    step_gauge,
+)
 from implicam.simulate.truth import write_rig
 from implicam.simulate.window import Window
 
@@ -32,6 +40,7 @@ __all__ = [
     "CAMERA_SETS",
     "SPECS",
     "Box",
+    "GaugeLength",
     "Optics",
     "Placement",
     "Recorded",
@@ -58,6 +67,7 @@ __all__ = [
     "simulate",
     "simulate_boards",
     "simulated",
+    "step_gauge",
     "views",
     "with_limit",
     "write_rig",

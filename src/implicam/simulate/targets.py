@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,42 @@ def random_positions(rig: Rig, n: int, rng: np.random.Generator) -> Target:
     """
     _check_counts(n=(n,))
     return _balls(rig, "random", rng.uniform(-0.5, 0.5, size=(n, 3)))
+
+
+GAUGE_SHARE = 0.95
+"""Length of a step gauge over that of the line in the volume that it is put on."""
+GAUGE_MARKS = (0.0, 0.15, 0.32, 0.52, 0.75, 1.0)
+"""Where its marks are, over its length: from the first, five lengths."""
+
+
+class GaugeLength(NamedTuple):
+    """A length between two marks of a step gauge: names of its ends, its true size, the name of its line."""
+
+    a: str
+    b: str
+    length: float
+    line: str
+
+
+def step_gauge(rig: Rig) -> tuple[Target, list[GaugeLength]]:
+    """A step gauge on seven lines: the four space diagonals of the working volume, and three along its edges.
+
+    Args:
+        rig: The rig.
+
+    Returns:
+        Its marks, and five lengths on each line.
+    """
+    half = rig.volume.size / 2
+    diagonals = np.array([[1, 1, 1], [1, 1, -1], [1, -1, 1], [-1, 1, 1]]) * half
+    marks, names, lengths = list[Floats](), list[str](), list[GaugeLength]()
+    for i, end in enumerate([*diagonals, *np.diag(half)]):
+        line, size = f"L{i + 1}", 2 * GAUGE_SHARE * float(np.linalg.norm(end))
+        names += [f"{line}-{k}" for k in range(len(GAUGE_MARKS))]
+        marks += [GAUGE_SHARE * (2 * at - 1) * end for at in GAUGE_MARKS]
+        lengths += [GaugeLength(f"{line}-0", f"{line}-{k}", at * size, line) for k, at in enumerate(GAUGE_MARKS) if k]
+    points = np.array(names)
+    return Target("lengths", points, points, rig.volume.world_from_box.apply(np.array(marks))), lengths
 
 
 def moving_board(

@@ -1,0 +1,172 @@
+"""Is what `verify` states true: its uncertainties, its power, its decisions?
+
+    OPENBLAS_NUM_THREADS=1 python benchmarks/verify.py --trials 1000       all tables, an hour on one core
+    OPENBLAS_NUM_THREADS=1 python benchmarks/verify.py --trials 20         does it run?
+
+Every trial is a rig of its own (lens errors of 0.5 px, 0.2 px noise), calibrated by forward-gp with known points at
+random, and a step gauge or a ball bar whose true length differs from its certificate as that says: standard
+uncertainty 5e-5 of the length, far more than good ones have, so that it shows; measured at 23 degrees C known to 0.2,
+steel, its coefficient of expansion known to 1e-6 per K; and 0.01 mm of setup at each length.
+
+coverage  of all lengths: the true error of the measured length is within the expanded uncertainty (k = 2, so 95.4 % is
+          right) (a) of the test, about the error that it found; (b) that the calibration predicts of the measured
+          length, about 0; (c) the error found is within both together. Of trials: (d) chi-squared of error bars above
+          its 97.5 % quantile, (e) below its 2.5 % quantile, (f) an error of scale found where there is none. ± standard
+          errors over trials.
+power     the known points of the rig are too large by a scale error, so all that it measures is: how often the test of
+          scale finds it, and the mean of the probabilities that it stated.
+decision  35 lengths of a rig that is exactly at its limit, or 4 U inside or outside of it, measured without error
+          of its own: how often conformity and non-conformity are proven.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+import implicam as ic
+from implicam.simulate import Target, build_rig, random_positions, simulate, step_gauge
+from implicam.verification import decide
+
+SD_SCALE, SD_EXPANSION, SD_TEMPERATURE, SD_SETUP = 5e-5, 1e-6, 0.2, 0.01
+EXPANSION, TEMPERATURE = 11.5e-6, 23.0
+CASES = (("stereo", 157, 0.2, "bar"), ("bar6", 35, 0.2, "gauge"))
+POWERS = (("stereo", 157, 0.05, 1e-4), ("bar6", 35, 0.05, 1e-4), ("bar6", 35, 0.2, 5e-4))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One verification of a simulated rig: what was stated, and the truth."""
+
+    found: ic.Verification
+    true_error: np.ndarray
+
+
+def shown(rig, kind: str) -> tuple[Target, list[tuple[str, str, float]]]:
+    """What is shown to the cameras, and the true lengths in it."""
+    gauge, lengths = step_gauge(rig)
+    if kind == "gauge":
+        return gauge, [(one.a, one.b, one.length) for one in lengths]
+    names, ends, pairs = [], [], []
+    half = 0.3 * float(rig.volume.size.min())  # a ball bar, once at each of 35 places
+    rng = np.random.default_rng(rig.seed + 77)
+    for i in range(35):
+        along = rng.normal(size=3)
+        along *= half / np.linalg.norm(along)
+        centre = rig.volume.world_from_box.apply(rng.uniform(-0.5, 0.5, (1, 3)) * (rig.volume.size - 2 * half))[0]
+        names += [f"bar{i}_a", f"bar{i}_b"]
+        ends += [centre - along, centre + along]
+        pairs.append((names[-2], names[-1], 2 * half))
+    return Target("bar", np.array(names), np.array(names), np.array(ends)), pairs
+
+
+def trial(
+    name: str, points: int, noise: float, kind: str, seed: int, *, scale: float = 0.0, exact: bool = False
+) -> Trial:
+    """A rig, its calibration, and a verification.
+
+    scale: by which known points are too far apart. exact: the gauge is as its certificate says.
+    """
+    rig = build_rig(name, seed=seed, lens_error=0.5, noise=noise)
+    known = simulate(rig, random_positions(rig, points, np.random.default_rng(seed)), seed=seed)
+    if scale:
+        known = replace(known, known=replace(known.known, xyz=known.xyz * (1 + scale)))
+    target, pairs = shown(rig, kind)
+    rng = np.random.default_rng([seed, 5])
+    certificate, expansion, temperature = rng.normal(size=3) * (not exact)
+    lengths, true = [], []
+    for a, b, length in pairs:
+        # the marks are at these places: the true length is given, and what it was at 20 degrees follows
+        setup = SD_SETUP * rng.normal() * (not exact)
+        warmer = TEMPERATURE + SD_TEMPERATURE * temperature - 20
+        at_20 = (length - setup) / (1 + (EXPANSION + SD_EXPANSION * expansion) * warmer)
+        lengths.append(
+            ic.CalibratedLength(
+                a, b, at_20 * (1 + SD_SCALE * certificate), sd=SD_SCALE * length, temperature=TEMPERATURE,
+                sd_temperature=SD_TEMPERATURE, expansion=EXPANSION, sd_expansion=SD_EXPANSION, sd_setup=SD_SETUP,
+            )
+            if not exact
+            else ic.CalibratedLength(a, b, length, sd=1e-6 * length)
+        )  # fmt: skip
+        true.append(length)
+    calibration = ic.ForwardGP().fit(known)
+    views = simulate(rig, target, seed=seed + 1_000_003)
+    found = ic.verify(calibration, replace(views, known=None), lengths, next_lengths=0)
+    return Trial(found, np.array([one.measured for one in found.lengths]) - np.array(true))
+
+
+def coverage(trials: int) -> Iterator[str]:
+    yield "| rig, known points, artefact | trials | (a) test | (b) predicted | (c) both | (d) | (e) | (f) |"
+    yield "|:--|--:|--:|--:|--:|--:|--:|--:|"
+    for name, points, noise, kind in CASES:
+        rows = []
+        for seed in range(trials):
+            one = trial(name, points, noise, kind, seed)
+            error, sd_test, sd = (
+                np.array([getattr(row, what) for row in one.found.lengths])
+                for what in ("error", "sd_test", "sd_predicted")
+            )
+            bars, scale = one.found.bars, one.found.scale
+            rows.append(
+                [
+                    np.mean(np.abs(error - one.true_error) < 2 * sd_test), np.mean(np.abs(one.true_error) < 2 * sd),
+                    np.mean(np.abs(error) < 2 * np.hypot(sd, sd_test)), bars.p_value < 0.025, bars.p_value > 0.975,
+                    scale.found,
+                ]
+            )  # fmt: skip
+        yield f"| {name}, {points}, {kind} | {trials} | {' | '.join(shares(rows))} |"
+
+
+def shares(rows) -> list[str]:
+    mean, error = np.mean(rows, axis=0), np.std(rows, axis=0, ddof=1) / np.sqrt(len(rows))
+    return [f"{100 * m:.1f} ± {100 * e:.1f} %" for m, e in zip(mean, error, strict=True)]
+
+
+def power(trials: int) -> Iterator[str]:
+    yield "| rig, known points, noise | scale error | trials | found | stated | its sd |"
+    yield "|:--|--:|--:|--:|--:|--:|"
+    for name, points, noise, scale in POWERS:
+        rows = []
+        for seed in range(trials):
+            test = trial(name, points, noise, "gauge", seed + 50_000, scale=scale, exact=True).found.scale
+            rows.append([test.found, test.power(scale), test.sd])
+        found, stated = shares([row[:2] for row in rows])
+        sd = np.mean([row[2] for row in rows])
+        yield f"| {name}, {points}, {noise} px | {scale:.0e} | {trials} | {found} | {stated} | {sd:.1e} |"
+
+
+def decisions(trials: int) -> Iterator[str]:
+    yield "| largest true error | trials | conformity proven | non-conformity proven | undecided |"
+    yield "|:--|--:|--:|--:|--:|"
+    rng, limit, sd = np.random.default_rng(0), 0.1, 0.005
+    for what, true in (
+        ("4 U inside the limit", limit - 8 * sd),
+        ("at the limit", limit),
+        ("4 U outside", limit + 8 * sd),
+    ):
+        found = []
+        for _ in range(trials):
+            errors = np.concatenate([[true], rng.uniform(-0.5, 0.5, 34) * true]) + sd * rng.normal()
+            each = {decide(float(error), limit, 2 * sd) for error in errors}
+            whole = next((d for d in ("does not conform", "undecided") if d in each), "conforms")
+            found.append([whole == d for d in ("conforms", "does not conform", "undecided")])
+        yield f"| {what} | {trials} | {' | '.join(shares(found))} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=("coverage", "power", "decisions"))
+    parser.add_argument("--trials", type=int, default=1000)
+    options = parser.parse_args()
+    for name, table in {"coverage": coverage, "power": power, "decisions": decisions}.items():
+        if options.only in (None, name):
+            print(f"\n{name}\n", flush=True)
+            for row in table(options.trials):
+                print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

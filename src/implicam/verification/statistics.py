@@ -1,0 +1,152 @@
+"""Tests of all lengths together: are error bars true, is there an error of scale, is one length a mistake?
+
+All take the errors of n lengths and their covariance: what the calibration predicts and what the test itself brings.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import chdtrc, chdtri, ndtr, ndtri
+
+from implicam.dataset import Floats
+
+LEVEL = 0.05
+"""Of the tests of error bars and of scale."""
+MIN_LENGTHS_JUDGED = 5
+"""With fewer, nothing is said of error bars, or of a length that is unlike the others."""
+SCATTER_LEVEL = 0.01
+"""Where lengths scatter more than by chance so often, the uncertainty of the scale is made larger."""
+MISTAKE_LEVEL = 0.001
+"""A length that chance alone makes so unlike the others, in one test of so many, is taken for a mistake."""
+FREE_SCALE_SD = 0.01
+"""Sd of a scale error that is let go when lengths are compared with each other."""
+POWER = 0.95
+
+
+@dataclass(frozen=True)
+class ErrorBarsTest:
+    """Whether the errors of the lengths are as large as the calibration predicts.
+
+    Attributes:
+        lengths: How many.
+        chi_squared: Sum of squared errors in units of what is predicted, with what they share.
+        p_value: That chance alone makes errors so large.
+        ratio: Error over predicted, root mean square: 1 is right.
+        low: Lower end of its 95 % interval.
+        high: Upper end.
+    """
+
+    lengths: int
+    chi_squared: float
+    p_value: float
+    ratio: float
+    low: float
+    high: float
+
+    @property
+    def verdict(self) -> str:
+        """`right`, `too small`, `too large` or `cannot tell`, as of `implicam.coverage`."""
+        if self.lengths < MIN_LENGTHS_JUDGED:
+            return "cannot tell"
+        return "too small" if self.low > 1 else "too large" if self.high < 1 else "right"
+
+
+@dataclass(frozen=True)
+class ScaleTest:
+    """An error of scale: what is measured is `1 + value` times as long as it is.
+
+    Attributes:
+        value: The scale error found.
+        sd: Its standard uncertainty, with certificate, temperature and the calibration's own scale.
+        widened: By which the sd was multiplied because lengths scatter more than predicted; 1 where they do not.
+    """
+
+    value: float
+    sd: float
+    widened: float = 1.0
+
+    @property
+    def p_value(self) -> float:
+        """That chance alone makes it so large."""
+        return float(2 * ndtr(-abs(self.value) / self.sd))
+
+    @property
+    def found(self) -> bool:
+        """Whether there is an error of scale, at the level of 5 %."""
+        return self.p_value < LEVEL
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Where the scale error is, with 95 %."""
+        half = float(ndtri(1 - LEVEL / 2)) * self.sd
+        return self.value - half, self.value + half
+
+    def power(self, scale_error: float) -> float:
+        """The probability that such a test finds an error of scale.
+
+        Args:
+            scale_error: 1e-4 for 0.1 mm in 1 m.
+        """
+        away, z = abs(scale_error) / self.sd, float(ndtri(1 - LEVEL / 2))
+        return float(ndtr(away - z) + ndtr(-away - z))
+
+    @property
+    def detectable(self) -> float:
+        """The scale error that is found with 95 %."""
+        return float(ndtri(1 - LEVEL / 2) + ndtri(POWER)) * self.sd
+
+
+def check_error_bars(error: Floats, cov: Floats) -> ErrorBarsTest:
+    """Compare errors with what is predicted.
+
+    Args:
+        error: (n,) of the lengths.
+        cov: (n, n) their covariance.
+    """
+    n = len(error)
+    chi2 = float(error @ cho_solve(cho_factor(cov), error))
+    low, high = (math.sqrt(chi2 / float(chdtri(n, p))) for p in (LEVEL / 2, 1 - LEVEL / 2))
+    return ErrorBarsTest(n, chi2, float(chdtrc(n, chi2)), math.sqrt(chi2 / n), low, high)
+
+
+def fit_scale(error: Floats, length: Floats, cov: Floats) -> ScaleTest:
+    """Fit an error of scale by generalised least squares.
+
+    Args:
+        error: (n,) of the lengths.
+        length: (n,) that were calibrated.
+        cov: (n, n) covariance of the errors.
+    """
+    factor = cho_factor(cov)
+    weights = cho_solve(factor, length)
+    information = float(weights @ length)
+    value, freedom = float(weights @ error) / information, len(error) - 1
+    rest = error - value * length
+    chi2 = float(rest @ cho_solve(factor, rest))
+    scatters = freedom > 0 and float(chdtrc(freedom, chi2)) < SCATTER_LEVEL
+    widened = math.sqrt(chi2 / freedom) if scatters else 1.0
+    return ScaleTest(value, widened / math.sqrt(information), widened)
+
+
+def unlike_the_others(error: Floats, length: Floats, cov: Floats) -> list[int]:
+    """Which lengths differ from what the others, with their common error of scale, say of them.
+
+    Args:
+        error: (n,) of the lengths.
+        length: (n,) that were calibrated.
+        cov: (n, n) covariance of the errors.
+
+    Returns:
+        Their numbers; none where many are unlike, for then it is not they that are wrong.
+    """
+    n = len(error)
+    if n < MIN_LENGTHS_JUDGED:
+        return []
+    inverse = np.linalg.inv(cov + FREE_SCALE_SD**2 * np.outer(length, length))
+    z = (inverse @ error) / np.sqrt(np.diagonal(inverse))
+    found = np.flatnonzero(2 * ndtr(-np.abs(z)) < MISTAKE_LEVEL / n)
+    return [] if len(found) > max(1, n // 10) else [int(i) for i in found]
