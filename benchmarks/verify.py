@@ -2,6 +2,7 @@
 
     OPENBLAS_NUM_THREADS=1 python benchmarks/verify.py --trials 1000       all tables, an hour on one core
     OPENBLAS_NUM_THREADS=1 python benchmarks/verify.py --trials 20         does it run?
+    python benchmarks/verify.py --real ../shared/real                      lengths in data of other people
 
 Every trial is a rig of its own (lens errors of 0.5 px, 0.2 px noise), calibrated by forward-gp with known points at
 random, and a step gauge or a ball bar whose true length differs from its certificate as that says: standard
@@ -24,10 +25,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 import implicam as ic
+from implicam.dataset.boards import CORNER, corner_positions
 from implicam.simulate import Target, build_rig, random_positions, simulate, step_gauge
 from implicam.verification import decide
 
@@ -35,6 +38,12 @@ SD_SCALE, SD_EXPANSION, SD_TEMPERATURE, SD_SETUP = 5e-5, 1e-6, 0.2, 0.01
 EXPANSION, TEMPERATURE = 11.5e-6, 23.0
 CASES = (("stereo", 157, 0.2, "bar"), ("bar6", 35, 0.2, "gauge"))
 POWERS = (("stereo", 157, 0.05, 1e-4), ("bar6", 35, 0.05, 1e-4), ("bar6", 35, 0.2, 5e-4))
+REAL = (
+    ("caliscope-charuco", "half of the pictures"), ("two-sided-tank", "half of the dots"),
+    ("water-tank-target", "half of the dots"), ("multiplane", "half of the dots"), ("rbc300", "half of the dots"),
+    ("rbc300", "plane-z150"), ("multiplane", "plane2"),
+)  # fmt: skip
+REAL_LENGTHS = 60
 
 
 @dataclass(frozen=True)
@@ -156,11 +165,66 @@ def decisions(trials: int) -> Iterator[str]:
         yield f"| {what} | {trials} | {' | '.join(shares(found))} |"
 
 
+def real(folder: Path) -> Iterator[str]:
+    yield "| set, left out | lengths | longest | largest error | rms error | predicted, rms | error bars | scale |"
+    yield "|:--|--:|--:|--:|--:|--:|:--|:--|"
+    for name, what in REAL:
+        data = ic.read_dataset(folder / name)
+        rng = np.random.default_rng(0)
+        if data.known is None:
+            calibration, views, lengths = boards(data, rng)
+        else:
+            shots = data.known.shots
+            out = shots == what if what in shots else np.isin(np.arange(len(data)), rng.permutation(len(data))[::2])
+            calibration, views = ic.ForwardGP().fit(data.select(~out)), data.select(out)
+            usable = np.flatnonzero(calibration.measure(views.observations).measured)
+            pairs = [rng.choice(usable, 2, replace=False) for _ in range(REAL_LENGTHS)]
+            pairs = {tuple(sorted(map(int, pair))) for pair in pairs}
+            lengths = [
+                ic.CalibratedLength(*views.points[[a, b]], float(np.linalg.norm(views.xyz[a] - views.xyz[b])))
+                for a, b in sorted(pairs)
+            ]
+        found = ic.verify(calibration, replace(views, known=None), lengths, next_lengths=0)
+        error, sd = (np.array([getattr(one, of) for one in found.measured]) for of in ("error", "sd_predicted"))
+        longest, unit = max(one.length.length for one in found.measured), found.length_unit
+        low, high = found.scale.interval
+        cells = [f"{longest:.4g} {unit}", *(f"{v:.3g} {unit}" for v in (found.worst.error, rms(error), rms(sd)))]
+        bars = f"{found.bars.ratio:.2f} ({found.bars.low:.2f} to {found.bars.high:.2f}): {found.bars.verdict}"
+        scale = f"{found.scale.value:+.1e} ({low:+.1e} to {high:+.1e})"
+        yield f"| {name}, {what} | {len(error)} | {' | '.join(cells)} | {bars} | {scale} |"
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def boards(data, rng):
+    """Calibrate from half of the pictures of boards; the lengths are diagonals of the boards in the others."""
+    match = [CORNER.fullmatch(str(point)) for point in data.points]
+    shot, corner = np.array([m["shot"] for m in match]), np.array([int(m["number"]) for m in match]) - 1
+    mine = np.isin(shot, rng.permutation(np.unique(shot))[::2])
+    calibration, views = ic.Explicit().fit(data.select(mine)), data.select(~mine)
+    flat, measured = corner_positions(data.extra["target"]), calibration.measure(views.observations).measured
+    lengths = []
+    for one in np.unique(shot[~mine]):
+        rows = np.flatnonzero((shot[~mine] == one) & measured)
+        if len(rows) > 1:
+            apart = np.linalg.norm(flat[corner[~mine][rows], None] - flat[corner[~mine][rows]], axis=2)
+            a, b = np.unravel_index(apart.argmax(), apart.shape)  # one length a picture: the longest that was seen
+            lengths.append(ic.CalibratedLength(*views.points[rows[[a, b]]], float(apart[a, b])))
+    return calibration, views, lengths
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=("coverage", "power", "decisions"))
     parser.add_argument("--trials", type=int, default=1000)
+    parser.add_argument("--real", type=Path, metavar="FOLDER")
     options = parser.parse_args()
+    if options.real:
+        for row in real(options.real):
+            print(row, flush=True)
+        return
     for name, table in {"coverage": coverage, "power": power, "decisions": decisions}.items():
         if options.only in (None, name):
             print(f"\n{name}\n", flush=True)

@@ -1,4 +1,4 @@
-"""Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium).
+"""Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium); `... verify` draws one of them.
 
 Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of the demo's
 overlays, and two of simulated boards; compares all methods, which takes minutes.
@@ -26,14 +26,14 @@ IMAGES = Path(__file__).parent / "images"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 
 
-def photograph(report: Path) -> None:
-    """The first screen of the report."""
+def photograph(report: Path, name: str = "report.png", height: int = 1360) -> None:
+    """The first screen of a page."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
-        page = browser.new_page(viewport={"width": 1240, "height": 1360})
+        page = browser.new_page(viewport={"width": 1240, "height": height})
         page.goto(report.as_uri())
         page.wait_for_timeout(6000)  # software rendering of the 3D view takes its time
-        page.screenshot(path=IMAGES / "report.png")
+        page.screenshot(path=IMAGES / name)
         browser.close()
 
 
@@ -61,8 +61,25 @@ def implicam(*words: str) -> None:
     subprocess.run([sys.executable, "-m", "implicam", *words], check=True)
 
 
+def verify(folder: Path) -> None:
+    """The first screen of a protocol: a limit that is a little too tight."""
+    rig, file = folder / "rig", folder / "rig.implicam"
+    implicam("simulate", str(rig), "--positions", "random", "--points", "157", "--check", "300")
+    implicam("calibrate", str(rig), "-o", str(file))
+    protocol = folder / "verify.html"
+    words = [sys.executable, "-m", "implicam", "verify", str(file), str(rig / "lengths"), "--mpe", "0.25 + L/5000",
+             "--temperature", "21.5", "--expansion", "11.5e-6", "--by", "A. Meyer", "--instrument", "bar6, hall 3",
+             "--certificate", "K-1234 (2026-03)", "-o", str(protocol)]  # fmt: skip
+    subprocess.run(words, check=False)  # ends with 1
+    photograph(protocol, "verify.png", 1240)
+
+
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
+    if sys.argv[1:] == ["verify"]:
+        with tempfile.TemporaryDirectory() as folder:
+            verify(Path(folder))
+        return
     if sys.argv[1:]:
         label(Path(sys.argv[1]))
         return
@@ -80,6 +97,7 @@ def main() -> None:
         implicam("detect", str(covered), "--infer")
         overlay = Image.open(covered / "detections" / "overlays" / "cam5" / "board01.jpg")
         overlay.crop((430, 250, 800, 560)).resize((740, 620)).save(IMAGES / "detect-covered.jpg", quality=85)
+        verify(Path(folder))
         six = Path(folder) / "six"
         implicam("simulate", str(six), "--positions", "random", "--points", "200", "--check", "300")
         implicam("compare", str(six), "--train", "17,35,87,157", "--seeds", "3", "--check", str(six / "check"),

@@ -50,6 +50,7 @@ VARIABLES = {
     "measured": "implicam.measurement.Measurement",
     "measurement": "implicam.measurement.Measurement",
     "loop": "implicam.active.Loop",
+    "tested": "implicam.verification.Verification",
 }
 """What a name that is no module, class or function stands for in the documentation."""
 

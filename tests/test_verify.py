@@ -14,6 +14,7 @@ import pytest
 
 import implicam as ic
 from command_line import Cli, cli, made  # noqa: F401  fixtures
+from implicam import calibration_file
 from implicam.active import Workspace
 from implicam.dataset import Dataset
 from implicam.derived import joint_distances
@@ -22,7 +23,7 @@ from implicam.simulate import Rig, build_rig, random_positions, simulate, step_g
 from implicam.verification import MaximumPermissibleError, Verification, decide, read_lengths
 from implicam.verification.lengths import lengths_by_names, shared_covariance
 from implicam.verification.printing import find_browser, print_page
-from implicam.verification.protocol import Circumstances, checksum_of, page
+from implicam.verification.protocol import Circumstances, page
 from implicam.verification.statistics import check_error_bars, fit_scale, unlike_the_others
 from implicam.verification.volume import bounding_box, cover, name_lines
 
@@ -389,7 +390,7 @@ def test_the_command_writes_protocol_and_table_and_ends_with_the_decision(made: 
     ran = cli("verify", file, lengths, "--mpe", "2 + L/100", "--by", "me", "--next", "1")
     assert ran.code == 0
     assert ran.out.startswith("Conformity with MPE = 2 + L/100 mm is proven")
-    assert checksum_of(file) in Path("verify.html").read_text()
+    assert calibration_file.checksum(file) in Path("verify.html").read_text()
     assert len(Path("verify.csv").read_text().splitlines()) == 36
     ran = cli("verify", file, lengths, "--mpe", "0.0001", "-o", "bad.html", "--purpose", "reverification")
     assert ran.code == 1

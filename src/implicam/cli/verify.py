@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from implicam import calibration_file
 from implicam.active.workspace import workspace_from
 from implicam.calibrators import Calibration, load_calibration
 from implicam.cli import show
@@ -23,7 +24,7 @@ from implicam.verification import CalibratedLength, Verification, read_lengths, 
 from implicam.verification.acceptance import COVERAGE_FACTOR, NEXT_LENGTHS
 from implicam.verification.lengths import LENGTHS_FILE, lengths_by_names
 from implicam.verification.printing import find_browser, print_page
-from implicam.verification.protocol import PURPOSES, Circumstances, checksum_of, write_protocol
+from implicam.verification.protocol import PURPOSES, Circumstances, write_protocol
 from implicam.verification.result import CONFORMS, NO_LIMIT
 
 MAX_ROWS_SHOWN = 40
@@ -108,7 +109,7 @@ def verify_command(
         progress("measuring", 1, 1)
     when = datetime.now().astimezone().isoformat(" ", "minutes")
     about = Circumstances(
-        purpose, when, by, instrument, certificate, note, calibration.name, checksum_of(calibration), data.name
+        purpose, when, by, instrument, certificate, note, calibration.name, calibration_file.checksum(calibration), data.name
     )
     write_protocol(output, found, about)
     write_text(beside, found.csv_text())

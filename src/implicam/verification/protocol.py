@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import platform
 from collections.abc import Iterator
@@ -70,16 +69,6 @@ class Circumstances:
     calibration: str = ""
     checksum: str = ""
     dataset: str = ""
-
-
-def checksum_of(path: Path) -> str:
-    """The SHA-256 checksum of a file.
-
-    Args:
-        path: The file.
-    """
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_protocol(path: Path, found: Verification, about: Circumstances) -> None:
