@@ -109,7 +109,15 @@ def verify_command(
         progress("measuring", 1, 1)
     when = datetime.now().astimezone().isoformat(" ", "minutes")
     about = Circumstances(
-        purpose, when, by, instrument, certificate, note, calibration.name, calibration_file.checksum(calibration), data.name
+        purpose,
+        when,
+        by,
+        instrument,
+        certificate,
+        note,
+        calibration.name,
+        calibration_file.checksum(calibration),
+        data.name,
     )
     write_protocol(output, found, about)
     write_text(beside, found.csv_text())
