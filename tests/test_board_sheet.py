@@ -42,6 +42,22 @@ def test_what_is_printed_is_detected_in_its_true_size(board, paper, tmp_path):
     assert np.abs(mm - (flat - flat.mean(axis=0))).max() < 0.05
 
 
+def test_edges_of_squares_in_a_png_are_where_they_belong_not_on_whole_pixels(tmp_path):
+    draw_board(Board(6, 9, 20.0), "a4", tmp_path / "board.png")
+    dark = 1.0 - read_picture(tmp_path / "board.png")
+    square = 20.0 * 300 / 25.4
+    for lines in (dark, dark.T):
+        half = len(lines) // 2
+        row = next(row for row in lines[half - 140 :] if (row[500:-500] > 0.5).mean() > 0.3)[150:]
+        starts = np.flatnonzero((row[1:] >= 0.5) & (row[:-1] < 0.5)) + 1
+        ends = np.flatnonzero((row[1:] < 0.5) & (row[:-1] >= 0.5)) + 1
+        ends = ends[: len(starts)]
+        lefts = [a + 1 - row[a - 1] - row[a] for a in starts[: len(ends)]]
+        rights = [b - 1 + row[b] + row[b - 1] for b in ends]
+        edges = np.array([lefts, rights]).T[:3].ravel()
+        np.testing.assert_allclose(np.diff(edges), square, atol=0.01)  # px
+
+
 def test_a_page_has_the_size_of_its_paper_and_is_the_same_file_twice(tmp_path):
     for ending in ("pdf", "svg"):
         for name in ("a", "b"):

@@ -315,6 +315,19 @@ def test_measured_points_come_in_the_unit_that_is_asked_for(made: Path, cli: Cli
     assert not Path("x.csv").exists()
 
 
+@pytest.mark.parametrize("ending", ["csv", "xlsx", "parquet"])
+def test_what_was_measured_is_written_as_its_name_says(ending: str, made: Path, cli: Cli) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip({"csv": "pandas", "xlsx": "openpyxl", "parquet": "pyarrow"}[ending])
+    told = cli("measure", made / "rig.implicam", made / "rig" / "check").out
+    assert cli("measure", made / "rig.implicam", made / "rig" / "check", "-o", f"new/m.{ending}").out == told.replace(
+        "measured.csv", f"new/m.{ending}"
+    )
+    read = {"csv": pandas.read_csv, "xlsx": pandas.read_excel, "parquet": pandas.read_parquet}[ending]
+    found = read(f"new/m.{ending}").replace("", float("nan"))
+    pandas.testing.assert_frame_equal(found, pandas.read_csv("measured.csv"), check_dtype=False)
+
+
 def test_a_unit_without_a_known_size_measures_and_is_not_converted(made: Path, cli: Cli) -> None:
     cli("convert", made / "rig", "rig.csv")
     Path("rig.csv.toml").unlink()

@@ -292,6 +292,32 @@ def test_the_calibration_of_qualisys_is_read(tmp_path):
         import_cameras(path)
 
 
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ('active="1" calibrated="true" video_resolution="1080p"', []),
+        ('active="1" video_resolution="N/A"', []),
+        ('active="1" calibrated="false"', ["Left out, because they are not calibrated: 26002."]),
+        ('active="0" calibrated="true"', ["Left out, because they are not active: 26002."]),
+        (
+            'active="1" calibrated="1" video_resolution="540p"',
+            ["QTM states video_resolution '540p' for 26002, and a view of 1920 x 1088 pixels"],
+        ),
+    ],
+)
+def test_a_camera_of_qualisys_that_its_own_file_does_not_vouch_for_is_named(tmp_path, attributes, said):
+    text = QCA.format(r=" ".join(f'r{i}{j}="{int(i == j)}"' for i in "123" for j in "123"))
+    first, rest = text.split('  <camera active="0"')
+    camera = first[first.index("<fov_video") :]
+    path = tmp_path / "lab.qca.txt"
+    path.write_text(f'{first}  <camera {attributes} serial="26002">{camera}{rest[rest.index("/>") + 2 :]}')
+    rig = import_cameras(path)
+    assert len(rig.cameras) == 1 + (not said or "Left out" not in said[0])
+    told = [note for note in rig.notes if "26002" in note]
+    assert len(told) == len(said)
+    assert all(note.startswith(wanted) for note, wanted in zip(told, said, strict=True))
+
+
 # ---- hostile input
 
 

@@ -76,6 +76,23 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+ENDINGS_OF_FILES = frozenset((
+    ".csv", ".tsv", ".txt", ".xlsx", ".xls", ".xlsm", ".xlsb", ".ods", ".numbers", ".parquet", ".feather", ".npz",
+    ".npy", ".json", ".toml", ".yaml", ".yml", ".xml", ".html", ".htm", ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".tif",
+    ".tiff", ".mat", ".h5", ".hdf5", ".pkl", ".zip", ".implicam", ".onnx",
+))  # fmt: skip
+"""Endings that promise what is in a file; another form is not written under such a name."""
+
+
+def is_file_name(path: Path) -> bool:
+    """Whether a name ends as one of `ENDINGS_OF_FILES`.
+
+    Args:
+        path: What is to be written.
+    """
+    return path.suffix.lower() in ENDINGS_OF_FILES
+
+
 def refuse_folder(path: Path) -> None:
     """Check that a file can have a name.
 

@@ -15,6 +15,7 @@ from implicam.dataset import Floats, Names
 from implicam.dataset.folder import csv_text, format_cells
 from implicam.dataset.frames import keep_others, rigid_parts
 from implicam.dataset.units import metres_per
+from implicam.dataset.written_table import write_table
 from implicam.errors import UsageError, did_you_mean, import_extra
 from implicam.files import write_text
 from implicam.formatting import decimal_number, number_with_sd
@@ -346,6 +347,20 @@ class Measurement(Plotted):
     def sd(self) -> Floats:
         """(n, 3) standard uncertainties of x, y and z."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
+
+    def write(self, path: str | Path) -> None:
+        """Write the table of `write_csv` as the ending says: .csv, .xlsx (`[excel]`) or .parquet (`[parquet]`).
+
+        Args:
+            path: The file; it is replaced whole.
+
+        Raises:
+            UsageError: It has another ending.
+            DatasetError: A workbook cannot hold a text.
+            MissingExtraError: What writes it is not installed.
+            ImplicamError: It cannot be written.
+        """
+        write_table(Path(path), self._table())
 
     def write_csv(self, path: str | Path) -> None:
         """Write measured.csv: every point keeps its row; one that was not measured has empty numbers and a reason.

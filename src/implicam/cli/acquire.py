@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from implicam.calibrators import load_calibration
 from implicam.cli import show
 from implicam.cli.app import Json, Seed, command, command_line, must_not_replace
 from implicam.cli.options import Options, OptionsOfParts, options_of_fields
 from implicam.dataset import Floats
-from implicam.dataset.folder import csv_text
+from implicam.dataset.written_table import check_table_name, write_table
 from implicam.errors import ImplicamError, UsageError, import_extra
-from implicam.files import write_text
+from implicam.files import refuse_folder
 from implicam.formatting import decimal_number, percent, without_dust
 from implicam.images import opencv
 from implicam.logs import LOG, log_to_file
@@ -51,7 +52,8 @@ def _suggest(
         str | None, typer.Option("--from", metavar="X,Y,Z", help="Where the robot is: the targets in a short order.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="Also write a CSV of them.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE", help="Also write a table of them: .csv, .xlsx or .parquet."),
     ] = None,
     seed: Seed = 0,
     json: Json = False,
@@ -64,7 +66,9 @@ def _suggest(
 
     reach = options["reach"]
     if output is not None:
+        refuse_folder(output)
         must_not_replace(output, calibration)
+        check_table_name(output)
     fitted = load_calibration(calibration)
     if reach is not None and not reach > 0:
         raise UsageError(f"a reach of {reach:g} is no length.", fix="give one greater than zero")
@@ -80,7 +84,7 @@ def _suggest(
     )
     cameras, unit = fitted.data.observations.camera_names, fitted.data.length_unit
     if output is not None:
-        write_text(output, csv_text(("point", "x", "y", "z", *_headings(cameras)), map(_cells, found.targets)))
+        write_table(output, _columns(cameras, found.targets))
     if json:
         targets = [
             {
@@ -118,13 +122,12 @@ def _pairs(cameras: Sequence[str], uv: Floats) -> list[tuple[str, Floats]]:
     return list(zip(cameras, uv, strict=True))
 
 
-def _headings(cameras: Sequence[str]) -> list[str]:
-    return [f"{axis}_{name}" for name in cameras for axis in "uv"]
-
-
-def _cells(target: Any) -> list[str]:
-    numbers = (*target.xyz, *target.uv.ravel())
-    return [target.name, *("" if np.isnan(x) else repr(float(x)) for x in numbers)]
+def _columns(cameras: Sequence[str], targets: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    """Of a table of the targets: where each is, and at which pixel each camera will see it."""
+    numbers = np.array([[*target.xyz, *target.uv.ravel()] for target in targets], dtype=np.float64)
+    headings = ["x", "y", "z", *(f"{axis}_{name}" for name in cameras for axis in "uv")]
+    names = np.array([target.name for target in targets], dtype=np.str_)
+    return {"point": names, **dict(zip(headings, numbers.T, strict=True))}
 
 
 def _pixel(uv: Floats) -> str:

@@ -15,7 +15,7 @@ from implicam.calibration_file import package_version
 from implicam.calibrators import DEFAULT_METHOD
 from implicam.dataset import Dataset, TableOptions, read_dataset
 from implicam.errors import UsageError, import_extra
-from implicam.files import refuse_folder
+from implicam.files import is_file_name, refuse_folder
 
 app = typer.Typer(
     name="implicam",
@@ -58,7 +58,6 @@ def command_line() -> str:
 
 
 CALIBRATION_SUFFIX = ".implicam"
-FILE_SUFFIXES = (".csv", ".xlsx", ".parquet", ".npz")
 FOLDER_FILES = ("dataset.toml", "points.csv", "observations.csv")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -108,10 +107,10 @@ def chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:
 
 def must_be_folder(path: Path) -> None:
     """UsageError where the name is that of a file."""
-    if path.suffix.lower() in FILE_SUFFIXES:
+    if is_file_name(path) and not path.exists():
         raise UsageError(
             f"{path} is the name of a file, and this command writes a folder.",
-            fix="leave the ending out; implicam convert makes a file of it",
+            fix="leave the ending out",
         )
 
 
@@ -152,6 +151,9 @@ def check_figure(path: Path) -> None:
     import_extra("matplotlib", "report", "a figure for print")
 
 
-def need_plotly() -> None:
-    """Say what is missing before the work, not after."""
+def must_be_page(path: Path) -> None:
+    """Say that no page can be written before the work, not after."""
+    refuse_folder(path)
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"{path} is no page.", fix="end the name in .html")
     import_extra("plotly", "report", "the HTML report")

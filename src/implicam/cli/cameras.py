@@ -20,6 +20,7 @@ from implicam.deploy.cpp_table import EXAMPLE_FILE, HEADER_FILE, TABLE_FILE
 from implicam.errors import UsageError, did_you_mean
 from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, export_cameras, import_cameras
 from implicam.exchange.pixel_maps import MAPS_FORMAT, write_maps
+from implicam.files import is_file_name
 
 ONNX_FORMAT, CPP_FORMAT = "onnx", "cpp"
 WRITE_FOLDERS = (*FOLDERS, MAPS_FORMAT, CPP_FORMAT)
@@ -58,6 +59,8 @@ def _export(
             f"--{min(given).replace('_', '-')} is an option of {MAPS_FORMAT}, and {to} has none.", fix="leave it out"
         )
     if to == ONNX_FORMAT:
+        if is_file_name(output) and output.suffix.lower() != ".onnx":
+            raise UsageError(f"{output} is no name for a graph of ONNX.", fix="end it in .onnx")
         notes = write_onnx(load_calibration(calibration), output, checksum(calibration))
         _tell(to, output, "a graph of ONNX, float64", notes, json)
         return

@@ -11,7 +11,7 @@ import typer
 
 from implicam.calibrators import load_calibration
 from implicam.cli import show
-from implicam.cli.app import Json, check_figure, command, must_not_replace, read
+from implicam.cli.app import Json, check_figure, command, must_be_calibration, must_not_replace, read
 from implicam.cli.options import with_table_options
 from implicam.dataset import TableOptions
 from implicam.dataset.table_options import DOCUMENTED
@@ -57,10 +57,7 @@ def check_command(
 
     No known point is needed; where there are some they are compared, too. Ends with 1 where it does not hold.
     """
-    if figure is not None and log is None:
-        raise UsageError("--figure draws a history of checks, and there is none.", fix="name one: --log checks.csv")
-    if figure is not None:
-        check_figure(figure)
+    _check_names(log, repair, figure)
     for made in filter(None, (log, repair, figure)):
         must_not_replace(made, calibration, dataset)
     fitted = load_calibration(calibration)
@@ -89,6 +86,17 @@ def check_command(
     elif repair is not None:
         show.line(f"{repair} is not written: {_NO_REPAIR[found.verdict]}")
     raise typer.Exit(int(not found.holds))
+
+
+def _check_names(log: Path | None, repair: Path | None, figure: Path | None) -> None:
+    if figure is not None and log is None:
+        raise UsageError("--figure draws a history of checks, and there is none.", fix="name one: --log checks.csv")
+    if figure is not None:
+        check_figure(figure)
+    if log is not None and log.suffix.lower() != ".csv":
+        raise UsageError(f"{log} is no name for a history, which is a CSV.", fix="end it in .csv")
+    if repair is not None:
+        must_be_calibration(repair)
 
 
 def _tell(found: CalibrationCheck) -> None:

@@ -46,9 +46,9 @@ from implicam.cli.app import (
     command,
     must_be_calibration,
     must_be_folder,
+    must_be_page,
     must_be_shot,
     must_not_replace,
-    need_plotly,
     read,
 )
 from implicam.cli.options import OptionsOfParts, calibrator_from_options, options_of_calibrators, with_table_options
@@ -65,6 +65,7 @@ from implicam.dataset.programs import PROGRAMS, read_program, write_program
 from implicam.dataset.table_options import DOCUMENTED
 from implicam.dataset.units import metres_per
 from implicam.dataset.wide import is_unit_missing
+from implicam.dataset.written_table import check_table_name
 from implicam.derived.table import distance_rows, distances_text, read_pairs
 from implicam.errors import DatasetError, UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
@@ -179,7 +180,9 @@ def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path |
 def measure_command(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     dataset: Annotated[Path, typer.Argument(help="What the cameras saw.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The table to write.")] = Path("measured.csv"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="The table to write: .csv, .xlsx or .parquet.")] = Path(
+        "measured.csv"
+    ),
     between: Annotated[
         tuple[str, str] | None,
         typer.Option("--distance", metavar="A B", help="The distance of two points, with its uncertainty."),
@@ -197,6 +200,7 @@ def measure_command(
     """
     refuse_folder(output)
     must_not_replace(output, calibration, dataset)
+    check_table_name(output)
     wanted = [*([between] if between else ()), *(read_pairs(pairs) if pairs else ())]
     beside = output.with_name("distances.csv")
     if wanted:
@@ -215,7 +219,7 @@ def measure_command(
     if unit != measured.length_unit:
         measured = measured.in_unit(unit)
     found = distance_rows(measured, wanted) if wanted else []
-    measured.write_csv(output)
+    measured.write(output)
     if wanted:
         write_text(beside, distances_text(found))
     count, typical = int(measured.measured.sum()), _typical(measured.sd)
@@ -286,9 +290,8 @@ def _evaluate(
     given = _any_given(method, options)
     _check_evaluate(dataset, cv, leave_out, given)
     if report is not None:
-        need_plotly()
-        refuse_folder(report)
         must_not_replace(report, file, dataset)
+        must_be_page(report)
     with show.progress(json) as progress:
         if dataset is not None:
             evaluation = evaluate(load_calibration(file), read(dataset, table, cameras, without))
@@ -384,9 +387,8 @@ def report_command(
     json: Json = False,
 ) -> None:
     """Write a one-page HTML report with an interactive 3D view."""
-    need_plotly()
-    refuse_folder(output)
     must_not_replace(output, calibration, dataset)
+    must_be_page(output)
     fitted = load_calibration(calibration)
     from implicam.report.call import report
 

@@ -13,11 +13,10 @@ import typer
 from implicam.active import Workspace, workspace_from
 from implicam.active.workspace import read_places
 from implicam.cli import show
-from implicam.cli.app import Json, Seed, command, need_plotly
+from implicam.cli.app import Json, Seed, command, must_be_page
 from implicam.dataset import Floats
 from implicam.design import Assumptions, Design, compare_designs
 from implicam.errors import UsageError
-from implicam.files import refuse_folder
 from implicam.formatting import decimal_number, percent
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 
@@ -59,10 +58,7 @@ def design_command(
 ) -> None:
     """Predict how uncertain a placement of cameras will be with N known points, and which camera helps most."""
     if output is not None:
-        refuse_folder(output)
-        if output.suffix.lower() not in (".html", ".htm"):
-            raise UsageError(f"{output} is no page.", fix="end the name in .html")
-        need_plotly()
+        must_be_page(output)
     box = None if workspace is None else workspace_from(workspace, None)
     if box is not None and box.places is not None:
         box = Workspace.hull(box.places)  # what lies between them is measured too, and may be known

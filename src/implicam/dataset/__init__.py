@@ -34,7 +34,7 @@ from implicam.dataset.wide import (
     write_wide_csv,
 )
 from implicam.errors import DatasetError
-from implicam.files import find_left_behind
+from implicam.files import find_left_behind, is_file_name
 
 __all__ = [
     "TRUTH_COLUMNS",
@@ -172,11 +172,14 @@ def write_dataset(
         write_wide_csv(data, path)
     elif suffix == ".xlsx":
         write_excel_workbook(data, path)
-    elif suffix in (*TEXT_SUFFIXES, *OTHER_WORKBOOKS):
-        raise DatasetError(f"{path}: no dataset is written as {suffix}.", fix="end the name in .csv, or in .xlsx")
     elif suffix == ".parquet":
         write_parquet(data, path)
     elif suffix == ".npz":
         write_npz_dataset(data, path)
+    elif is_file_name(path) and not path.is_dir():
+        raise DatasetError(
+            f"{path}: no dataset is written as {suffix}.",
+            fix="end the name in .csv, .xlsx, .parquet or .npz, or in nothing for a folder",
+        )
     else:
         write_folder(data, path, overwrite=overwrite, also=also, fill=fill)

@@ -120,13 +120,13 @@ def _sheet(path: Path, name: str, cells: list[Row]) -> Sheet:
     return Sheet(f"{path}, sheet {name!r}", header, rows, unit="row", first=first)
 
 
-def write_excel(path: Path, columns: Sequence[tuple[str, list[Any]]], description: str) -> None:
+def write_excel(path: Path, columns: Sequence[tuple[str, list[Any]]], description: str = "") -> None:
     """Write a table, and its description on a sheet of its own; openpyxl writes numbers with 16 digits.
 
     Args:
         path: The file; one that is there is replaced.
         columns: Heading and cells of each: numbers, text, or None for an empty cell. A text is never a formula.
-        description: The text of dataset.toml.
+        description: The text of dataset.toml; a table without one has no such sheet.
 
     Raises:
         DatasetError: A text has a character that no workbook has.
@@ -142,18 +142,20 @@ def write_excel(path: Path, columns: Sequence[tuple[str, list[Any]]], descriptio
             made.data_type = "s"  # "=1+1" is a name
         return made
 
-    table, beside = book.create_sheet("table"), book.create_sheet(DESCRIPTION_SHEET)
+    table = book.create_sheet("table")
     try:
         table.append([cell(table, heading) for heading, _ in columns])
         for row in zip(*(cells for _, cells in columns), strict=True):
             table.append([cell(table, value) for value in row])
-        for line in description.splitlines():
-            beside.append([cell(beside, line)])
+        if description:
+            beside = book.create_sheet(DESCRIPTION_SHEET)
+            for line in description.splitlines():
+                beside.append([cell(beside, line)])
     except openpyxl.utils.exceptions.IllegalCharacterError as error:
         raise DatasetError(
-            f"{path} cannot hold all text of the dataset.",
+            f"{path} cannot hold all text of the table.",
             why=f"a cell has a character that no workbook has: {str(error)[:100]}",
-            fix="write it as .csv, .parquet or .npz",
+            fix="write it as .csv or .parquet",
         ) from None
     with replacing(path) as temporary:
         book.save(temporary)

@@ -29,6 +29,7 @@ from implicam.exchange import (
 )
 from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
 from implicam.exchange.source import Source
+from implicam.files import is_file_name
 from implicam.lenses import BrownConrady, KannalaBrandt
 
 __all__ = [
@@ -60,6 +61,8 @@ class Format:
     read: Read
     knows: Callable[[Source], bool]
     what: str
+    endings: tuple[str, ...] = ()
+    """Of the names that are usual for its file; none where it is a folder."""
     fits_lenses: bool = False
     """Whether it fits its own camera to any lens; the others hold the two families of OpenCV as they are."""
 
@@ -78,16 +81,23 @@ def _one_file(read: Callable[[Path], Rig]) -> Read:
     return read_one
 
 
+TOML, YAML = (".toml",), (".yaml", ".yml")
+
 FORMATS = {
     "colmap": Format(colmap.write, _one_file(colmap.read), colmap.knows, "COLMAP's model, a folder"),
-    "qualisys": Format(qualisys.write, _one_file(qualisys.read), qualisys.knows, "Qualisys's .qca.txt", True),
-    "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml"),
-    "caliscope": Format(caliscope.write, _one_file(caliscope.read), caliscope.knows, "caliscope's camera_array.toml"),
+    "qualisys": Format(
+        qualisys.write, _one_file(qualisys.read), qualisys.knows, "Qualisys's .qca.txt", (".txt", ".xml"), True
+    ),
+    "kalibr": Format(kalibr.write, _one_file(kalibr.read), kalibr.knows, "Kalibr's camchain.yaml", YAML),
+    "caliscope": Format(
+        caliscope.write, _one_file(caliscope.read), caliscope.knows, "caliscope's camera_array.toml", TOML
+    ),
     "pose2sim": Format(
         anipose.write_pose2sim,
         _one_file(anipose.read_pose2sim),
         anipose.knows_pose2sim,
         "Pose2Sim's Calib.toml",
+        TOML,
         True,
     ),
     "aniposelib": Format(
@@ -95,20 +105,34 @@ FORMATS = {
         _one_file(anipose.read_aniposelib),
         anipose.knows_aniposelib,
         "aniposelib's calibration.toml",
+        TOML,
     ),
-    "easymocap": Format(easymocap.write, easymocap.read, easymocap.knows, "EasyMocap's intri.yml and extri.yml", True),
+    "easymocap": Format(
+        easymocap.write, easymocap.read, easymocap.knows, "EasyMocap's intri.yml and extri.yml", (), True
+    ),
     "ros": Format(ros.write, ros.read, ros.knows, "ROS's camera_info, a file a camera"),
     "opencv-stereo": Format(
-        opencv_stereo.write, opencv_stereo.read, opencv_stereo.knows, "K1, D1, K2, D2, R, T of cv2.stereoCalibrate"
+        opencv_stereo.write,
+        opencv_stereo.read,
+        opencv_stereo.knows,
+        "K1, D1, K2, D2, R, T of cv2.stereoCalibrate",
+        YAML,
     ),
-    "opencv": Format(opencv.write, opencv.read, opencv.knows, "OpenCV FileStorage, YAML, XML or JSON"),
-    "openptv": Format(openptv.write, openptv.read, openptv.knows, "OpenPTV's .ori and .addpar with ptv.par", True),
-    "myptv": Format(myptv.write, myptv.read, myptv.knows, "MyPTV's camera files, Tsai model", True),
-    "dlt": Format(dlt.write, _one_file(dlt.read), dlt.knows, "DLT coefficients as a CSV of DLTdv or easyWand", True),
+    "opencv": Format(opencv.write, opencv.read, opencv.knows, "OpenCV FileStorage, YAML, XML or JSON", YAML),
+    "openptv": Format(openptv.write, openptv.read, openptv.knows, "OpenPTV's .ori and .addpar with ptv.par", (), True),
+    "myptv": Format(myptv.write, myptv.read, myptv.knows, "MyPTV's camera files, Tsai model", (), True),
+    "dlt": Format(
+        dlt.write,
+        _one_file(dlt.read),
+        dlt.knows,
+        "DLT coefficients as a CSV of DLTdv or easyWand",
+        (".csv", ".txt"),
+        True,
+    ),
 }
 """In the order in which they are tried on a file: first the one that may be binary, and is known by names of files."""
 
-FOLDERS = ("colmap", "easymocap", "ros", "openptv", "myptv")
+FOLDERS = tuple(name for name, form in FORMATS.items() if not form.endings)
 """The names of those that are a folder when they are written."""
 
 
@@ -124,11 +148,18 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
         Notes, each a sentence on what the format lost or cost; none where it holds everything.
 
     Raises:
-        UsageError: There is no such format.
+        UsageError: There is no such format, or the name has the ending of another.
         DatasetError: The format cannot hold the rig; the error names one that can.
         ImplicamError: The file cannot be written.
     """
-    form = _find_format(to)
+    form, path = _find_format(to), Path(path)
+    if is_file_name(path) and path.suffix.lower() not in form.endings and not path.is_dir():
+        raise UsageError(
+            f"{path}: {to} is not written as {path.suffix}.",
+            fix=f"end the name in {' or '.join(form.endings)}"
+            if form.endings
+            else "it is a folder: leave the ending out",
+        )
     for camera in rig.cameras:
         if not (form.fits_lenses or isinstance(camera.lens, BrownConrady | KannalaBrandt)):
             raise DatasetError(
@@ -136,7 +167,7 @@ def export_cameras(rig: Rig, to: str, path: str | Path) -> list[str]:
                 why="it holds the two families of OpenCV, brown-conrady and kannala-brandt",
                 fix=", ".join(["calibrate with one of these", *_imitating(rig)]),
             )
-    return form.write(rig, Path(path))
+    return form.write(rig, path)
 
 
 def _imitating(rig: Rig) -> list[str]:

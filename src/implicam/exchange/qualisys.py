@@ -1,6 +1,6 @@
 """`qualisys`: the calibration that QTM (Qualisys) exports, NAME.qca.txt, which is XML.
 
-    cameras/camera    serial, model, active
+    cameras/camera    serial, model, active, calibrated, viewrotation, video_resolution: "1080p" is a number of rows
       fov_video       left, top, right, bottom: what of the sensor the pictures show
       transform       x, y, z: the camera's centre, mm; r11 ... r33: from the world to a camera frame with y up, z back
       intrinsic       focalLengthU, focalLengthV, centerPointU, centerPointV, in 1/64 pixel; sensorMaxU, sensorMaxV;
@@ -12,6 +12,8 @@ of the first one. Pose2Sim divides the distortion by 64 as well, which real file
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
 from dataclasses import astuple
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -30,6 +32,9 @@ from implicam.geometry import Pose
 
 UNITS_PER_PIXEL = 64.0
 HALF_PIXEL = "Qualisys does not say where in a pixel its coordinates begin: half a pixel is not known."
+MAX_RELATIVE_ROWS = 0.02
+"""How far "1080p" may be from the rows of the sensor; a sensor of 1088 has it."""
+_ROWS = re.compile(r"(\d{2,5})p", re.IGNORECASE)
 FROM_Y_UP = np.diag([1.0, -1.0, -1.0])
 
 INTRINSICS = ("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "skew")
@@ -91,7 +96,7 @@ def knows(source: Source) -> bool:
 
 
 def read(path: Path) -> Rig:
-    """Read the cameras that are active, named by their serial numbers.
+    """Read the cameras that are active and calibrated, named by their serial numbers.
 
     Args:
         path: The .qca.txt file.
@@ -103,21 +108,53 @@ def read(path: Path) -> Rig:
         DatasetError: The file has a mistake; the error names the camera and the value.
     """
     elements = read_xml(path).findall("cameras/camera")
-    active = [element for element in elements if element.get("active", "1") not in ("0", "false")]
-    if not 0 < len(active) <= MAX_CAMERAS:
+    left_out = {element: reason for element in elements for mark, reason in _UNUSABLE if _is_off(element, mark)}
+    usable = [element for element in elements if element not in left_out]
+    if not 0 < len(usable) <= MAX_CAMERAS:
         raise DatasetError(
-            f"{path}: {len(active)} of {len(elements)} cameras are active.",
+            f"{path}: {len(usable)} of {len(elements)} cameras are active and calibrated.",
             fix="calibrate in QTM, and export the calibration again",
         )
     cameras, notes = [], [HALF_PIXEL]
-    for i, element in enumerate(active):
+    for i, element in enumerate(usable):
         camera, said = _read_camera(element, f"{path}: camera {element.get('serial', i)}")
         cameras.append(camera)
         notes += said
-    left_out = [element.get("serial", "?") for element in elements if element not in active]
-    notes += [f"Left out, because they are not active: {list_names(left_out)}."] if left_out else []
+    for _, reason in _UNUSABLE:
+        names = [element.get("serial", "?") for element, why in left_out.items() if why == reason]
+        notes += [f"Left out, because they are {reason}: {list_names(names)}."] if names else []
+    notes += _describe_sizes(zip(usable, cameras, strict=True))
     with naming(str(path)):
         return Rig(tuple(cameras), "mm", tuple(notes))
+
+
+_UNUSABLE = (("active", "not active"), ("calibrated", "not calibrated"))
+"""Attributes that say that the numbers of a camera are of no use, and what a note says then; the last that holds."""
+
+
+def _is_off(element: Element, mark: str) -> bool:
+    return element.get(mark, "1").strip().lower() in ("0", "false", "no")
+
+
+def _describe_sizes(read: Iterable[tuple[Element, ExplicitCamera]]) -> list[str]:
+    """Cameras whose videos have another number of rows than the view that the lens belongs to."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for element, camera in read:
+        stated = element.get("video_resolution", "")
+        rows = _ROWS.fullmatch(stated.strip())
+        view, sensor = min(camera.size), min(_sensor_size(element))  # a camera on its side has them as columns
+        if rows and all(abs(int(rows[1]) - has) > MAX_RELATIVE_ROWS * has for has in (view, sensor)):
+            found.setdefault((stated, " x ".join(map(str, camera.size))), []).append(camera.name)
+    return [
+        f"QTM states video_resolution {stated!r} for {list_names(names)}, and a view of {size} pixels: the lens is "
+        f"that of {size}. Videos of another size must be enlarged to it before points are found in them."
+        for (stated, size), names in found.items()
+    ]
+
+
+def _sensor_size(element: Element) -> list[float]:
+    intrinsic = _child(element, "intrinsic", "intrinsic")
+    return [(end + 1) // UNITS_PER_PIXEL for end in _numbers(intrinsic, ("sensorMaxU", "sensorMaxV"), "intrinsic")]
 
 
 def _read_camera(element: Element, place: str) -> tuple[ExplicitCamera, list[str]]:

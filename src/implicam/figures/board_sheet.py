@@ -192,6 +192,8 @@ def _draw(sheet: Print, page: Floats, path: Path) -> tuple[float, float]:
         "below alike.",
         f"implicam detect FOLDER {sheet.words[1]}",
     )
+    for artist in (*axes.patches, *axes.lines):
+        artist.set_snap(False)  # of a .png: edges where they are, in grey, and not on the next whole pixel
     size = min(7.0, 1.75 * (page[0] - 2 * RIM_MM) / max(map(len, told)) * 72 / MM_PER_INCH)
     for k, line in enumerate(told):
         font = "monospace" if k == 2 else "sans-serif"

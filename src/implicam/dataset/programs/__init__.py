@@ -16,6 +16,7 @@ from implicam.dataset.programs import pose, ptv, xypts
 from implicam.dataset.programs.views import UNKNOWN_UNIT, Numbers, Views, rows_of_numbers
 from implicam.dataset.table_options import TableOptions
 from implicam.errors import DatasetError, UsageError, did_you_mean
+from implicam.files import is_file_name
 
 __all__ = ["PROGRAMS", "Program", "read_program", "write_program"]
 
@@ -28,18 +29,21 @@ class Program:
     write: Callable[[Dataset, Path], list[str]]
     what: str
     first_pixel: int = 0
+    folder: bool = False
 
 
 PROGRAMS = {
     "dltdv": Program(xypts.read_dltdv, xypts.write_dltdv, "xypts.csv of DLTdv", 1),
     "easywand": Program(xypts.read_dltdv, xypts.write_dltdv, "xypts.csv, as easyWand takes it", 1),
     "argus": Program(xypts.read_argus, xypts.write_argus, "xypts.csv of Argus"),
-    "myptv": Program(ptv.read_myptv, ptv.write_myptv, "a folder of cal_points of MyPTV"),
-    "openptv": Program(ptv.read_openptv, ptv.write_openptv, "a folder of .fix and .crd of OpenPTV"),
+    "myptv": Program(ptv.read_myptv, ptv.write_myptv, "a folder of cal_points of MyPTV", folder=True),
+    "openptv": Program(ptv.read_openptv, ptv.write_openptv, "a folder of .fix and .crd of OpenPTV", folder=True),
     "deeplabcut": Program(
-        pose.read_deeplabcut, pose.write_deeplabcut, "a folder of tables of DeepLabCut, one a camera"
+        pose.read_deeplabcut, pose.write_deeplabcut, "a folder of tables of DeepLabCut, one a camera", folder=True
     ),
-    "sleap": Program(pose.read_sleap, pose.write_sleap, "a folder of analysis tables of SLEAP, one a camera"),
+    "sleap": Program(
+        pose.read_sleap, pose.write_sleap, "a folder of analysis tables of SLEAP, one a camera", folder=True
+    ),
 }
 
 
@@ -82,14 +86,19 @@ def write_program(data: Dataset, path: str | Path, kind: str) -> list[str]:
         What the format could not hold, in sentences.
 
     Raises:
-        UsageError: There is no such program.
+        UsageError: There is no such program, or the name has the ending of something else.
         DatasetError: The format cannot hold the dataset.
         ImplicamError: The files cannot be written.
     """
-    program = _find(kind)
+    program, path = _find(kind), Path(path)
+    if is_file_name(path) and not path.is_dir() and (program.folder or path.suffix.lower() not in (".csv", ".txt")):
+        raise UsageError(
+            f"{path}: {program.what} is not written as {path.suffix}.",
+            fix="it is a folder: leave the ending out" if program.folder else "end the name in .csv",
+        )
     cameras = tuple(replace(camera, width=None, height=None) for camera in data.cameras)  # pixels from 1 may be outside
     observations = replace(data.observations, cameras=cameras, uv=data.observations.uv + program.first_pixel)
-    return program.write(replace(data, observations=observations), Path(path))
+    return program.write(replace(data, observations=observations), path)
 
 
 def _find(kind: str) -> Program:
