@@ -2,6 +2,7 @@
 much work tests take."""
 
 import os
+import pickle
 import shutil
 from collections import Counter
 from typing import Any
@@ -65,6 +66,29 @@ def pytest_terminal_summary(terminalreporter):
 def _examples_write_elsewhere(request, tmp_path, monkeypatch):
     if isinstance(request.node, pytest.DoctestItem):
         monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def looks_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A simulated camera that takes photographs is made once in a process: its lines of sight and its background take
+    a third of a second, and every session begins with them."""
+    from implicam.simulate import photographs
+
+    make = photographs._Look
+
+    def look(camera: Any, optics: Any, rng: Any) -> Any:
+        key = pickle.dumps((camera, optics, rng.bit_generator.state))
+        if key not in _looks:
+            while len(_looks) >= MOST_LOOKS:
+                del _looks[next(iter(_looks))]
+            _looks[key] = make(camera, optics, rng)
+        return _looks[key]
+
+    monkeypatch.setattr(photographs, "_Look", look)
+
+
+MOST_LOOKS = 8  # 25 MB each
+_looks: dict[bytes, Any] = {}
 
 
 @pytest.fixture

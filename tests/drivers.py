@@ -32,7 +32,7 @@ def nothing_left() -> Iterator[None]:
     """Threads that a driver started have ended after the test."""
     before = set(threading.enumerate())
     yield
-    end = time.monotonic() + 5
+    end = time.monotonic() + 60
     while (left := set(threading.enumerate()) - before) and time.monotonic() < end:
         time.sleep(0.01)
     assert not left

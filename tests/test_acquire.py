@@ -19,6 +19,8 @@ from implicam.errors import UsageError
 from implicam.session import Session
 from implicam.session.setup import Setup, open_session
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 # its options are the fields of a setup
 
 
@@ -99,7 +101,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[float, int, str]:
     """Seconds from SIGTERM to the end, the exit code, and what was said."""
     begin = time.monotonic()
     process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=180)
     return time.monotonic() - begin, process.returncode, out + err
 
 

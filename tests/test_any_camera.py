@@ -39,9 +39,7 @@ def stretched(ratio: float) -> Dataset:
     return with_pixels(read_dataset(CASES / "nonsquare-points"), change)
 
 
-@pytest.mark.parametrize(
-    "ratio", [pytest.param(0.75, marks=pytest.mark.slow), 1.0, 1.333, pytest.param(1.5, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("ratio", [pytest.param(0.75, marks=pytest.mark.slow), 1.0, 1.333])
 def test_pixels_need_not_be_square(ratio: float) -> None:
     found = cross_validate(ForwardGP().fit, stretched(ratio), 5).coverage.overall
     assert found.rmse == pytest.approx(0.212, rel=0.05)

@@ -22,8 +22,21 @@ from implicam.cli.commands import EXAMPLES, app
 from implicam.coverage import Estimate
 from implicam.dataset import read_dataset
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 COMMANDS = sorted(command.name for command in app.registered_commands)
-HEAVY = ["viser", "plotly", "matplotlib", "torch", "gpytorch", "pyarrow", "cv2", "sklearn", "scipy.stats", "scipy.signal"]
+HEAVY = [
+    "viser",
+    "plotly",
+    "matplotlib",
+    "torch",
+    "gpytorch",
+    "pyarrow",
+    "cv2",
+    "sklearn",
+    "scipy.stats",
+    "scipy.signal",
+]
 
 # examples and help
 
@@ -200,12 +213,13 @@ def json_commands(made: Path) -> dict[str, list[str]]:
         "import": ["import", str(made / "cameras.toml"), "-o", "cameras.implicam"],
         "suggest": ["suggest", file, "-n", "3"],
         "design": ["design", "stereo", "--points", "20"],
-        "acquire": ["acquire", "session", "--rig", "stereo", "--budget", "9", "--speed", "1000", "--unattended"],
         "info": ["info", file],
     }
 
 
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("demo", "paper", *ASKS_A_PERSON)])
+@pytest.mark.parametrize(
+    "command", [name for name in COMMANDS if name not in ("demo", "paper", "acquire", *ASKS_A_PERSON)]
+)
 def test_json_is_json_and_nothing_else(command: str, made: Path, cli: Cli) -> None:
     ran = cli(*json_commands(made)[command], "--json")
     assert ran.code == 0
@@ -274,9 +288,10 @@ def test_suggest_says_where_and_what_the_cameras_see(made: Path, cli: Cli) -> No
 
 def test_acquire_goes_on_and_refuses_what_it_cannot(cli: Cli) -> None:
     words = ["acquire", "session", "--unattended", "--json"]
-    assert cli(*words, "--rig", "stereo", "--speed", "1000", "--budget", "8").json["points"] == 8
+    first = cli(*words, "--rig", "stereo", "--speed", "1000", "--budget", "8")
+    assert (first.code, first.json["points"], first.err) == (0, 8, "")
     again = cli(*words, "--budget", "9")
-    assert again.json["points"] == 9
+    assert (again.code, again.json["points"], again.err) == (0, 9, "")
     assert again.json["stopped"] == "all 9 points of the budget are measured"
     assert len(read_dataset("session")) == 9
     for wrong, why in (
@@ -504,7 +519,6 @@ def test_wrong_usage_shows_the_usage(line: str, made: Path, cli: Cli) -> None:
 def test_the_real_command_returns_the_same_codes(made: Path, tmp_path: Path) -> None:
     assert real("info nothing", tmp_path).code == 1
     assert real("info", tmp_path).code == 2
-    assert real("evaluate nothing", tmp_path).code == 2
 
 
 @pytest.mark.parametrize("words", [["--debug", "info", "nothing"], ["info", "nothing", "--debug"]])

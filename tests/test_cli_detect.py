@@ -13,6 +13,8 @@ import pytest
 from implicam.cli import main
 from implicam.dataset import read_dataset
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 cv2 = pytest.importorskip("cv2")
 
 Cli = Callable[..., tuple[int, str, str]]

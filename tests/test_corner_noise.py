@@ -89,8 +89,8 @@ def test_error_bars_hold_whatever_became_of_the_pixels(kind):
 def test_where_a_board_cannot_tell_its_error_bars_are_not_too_small():
     """Corners at one phase of the pixels' grid are all off together: a whole number of pixels a square, not turned."""
     for offset in (0.1, 0.6):
-        h = np.array([[28.0, 0, 300.5 + offset], [0, 28.0, 200.5 - offset], [0, 0, 1]])
-        clean = photograph(checkered(ROWS, COLUMNS), h, blur=0.5, noise=0, fine=10, shape=(400, 600))
+        h = np.array([[28.0, 0, 190.5 + offset], [0, 28.0, 140.5 - offset], [0, 0, 1]])
+        clean = photograph(checkered(ROWS, COLUMNS), h, blur=0.5, noise=0, fine=10, shape=(280, 380))
         found = Board(ROWS, COLUMNS).detect(taken("edge-aware", clean, 0.004, 3), VIEW)
         assert nees(found, corners_of(ROWS, COLUMNS, h)).mean() < 4
 

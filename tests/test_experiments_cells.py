@@ -331,7 +331,7 @@ def test_two_runs_on_one_folder_do_no_harm(tmp_path: Path) -> None:
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as other:
         results = run(cells, folder, jobs=1)
-        told, _ = other.communicate(timeout=60)
+        told, _ = other.communicate(timeout=180)
     assert told.split() == ["10", "0"]
     assert [value["squared"] for value in results.values.values()] == [i * i for i in range(10)]
     assert max(times(journal).values()) <= 2

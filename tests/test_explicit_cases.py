@@ -114,7 +114,7 @@ def with_square_pixels() -> float:
 
 
 @pytest.mark.parametrize(
-    "ratio", [pytest.param(0.75, marks=pytest.mark.slow), 1.067, pytest.param(1.333, marks=pytest.mark.slow), 1.5]
+    "ratio", [pytest.param(0.75, marks=pytest.mark.slow), pytest.param(1.067, marks=pytest.mark.slow), 1.5]
 )
 def test_pixels_of_any_shape_cost_nothing(ratio: float) -> None:
     assert with_square_pixels() == pytest.approx(0.211, abs=0.005)
@@ -224,12 +224,15 @@ def test_neither_camera_is_to_blame() -> None:
     assert baselines[0] == pytest.approx(120, abs=6)
 
 
-@pytest.mark.parametrize(("moved", "doubted"), [
-    (0.0, False), (0.1, False), pytest.param(3.0, True, marks=pytest.mark.slow),
+@pytest.mark.parametrize(("moved", "doubted", "seeds"), [
+    (0.1, False, range(3)),
+    pytest.param(0.1, False, range(3, 6), marks=pytest.mark.slow),
+    pytest.param(0.0, False, range(6), marks=pytest.mark.slow),
+    pytest.param(3.0, True, range(6), marks=pytest.mark.slow),
 ])  # fmt: skip
-def test_error_bars_hold_what_moved_between_two_pictures(moved: float, doubted: bool) -> None:
-    """Six rigs; without the boards' own movement in the covariance 0.3 mm made this 55 instead of 6."""
-    found = [calibrate_largest_group(boards_of(held(seed, moved=moved)), "brown-conrady") for seed in range(6)]
+def test_error_bars_hold_what_moved_between_two_pictures(moved: float, doubted: bool, seeds: range) -> None:
+    """Without the boards' own movement in the covariance 0.3 mm made this 55 instead of 6."""
+    found = [calibrate_largest_group(boards_of(held(seed, moved=moved)), "brown-conrady") for seed in seeds]
     assert 2.5 < np.mean([pose_error(group) for group in found]) < 11
     assert all(bool(group.doubts) == doubted for group in found)
 

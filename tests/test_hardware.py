@@ -26,6 +26,8 @@ from implicam.hardware import FolderCamera, GenICamCamera, OpenCVCamera, simulat
 from implicam.hardware.genicam import to_grey
 from implicam.images import write_picture
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 # ---- cameras -------------------------------------------------------------------------------------------------------
 
 

@@ -35,6 +35,8 @@ from implicam.hardware import (
     trigger_from,
 )
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 # ---- robots --------------------------------------------------------------------------------------------------------
 
 
@@ -136,19 +138,25 @@ def test_the_arm_moves_in_metres_with_its_tool_and_orientation(controller: Contr
     assert URRobot(HOST, box=BOX, unit="m").sd == pytest.approx((1e-4,) * 3)
 
 
-def test_stop_stops_the_arm_on_its_way(controller: Controller, arm: URRobot) -> None:
-    def way() -> float:
-        x, y = controller.tell()["pose"][:2]  # m
-        return float(np.hypot(1e3 * x - 300, 1e3 * y - 200) / np.hypot(200, 300))
+def on_its_way(controller: Controller, act: Callable[[], object]) -> threading.Thread:
+    """Does something as soon as the arm has left (300, 200) towards (500, 500), however busy the machine is."""
 
-    def stop_on_the_way() -> None:
-        while way() < 0.1:
+    def wait_and_act() -> None:
+        way = 0.0
+        while way < 0.1:
             time.sleep(0.02)
-        arm.stop()
+            x, y = controller.tell()["pose"][:2]  # m
+            way = float(np.hypot(1e3 * x - 300, 1e3 * y - 200) / np.hypot(200, 300))
+        act()
 
+    thread = threading.Thread(target=wait_and_act)
+    thread.start()
+    return thread
+
+
+def test_stop_stops_the_arm_on_its_way(controller: Controller, arm: URRobot) -> None:
     arm.open()
-    stopper = threading.Thread(target=stop_on_the_way)
-    stopper.start()
+    stopper = on_its_way(controller, arm.stop)
     with pytest.raises(HardwareError, match="was stopped at") as caught:
         arm.move(np.array([500.0, 500.0, 400.0]))
     stopper.join()
@@ -172,11 +180,10 @@ def test_stop_stops_the_arm_on_its_way(controller: Controller, arm: URRobot) -> 
 )
 def test_what_halts_the_arm_on_its_way_is_named(controller: Controller, arm: URRobot, line: str, words: str) -> None:
     arm.open()
-    timer = threading.Timer(0.3, lambda: controller.tell(line))
-    timer.start()
+    halting = on_its_way(controller, lambda: controller.tell(line))
     with pytest.raises(HardwareError, match=words) as caught:
         arm.move(np.array([500.0, 500.0, 400.0]))
-    timer.join()
+    halting.join()
     says_all(caught.value)
     if "lost" not in words:
         with pytest.raises(HardwareError, match=words):

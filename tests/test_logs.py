@@ -11,6 +11,8 @@ from command_line import Cli, cli  # noqa: F401  a fixture
 from implicam.cli import show
 from implicam.logs import log_to_file
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 SIMULATE = ["simulate", "rig", "--cameras", "2R", "--positions", "random", "--points", "20", "--seed", "1"]
 
 

@@ -43,6 +43,10 @@ def others() -> Dataset:
     return known(400).select(np.arange(200, 400))
 
 
+BRIEF = MLPSettings(max_epochs=60)
+"""For what does not depend on how well it has learned."""
+
+
 @cache
 def fitted(n: int = 60, **options: Any) -> MLPCalibration:
     return MLP(**options).fit(known(400).select(np.arange(n)))
@@ -360,13 +364,13 @@ def test_training_leaves_the_threads_of_torch_alone() -> None:
 def test_a_batch_of_datasets_is_the_single_fits_with_counted_seeds() -> None:
     data = known(400)
     sets = [data.select(np.arange(*rows)) for rows in ((30,), (3,), (20, 60))]
-    found = MLP(seed=5).fit_many(sets)
+    found = MLP(seed=5, settings=BRIEF).fit_many(sets)
     assert isinstance(found[1], FitError)
     assert "3 usable known points" in str(found[1])
     for i in (0, 2):
-        one, alone = found[i], MLP(seed=5 + i).fit(sets[i])
+        one, alone = found[i], MLP(seed=5 + i, settings=BRIEF).fit(sets[i])
         assert isinstance(one, MLPCalibration)
-        assert one.calibrator == alone.calibrator == MLP(seed=5 + i)
+        assert one.calibrator == alone.calibrator == MLP(seed=5 + i, settings=BRIEF)
         assert one.data is sets[i]
         a, b = one.measure(others().observations), alone.measure(others().observations)
         np.testing.assert_allclose(a.xyz, b.xyz, rtol=0, atol=1e-3)
@@ -479,12 +483,12 @@ def test_points_that_cannot_be_used_are_left_out_and_none_is_kept_for_stopping(t
     uv = o.uv.copy()
     uv[[3, 17, 31], [0, 1, 3]] = np.nan
     holes = replace(data, observations=Observations(o.points, o.cameras, uv, o.sd))
-    calibration = MLP().fit(holes)
+    calibration = MLP(settings=BRIEF).fit(holes)
     assert [u.point for u in calibration.unused] == [str(data.points[i]) for i in (3, 17, 31)]
     assert calibration.unused[0].reason == "mlp needs every camera; not seen by cam2"
     assert len(calibration.held_out) == 37
     complete = data.select(np.setdiff1d(np.arange(40), [3, 17, 31]))
-    expected = MLP().fit(complete)
+    expected = MLP(settings=BRIEF).fit(complete)
     np.testing.assert_array_equal(calibration.measure(o).xyz, expected.measure(o).xyz)
     calibration.save(tmp_path / "rig.implicam")
     assert load_calibration(tmp_path / "rig.implicam").residuals == calibration.residuals

@@ -20,6 +20,8 @@ from implicam.errors import UsageError
 from implicam.simulate import Rig
 from test_active import known, rig, room  # noqa: F401  fixtures
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 # Step 1: the rule
 
 

@@ -23,6 +23,8 @@ from implicam.images import write_picture
 from implicam.session.setup import Setup, open_session
 from implicam.viewer.pictures import BALL, montage
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 # Step 1: the detector, a frozen dataclass
 
 

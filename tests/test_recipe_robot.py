@@ -21,6 +21,8 @@ from implicam.session.setup import Setup, open_session
 from test_hardware_robots import HOST
 from toy_robot import AXES, RIG, ToyCamera, ToyRobot, ToyTrigger
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 CORNERS = RIG.volume.world_from_box.apply((np.mgrid[0:2, 0:2, 0:2].reshape(3, -1).T - 0.5) * RIG.volume.size)
 BOX = CORNERS.min(axis=0), CORNERS.max(axis=0)
 CAMERA_SPECS = tuple((camera.name, f"toy:{number}") for number, camera in enumerate(RIG.cameras))

@@ -283,7 +283,7 @@ def test_page_draws_in_a_browser(tmp_path: Path, chromium: dict[str, Any]):
             view = browser.new_page(viewport={"width": 1400, "height": 1000})
             told, asked = listen(view)
             view.goto((tmp_path / "report.html").as_uri())
-            view.wait_for_selector("#plot-scene canvas", timeout=30_000)
+            view.wait_for_selector("#plot-scene canvas", timeout=120_000)
             view.wait_for_function("document.querySelectorAll('.js-plotly-plot .main-svg').length >= 3")
             view.locator("#plot-scene").scroll_into_view_if_needed()
             assert view.evaluate("document.querySelectorAll('#plot-error-sd .point').length") == 503
@@ -313,7 +313,7 @@ def test_nothing_is_cut_off_on_a_phone(tmp_path: Path, chromium: dict[str, Any],
         size = {"width": 390, "height": 844}
         view = browser.new_context(viewport=size, is_mobile=True, has_touch=True, color_scheme=scheme).new_page()
         view.goto((tmp_path / "report.html").as_uri())
-        view.wait_for_function("document.querySelectorAll('.js-plotly-plot .main-svg').length >= 3", timeout=60_000)
+        view.wait_for_function("document.querySelectorAll('.js-plotly-plot .main-svg').length >= 3", timeout=120_000)
         beyond = view.evaluate(
             """() => [...document.querySelectorAll("body *")].filter((one) => {
                 const box = one.getBoundingClientRect();

@@ -21,6 +21,8 @@ from implicam.session.setup import Setup, open_session
 from test_hardware_robots import HOST, Controller, controller  # noqa: F401  a fixture
 from toy_robot import RIG
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 HALT_SECONDS = 0.5
 
 ACQUIRE = f"""
@@ -84,7 +86,7 @@ def test_the_arm_halts_when_the_session_is_ended(
     process.send_signal(signal.Signals[sent])
     seconds = waited(lambda: not controller.tell()["moving"], 10)
     state = controller.tell()
-    out, err = process.communicate(timeout=30)
+    out, err = process.communicate(timeout=180)
     assert seconds < HALT_SECONDS, out + err
     assert controller.tell()["pose"] == state["pose"]
     assert np.linalg.norm(np.subtract(state["pose"], state["moves"][-1][:6])) > 0.01  # it was on its way
@@ -113,7 +115,7 @@ def test_a_robot_of_a_package_halts_at_ctrl_c(tmp_path: Path) -> None:
     waited(lambda: len(lines) > 10 and lines[-1][1:] != lines[-10][1:], 60)
     sent = time.monotonic()
     process.send_signal(signal.SIGINT)
-    process.wait(timeout=30)
+    process.wait(timeout=180)
     reader.join()
     process.stdout.close()
     process.stderr.close()
@@ -135,7 +137,7 @@ def test_leaving_a_session_stops_its_robot_before_anything_is_waited_for(tmp_pat
         waited(lambda: guided.state.phase == "moving", 10)
         with guided._camera_lock:  # a camera takes its time
             guided.leave()
-            going.join(timeout=5)
+            going.join(timeout=60)
             assert not going.is_alive()
         assert guided.state.phase == "trouble"
         guided.go()  # pressed just before
@@ -151,7 +153,7 @@ def test_a_session_that_is_closed_stops_its_robot(tmp_path: Path) -> None:
     going.start()
     waited(lambda: guided.state.phase == "moving", 10)
     guided.close()
-    going.join(timeout=5)
+    going.join(timeout=60)
     assert not going.is_alive()
 
 

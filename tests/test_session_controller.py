@@ -22,6 +22,8 @@ from implicam.session import Session
 from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, Equipment, SessionController
 from implicam.session.setup import Setup, open_session, with_options
 
+pytestmark = pytest.mark.usefixtures("looks_kept")
+
 SETUP = Setup(rig="stereo", budget=12, speed=1e6)
 
 
@@ -220,7 +222,7 @@ def test_the_robot_stops_at_once_from_another_thread(tmp_path: Path) -> None:
             time.sleep(0.01)
         time.sleep(0.1)
         controller.stop_robot()
-        going.join(timeout=10)
+        going.join(timeout=60)
         assert not going.is_alive()
         assert controller.state.phase == "trouble"
         assert "stopped" in controller.state.message

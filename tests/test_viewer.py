@@ -342,7 +342,7 @@ class Slow:
 
     def slow(self) -> None:
         self.done.append("slow")
-        self.gate.wait(10)
+        self.gate.wait(60)
 
     def fail(self) -> None:
         raise UsageError("not now")
@@ -368,7 +368,7 @@ def work() -> Iterator[tuple[Slow, Worker, list[Any]]]:
     assert not worker._thread.is_alive()
 
 
-def until(true: Any, seconds: float = 10.0) -> None:
+def until(true: Any, seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end, "it did not happen in time"
@@ -471,7 +471,7 @@ class Command:
     def end(self, how: signal.Signals | None = None) -> int:
         if how is not None:
             self.process.send_signal(how)
-        self.process.communicate(timeout=30)
+        self.process.communicate(timeout=180)
         return self.process.returncode
 
 
@@ -482,10 +482,10 @@ class Visitor:
         self.page = page
 
     def reads(self, text: str) -> None:
-        self.page.get_by_text(text).first.wait_for(timeout=45_000)
+        self.page.get_by_text(text).first.wait_for(timeout=120_000)
 
     def presses(self, name: str) -> None:
-        self.page.get_by_role("button", name=name, exact=name != "Stop now").click(timeout=30_000)
+        self.page.get_by_role("button", name=name, exact=name != "Stop now").click(timeout=120_000)
 
     def measures(self, number: int) -> None:
         self.reads(f"Point {number}: press Go")

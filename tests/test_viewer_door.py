@@ -67,7 +67,7 @@ def test_a_browser_shows_the_page_but_not_in_a_foreign_frame_nor_for_a_foreign_s
         page.goto(f"http://localhost:{front.port}/")
         page.get_by_label("token").fill("a b;c")
         page.get_by_role("button", name="Open").click()
-        page.get_by_text("Put the ball here").wait_for(timeout=20_000)
+        page.get_by_text("Put the ball here").wait_for(timeout=120_000)
         assert page.url == f"http://localhost:{front.port}/"
         assert page.evaluate("document.cookie") == ""
 
@@ -86,7 +86,7 @@ def test_a_browser_shows_the_page_but_not_in_a_foreign_frame_nor_for_a_foreign_s
         elsewhere.write_text(f'<iframe src="http://localhost:{front.port}/"></iframe>')
         with (
             Front(host="127.0.0.1", port=0, behind=behind, token=None, files={"/": elsewhere}) as other,
-            page.expect_console_message(lambda message: "frame-ancestors" in message.text, timeout=8000),
+            page.expect_console_message(lambda message: "frame-ancestors" in message.text, timeout=120_000),
         ):
             page.goto(other.url)
         browser.close()
