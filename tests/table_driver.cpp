@@ -51,7 +51,11 @@ std::string answer(const implicam::Rig& rig, const std::string& question) {
   for (const double x : found.xyz) out += digits(x);
   for (const auto& row : found.covariance)
     for (const double entry : row) out += digits(entry);
-  return out + digits(found.chi_squared) + digits(found.p) + " " + std::to_string(found.views);
+  out += digits(found.chi_squared) + digits(found.p) + " " + std::to_string(found.views);
+  int left_out = -1, second = -1;
+  if (!found.left_out.empty()) left_out = found.left_out[0];
+  if (found.left_out.size() > 1) second = found.left_out[1];
+  return out + " " + std::to_string(left_out) + " " + std::to_string(second);
 }
 
 }  // namespace

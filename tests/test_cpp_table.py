@@ -26,7 +26,7 @@ from implicam.deploy import cpp_table, write_cpp
 from implicam.deploy.cpp_table import EXAMPLE_FILE, HEADER_FILE, TABLE_FILE
 from implicam.deploy.spline_table import MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR, tabulate
 from implicam.errors import UsageError
-from implicam.simulate import random_positions, simulate
+from implicam.simulate import build_rig, random_positions, simulate
 
 COMPILERS = [name for name in ("g++", "clang++") if shutil.which(name)]
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C++ compiler (g++ or clang++)")
@@ -138,7 +138,7 @@ def compare(made: RigCalibration, driver: Path, folder: Path, threads: int = 0) 
     covariance = answers[both, 4:13].reshape(-1, 3, 3)
     np.testing.assert_allclose(covariance / size, measured.cov[both] / size, rtol=0, atol=COVARIANCE_PART)
     np.testing.assert_allclose(answers[both, 14], measured.consistency[both], rtol=0, atol=0.005)
-    np.testing.assert_array_equal(answers[:, 15], np.isfinite(numbers[..., 0]).sum(axis=1))
+    np.testing.assert_array_equal(answers[both, 15], measured.views[both])
     return state
 
 
@@ -146,6 +146,37 @@ def compare(made: RigCalibration, driver: Path, folder: Path, threads: int = 0) 
 def test_it_projects_and_measures_as_python_does(driver: Path, tmp_path: Path) -> None:
     state = compare(plain(), driver, tmp_path / "table", threads=3)
     assert {OK, TOO_FEW} <= set(state.tolist()) <= {OK, DOUBTFUL, NOT_SEEN, TOO_FEW, OUTSIDE}
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_it_leaves_out_the_wrong_views_that_python_leaves_out(driver: Path, tmp_path: Path) -> None:
+    rig = build_rig("bar6", seed=4)
+    made = ic.Explicit(lens="kannala-brandt").fit(
+        simulate(rig, random_positions(rig, 40, np.random.default_rng(5)), seed=5)
+    )
+    write_cpp(made, tmp_path / "table")
+    rng, low, high = np.random.default_rng(8), made.data.xyz.min(axis=0), made.data.xyz.max(axis=0)
+    seen = views_of(made, rng.uniform(low, high, (100, 3)))
+    uv, wrong = seen.uv.copy(), rng.integers(0, 6, 100)
+    uv[np.arange(100), wrong] += rng.choice([-1.0, 1.0], (100, 2)) * rng.choice([5.0, 30.0], (100, 1))
+    uv[:30, 0] += 20.0  # another one
+    size = np.array([[camera.width, camera.height] for camera in made.trained.cameras])
+    uv[((uv < 0) | (uv > size - 1)).any(axis=2)] = np.nan
+    measured = made.measure(ic.Observations(seen.points, seen.cameras, uv, np.full(uv.shape, np.nan)))
+    told = [
+        re.findall(r"cam(\d)", reason) if "measured without" in reason else [] for reason in measured.reason.tolist()
+    ]
+    questions = [f"t {words_of(*[w for view in row for w in (*view, np.nan)])}" for row in uv]
+    answers = ask(driver, tmp_path / "table" / TABLE_FILE, questions)
+    left_out = [sorted(str(int(c) + 1) for c in row[16:] if c >= 0) for row in answers]
+    assert np.mean([a == b for a, b in zip(left_out, told, strict=True)]) >= 0.98
+    assert sum(len(cameras) == 1 for cameras in told) > 40
+    assert sum(len(cameras) == 2 for cameras in told) > 5
+    both = np.array([bool(a) and a == b for a, b in zip(left_out, told, strict=True)])
+    off = answers[both, 1:4] - measured.xyz[both]
+    distance = np.sqrt(np.einsum("ni,nij,nj->n", off, np.linalg.inv(measured.cov[both]), off))
+    assert distance.max() < POSITION_SDS
 
 
 @pytest.fixture(scope="module")

@@ -186,7 +186,9 @@ def _sections(rig: FittedRig, table: SplineTable) -> dict[str, NDArray[Any]]:
     grid[..., :5] = table.own
     marks = np.packbits(table.marked, axis=3, bitorder="little")
     accuracy = [table.pixel_error, table.variance_error, float(table.marked.mean()), table.places]
-    rules = [rig.settings.min_p_value, rig.settings.disagree_p_value, float(rig.misfit_adds), *accuracy]
+    s = rig.settings
+    p_values = [s.min_p_value, s.disagree_p_value, s.agree_p_value, s.clearly_better_ratio]
+    rules = [*p_values, float(rig.misfit_adds), *accuracy]
     sensors = [
         [camera.width or 0, camera.height or 0, model.noise, *model.image.centre, model.image.half, stated]
         for camera, model, stated in zip(cameras, models, rig.usual_stated_noise, strict=True)

@@ -3,7 +3,8 @@
 // `implicam export rig.implicam --to cpp -o folder` writes this file and a table, rig.table.
 //
 //   implicam::Rig rig;
-//   if (implicam::Status s = rig.load("rig.table"); s != implicam::Status::ok) { puts(implicam::message(s)); return 1; }
+//   implicam::Status status = rig.load("rig.table");
+//   if (status != implicam::Status::ok) { puts(implicam::message(status)); return 1; }
 //   std::vector<implicam::View> views(rig.cameras());                    // not seen unless it is set
 //   views[0] = {612.3, 401.8}; views[2] = {330.1, 418.6};
 //   implicam::Position found = rig.triangulate(views);
@@ -34,7 +35,7 @@ namespace implicam {
 
 enum class Status {
   ok,
-  doubtful,            // measured, but the views hardly agree: a wrong match in one of them is likely
+  doubtful,            // measured, but the views hardly agree, and none of them is clearly the wrong one
   not_seen,            // no camera saw it
   too_few_views,       // one camera saw it; a position takes two
   views_contradict,    // no position explains the views: a wrong match in one of them
@@ -55,12 +56,12 @@ enum class Status {
 inline const char* message(Status status) {
   switch (status) {
     case Status::ok: return "ok";
-    case Status::doubtful: return "measured, but the views hardly agree: a wrong match in one of them is likely";
+    case Status::doubtful: return "measured, but the views hardly agree, and none of them is clearly the wrong one";
     case Status::not_seen: return "no camera saw it";
     case Status::too_few_views: return "one camera saw it; a position takes two";
     case Status::views_contradict: return "the views contradict each other: a wrong match in one of them";
     case Status::no_position: return "no position explains the views";
-    case Status::outside_workspace: return "it, or where its views meet best, lies outside of the box that the table holds";
+    case Status::outside_workspace: return "it, or where its views meet best, lies outside of the box of the table";
     case Status::not_tabulated: return "the table is not accurate enough there for one of these cameras";
     case Status::outside_image: return "the camera does not see this position";
     case Status::wrong_input: return "a camera that is not there, a number that is none, or not one view a camera";
@@ -98,7 +99,8 @@ struct Position {
   std::array<std::array<double, 3>, 3> covariance{nothing<3>()};  // of xyz, everything included
   double chi_squared = NOT_A_NUMBER;  // with 2 * views - 3 degrees of freedom where the views agree
   double p = NOT_A_NUMBER;            // the probability of a larger one
-  int views = 0;
+  int views = 0;                      // that were used
+  std::vector<int> left_out;          // cameras whose view contradicts the others, and was not used
   bool measured() const { return status == Status::ok || status == Status::doubtful; }
 };
 
@@ -199,7 +201,8 @@ class Rig {
     }
     out.status = Status::outside_image;
     const double half = sensors_[c].half * VISIBLE_HALVES;
-    if (!(std::fabs(here.mean[0] - sensors_[c].cu) <= half && std::fabs(here.mean[1] - sensors_[c].cv) <= half)) return out;
+    const double du = here.mean[0] - sensors_[c].cu, dv = here.mean[1] - sensors_[c].cv;
+    if (!(std::fabs(du) <= half && std::fabs(dv) <= half)) return out;
     const double noise = cameras_[c].noise * cameras_[c].noise;
     out.status = Status::ok;
     out.uv = {here.mean[0], here.mean[1]};
@@ -208,7 +211,9 @@ class Rig {
   }
 
   // Where a point is, eqs. (20) to (22). views: one for each camera, in their order.
-  Position triangulate(const std::vector<View>& views) const noexcept { return triangulate(views.data(), views.size()); }
+  Position triangulate(const std::vector<View>& views) const noexcept {
+    return triangulate(views.data(), views.size());
+  }
   Position triangulate(const View* views, std::size_t count) const noexcept {
     try {
       return measure(views, count);
@@ -224,8 +229,9 @@ class Rig {
   using Mat3 = std::array<Vec3, 3>;
   static constexpr std::size_t MAX_BYTES = std::size_t{1} << 31, MAX_CAMERAS = 1000, MAX_NODES = 4096, CHANNELS = 8;
   static constexpr std::size_t HEADER = 64, ENTRY = 88, MAX_SECTIONS = 64, MAX_RANK = 6;
-  static constexpr int MAX_STEPS = 60;
-  static constexpr double STEP_SDS = 1e-7, VISIBLE_HALVES = 1.5, FARTHEST = 1.0;
+  static constexpr std::size_t MAX_VIEWS_FOR_PAIRS = 12;
+  static constexpr int MAX_STEPS = 60, STEPS_TO_MEND = 3;
+  static constexpr double STEP_SDS = 1e-7, VISIBLE_HALVES = 1.5, FARTHEST = 1.0, HOPELESS_CHI_SQUARED = 1e4;
 
   struct Sensor {
     double cu = 0, cv = 0, half = 0, stated = 0;
@@ -266,7 +272,7 @@ class Rig {
   std::vector<float> grid_, ties_, through_;
   std::vector<unsigned char> marks_;
   std::size_t mark_bytes_ = 0, unknowns_ = 0;
-  double min_p_ = 0, disagree_p_ = 0;
+  double min_p_ = 0, disagree_p_ = 0, agree_p_ = 0, clearly_better_ = 0;
   bool misfit_adds_ = false, estimated_ = false;
   std::vector<Shot> shots_;
   Mat3 along_{};
@@ -406,11 +412,13 @@ class Rig {
     }
     scale_ = values[3];
     if (!(scale_ > 0)) return false;
-    if (!read(sections, "rules", {7}, values)) return false;
+    if (!read(sections, "rules", {9}, values)) return false;
     min_p_ = values[0];
     disagree_p_ = values[1];
-    misfit_adds_ = values[2] > 0;
-    accuracy_ = {values[3], values[4], values[5], values[6]};
+    agree_p_ = values[2];
+    clearly_better_ = values[3];
+    misfit_adds_ = values[4] > 0;
+    accuracy_ = {values[5], values[6], values[7], values[8]};
     if (!read(sections, "sensors", {C, 7}, values, true)) return false;
     std::string rest = text(*names);
     for (std::size_t c = 0; c < C; ++c) {
@@ -426,7 +434,7 @@ class Rig {
     }
     if (!read(sections, "projections", {C, 12}, values)) return false;
     projection_.resize(C);
-    for (std::size_t c = 0; c < C; ++c) std::copy_n(values.begin() + static_cast<std::ptrdiff_t>(12 * c), 12, projection_[c].begin());
+    for (std::size_t c = 0; c < C; ++c) std::copy_n(values.data() + 12 * c, 12, projection_[c].begin());
     if (find(sections, "ties") != nullptr &&
         !read(sections, "ties", {box[0], box[1], box[2], C * (C - 1) / 2, 4}, ties_))
       return false;
@@ -435,7 +443,8 @@ class Rig {
 
   bool build_labels(const std::vector<Section>& sections, const std::vector<std::size_t>& box, std::size_t C) {
     const Section* shots = find(sections, "shots");
-    if (shots->shape.size() != 2 || shots->shape[1] != 17 || shots->shape[0] < 1 || shots->shape[0] > 100000) return false;
+    if (shots->shape.size() != 2 || shots->shape[1] != 17) return false;
+    if (shots->shape[0] < 1 || shots->shape[0] > 100000) return false;
     const std::size_t S = shots->shape[0];
     std::vector<double> values;
     if (!read(sections, "shots", {S, 17}, values)) return false;
@@ -465,7 +474,8 @@ class Rig {
     std::copy_n(values.begin() + 17, 6, bars_.begin());
     if (!(half_length_ > 0) || !(reach_ >= 0)) return false;
     const Section* polynomial = find(sections, "polynomial");
-    if (polynomial == nullptr || polynomial->shape.size() != 2 || polynomial->shape[0] < 1 || polynomial->shape[0] > 3) return false;
+    if (polynomial == nullptr || polynomial->shape.size() != 2) return false;
+    if (polynomial->shape[0] < 1 || polynomial->shape[0] > 3) return false;
     if (!read(sections, "polynomial", {polynomial->shape[0], S}, polynomial_)) return false;
     const Section* sd = find(sections, "label_sd");
     if (sd == nullptr) return true;
@@ -735,6 +745,7 @@ class Rig {
       if (!invert(here.H, inverse)) return false;
       step = times(inverse, here.g);
       if (!(dot(step, here.g) > STEP_SDS * STEP_SDS)) return true;
+      if (i > STEPS_TO_MEND && here.held && here.squares - dot(step, here.g) > HOPELESS_CHI_SQUARED) return false;
       double part = 1;
       for (int halvings = 0;; ++halvings) {
         const Vec3 there = inside({at[0] + part * step[0], at[1] + part * step[1], at[2] + part * step[2]}, FARTHEST);
@@ -767,6 +778,88 @@ class Rig {
     return sd * usual / stated;
   }
 
+  struct Solution {
+    Status status = Status::no_position;
+    Vec3 at{};
+    Mat3 covariance{};
+    Normal here;
+    double chi_squared = NOT_A_NUMBER, p = NOT_A_NUMBER;
+  };
+
+  // Where a point is by all of these views, in the working frame; from other starts too, where the first leads nowhere.
+  void solve(const Views& views, Solution& out, bool other_starts = true) const {
+    const int degrees = 2 * static_cast<int>(views.cameras.size()) - 3;
+    Vec3 step{};
+    Normal& here = out.here;
+    out.at = start(views);
+    bool ended = descend(views, out.at, here, step);
+    for (int eighth = 0; other_starts && eighth < 8 && !(ended && here.held); ++eighth) {
+      Vec3 other{}, other_step{};
+      for (std::size_t a = 0; a < 3; ++a)
+        other[a] = low_[a] + step_[a] * static_cast<double>(nodes_[a] - 3) * ((eighth >> a & 1) != 0 ? 0.75 : 0.25);
+      Normal there;
+      if (!descend(views, other, there, other_step)) continue;
+      if (ended && there.squares >= here.squares) continue;
+      ended = true;
+      out.at = other;
+      step = other_step;
+      std::swap(here, there);
+    }
+    out.status = Status::no_position;
+    if (!ended && !here.L.empty() && survival(here.squares - dot(here.g, step), degrees) < min_p_)
+      out.status = Status::views_contradict;
+    if (!ended || !invert(here.H, out.covariance)) return;
+    out.status = Status::outside_workspace;
+    if (!here.held) return;
+    out.chi_squared = std::max(0.0, here.squares - dot(here.g, step));
+    out.p = survival(out.chi_squared, degrees);
+    out.status = out.p < min_p_ ? Status::views_contradict : out.p < disagree_p_ ? Status::doubtful : Status::ok;
+    for (std::size_t a = 0; a < 3; ++a) out.at[a] += step[a];
+  }
+
+  static Views without(const Views& views, std::size_t a, std::size_t b) {
+    Views out;
+    for (std::size_t i = 0; i < views.cameras.size(); ++i) {
+      if (i == a || i == b) continue;
+      out.cameras.push_back(views.cameras[i]);
+      out.uv.insert(out.uv.end(), {views.uv[2 * i], views.uv[2 * i + 1]});
+      out.noise.push_back(views.noise[i]);
+    }
+    return out;
+  }
+
+  // Leaves out the one view, or the two of five and more, without which the others agree, if that is clear, eq. (W3).
+  void leave_out_wrong(Views& views, Solution& found, std::vector<int>& left_out) const {
+    const std::size_t V = views.cameras.size(), none = V;
+    for (std::size_t size = 1; size <= (V >= 5 ? 2U : 1U); ++size) {
+      if (size == 2 && V > MAX_VIEWS_FOR_PAIRS) return;
+      Solution best, tried;
+      double second = 0;
+      std::size_t first_out = none, second_out = none;
+      best.p = 0;
+      for (std::size_t a = 0; a < V; ++a)
+        for (std::size_t b = size == 1 ? none : a + 1; b < (size == 1 ? none + 1 : V); ++b) {
+          tried = Solution{};
+          solve(without(views, a, b), tried, false);
+          const double p = std::isfinite(tried.p) ? tried.p : 0.0;
+          if (p > best.p) {
+            second = best.p;
+            std::swap(best, tried);
+            first_out = a;
+            second_out = b;
+          } else {
+            second = std::max(second, p);
+          }
+        }
+      if (!(best.p > agree_p_ && best.p > clearly_better_ * second)) continue;
+      left_out.push_back(static_cast<int>(views.cameras[first_out]));
+      if (second_out != none) left_out.push_back(static_cast<int>(views.cameras[second_out]));
+      views = without(views, first_out, second_out);
+      found = std::move(best);
+      return;
+    }
+  }
+
   Position measure(const View* given, std::size_t count) const {
     Position out;
     if (cameras_.empty()) return out;
@@ -780,46 +873,26 @@ class Rig {
         views.uv.push_back(given[c].v);
         views.noise.push_back(noise_of(c, given[c].sd));
       }
-    const std::size_t V = views.cameras.size();
-    out.views = static_cast<int>(V);
-    out.status = V == 0 ? Status::not_seen : Status::too_few_views;
-    if (V < 2) return out;
-
-    Vec3 at = start(views), step{};
-    Normal here;
-    bool ended = descend(views, at, here, step);
-    for (int eighth = 0; eighth < 8 && !(ended && here.held); ++eighth) {  // other starts, where the first leads nowhere
-      Vec3 other{}, other_step{};
-      for (std::size_t a = 0; a < 3; ++a)
-        other[a] = low_[a] + step_[a] * static_cast<double>(nodes_[a] - 3) * ((eighth >> a & 1) != 0 ? 0.75 : 0.25);
-      Normal there;
-      if (!descend(views, other, there, other_step)) continue;
-      if (ended && there.squares >= here.squares) continue;
-      ended = true;
-      at = other;
-      step = other_step;
-      std::swap(here, there);
-    }
-    out.status = Status::no_position;
-    Mat3 covariance{};
-    if (!ended && !here.L.empty() && survival(here.squares - dot(here.g, step), 2 * out.views - 3) < min_p_)
-      out.status = Status::views_contradict;
-    if (!ended || !invert(here.H, covariance)) return out;
-    out.status = Status::outside_workspace;
-    if (!here.held) return out;
-    out.chi_squared = std::max(0.0, here.squares - dot(here.g, step));
-    out.p = survival(out.chi_squared, 2 * out.views - 3);
-    out.status = Status::views_contradict;
-    if (out.p < min_p_) return out;
-    out.status = Status::not_tabulated;
+    out.views = static_cast<int>(views.cameras.size());
+    out.status = out.views == 0 ? Status::not_seen : Status::too_few_views;
+    if (out.views < 2) return out;
+    Solution found;
+    solve(views, found);
+    if (out.views >= 3 && !(found.p >= disagree_p_)) leave_out_wrong(views, found, out.left_out);
+    out.views = static_cast<int>(views.cameras.size());
+    out.chi_squared = found.chi_squared;
+    out.p = found.p;
+    out.status = found.status;
+    if (!out.measured()) return out;
     for (const std::size_t c : views.cameras)
-      if (marked(here.cell, c)) return out;
-    out.status = out.p < disagree_p_ ? Status::doubtful : Status::ok;
-    for (std::size_t a = 0; a < 3; ++a) at[a] += step[a];
-    if (!shots_.empty()) as_labelled(views, here, at, covariance);
+      if (marked(found.here.cell, c)) {
+        out.status = Status::not_tabulated;
+        return out;
+      }
+    if (!shots_.empty()) as_labelled(views, found.here, found.at, found.covariance);
     for (std::size_t a = 0; a < 3; ++a) {
-      out.xyz[a] = at[a] * scale_ + offset_[a];
-      for (std::size_t b = 0; b < 3; ++b) out.covariance[a][b] = covariance[a][b] * scale_ * scale_;
+      out.xyz[a] = found.at[a] * scale_ + offset_[a];
+      for (std::size_t b = 0; b < 3; ++b) out.covariance[a][b] = found.covariance[a][b] * scale_ * scale_;
     }
     return out;
   }
