@@ -95,7 +95,7 @@ def verify_command(
         raise UsageError(f"--purpose {purpose!r} is not known.", fix=f"write {' or '.join(PURPOSES)}")
     beside, printed = output.with_suffix(".csv"), output.with_suffix(".pdf")
     for path in (output, beside, printed):
-        must_not_replace(path, calibration, dataset, lengths)
+        must_not_replace(path, calibration, dataset, lengths or _lengths_file(dataset))
     import_extra("jinja2", "report", "the protocol")
     fitted = load_calibration(calibration)
     unit = table.unit or fitted.data.length_unit
@@ -147,7 +147,7 @@ def _lengths(
     if length is not None:
         return lengths_by_names(list(map(str, data.points)), length, sd=sd)
     if path is None:
-        path = (dataset if dataset.is_dir() else dataset.parent) / LENGTHS_FILE
+        path = _lengths_file(dataset)
         if not path.is_file():
             raise DatasetError(
                 f"{path} does not exist, so no length is known.",
@@ -155,6 +155,11 @@ def _lengths(
                 "length for all points named bar01_a and bar01_b: --length 500 --length-sd 0.002",
             )
     return read_lengths(path)
+
+
+def _lengths_file(dataset: Path) -> Path:
+    """Where lengths are looked for, in a folder or beside a file."""
+    return (dataset if dataset.is_dir() else dataset.parent) / LENGTHS_FILE
 
 
 def _at_temperature(one: CalibratedLength, temperature: float | None, expansion: float | None) -> CalibratedLength:
