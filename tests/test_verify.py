@@ -207,6 +207,9 @@ def test_one_wrong_length_is_named_and_a_scale_error_is_none() -> None:
     assert unlike_the_others(error, length, cov) == []
     error[7] += 0.2
     assert unlike_the_others(error, length, cov) == [7]
+    both = cov + 0.02 * np.outer(length, length) / 350**2  # with a large error that all share
+    error[7] += 100
+    assert unlike_the_others(error, length, both) == [7]
     error[::2] += 0.2  # not single lengths
     assert unlike_the_others(error, length, cov) == []
 
@@ -256,7 +259,7 @@ def test_a_length_that_was_not_measured_proves_nothing() -> None:
     missing = [one for one in found.lengths if not one.is_measured]
     assert [one.length.b for one in missing] == ["L3-5"]
     assert "L3-5 was not measured" in missing[0].note
-    assert "not measured" in " ".join(found.notes)
+    assert "1 could not be measured" in " ".join(found.notes)
     assert page(found, Circumstances()).count("not measured") >= 2
 
 
@@ -289,6 +292,18 @@ def test_a_method_that_does_not_say_what_errors_share_still_decides() -> None:
     assert found.decision == "conforms"
     assert (found.bars, found.scale) == (None, None)
     assert "does not say" in " ".join(found.notes)
+
+
+def test_a_mistake_in_one_length_counts_but_spoils_neither_error_bars_nor_scale() -> None:
+    lengths = list(gauge()[1])
+    lengths[8] = replace(lengths[8], length=lengths[8].length + 5)
+    found = ic.verify(rig_and_calibration()[1], measured(), lengths, mpe="2 + L/200", next_lengths=0)
+    assert found.decision == "does not conform"
+    assert found.bars is not None
+    assert (found.bars.verdict, found.bars.lengths) == ("right", 34)
+    assert found.scale is not None
+    assert (found.scale.widened, found.scale.found) == (1, False)
+    assert any(note.startswith(f"{lengths[8].title} is unlike the others") for note in found.notes)
 
 
 # the arrangement

@@ -103,8 +103,10 @@ def verify(
     error, bars, scale, odd = (measured - calibrated)[seen], None, None, list[int]()
     if cov is not None:
         total = cov + shared_covariance(used)
-        bars, scale = check_error_bars(error, total), fit_scale(error, calibrated[seen], total)
         odd = unlike_the_others(error, calibrated[seen], total)
+        rest = np.setdiff1d(np.arange(len(error)), odd)
+        bars = check_error_bars(error[rest], total[np.ix_(rest, rest)])
+        scale = fit_scale(error[rest], calibrated[seen][rest], total[np.ix_(rest, rest)])
     volume = _volume(calibration, measurement, workspace, ends, used, next_lengths)
     lines = iter(volume.lines if volume else [one.line for one in used])
     sds = iter(np.sqrt(np.diagonal(cov)) if cov is not None else np.full(len(used), np.nan))
@@ -203,10 +205,11 @@ def _notes(
 ) -> list[str]:  # fmt: skip
     notes = [measurement.alarm] if measurement.alarm else []
     if len(used) < len(known):
-        notes.append(f"{len(known) - len(used)} of {len(known)} lengths were not measured; nothing is proven without.")
+        count = len(known) - len(used)
+        notes.append(f"Of {len(known)} lengths {count} could not be measured: conformity is not proven without them.")
     notes += [
         f"{one.title} is unlike the others, more than chance explains: look for a mistake in its marks or its row, and "
-        "measure it again. It counts as it is."
+        "measure it again. It counts in the decision; error bars and scale are judged without it."
         for one in odd
     ]
     if unstated := [one.title for one in known if one.sd is None]:

@@ -139,7 +139,8 @@ def _facts(found: Verification, about: Circumstances) -> Iterator[tuple[str, str
 def _tiles(found: Verification) -> Iterator[tuple[str, str, str]]:
     unit, worst = found.length_unit, found.worst
     yield (
-        "largest error" if found.mpe is None else "error nearest its limit", f"{signed_number(worst.error, 3)} {unit}",
+        "largest error" if found.mpe is None else "largest error against its limit",
+        f"{signed_number(worst.error, 3)} {unit}",
         f"{worst.length.title}; limit {number(worst.limit)} {unit}" if found.mpe else worst.length.title,
     )  # fmt: skip
     yield (
