@@ -809,10 +809,10 @@ class Rig {
     if (!ended && !here.L.empty() && survival(here.squares - dot(here.g, step), degrees) < min_p_)
       out.status = Status::views_contradict;
     if (!ended || !invert(here.H, out.covariance)) return;
+    out.chi_squared = std::max(0.0, here.squares - dot(here.g, step));
+    out.p = survival(out.chi_squared, degrees);  // also outside of the box: views that agree there are not wrong
     out.status = Status::outside_workspace;
     if (!here.held) return;
-    out.chi_squared = std::max(0.0, here.squares - dot(here.g, step));
-    out.p = survival(out.chi_squared, degrees);
     out.status = out.p < min_p_ ? Status::views_contradict : out.p < disagree_p_ ? Status::doubtful : Status::ok;
     for (std::size_t a = 0; a < 3; ++a) out.at[a] += step[a];
   }
