@@ -7,6 +7,7 @@ from implicam.images import opencv
 
 VIEW = View("cam1", "s1")
 SHAPE = (480, 640)
+STRIP = 16
 
 
 def rotated(angle, scale, at=(320, 240), tilt=(0.0, 0.0)):
@@ -42,10 +43,13 @@ def photograph(paint, h, *, shape=SHAPE, blur=0.7, noise=0.015, seed=0, under=No
     v, u = ((np.arange(n * fine) + 0.5) / fine - 0.5 for n in shape)
     inverse = np.linalg.inv(h)
     u, v = u[None, :], v[:, None]
-    x, y, w = (row[0] * u + row[1] * v + row[2] for row in inverse)
-    value = paint(x / w, y / w)
     ground = 0.35 if under is None else np.kron(under, np.ones((fine, fine), np.float32))
-    value = np.where(np.isnan(value), ground, value).astype(np.float32)
+    value = np.empty((v.size, u.size), np.float32)
+    for start in range(0, v.size, STRIP):  # what fits into a cache
+        strip = slice(start, start + STRIP)
+        x, y, w = (row[0] * u + row[1] * v[strip] + row[2] for row in inverse)
+        painted = paint(x / w, y / w)
+        value[strip] = np.where(np.isnan(painted), ground if under is None else ground[strip], painted)
     value = cv2.GaussianBlur(value, (0, 0), blur * fine)
     return noisy(cv2.resize(value, shape[::-1], interpolation=cv2.INTER_AREA), noise, seed)
 
