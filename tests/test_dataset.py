@@ -185,6 +185,16 @@ def test_wide_csv_without_description(tmp_path: Path) -> None:
         read_dataset(path)
 
 
+def test_pixels_alone_need_no_unit(tmp_path: Path) -> None:
+    (tmp_path / "new.csv").write_text("u_a,v_a,u_b,v_b\n1,2,3,4\n")
+    data = read_dataset(tmp_path / "new.csv")
+    assert data.length_unit == "unknown"
+    for name in ("out.csv", "out.npz", "out"):
+        write_dataset(data, tmp_path / name)
+        assert read_dataset(tmp_path / name).length_unit == "unknown"
+        assert read_dataset(tmp_path / name, unit="m").length_unit == "m"
+
+
 def test_a_wide_csv_leaves_other_toml_files_alone(tmp_path: Path) -> None:
     (tmp_path / "pyproject.toml").write_text("[project]\n")
     write_dataset(simulated("stereo", points=3, seed=0), tmp_path / "pyproject.csv")

@@ -42,13 +42,13 @@ def test_arrays_are_the_dataset_of_the_same_numbers() -> None:
     uv, xyz = data.observations.uv, data.xyz
     sizes = [(c.width, c.height) for c in data.cameras]
     made = Dataset.from_arrays(
-        uv, xyz, sd=data.observations.sd, cameras=data.camera_names, size=sizes, points=data.points
+        uv, xyz, sd=data.observations.sd, cameras=data.camera_names, size=sizes, points=data.points, unit="mm"
     )
     assert made.cameras == data.cameras
     np.testing.assert_array_equal(made.observations.uv, uv)
     again = ic.ForwardGP().fit(made).measure(made)
     np.testing.assert_allclose(again.xyz, measured().xyz, atol=1e-6)
-    by_name = Dataset.from_arrays({name: uv[:, k] for k, name in enumerate(data.camera_names)}, xyz)
+    by_name = Dataset.from_arrays({name: uv[:, k] for k, name in enumerate(data.camera_names)}, xyz, unit="mm")
     np.testing.assert_array_equal(by_name.observations.uv, uv)
     assert by_name.camera_names == data.camera_names
     assert by_name.points[0] == "p0001"
@@ -100,12 +100,43 @@ UV, XYZ = np.full((6, 3, 2), 5.0) + np.arange(36).reshape(6, 3, 2), np.arange(18
         ({"uv": UV, "points": ["a"]}, "1 points, but uv has 6 rows"),
         ({"uv": UV, "sd": [0.1, 0.2]}, r"sd has the shape \(2,\)"),
         ({"uv": UV, "shots": list("aabbcc")}, "belong to known positions"),
-        ({"uv": UV, "xyz": np.where(XYZ == 4, np.nan, XYZ)}, "finite"),
+        ({"uv": UV, "xyz": np.where(XYZ == 4, np.nan, XYZ)}, r"xyz\[1\], of point 'p0002', is \[3.0, nan, 5.0\]"),
+        ({"uv": {"a": UV[:, :1], "b": UV[:4, 1:2]}}, r"a \(6, 2\), b \(4, 2\)"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused_with_the_cure(options: dict[str, Any], words: str) -> None:
     with pytest.raises(DatasetError, match=words):
-        Dataset.from_arrays(**options)
+        Dataset.from_arrays(**options, unit="mm")
+
+
+def test_the_unit_of_positions_is_said_and_pixels_need_none() -> None:
+    for options in ({"length_unit": "m"}, {}):
+        with pytest.raises(UsageError, match="unit="):
+            Dataset.from_arrays(UV, XYZ, **options)
+    with pytest.raises(UsageError, match="write unit='m'"):
+        ic.read_dataset("rig", length_unit="m")  # type: ignore[arg-type]
+    pixels = Dataset.from_arrays(UV)
+    assert repr(pixels).startswith("dataset 'arrays': 6 points")
+    with pytest.raises(DatasetError, match="no known positions") as caught:
+        ic.evaluate(fitted(), pixels)
+    assert "xyz=" in caught.value.fix
+    assert fitted().length_unit == "mm"
+
+
+def test_pixels_as_opencv_and_pandas_have_them() -> None:
+    stacked = Dataset.from_arrays({name: UV[:, k : k + 1] for k, name in enumerate("abc")})
+    np.testing.assert_array_equal(stacked.observations.uv, UV)
+    pandas = pytest.importorskip("pandas")
+    with pytest.raises(DatasetError, match="uv is a DataFrame") as caught:
+        Dataset.from_arrays(pandas.DataFrame(UV.reshape(6, 6)))
+    assert "uv.to_numpy().reshape(-1, 3, 2)" in caught.value.fix
+
+
+def test_several_datasets_are_joined_one_by_one_or_as_a_list() -> None:
+    parts = [rig().select([i, i + 1]) for i in (0, 2, 4)]
+    assert len(ic.join(*parts)) == len(ic.join(parts)) == 6
+    with pytest.raises(UsageError, match="a str is no dataset"):
+        ic.join(parts[0], "rig")  # type: ignore[arg-type]
 
 
 def test_what_is_no_dataset_is_refused_with_the_cure() -> None:
@@ -173,16 +204,16 @@ def test_another_frame_is_the_same_world() -> None:
 
 
 def test_uncertainties_that_turn_lose_their_correlation_and_say_so() -> None:
-    data = Dataset.from_arrays(UV, XYZ, position_sd=[0.1, 0.2, 0.3])
+    data = Dataset.from_arrays(UV, XYZ, unit="mm", position_sd=[0.1, 0.2, 0.3])
     quarter = Rotation.from_euler("z", 90, degrees=True)
     turned = data.transformed(quarter)
     np.testing.assert_allclose(turned.positions.sd[0], [0.2, 0.1, 0.3], atol=1e-12)
     assert "correlated" in turned.notes[-1]
-    assert not Dataset.from_arrays(UV, XYZ, position_sd=0.1).transformed(quarter).notes
+    assert not Dataset.from_arrays(UV, XYZ, unit="mm", position_sd=0.1).transformed(quarter).notes
 
 
 def test_what_an_interactive_python_shows_is_short() -> None:
-    big = Dataset.from_arrays(np.random.default_rng(1).uniform(1, 900, (500, 48, 2)), np.zeros((500, 3)))
+    big = Dataset.from_arrays(np.random.default_rng(1).uniform(1, 900, (500, 48, 2)), np.zeros((500, 3)), unit="mm")
     for thing in (rig(), big, fitted(), measured(), measured().with_alarm("a camera moved")):
         lines = repr(thing).splitlines()
         assert 1 < len(lines) <= 10, lines

@@ -408,6 +408,8 @@ def _known_points_test(calibration: RigCalibration, data: Dataset) -> KnownPoint
     """A few numbers that a bias shows in, and not all errors together: of many points these would tell a noise that is
     stated a few per cent too small from chance."""
     measured = calibration.measure(data.observations)
+    if data.known is not None and data.length_unit != measured.length_unit:
+        data = data.in_unit(measured.length_unit)
     rows = np.flatnonzero(measured.measured & np.isfinite(data.xyz).all(axis=1))
     if len(rows) < MIN_KNOWN_POINTS:
         return None

@@ -442,6 +442,11 @@ class CalibrationBase(Plotted):
     calibrator: Calibrator
     data: Dataset
 
+    @property
+    def length_unit(self) -> str:
+        """Of the positions that it measures."""
+        return self.data.length_unit
+
     def __repr__(self) -> str:
         """Two lines; `summary()` and `implicam info` of its file say more."""
         cameras = int(self.data.observations.seen.any(axis=0).sum())

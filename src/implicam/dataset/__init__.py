@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from implicam.dataset.copies import describe_copies, find_copies, remove_copies
@@ -21,6 +22,7 @@ from implicam.dataset.model import (
     covariance_from_columns,
 )
 from implicam.dataset.table_options import TableOptions, size_text
+from implicam.dataset.units import UNKNOWN_UNIT, refuse_length_unit
 from implicam.dataset.wide import (
     arrays_from_dataset,
     dataset_from_arrays,
@@ -70,6 +72,7 @@ def read_dataset(
     first_pixel: int | None = None,
     v_up: bool = False,
     size: str | tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
+    length_unit: None = None,
 ) -> Dataset:
     """Read a dataset from a folder, a .csv, .tsv or .txt, an .xlsx, a .parquet or an .npz.
 
@@ -79,6 +82,7 @@ def read_dataset(
         first_pixel: How the file counts the centre of the first pixel, 0 or 1; None for 0.
         v_up: Whether it counts v from the bottom row upwards.
         size: Width and height of the pictures, for all cameras or for each by name; None to use what the data state.
+        length_unit: Not used: it is `unit` here.
 
     Returns:
         The dataset, with marks for missing views read as missing, and pixels counted as docs/conventions.md says.
@@ -95,6 +99,7 @@ def read_dataset(
     >>> len(ic.read_dataset(folder))
     30
     """
+    refuse_length_unit(length_unit)
     path = Path(path)
     options = TableOptions(unit, first_pixel, v_up, size_text(size))
     try:
@@ -103,6 +108,8 @@ def read_dataset(
         raise DatasetError(
             f"{path} cannot be read.", why=str(error), fix="check the name and the permissions"
         ) from error
+    if unit is not None and data.length_unit != unit and data.length_unit == UNKNOWN_UNIT:
+        data = replace(data, length_unit=unit)
     if unit is not None and data.length_unit != unit:
         raise DatasetError(
             f"{path} is in {data.length_unit!r}, not in {unit!r}.",

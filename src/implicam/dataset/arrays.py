@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from implicam.dataset.marks import remove_marks
 from implicam.dataset.model import Camera, Dataset, Floats, KnownPositions, Observations
-from implicam.errors import DatasetError
+from implicam.dataset.units import UNKNOWN_UNIT
+from implicam.errors import DatasetError, UsageError
 
 Size = tuple[int, int]
 
@@ -35,7 +36,7 @@ def from_arrays(
     size: Size | Sequence[Size] | None = None,
     points: Sequence[object] | None = None,
     shots: Sequence[object] | None = None,
-    length_unit: str = "mm",
+    unit: str | None = None,
     name: str = "arrays",
 ) -> Dataset:
     """`Dataset.from_arrays`.
@@ -49,10 +50,11 @@ def from_arrays(
         size: Of their images.
         points: Names of the points.
         shots: Which points belong to one exposure.
-        length_unit: Of the positions.
+        unit: Of the positions.
         name: Of the dataset.
 
     Raises:
+        UsageError: There are positions, and their unit is not stated.
         DatasetError: A shape, a type or a number is not possible.
     """
     if isinstance(uv, Mapping):
@@ -63,8 +65,17 @@ def from_arrays(
                 fix="leave out cameras=, or give uv as one array of (points, cameras, 2)",
             )
         cameras, uv = list(uv), _side_by_side({str(key): _numbers(one, f"uv[{key!r}]") for key, one in uv.items()})
+    table = hasattr(uv, "to_numpy")
     pixels = _numbers(uv, "uv")
     positions = None if xyz is None else _numbers(xyz, "xyz")
+    if positions is not None and unit is None:
+        raise UsageError("the length unit of xyz is not stated.", fix='add it: unit="mm", "m", ...')
+    if table and pixels.ndim != 3:
+        raise DatasetError(
+            f"uv is a {type(uv).__name__} of the shape {pixels.shape}; expected is an array (points, cameras, 2).",
+            fix="give a table with headings to Dataset.from_dataframe, or the numbers: uv.to_numpy()"
+            + (f".reshape(-1, {pixels.shape[1] // 2}, 2)" if pixels.ndim == 2 and pixels.shape[1] % 2 == 0 else ""),
+        )
     _check_shapes(pixels, positions, None if cameras is None else len(cameras))
     n, c = pixels.shape[:2]
     named = _cameras([f"cam{k + 1}" for k in range(c)] if cameras is None else cameras, size, c)
@@ -73,11 +84,12 @@ def from_arrays(
     observations = Observations(names, named, pixels, _pixel_sd(sd, pixels))
     known = None
     if positions is not None:
+        _check_finite(positions, texts)
         shot = names if shots is None else np.array([str(one) for one in _of_length(shots, n, "shots")], dtype=np.str_)
         known = KnownPositions(shot, positions, _position_sd(position_sd, n))
     elif position_sd is not None or shots is not None:
         raise DatasetError("position_sd and shots belong to known positions.", fix="give xyz, or leave them out")
-    return remove_marks(Dataset(name, length_unit, observations, known))
+    return remove_marks(Dataset(name, unit or UNKNOWN_UNIT, observations, known))
 
 
 def _numbers(value: Any, what: str) -> Floats:
@@ -97,7 +109,20 @@ def _numbers(value: Any, what: str) -> Floats:
         ) from error
 
 
+def _check_finite(xyz: Floats, points: Sequence[str]) -> None:
+    rows = np.flatnonzero(~np.isfinite(xyz).all(axis=1))
+    if len(rows):
+        more = f", and {len(rows) - 1} more" if len(rows) > 1 else ""
+        raise DatasetError(
+            f"xyz[{rows[0]}], of point {points[rows[0]]!r}, is {xyz[rows[0]].tolist()}{more}.",
+            why="a known point needs its whole position",
+            fix="leave such points out: keep = np.isfinite(xyz).all(axis=1), then uv[keep] and xyz[keep]; or measure "
+            "them, from a dataset without xyz",
+        )
+
+
 def _side_by_side(pixels: dict[str, Floats]) -> Floats:
+    pixels = {name: one[:, 0] if one.ndim == 3 and one.shape[1] == 1 else one for name, one in pixels.items()}
     shapes = {name: one.shape for name, one in pixels.items()}
     if not pixels or len(set(shapes.values())) > 1 or any(len(s) != 2 or s[1] != 2 for s in shapes.values()):
         told = ", ".join(f"{name} {shape}" for name, shape in list(shapes.items())[:6]) or "no camera"

@@ -1,31 +1,46 @@
-"""One dataset of the points of two."""
+"""One dataset of the points of several."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
+from typing import cast
 
 import numpy as np
 
 from implicam.dataset.model import Dataset, KnownPositions, Names, Observations
-from implicam.errors import DatasetError
+from implicam.errors import DatasetError, UsageError
 
 
-def join(first: Dataset, second: Dataset) -> Dataset:
-    """One dataset of the points of two, named and described as the first.
+def join(*datasets: Dataset | Sequence[Dataset]) -> Dataset:
+    """One dataset of the points of several, named and described as the first.
 
     Args:
-        first: Its points come first.
-        second: With the same cameras and length unit, and with known positions if the first has them.
+        datasets: In the order of their points, one by one or as a list; with the same cameras and length unit, and all
+            with known positions or none.
 
     Raises:
-        DatasetError: The two do not belong together, or a point has the same name in both.
+        UsageError: There is none, or one of them is no dataset.
+        DatasetError: Two do not belong together, or a point has the same name in both.
 
     >>> import implicam as ic
     >>> rig = ic.simulated("stereo", points=30, seed=1)
     >>> len(ic.join(rig.select(range(10)), rig.select(range(10, 30))))
     30
     """
+    given: list[object] = []
+    for one in datasets:
+        given += one if isinstance(one, list | tuple) else [one]
+    for part in given:
+        if not isinstance(part, Dataset):
+            raise UsageError(f"a {type(part).__name__} is no dataset.", fix="join(a, b), both of read_dataset say")
+    if not given:
+        raise UsageError("no dataset is given.", fix="join(a, b)")
+    return reduce(_join_two, cast(list[Dataset], given))
+
+
+def _join_two(first: Dataset, second: Dataset) -> Dataset:
     if first.cameras != second.cameras or first.length_unit != second.length_unit:
         raise DatasetError(
             f"datasets {first.name!r} and {second.name!r} do not belong to one rig.",

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from implicam.dataset.plain import to_plain
-from implicam.dataset.units import metres_per
+from implicam.dataset.units import metres_per, refuse_length_unit
 from implicam.errors import DatasetError, did_you_mean
 from implicam.plotted import Plotted
 
@@ -202,8 +202,11 @@ class KnownPositions:
         for shot in np.unique(shots):
             check_name(str(shot), "shot")
         xyz = _array(self.xyz, (n, 3), "xyz")
-        if not np.isfinite(xyz).all():
-            raise DatasetError("a known position must be finite.")
+        for i in np.flatnonzero(~np.isfinite(xyz).all(axis=1))[:1]:
+            raise DatasetError(
+                f"known position {i + 1} of {n} is not finite: {', '.join(f'{value:g}' for value in xyz[i])}.",
+                fix="fill it in, or leave the point out",
+            )
         sd = _array(self.sd, (n, 3), "sd")
         check_position_sd(sd, lambda i: f"known position {i + 1}")
         extra = _check_columns(self.extra, (n,), (*POINT_COLUMNS, *SD_POINT))
@@ -266,7 +269,7 @@ class Dataset(Plotted):
 
     >>> import implicam as ic
     >>> rig = ic.simulated("stereo", points=30, seed=1)
-    >>> data = ic.Dataset.from_arrays(rig.observations.uv, rig.xyz, cameras=["left", "right"])
+    >>> data = ic.Dataset.from_arrays(rig.observations.uv, rig.xyz, cameras=["left", "right"], unit="mm")
     >>> len(data), data.camera_names
     (30, ('left', 'right'))
     """
@@ -308,14 +311,16 @@ class Dataset(Plotted):
         size: tuple[int, int] | Sequence[tuple[int, int]] | None = None,
         points: Sequence[object] | None = None,
         shots: Sequence[object] | None = None,
-        length_unit: str = "mm",
+        unit: str | None = None,
         name: str = "arrays",
+        length_unit: None = None,
     ) -> Dataset:
         """A dataset from arrays.
 
         >>> import numpy as np
         >>> uv = np.array([[[640.5, 480.2], [610.1, 475.0]], [[700.0, 480.9], [np.nan, np.nan]]])
-        >>> Dataset.from_arrays(uv, [[0, 0, 0], [10, 0, 0]], cameras=["left", "right"], size=(1280, 960))
+        >>> xyz = [[0, 0, 0], [10, 0, 0]]
+        >>> Dataset.from_arrays(uv, xyz, unit="mm", cameras=["left", "right"], size=(1280, 960))
         dataset 'arrays' in mm: 2 points with known positions, 2 cameras
           left   1280 x 960 px, 2 views
           right  1280 x 960 px, 1 view
@@ -323,7 +328,8 @@ class Dataset(Plotted):
 
         Args:
             uv: (n, cameras, 2) pixels; NaN or masked where a camera did not see the point. Or the pixels (n, 2) of each
-                camera by its name. (-1, -1) and (0, 0) are taken for views that are missing, and `notes` says so.
+                camera by its name, or (n, 1, 2) as OpenCV gives them. (-1, -1) and (0, 0) are taken for views that are
+                missing, and `notes` says so.
             xyz: (n, 3) known positions in the world frame, in the length unit; None where they are to be measured.
             sd: Standard uncertainty of the pixels, px: a number, (cameras,), (n, cameras) or (n, cameras, 2); None
                 where it is not known.
@@ -332,32 +338,44 @@ class Dataset(Plotted):
             size: Width and height of the images in pixels, of all or one pair for each camera.
             points: n names; p0001, p0002, ... where none are given.
             shots: n names: the points of one exposure share one. Each point is a shot of its own where none are given.
-            length_unit: Of all positions.
+            unit: The length unit of all positions, "mm" say; wanted where there are known positions.
             name: Of the dataset.
+            length_unit: Not used: it is `unit` here.
 
         Raises:
+            UsageError: The unit is not stated, or by another name.
             DatasetError: A shape, a type or a number is not possible; says how to mend it.
         """
         from implicam.dataset.arrays import from_arrays  # it is made of what this module defines
 
+        refuse_length_unit(length_unit)
+
         return from_arrays(
             uv, xyz, sd=sd, position_sd=position_sd, cameras=cameras, size=size, points=points, shots=shots,
-            length_unit=length_unit, name=name,
+            unit=unit, name=name,
         )  # fmt: skip
 
     @classmethod
     def from_dataframe(
-        cls, table: Any, *, unit: str | None = None, first_pixel: int = 0, v_up: bool = False, size: Any = None
+        cls,
+        table: Any,
+        *,
+        unit: str | None = None,
+        first_pixel: int = 0,
+        v_up: bool = False,
+        size: Any = None,
+        length_unit: None = None,
     ) -> Dataset:
         """A dataset from a table of pandas, read as `read_dataset` reads the same table in a file.
 
         Args:
             table: A pandas.DataFrame with a row for each point (x, y, z, u_cam1, v_cam1, ...) or for each view (point,
                 camera, u, v). An index with a name is a column.
-            unit: The length unit; None where the headings state it.
+            unit: The length unit; None where the headings state it, or there are no known positions.
             first_pixel: How the centre of the first pixel is counted, 0 or 1.
             v_up: Whether v is counted from the bottom row upwards.
             size: Width and height of the images in pixels, of all or for each camera by name.
+            length_unit: Not used: it is `unit` here.
 
         Raises:
             UsageError: It is no table of pandas, or the options contradict it.
@@ -366,6 +384,7 @@ class Dataset(Plotted):
         from implicam.dataset.dataframe import dataset_from_dataframe
         from implicam.dataset.table_options import TableOptions, size_text
 
+        refuse_length_unit(length_unit)
         return dataset_from_dataframe(table, TableOptions(unit, first_pixel, v_up, size_text(size)))
 
     def to_dataframe(self) -> Any:
@@ -407,11 +426,11 @@ class Dataset(Plotted):
         if self.known is None:
             raise DatasetError(
                 f"dataset {self.name!r} has no known positions.",
-                why="there is no points.csv (in a table of one file: no columns named x, y and z, in small letters)",
+                why="there is no points.csv in its folder, no columns x, y and z in its table, or no xyz in its arrays",
                 fix="calibrate from its boards alone: --method explicit; or add points.csv with point,shot,x,y,z"
                 if isinstance(self.extra.get("target"), Mapping) and "rows" in self.extra["target"]
-                else "add points.csv with point,shot,x,y,z, or the columns x, y and z; without them a dataset can only "
-                "be measured",
+                else "add points.csv with point,shot,x,y,z, the columns x, y and z, or xyz=; without them a dataset "
+                "can only be measured and checked",
             )
         return self.known
 
@@ -734,7 +753,7 @@ def check_views(uv: Floats, sd: Floats, cameras: Sequence[Camera], place: Callab
                 f"{view(int(i), k)}: pixel u = {uv[i, k, 0]:g}, v = {uv[i, k, 1]:g} is far outside the "
                 f"{camera.width} x {camera.height} image.",
                 why=why,
-                fix="correct the value, remove the row, or correct width and height in dataset.toml",
+                fix="correct the value, remove the row, or correct the width and height of the camera",
             )
     for i, k in np.argwhere((((sd <= 0) | np.isinf(sd)) & ~np.isnan(uv)).any(axis=2))[:1]:
         raise DatasetError(

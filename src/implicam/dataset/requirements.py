@@ -45,7 +45,7 @@ def require_dataset(given: object) -> None:
         raise UsageError(
             f"a dataset is wanted, and not {_type_of(given)}.",
             why="a fit needs the known positions beside the pixels" if isinstance(given, Observations) else "",
-            fix=_reading(given, "fit(ic.Dataset.from_arrays(uv, xyz)), or fit(ic.read_dataset(path))"),
+            fix=_reading(given, 'fit(ic.Dataset.from_arrays(uv, xyz, unit="mm")), or fit(ic.read_dataset(path))'),
         )
 
 
@@ -73,7 +73,7 @@ def match_cameras(trained: Observations, observations: Observations) -> Observat
         raise DatasetError(
             f"the observations have no camera {', '.join(map(repr, missing))}.",
             why=f"the calibration was made with {', '.join(wanted)}; these data have {', '.join(given)}",
-            fix="measure with data of the same rig, with the same camera names in dataset.toml",
+            fix="give the cameras the names that they had when the rig was calibrated",
         )
     ordered = observations.with_cameras(wanted)
     for camera, other in zip(trained.cameras, ordered.cameras, strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from implicam.dataset.model import Dataset
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.formatting import decimal_number
 
 MAX_CAMERA_LINES = 6
@@ -16,8 +17,9 @@ def describe_dataset(data: Dataset) -> str:
     """
     seen = data.observations.seen.sum(axis=0).tolist()
     known = "with" if data.known else "without"
+    unit = "" if data.length_unit == UNKNOWN_UNIT else f" in {data.length_unit}"
     lines = [
-        f"dataset {data.name!r} in {data.length_unit}: {_count(len(data), 'point')} {known} known positions, "
+        f"dataset {data.name!r}{unit}: {_count(len(data), 'point')} {known} known positions, "
         f"{_count(len(data.cameras), 'camera')}"
     ]
     shown = data.cameras if len(data.cameras) <= MAX_CAMERA_LINES + 1 else data.cameras[:MAX_CAMERA_LINES]

@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
-from implicam.errors import DatasetError, did_you_mean
+from implicam.errors import DatasetError, UsageError, did_you_mean
 
 METRES_PER_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+
+UNKNOWN_UNIT = "unknown"
+"""Of what has no positions, and does not state the unit."""
+
+
+def refuse_length_unit(given: object) -> None:
+    """Refuse the other name of the argument `unit`.
+
+    Args:
+        given: The value of `length_unit=`; None where it was not given.
+
+    Raises:
+        UsageError: It was given.
+    """
+    if given is not None:
+        raise UsageError(f"length_unit={given!r} is no argument here.", fix=f"write unit={given!r}")
 
 
 def metres_per(unit: str) -> float:

@@ -46,6 +46,7 @@ from implicam.dataset.tables import (
     read_toml,
     require_file,
 )
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError, ImplicamError, did_you_mean, import_extra
 from implicam.files import npz_bytes, read_npz, replacing, toml_text, write_text
 
@@ -108,7 +109,7 @@ def read_brought(sheet: Sheet, path: Path, unit: str | None) -> Dataset:
         DatasetError: The unit is not stated, there are two ways to read the table, or it has a mistake.
     """
     brought = read_sheet(sheet)
-    if unit is None and not brought.unit:
+    if unit is None and not brought.unit and "x" in brought.columns.numbers:
         raise DatasetError(
             f"{path}: {_UNIT_MISSING}",
             why=f"a table carries it in {_description_path(path).name} beside it, which is not there"
@@ -124,7 +125,7 @@ def read_brought(sheet: Sheet, path: Path, unit: str | None) -> Dataset:
         )
     with naming(path):
         cameras = tuple(Camera(name) for name in brought.cameras)
-        stated = unit or brought.unit
+        stated = unit or brought.unit or UNKNOWN_UNIT
         layout = _Layout(cameras, brought.views, brought.further, path.stem, stated, {})
         return replace(_assemble(brought.columns, layout), notes=brought.notes)
 

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.exchange import (
     anipose,
@@ -27,7 +28,7 @@ from implicam.exchange import (
     qualisys,
     ros,
 )
-from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.exchange.source import Source
 from implicam.files import is_file_name
 from implicam.lenses import BrownConrady, KannalaBrandt

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from implicam.dataset.tables import naming
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError
 from implicam.exchange.checks import (
     MAX_CAMERAS,
@@ -32,7 +33,7 @@ from implicam.exchange.checks import (
     shorten,
 )
 from implicam.exchange.fits import fit_four_coefficients
-from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source, read_toml
 from implicam.files import toml_text, write_text

@@ -16,10 +16,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from implicam.dataset.tables import naming
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError, did_you_mean
 from implicam.exchange.checks import MAX_CAMERAS, lens_from_numbers, read_numbers, shorten
 from implicam.exchange.colmap_files import MODEL_NUMBERS, CameraEntry, Model, read_model
-from implicam.exchange.model import UNKNOWN_UNIT, Rig
+from implicam.exchange.model import Rig
 from implicam.exchange.other_lenses import (
     OtherLens,
     division_lens,

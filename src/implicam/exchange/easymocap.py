@@ -15,11 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from implicam.dataset.tables import naming
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError
 from implicam.exchange.checks import MAX_CAMERAS, check_text, get_entry, list_names, read_integer, shorten
 from implicam.exchange.fits import nearest_brown_conrady
 from implicam.exchange.folders import write_folder
-from implicam.exchange.model import UNKNOWN_UNIT, Rig
+from implicam.exchange.model import Rig
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source, read_yaml
 from implicam.exchange.storage import lens_lines, matrix_lines, read_lens, read_pose

@@ -18,9 +18,6 @@ from implicam.errors import DatasetError, did_you_mean
 from implicam.geometry import Pose
 from implicam.lenses import Bools, BrownConrady, Floats, Lens
 
-UNKNOWN_UNIT = "unknown"
-"""The length unit of a rig whose file does not say it."""
-
 
 @dataclass(frozen=True, eq=False)
 class ExplicitCamera:

@@ -20,12 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from implicam.dataset.tables import naming
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError
 from implicam.exchange.angles import angles_from_rotation, rotation_from_angles
 from implicam.exchange.checks import check_text, read_image_size, read_numbers, read_text, shorten
 from implicam.exchange.fits import MAX_LENS_DIFFERENCE_PX, Cost, image_rays
 from implicam.exchange.folders import write_folder
-from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig, has_distortion
+from implicam.exchange.model import ExplicitCamera, Rig, has_distortion
 from implicam.exchange.other_lenses import OtherLens
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from implicam.dataset.tables import naming
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError
 from implicam.exchange.checks import check_text, list_names
-from implicam.exchange.model import UNKNOWN_UNIT, Rig
+from implicam.exchange.model import Rig
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source, read_yaml
 from implicam.exchange.storage import lens_lines, matrix_lines, read_lens, read_pose, read_size

@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 
 from implicam.dataset.tables import naming
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError
 from implicam.exchange.checks import check_text, get_entry, lens_from_matrix, rotation_matrix, shorten
 from implicam.exchange.folders import write_folder
-from implicam.exchange.model import UNKNOWN_UNIT, ExplicitCamera, Rig
+from implicam.exchange.model import ExplicitCamera, Rig
 from implicam.exchange.other_lenses import OtherLens
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source, read_yaml

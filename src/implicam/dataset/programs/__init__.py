@@ -13,8 +13,9 @@ from pathlib import Path
 from implicam.dataset.marks import remove_marks
 from implicam.dataset.model import Dataset
 from implicam.dataset.programs import pose, ptv, xypts
-from implicam.dataset.programs.views import UNKNOWN_UNIT, Numbers, Views, rows_of_numbers
+from implicam.dataset.programs.views import Numbers, Views, rows_of_numbers
 from implicam.dataset.table_options import TableOptions
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError, UsageError, did_you_mean
 from implicam.files import is_file_name
 

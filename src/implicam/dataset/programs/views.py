@@ -11,9 +11,8 @@ import numpy as np
 
 from implicam.dataset.model import Camera, Dataset, KnownPositions, Names, Observations
 from implicam.dataset.tables import naming, read_lines, read_number
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError
-
-UNKNOWN_UNIT = "unknown"
 
 Numbers = tuple[float, ...]
 
