@@ -182,7 +182,7 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
         (
             "{at}/rig/observations.csv, line 4, camera 'cam1': pixel u = 50, v = -60 is far outside the 640 x 480 image.\n"
             '  why: u is the column and v the row, counted from 0 at the centre of the top-left pixel\n'
-            '  fix: correct the value, remove the row, or correct width and height in dataset.toml'
+            '  fix: correct the value, remove the row, or correct the width and height of the camera'
         ),
     ),
     'far outside 2': (
@@ -190,7 +190,7 @@ MISTAKES: dict[str, tuple[dict[str, str | bytes | None], str]] = {
         (
             "{at}/rig/observations.csv, line 4, camera 'cam1': pixel u = 10000, v = 60 is far outside the 640 x 480 image.\n"
             '  why: u is the column and v the row, counted from 0 at the centre of the top-left pixel\n'
-            '  fix: correct the value, remove the row, or correct width and height in dataset.toml'
+            '  fix: correct the value, remove the row, or correct the width and height of the camera'
         ),
     ),
     'no known position': (

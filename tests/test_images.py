@@ -12,8 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from implicam.detect.folder import note_turned
+from implicam.detect.model import View
 from implicam.errors import ImageError, UsageError
-from implicam.images import blank, eight_bit, one_thread_each, read_picture, write_picture
+from implicam.images import blank, eight_bit, one_thread_each, read_picture, stored_jpeg, write_picture
 from implicam.picture_names import find_pictures, in_order
 
 cv2 = pytest.importorskip("cv2")
@@ -55,6 +57,30 @@ def test_every_form_is_read_as_grey_from_0_to_1(tmp_path, ending, bits, channels
     assert grey.shape == (48, 64)
     # colour is rounded to whole steps by OpenCV
     np.testing.assert_allclose(grey * (2**bits - 1), colour, atol=0.02 if channels == 1 else 1.0)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_turn_that_exif_asks_for_is_named_with_both_sizes(tmp_path, orientation, order):
+    path = saved(tmp_path / "a.jpg", scene())
+    exif = b"Exif\0\0" + (b"II" if order == "<" else b"MM") + struct.pack(order + "HIH", 42, 8, 2)
+    exif += struct.pack(order + "HHIHH", 0x0100, 3, 1, 64, 0) + struct.pack(
+        order + "HHIHH", 0x0112, 3, 1, orientation, 0
+    )
+    data = path.read_bytes()
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:])
+    assert cv2.imread(str(path)).shape[:2] == ((64, 48) if orientation > 4 else (48, 64))
+    assert read_picture(path).shape == (48, 64)
+    stored = stored_jpeg(path)
+    assert (stored.size, stored.orientation) == ((64, 48), orientation)
+    assert stored.shown == ((48, 64) if orientation > 4 else (64, 48))
+    (tmp_path / "b.jpg").write_bytes(data)
+    notes = note_turned({View("left", "a"): path, View("left", "b"): tmp_path / "b.jpg"})
+    assert len(notes) == (orientation != 1)
+    assert all("64 x 48 stored, " in note and "was turned between" in note for note in notes)
+    for cut in range(0, len(data), 7):
+        path.write_bytes(path.read_bytes()[:cut])
+        assert stored_jpeg(path) is None or stored.size == (64, 48)
 
 
 def test_jpeg_is_read_within_its_loss(tmp_path):

@@ -212,7 +212,7 @@ REFUSED = {
         "decimal points",
     ),
     "two separators": ("x;y,z;u\n1;2,3;4\n", "semicolons or commas may separate", "leave it out of the headings"),
-    "the index of pandas": (",x,y,z,u_a,v_a\n0,1,2,3,4,5\n", "a column has no name", "give it a name"),
+    "the index of pandas": (",x,y,z,u_a,v_a\n5,1,2,3,4,5\n", "a column has no name", "give it a name"),
     "a view twice": ("point,camera,u,v\np,a,1,2\np,a,3,4\n", "point 'p' is seen twice by camera 'a'", "keep one"),
     "two places": (
         "point,camera,u,v,x,y,z\np,a,1,2,0,0,0\np,b,3,4,0,1,0\n",
@@ -242,6 +242,54 @@ def test_one_line_says_how_the_headings_were_read(tmp_path: Path) -> None:
     )
     assert read.observations.uv.tolist() == [[[10.25, 20.0]]]
     assert sheet(tmp_path, "point,x,y,z,u_a,v_a\np,1,2,3,4,5\n").notes == ()
+
+
+BODY = "a{s}1{s}2{s}3{s}4.5{s}6.5\nb{s}4{s}5{s}6{s}7.5{s}8.5\n"
+COMMA = BODY.format(s=",")
+ABOVE = {
+    "a comment": ("# of 3 Nov\npoint,x,y,z,u_cam1,v_cam1\n" + COMMA, "left out above the headings: '# of 3 Nov'"),
+    "a title": ("Rig 2,,,,,\n,,,,,\npoint,x,y,z,u_cam1,v_cam1\n" + COMMA, "left out above the headings: 'Rig 2'"),
+    "a title with a comma": (
+        "Rig 2, Nov\npoint,x,y,z,u_cam1,v_cam1\n" + COMMA,
+        "left out above the headings: 'Rig 2 Nov'",
+    ),
+    "numpy": ("# point,x,y,z,u_cam1,v_cam1\n" + COMMA, ""),
+    "blanks": ("point x y z u_cam1 v_cam1\n" + BODY.format(s=" "), "separated by blanks"),
+    "fixed width": ("point   x  y z u_cam1   v_cam1\n" + BODY.format(s="   "), "separated by blanks"),
+    "two rows": ("point,World,,,Cam 1,\n,x,y,z,u,v\n" + COMMA, "the headings are in two rows: 'Cam 1 v'"),
+    "pandas, counted": (",point,x,y,z,u_cam1,v_cam1\n0,a,1,2,3,4.5,6.5\n1,b,4,5,6,7.5,8.5\n", "counts the rows"),
+    "pandas, named": (",x,y,z,u_cam1,v_cam1\n" + COMMA, "the first column names the points"),
+    "px_x": ("point,x,y,z,px_x_1,px_y_1\n" + COMMA, "u and v of 1 ('px_x_1', 'px_y_1')"),
+    "px_x in rows": ("point,cam,px_x,px_y,X,Y,Z\na,0,4.5,6.5,1,2,3\nb,0,7.5,8.5,4,5,6\n", "('px_x', 'px_y')"),
+}
+
+
+@pytest.mark.parametrize("case", ABOVE)
+def test_headings_that_are_not_the_first_row_of_a_plain_table(case: str, tmp_path: Path) -> None:
+    text, said = ABOVE[case]
+    (tmp_path / "t.txt").write_text(text)
+    data = read_dataset(tmp_path / "t.txt", unit="mm")
+    assert data.points.tolist() == ["a", "b"]
+    assert data.xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert data.observations.uv[:, 0].tolist() == [[4.5, 6.5], [7.5, 8.5]]
+    assert said in " ".join(data.notes)
+
+
+def test_the_cameras_of_a_calibration_tell_what_x1_is(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n")
+    assert read_dataset(tmp_path / "t.csv", cameras=["1", "2"]).camera_names == ("1", "2")
+    with pytest.raises(DatasetError, match="cannot be told whether '1' is a camera") as caught:
+        read_dataset(tmp_path / "t.csv", cameras=["left", "right"])
+    assert "u_left and v_left, as the calibration has them: left, right" in caught.value.fix
+
+
+@pytest.mark.parametrize(
+    "text", ["point,camera,u,v\na,CAM1 ,1,2\nb,cam1,3,4\n", "point,u_cam1,v_cam1,u_Cam_1,v_Cam_1\na,1,2,3,4\n"]
+)
+def test_two_spellings_of_a_camera_are_named(text: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(DatasetError, match=r"\(1 view\) and '[cC]am_?1' \(1 view\) are two cameras"):
+        read_dataset(tmp_path / "t.csv")
 
 
 def test_shots_stay_shots(tmp_path: Path) -> None:

@@ -82,6 +82,33 @@ def test_what_a_workbook_does_not_say_is_refused(sheets: list[list[list[Any]]], 
     assert caught.value.fix
 
 
+PLACES = [["name", "X", "Y", "Z", "shot"], ["b", 4, 5, 6, "s"], ["a", 1, 2, 3, "s"], ["c", 7, 8, 9, "s"]]
+PIXELS = [["point", "u_cam1", "v_cam1"], ["a", 1.5, 2.5], ["b", 3.5, 4.5]]
+
+
+def test_positions_on_a_sheet_of_their_own_are_joined_by_name(tmp_path: Path) -> None:
+    read = read_dataset(workbook(tmp_path / "w.xlsx", PLACES, PIXELS, [["seen by Ann"]]), unit="mm")
+    assert read.xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert read.shots.tolist() == ["s", "s"]
+    assert "sheet 'Tabelle1', 1 of them of points that no camera saw" in read.notes[0]
+    assert "left out are the sheets 'Tabelle3'" in read.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("sheets", "said"),
+    [
+        ([PLACES[:2], PIXELS], "point 'a' has no known position"),
+        ([[*PLACES, PLACES[1]], PIXELS], "the point 'b' is there twice"),
+        ([PLACES, PLACES, PIXELS], "cannot be told which known positions"),
+        ([PLACES, [row[1:] for row in PIXELS]], "cannot be told which known positions"),
+    ],
+)
+def test_positions_on_a_sheet_that_do_not_fit_are_refused(sheets: Any, said: str, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError) as caught:
+        read_dataset(workbook(tmp_path / "w.xlsx", *sheets), unit="mm")
+    assert said in caught.value.what
+
+
 def test_a_workbook_that_grows_beyond_measure(tmp_path: Path) -> None:
     pytest.importorskip("openpyxl")
     with zipfile.ZipFile(tmp_path / "w.xlsx", "w", zipfile.ZIP_DEFLATED) as archive:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +51,7 @@ def one_thread_each() -> Iterator[None]:
 def read_picture(path: Path) -> Grey:
     """Read a photograph: PNG, JPEG or TIFF, grey or colour, 8 or 16 bits.
 
-    A rotation that only the file's EXIF tag asks for is not done: pixels are those of the sensor.
+    A rotation that only the file's EXIF tag asks for is not done: pixels are those of the sensor (`stored_jpeg`).
 
     Args:
         path: The file.
@@ -118,6 +119,61 @@ def _ends_jpeg(data: bytes) -> bool:
         else:
             at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return False
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A JPEG as it is stored: width and height, and how its EXIF tag asks viewers to turn it; 1 for not at all."""
+
+    size: tuple[int, int]
+    orientation: int
+
+    @property
+    def shown(self) -> tuple[int, int]:
+        """Width and height as viewers show it, and `cv2.imread` reads it."""
+        return self.size if self.orientation < 5 else self.size[::-1]
+
+
+def stored_jpeg(path: Path) -> Stored | None:
+    """How a JPEG is stored, from its head.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Size and orientation; None of a file that is no JPEG, or is damaged, which reading it tells.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return None
+    at, orientation = 2, 1
+    while head.startswith(_JPEG) and at + 9 < len(head) and head[at] == 0xFF:
+        marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
+        if marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
+            orientation = _exif_orientation(head[at + 10 : at + 2 + length])
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # the frame: its height, then its width
+            height, width = (int.from_bytes(head[at + i : at + i + 2], "big") for i in (5, 7))
+            return Stored((width, height), orientation)
+        at += 1 if marker == 0xFF else 2 + length
+    return None
+
+
+_HEAD_BYTES = 1 << 18
+"""EXIF with its preview has at most 64 KiB, and the frame comes soon after it."""
+
+
+def _exif_orientation(tiff: bytes) -> int:
+    """The tag 0x0112 of the first directory; 1 where it is not there."""
+    order: Literal["little", "big"] = "little" if tiff[:2] == b"II" else "big"
+    start = int.from_bytes(tiff[4:8], order)
+    for i in range(int.from_bytes(tiff[start : start + 2], order)):
+        entry = tiff[start + 2 + 12 * i : start + 14 + 12 * i]
+        if int.from_bytes(entry[:2], order) == 0x0112:
+            found = int.from_bytes(entry[8:10], order)
+            return found if 1 <= found <= 8 else 1
+    return 1
 
 
 def to_grey(image: NDArray[Any], path: Path) -> Grey:

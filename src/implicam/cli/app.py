@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from implicam.calibration_file import package_version
-from implicam.calibrators import DEFAULT_METHOD
+from implicam.calibrators import DEFAULT_METHOD, Calibration
 from implicam.dataset import Dataset, TableOptions, read_dataset
 from implicam.errors import UsageError, import_extra
 from implicam.files import is_file_name, refuse_folder
@@ -91,9 +91,16 @@ LeaveOut = Annotated[
 Report = Annotated[Path | None, typer.Option("--report", help="Also write a one-page HTML report with a 3D view.")]
 
 
-def read(path: Path, table: TableOptions, cameras: str | None = None, without: str | None = None) -> Dataset:
-    """The dataset, with the cameras that were asked for."""
-    return chosen(read_dataset(path, **asdict(table)), cameras, without)
+def read(
+    path: Path,
+    table: TableOptions,
+    cameras: str | None = None,
+    without: str | None = None,
+    calibration: Calibration | None = None,
+) -> Dataset:
+    """The dataset, with the cameras that were asked for; a calibration knows the names that cameras have."""
+    names = () if calibration is None else calibration.data.camera_names
+    return chosen(read_dataset(path, **asdict(table), cameras=names), cameras, without)
 
 
 def chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:

@@ -61,7 +61,7 @@ def check_command(
     for made in filter(None, (log, repair, figure)):
         must_not_replace(made, calibration, dataset)
     fitted = load_calibration(calibration)
-    data = read(dataset, table)
+    data = read(dataset, table, calibration=fitted)
     with show.progress(json) as progress:
         progress("checking", 0, 1)
         found = check_calibration(fitted, data, level=level)

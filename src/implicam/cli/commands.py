@@ -211,7 +211,7 @@ def measure_command(
     if unit != fitted.data.length_unit:
         metres_per(unit)  # refused before the work
         metres_per(fitted.data.length_unit)
-    data = _read_to_measure(dataset, replace(table, unit=None), fitted.data.length_unit)
+    data = _read_to_measure(dataset, replace(table, unit=None), fitted)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
         measured = fitted.measure(data.observations).with_columns(data.further_columns())
@@ -255,14 +255,14 @@ def measure_command(
     raise typer.Exit(int(bool(measured.alarm)))
 
 
-def _read_to_measure(path: Path, table: TableOptions, likely: str) -> Dataset:
-    """The unit of data to be measured does not matter; a table that states none is read as in the `likely` one."""
+def _read_to_measure(path: Path, table: TableOptions, fitted: Calibration) -> Dataset:
+    """The unit of data to be measured does not matter; a table that states none is read as in the calibration's."""
     try:
-        return read(path, table)
+        return read(path, table, calibration=fitted)
     except DatasetError as error:
         if not is_unit_missing(error):
             raise
-        return read(path, replace(table, unit=likely))
+        return read(path, replace(table, unit=fitted.data.length_unit), calibration=fitted)
 
 
 def _typical(sd: Any) -> list[float]:
@@ -294,7 +294,8 @@ def _evaluate(
         must_be_page(report)
     with show.progress(json) as progress:
         if dataset is not None:
-            evaluation = evaluate(load_calibration(file), read(dataset, table, cameras, without))
+            fitted = load_calibration(file)
+            evaluation = evaluate(fitted, read(dataset, table, cameras, without, fitted))
         else:
             make = partial(calibrator_from_options, method, seed, options)
             fit, data = _fit_and_data(file, make, cameras, without, table, given)
@@ -393,7 +394,7 @@ def report_command(
     from implicam.report.call import report
 
     with show.progress(json) as progress:
-        data = None if dataset is None else read(dataset, table)
+        data = None if dataset is None else read(dataset, table, calibration=fitted)
         sha256 = calibration_file.checksum(calibration)
         evaluation = report(fitted, output, data=data, checksum=sha256, progress=progress)
     if json:
@@ -432,7 +433,8 @@ def convert_command(
     if json:
         show.emit_json({"dataset": str(out), "points": len(data), "notes": notes})
         return
-    show.line(f"{out}: {len(data)} points, {len(data.cameras)} cameras")
+    without = "" if data.known is not None else " without known positions"
+    show.line(f"{out}: {len(data)} points{without}, {len(data.cameras)} cameras")
     show.notes(notes)
 
 

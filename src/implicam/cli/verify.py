@@ -99,7 +99,7 @@ def verify_command(
     import_extra("jinja2", "report", "the protocol")
     fitted = load_calibration(calibration)
     unit = table.unit or fitted.data.length_unit
-    data = read(dataset, replace(table, unit=unit))
+    data = read(dataset, replace(table, unit=unit), calibration=fitted)
     known = _lengths(lengths, length, length_sd, dataset, data)
     known = [_at_temperature(one, temperature, expansion) for one in known]
     volume = None if workspace is None else workspace_from(workspace, _known_xyz(fitted, unit))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -72,6 +72,7 @@ def read_dataset(
     first_pixel: int | None = None,
     v_up: bool = False,
     size: str | tuple[int, int] | Mapping[str, tuple[int, int]] | None = None,
+    cameras: Sequence[str] = (),
     length_unit: None = None,
 ) -> Dataset:
     """Read a dataset from a folder, a .csv, .tsv or .txt, an .xlsx, a .parquet or an .npz.
@@ -82,6 +83,8 @@ def read_dataset(
         first_pixel: How the file counts the centre of the first pixel, 0 or 1; None for 0.
         v_up: Whether it counts v from the bottom row upwards.
         size: Width and height of the pictures, for all cameras or for each by name; None to use what the data state.
+        cameras: Names that cameras are known to have, those of a calibration say: in a table of pixels alone, headings
+            x1, y1 are then of camera 1, and of no marker.
         length_unit: Not used: it is `unit` here.
 
     Returns:
@@ -103,7 +106,7 @@ def read_dataset(
     path = Path(path)
     options = TableOptions(unit, first_pixel, v_up, size_text(size))
     try:
-        data = _read(path, unit)
+        data = _read(path, unit, tuple(cameras))
     except OSError as error:  # permissions, a broken disk, a name too long
         raise DatasetError(
             f"{path} cannot be read.", why=str(error), fix="check the name and the permissions"
@@ -119,16 +122,16 @@ def read_dataset(
     return options.apply(remove_marks(data))  # a mark is one as the file has it
 
 
-def _read(path: Path, unit: str | None) -> Dataset:
+def _read(path: Path, unit: str | None, cameras: tuple[str, ...]) -> Dataset:
     suffix = path.suffix.lower()
     if path.is_dir():
         return read_folder(path)
     if suffix in TEXT_SUFFIXES:
-        return read_wide_csv(path, unit)
+        return read_wide_csv(path, unit, cameras)
     if suffix == ".parquet":
-        return read_parquet(path, unit)
+        return read_parquet(path, unit, cameras)
     if suffix == ".xlsx":
-        return read_excel_workbook(path, unit)
+        return read_excel_workbook(path, unit, cameras)
     if suffix == ".npz":
         return read_npz_dataset(path)
     old = find_left_behind(path)

@@ -18,6 +18,8 @@ from implicam.dataset.tables import NO_VALUE_WORDS, Row, read_lines, split_lines
 from implicam.errors import DatasetError
 
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
+BLANKS = " "
+"""Any number of blanks, where none of `SEPARATORS` is there."""
 
 ROWS_LOOKED_AT = 50
 """Rows that must have as many cells as the header, before a character is taken for the separator."""
@@ -35,19 +37,21 @@ class Writing(NamedTuple):
 
     def describe(self) -> list[str]:
         """What is unlike a CSV with commas and decimal points, in words."""
-        said = [] if self.separator == "," else [f"separated by {SEPARATORS[self.separator]}"]
+        marks = {**SEPARATORS, BLANKS: "blanks"}
+        said = [] if self.separator == "," else [f"separated by {marks.get(self.separator, repr(self.separator))}"]
         return [*said, "decimal commas"] if self.decimal == "," else said
 
 
 AS_DOCUMENTED = Writing()
 
 
-def find_separator(path: Path, is_header: Callable[[Sequence[str]], bool]) -> Writing:
+def find_separator(path: Path, find_header: Callable[[list[list[str]]], int | None]) -> Writing:
     """Find what separates the cells of a table.
 
     Args:
         path: The file.
-        is_header: Whether names are such as a header has; it decides where two characters would do.
+        find_header: The number of the row of headings, of the first rows; None where there is none that can be read.
+            It decides where two characters would do.
 
     Returns:
         The separator, a comma where the header has one cell only.
@@ -60,11 +64,18 @@ def find_separator(path: Path, is_header: Callable[[Sequence[str]], bool]) -> Wr
     if told:
         return Writing(told[1], 1)
     split = {mark: _split(lines, mark) for mark in SEPARATORS}
-    possible = {mark: rows for mark, rows in split.items() if rows and len(rows[0]) > 1}
+    at = {mark: find_header(rows) for mark, rows in split.items() if rows}
+    below = {mark: rows[at.get(mark) or 0 :] for mark, rows in split.items()}
+    possible = {mark: rows for mark, rows in below.items() if rows and len(rows[0]) > 1}
+    if not any(number is not None for number in at.values()):
+        blank = [line.split() for line in lines if line.strip()]
+        number = find_header(blank)
+        if number is not None and len({len(row) for row in blank[number:]}) == 1:
+            return Writing(BLANKS)
     if len(possible) < 2:
         return Writing(next(iter(possible), ","))
     even = [mark for mark, rows in possible.items() if len({len(row) for row in rows}) == 1]
-    read = [mark for mark in even or possible if is_header([cell.strip() for cell in possible[mark][0]])]
+    read = [mark for mark in even or possible if at[mark] is not None]
     if len(read) == 1:
         return Writing(read[0])
     if len(even) == 1:
@@ -95,6 +106,9 @@ def rows_of(path: Path, writing: Writing) -> Iterator[Row]:
     Raises:
         DatasetError: A row is not well-formed; names the line.
     """
+    if writing.separator == BLANKS:
+        yield from ((line, text.split()) for line, text in enumerate(read_lines(path), 1) if text.strip())
+        return
     for line, row in split_lines(path, writing.separator):
         if line > writing.skipped and any(map(str.strip, row)):
             yield line, row

@@ -10,10 +10,13 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from implicam.dataset.sheet import Sheet, cell_text, is_header
+from implicam.dataset.header_rows import MAX_TITLE_ROWS, is_header
+from implicam.dataset.headings import find_positions, read_headings
+from implicam.dataset.sheet import Sheet, cell_text, sheet_below
 from implicam.dataset.tables import Row, require_file
 from implicam.errors import DatasetError, import_extra
 from implicam.files import MAX_INFLATION_RATIO, MIN_INFLATED_BYTES, replacing
@@ -25,11 +28,12 @@ MAX_CELLS = 20_000_000
 """Rows times columns that a sheet may declare; Excel itself has room for 17 billion."""
 
 
-def read_excel(path: Path) -> tuple[Sheet, str | None]:
+def read_excel(path: Path, cameras: Sequence[str] = ()) -> tuple[Sheet, str | None]:
     """Read a workbook.
 
     Args:
         path: The file.
+        cameras: Names that cameras are known to have.
 
     Returns:
         The table, and the description that `write_excel` put beside it; None where there is none.
@@ -44,7 +48,7 @@ def read_excel(path: Path) -> tuple[Sheet, str | None]:
     try:
         _refuse_bomb(path, content)
         values = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
-        return _read_sheets(path, values, openpyxl.load_workbook(io.BytesIO(content), read_only=True))
+        return _read_sheets(path, values, openpyxl.load_workbook(io.BytesIO(content), read_only=True), cameras)
     except DatasetError:
         raise
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError, OSError, EOFError, SyntaxError) as error:
@@ -67,7 +71,7 @@ def _refuse_bomb(path: Path, content: bytes) -> None:
         )
 
 
-def _read_sheets(path: Path, values: Any, formulas: Any) -> tuple[Sheet, str | None]:
+def _read_sheets(path: Path, values: Any, formulas: Any, cameras: Sequence[str]) -> tuple[Sheet, str | None]:
     description = None
     tables: dict[str, Sheet] = {}
     for name in values.sheetnames:
@@ -75,9 +79,9 @@ def _read_sheets(path: Path, values: Any, formulas: Any) -> tuple[Sheet, str | N
         if name == DESCRIPTION_SHEET:
             description = "\n".join("".join(row) for _, row in cells)
         elif any(any(row) for _, row in cells):
-            tables[name] = _sheet(path, name, cells)
-    readable = [sheet for sheet in tables.values() if is_header([cell.strip() for cell in sheet.header])]
-    found = readable or list(tables.values())
+            tables[name] = _sheet(path, name, cells, cameras)
+    readable = {name: sheet for name, sheet in tables.items() if is_header(sheet.header, cameras)}
+    found = list((readable or tables).values())
     if len(found) != 1:
         raise DatasetError(
             f"{path} has {len(found)} sheets with a table: {', '.join(map(repr, list(tables)[:8]))}."
@@ -85,7 +89,48 @@ def _read_sheets(path: Path, values: Any, formulas: Any) -> tuple[Sheet, str | N
             else f"{path} is empty.",
             fix="keep one sheet, or save the one that is meant as CSV",
         )
-    return found[0], description
+    others = {name: sheet for name, sheet in tables.items() if sheet is not found[0]}
+    return (found[0] if description is not None else _with_positions(found[0], others)), description
+
+
+def _with_positions(table: Sheet, others: dict[str, Sheet]) -> Sheet:
+    """The table with the known positions of another sheet beside it, where names of points say which is which."""
+    header = [cell.strip() for cell in table.header]
+    own = read_headings(header, table.header_place, table.cameras)
+    places = {name: find_positions(sheet.header, sheet.header_place) for name, sheet in others.items()}
+    with_positions = [name for name, columns in places.items() if columns] if not own.positions else []
+    unused = [name for name in others if name not in with_positions]
+    said = (*table.said, f"left out are the sheets {', '.join(map(repr, unused))}") if unused else table.said
+    if not with_positions:
+        return replace(table, said=said)
+    name, sheet = with_positions[0], others[with_positions[0]]
+    point, _ = places[name] or ("", ())
+    if len(with_positions) > 1 or not own.point:
+        why = f"the sheets {', '.join(map(repr, with_positions))} have x, y and z"
+        raise DatasetError(
+            f"{table.place}: it cannot be told which known positions belong to these pixels.",
+            why=why if own.point else f"{why}, and no column names the points of these pixels",
+            fix="put x, y and z beside the pixels, or name the points in both sheets, and keep one sheet of positions",
+        )
+    at, rows = sheet.header.index(point), {}
+    for line, row in sheet.rows():
+        key = row[at].strip()
+        if key in rows:
+            raise DatasetError(
+                f"{sheet.place}, row {line}: the point {key!r} is there twice.", fix="give each point one position"
+            )
+        rows[key] = [cell for i, cell in enumerate(row) if i != at]
+    more = [heading for heading in sheet.header if heading != point]
+    of_table = header.index(own.point)
+
+    def joined() -> Iterator[Row]:
+        return ((line, [*row, *rows.get(row[of_table].strip(), [""] * len(more))]) for line, row in table.rows())
+
+    named = {row[of_table].strip() for _, row in table.rows()}
+    rest = len(set(rows) - named)
+    told = f"the known positions are in the sheet {name!r}"
+    told += f", {rest} of them of points that no camera saw" if rest else ""
+    return replace(table, header=[*header, *more], rows=joined, said=(*said, told))
 
 
 def _cells(path: Path, name: str, values: Any, formulas: Any) -> list[Row]:
@@ -110,14 +155,9 @@ def _cells(path: Path, name: str, values: Any, formulas: Any) -> list[Row]:
     return rows
 
 
-def _sheet(path: Path, name: str, cells: list[Row]) -> Sheet:
+def _sheet(path: Path, name: str, cells: list[Row], cameras: Sequence[str]) -> Sheet:
     filled = [(number, row) for number, row in cells if any(cell.strip() for cell in row)]
-    first, header = filled[0]
-
-    def rows() -> Iterator[Row]:
-        return iter(filled[1:])
-
-    return Sheet(f"{path}, sheet {name!r}", header, rows, unit="row", first=first)
+    return sheet_below(f"{path}, sheet {name!r}", filled[: MAX_TITLE_ROWS + 2], lambda: iter(filled), "row", cameras)
 
 
 def write_excel(path: Path, columns: Sequence[tuple[str, list[Any]]], description: str = "") -> None:

@@ -127,12 +127,13 @@ class Headings:
         return said
 
 
-def read_headings(header: Sequence[str], place: str) -> Headings:
+def read_headings(header: Sequence[str], place: str, cameras: Sequence[str] = ()) -> Headings:
     """Read the headings of a table.
 
     Args:
         header: The headings, each once, without spaces around them.
         place: File and line, for errors.
+        cameras: Names that cameras are known to have.
 
     Raises:
         DatasetError: There are no pixels of cameras, half of a pair is missing, or there are two ways to read the
@@ -145,12 +146,12 @@ def read_headings(header: Sequence[str], place: str) -> Headings:
     rest = [heading for heading in parsed if heading.text not in (*positions, camera)]
     pixels = _find_view_pixels(rest) if camera else {}
     if not pixels:
-        camera, pixels = "", _find_pixels(rest, bool(positions), place)
+        camera, pixels = "", _find_pixels(rest, bool(positions), place, cameras)
     taken = {*positions, camera, *(column for pair in pixels.values() for column in pair)}
     point = _find_point([text for text in header if text not in taken], place)
     known = ("shot", *SD_POINT) if positions else SD_POINT
     other = [text for text in header if text not in taken and text not in (point, *known)]
-    times = [text for text in other if _squeezed(text) in _TIME_WORDS]
+    times = [text for text in other if squeezed(text) in _TIME_WORDS]
     views, further = _find_view_columns(other, list(pixels), place)
     return Headings(
         point=point,
@@ -178,11 +179,13 @@ def take_apart(text: str) -> Heading:
     if bare[:2] in ("u_", "v_") and len(bare) > 2:
         return Heading(text, bare[2:], bare[0], unit)  # as in docs/formats.md: the name may be anything
     words = list(_WORD.finditer(bare))
+    pixels = [word for word in words if word[0].lower() in _PIXEL_UNITS]
+    others = [word for word in words if word not in pixels]
+    if not unit and len(pixels) == 1 and others and (_is_axis(others[0]) or _is_axis(others[-1])):
+        return _find_axis(text, bare, others, "px")  # px_x, pixel_x_cam1, cam1_x_px
     if not unit and len(words) > 1 and _is_axis(words[0]) and _unit_of(words[-1][0]):
         words, unit = words[:-1], _unit_of(words[-1][0])  # x_mm, "x in mm"
         words = words[:-1] if len(words) > 1 and words[-1][0].lower() == "in" else words
-    elif not unit and len(words) > 2 and words[-1][0].lower() in _PIXEL_UNITS:
-        words, unit = words[:-1], "px"  # cam1_x_px
     return _find_axis(text, bare, words, unit)
 
 
@@ -217,8 +220,12 @@ def _unit_of(text: str) -> str:
     return "px" if text in _PIXEL_UNITS else _LENGTH_UNITS.get(text, "")
 
 
-def _squeezed(text: str) -> str:
-    """In small letters, without spaces and marks."""
+def squeezed(text: str) -> str:
+    """In small letters, without spaces and marks.
+
+    Args:
+        text: A heading, or a name.
+    """
     return "".join(_WORD.findall(text)).lower()
 
 
@@ -259,6 +266,24 @@ def _find_positions(parsed: list[Heading], long: bool, place: str) -> tuple[str,
     return ()
 
 
+def find_positions(header: Sequence[str], place: str) -> tuple[str, tuple[str, ...]] | None:
+    """The columns of a table of positions alone: that of names, and x, y and z.
+
+    Args:
+        header: The headings, without spaces around them.
+        place: File and line, for errors.
+
+    Returns:
+        Their headings; None where it is no such table.
+
+    Raises:
+        DatasetError: There are two ways to read the headings.
+    """
+    positions = _find_positions([take_apart(text) for text in header], False, place)
+    point = _find_point([text for text in header if text not in positions], place) if positions else ""
+    return (point, positions) if positions and point else None
+
+
 def _one_unit(positions: list[Heading], place: str) -> str:
     units = sorted({heading.unit for heading in positions if heading.unit})
     if len(units) > 1:
@@ -272,7 +297,7 @@ def _one_unit(positions: list[Heading], place: str) -> str:
 
 def _camera_column(parsed: list[Heading]) -> str:
     """The column of a long table that names the camera of each row; empty where there is none."""
-    found = [heading.text for heading in parsed if not heading.axis and _squeezed(heading.text) in _CAMERA_COLUMNS]
+    found = [heading.text for heading in parsed if not heading.axis and squeezed(heading.text) in _CAMERA_COLUMNS]
     return found[0] if len(found) == 1 else ""
 
 
@@ -288,7 +313,7 @@ Axes = dict[str, list[Heading]]
 """Axis -> the headings that have it; of one name."""
 
 
-def _find_pixels(rest: list[Heading], known: bool, place: str) -> dict[str, tuple[str, str]]:
+def _find_pixels(rest: list[Heading], known: bool, place: str, cameras: Sequence[str]) -> dict[str, tuple[str, str]]:
     """Camera -> its columns of u and v."""
     by_label: dict[str, Axes] = {}
     for heading in rest:
@@ -296,7 +321,7 @@ def _find_pixels(rest: list[Heading], known: bool, place: str) -> dict[str, tupl
             by_label.setdefault(heading.label, {}).setdefault(heading.axis, []).append(heading)
     named = {label: axes for label, axes in by_label.items() if "u" in axes or "v" in axes}
     if not named:
-        named = _of_cameras({label: axes for label, axes in by_label.items() if "z" not in axes}, known, place)
+        named = _of_cameras({label: axes for label, axes in by_label.items() if "z" not in axes}, known, place, cameras)
     pairs, lonely = dict[str, tuple[str, str]](), list[tuple[Heading, str]]()
     for label, axes in named.items():
         pair = _find_pair(label, axes, place)
@@ -328,9 +353,9 @@ def _find_pair(label: str, axes: Axes, place: str) -> tuple[str, str] | None:
     return pairs[0] if pairs else None
 
 
-def _of_cameras(found: dict[str, Axes], known: bool, place: str) -> dict[str, Axes]:
+def _of_cameras(found: dict[str, Axes], known: bool, place: str, names: Sequence[str]) -> dict[str, Axes]:
     """Those whose names are cameras'; refused where others are pairs, too."""
-    cameras = {label: axes for label, axes in found.items() if is_camera_name(label, known)}
+    cameras = {label: axes for label, axes in found.items() if label in names or is_camera_name(label, known)}
     others = [label for label, axes in found.items() if label not in cameras and len(axes) > 1]
     if others:
         columns = [heading.text for headings in found[others[0]].values() for heading in headings]
@@ -339,7 +364,9 @@ def _of_cameras(found: dict[str, Axes], known: bool, place: str) -> dict[str, Ax
         raise DatasetError(
             f"{place}: {_quoted(columns)} are a pair, and it cannot be told whether {others[0]!r} is a camera{also}.",
             why=f"a pair of columns may be the pixels of a camera, or a marker in the picture of one{more}",
-            fix=f"{_RENAME}; or, of a table of DLTdv, Argus and others, implicam convert --from PROGRAM",
+            fix=f"name the pixels u_{names[0]} and v_{names[0]}, as the calibration has them: {', '.join(names)}"
+            if names
+            else f"{_RENAME}; or, of a table of DLTdv, Argus and others, implicam convert --from PROGRAM",
         )
     return cameras
 
@@ -387,7 +414,7 @@ def _no_cameras_error(rest: list[Heading], place: str) -> DatasetError:
 def _find_point(free: list[str], place: str) -> str:
     if "point" in free:
         return "point"
-    found = [text for text in free if _squeezed(text) in _POINT_WORDS or text == "#"]
+    found = [text for text in free if squeezed(text) in _POINT_WORDS or text == "#"]
     if len(found) > 1:
         raise DatasetError(f"{place}: {_quoted(found)} may all name the points.", fix="call the one that does 'point'")
     return found[0] if found else ""
@@ -400,13 +427,13 @@ def _find_view_columns(
     views: dict[str, dict[str, str]] = {}
     further = list[str]()
     camera_of = {camera.lower(): camera for camera in cameras if camera}
-    squeezed = {_squeezed(camera) for camera in cameras}
+    known = {squeezed(camera) for camera in cameras}
     for text in other:
         name, camera = _split_camera(text, camera_of)
         numbered = _NUMBERED_CAMERA.search(text.replace("_", " "))
         if camera and name and name not in VIEW_COLUMNS:
             views.setdefault(name, {})[camera] = text
-        elif numbered and _squeezed(numbered[0]) not in squeezed and any(map(_NUMBERED_CAMERA.search, cameras)):
+        elif numbered and squeezed(numbered[0]) not in known and any(map(_NUMBERED_CAMERA.search, cameras)):
             raise DatasetError(
                 f"{place}: the column {text!r} names {numbered[0].replace(' ', '_')!r}, which has no columns of "
                 f"pixels{did_you_mean(numbered[0], cameras)}.",

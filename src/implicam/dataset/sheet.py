@@ -9,10 +9,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from implicam.dataset.dialect import AS_DOCUMENTED, Writing, find_separator, look_at_numbers, rows_of
-from implicam.dataset.headings import Headings, read_headings
+from implicam.dataset.header_rows import MAX_TITLE_ROWS, HeaderRows, find_header
+from implicam.dataset.headings import Headings, read_headings, squeezed
 from implicam.dataset.long_table import Brought, pivot
 from implicam.dataset.model import SD_POINT, SD_VIEW
 from implicam.dataset.tables import (
@@ -52,6 +56,10 @@ class Sheet:
     unit: str = "line"
     first: int = 1
     writing: Writing = AS_DOCUMENTED
+    said: tuple[str, ...] = ()
+    """What was done to find the headings, in words."""
+    cameras: tuple[str, ...] = ()
+    """Names that cameras are known to have."""
 
     @property
     def header_place(self) -> str:
@@ -59,40 +67,55 @@ class Sheet:
         return f"{self.place}, {self.unit} {self.first}"
 
 
-def sheet_of_text(path: Path) -> Sheet:
-    """The cells of a CSV, with commas, semicolons, tabs or bars.
+def sheet_of_text(path: Path, cameras: Sequence[str] = ()) -> Sheet:
+    """The cells of a CSV, with commas, semicolons, tabs, bars or blanks.
 
     Args:
         path: The file.
+        cameras: Names that cameras are known to have.
 
     Raises:
         DatasetError: There is no such file, it is no text, or has no header.
     """
     require_file(path, f"put a comma-separated table with the columns {EXAMPLE_HEADER} there")
-    writing = find_separator(path, is_header)
-    first, header = next(rows_of(path, writing), (1, list[str]()))
-    if not header:
+
+    def header_number(rows: list[list[str]]) -> int | None:
+        found = find_header(rows, cameras)
+        return None if found is None else found.rows - 1
+
+    writing = find_separator(path, header_number)
+    top = list(islice(rows_of(path, writing), MAX_TITLE_ROWS + 2))
+    if not top:
         raise DatasetError(f"{path} is empty.", fix=f"its first line must be {EXAMPLE_HEADER}, then one row per entry")
-
-    def rows() -> Iterator[Row]:
-        everything = rows_of(path, writing)
-        next(everything)
-        return everything
-
-    return Sheet(str(path), header, rows, first=first, writing=writing)
+    return sheet_below(str(path), top, lambda: rows_of(path, writing), "line", cameras, writing)
 
 
-def is_header(header: Sequence[str]) -> bool:
-    """Whether names are those of a table that can be read.
+def sheet_below(
+    place: str,
+    top: Sequence[Row],
+    everything: Callable[[], Iterator[Row]],
+    unit: str,
+    cameras: Sequence[str] = (),
+    writing: Writing = AS_DOCUMENTED,
+) -> Sheet:
+    """A sheet with the headings where they are: in the first row, or below a title.
 
     Args:
-        header: Without spaces around them.
+        place: The file, or the file and what in it.
+        top: The first rows, at least one.
+        everything: Gives all rows, each time from the start.
+        unit: What an error calls a row.
+        cameras: Names that cameras are known to have.
+        writing: How the text is written.
     """
-    try:
-        read_headings(header, "")
-    except DatasetError:
-        return False
-    return True
+    found = find_header([row for _, row in top], cameras) or HeaderRows([cell.strip() for cell in top[0][1]], 1)
+    said = (found.said,) if found.said else ()
+
+    def rows() -> Iterator[Row]:
+        return islice(everything(), found.rows, None)
+
+    first = top[found.rows - 1][0]
+    return Sheet(place, list(found.header), rows, unit, first, writing, said, tuple(cameras))
 
 
 def cell_text(value: object) -> str:
@@ -117,10 +140,10 @@ def read_sheet(sheet: Sheet) -> Brought:
     Raises:
         DatasetError: There are two ways to read it, or it has a mistake; names the line, the value and the cure.
     """
-    sheet = _without_empty_columns(sheet)
+    sheet = _with_index_named(_without_empty_columns(sheet))
     _refuse_numbers(sheet)
     check_headings(sheet.header_place, sheet.header)
-    headings = read_headings(sheet.header, sheet.header_place)
+    headings = read_headings(sheet.header, sheet.header_place, sheet.cameras)
     table, words, decimal = _read_cells(sheet, headings)
     if not table.n:
         raise DatasetError(f"{sheet.place} has a header and no rows.", fix="add one row per point")
@@ -134,6 +157,8 @@ def read_sheet(sheet: Sheet) -> Brought:
         numbers = {names.get(column, column): values for column, values in table.numbers.items()}
         views = tuple(name for name in headings.views if name not in SD_VIEW)
         found = Brought(Columns(texts, numbers, table.n, table.place), tuple(headings.pixels), views, headings.further)
+    _refuse_alike(found, sheet.place)
+    said = "; ".join([*([said] if said else []), *sheet.said])
     notes = (*_describe(sheet.writing._replace(decimal=decimal), headings, said), *_count_missing(words))
     return replace(found, unit=headings.unit, notes=notes)
 
@@ -178,6 +203,42 @@ def _without_empty_columns(sheet: Sheet) -> Sheet:
             yield line, row if short else [*(row[i] for i in kept), *row[len(header) :]]
 
     return replace(sheet, header=[header[i] for i in kept], rows=rows)
+
+
+def _with_index_named(sheet: Sheet) -> Sheet:
+    """The sheet without pandas' index, a first column without a name that counts the rows; one of names is `point`."""
+    if not sheet.header or sheet.header[0] or "" in sheet.header[1:]:
+        return sheet
+    cells = [row[0].strip() for _, row in sheet.rows() if row]
+    if cells in ([str(i) for i in range(len(cells))], [str(i + 1) for i in range(len(cells))]):
+
+        def rows() -> Iterator[Row]:
+            return ((line, row[1:]) for line, row in sheet.rows())
+
+        said = "left out is the first column, which has no name and counts the rows"
+        return replace(sheet, header=sheet.header[1:], rows=rows, said=(*sheet.said, said))
+    try:
+        named = read_headings(sheet.header[1:], "", sheet.cameras).point
+    except DatasetError:
+        return sheet
+    if named or len(set(cells)) < len(cells) or any(map(_is_number, cells)):
+        return sheet
+    return replace(sheet, header=["point", *sheet.header[1:]], said=(*sheet.said, "the first column names the points"))
+
+
+def _refuse_alike(found: Brought, place: str) -> None:
+    """Refuse cameras whose names differ in case, blanks and marks only: a slip makes two cameras of one."""
+    first: dict[str, str] = {}
+    for camera in found.cameras:
+        other = first.setdefault(squeezed(camera), camera)
+        if other != camera and squeezed(camera):
+            views = {name: int(np.isfinite(found.columns.numbers[f"u_{name}"]).sum()) for name in (other, camera)}
+            told = " and ".join(f"{name!r} ({n} view{'s' * (n != 1)})" for name, n in views.items())
+            raise DatasetError(
+                f"{place}: {told} are two cameras whose names are alike.",
+                why="a slip in a name makes two cameras of one, and each then has too few views",
+                fix="write the name of a camera the same everywhere; two that are two need names that differ in more",
+            )
 
 
 def _refuse_numbers(sheet: Sheet) -> None:

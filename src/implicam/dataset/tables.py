@@ -298,7 +298,7 @@ def check_headings(place: str, header: Sequence[str]) -> None:
         if name == "":
             raise DatasetError(
                 f"{place}: a column has no name.",
-                why="a comma at the end of a line, or an empty column of a spreadsheet, makes one more column",
+                why="a comma at the end of a line, a spreadsheet, or the index of pandas makes one more column",
                 fix="remove the comma or the column from every line, or give it a name",
             )
         with naming(place):

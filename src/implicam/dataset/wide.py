@@ -8,7 +8,7 @@ without it is one that people bring: sheet.py reads it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -180,7 +180,7 @@ def _assemble(table: Columns, layout: _Layout) -> Dataset:
     return Dataset(layout.name, layout.unit, observations, known, layout.extra, columns=columns)
 
 
-def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
+def read_wide_csv(path: Path, unit: str | None = None, cameras: Sequence[str] = ()) -> Dataset:
     """Read `x,y,z,u_cam1,v_cam1,...`, with or without point, shot, sd_x, sd_u_cam1 and further columns.
 
     A table without a description may be written as people write it, see `read_sheet`.
@@ -188,13 +188,14 @@ def read_wide_csv(path: Path, unit: str | None = None) -> Dataset:
     Args:
         path: The file; its description is read from `<name>.csv.toml` beside it, where that is there.
         unit: The length unit where there is no description; else it is not used.
+        cameras: Names that cameras are known to have; not used either where there is a description.
 
     Raises:
         DatasetError: The unit is not stated, or there is a mistake; names file, line, value and cure.
     """
     sidecar = _description_path(path)
     if not sidecar.exists():
-        return read_brought(sheet_of_text(path), path, unit)
+        return read_brought(sheet_of_text(path, cameras), path, unit)
     header, rows = read_table(path, (), EXAMPLE_HEADER)
     layout = _described_layout(header, read_toml(sidecar), path)
     numbers = dict.fromkeys(layout.numbers(), NumberColumn("leave the cell empty where there is no value", ("", "nan")))
@@ -282,18 +283,19 @@ def write_wide_csv(data: Dataset, path: Path) -> None:
         write_text(sidecar, description)
 
 
-def read_excel_workbook(path: Path, unit: str | None = None) -> Dataset:
+def read_excel_workbook(path: Path, unit: str | None = None, cameras: Sequence[str] = ()) -> Dataset:
     """Read a wide table from Excel's .xlsx.
 
     Args:
         path: The file.
         unit: The length unit where the workbook has no description; else it is not used.
+        cameras: Names that cameras are known to have; not used either where there is a description.
 
     Raises:
         DatasetError: It is no workbook, the unit is not stated, or there is a mistake; names the sheet and the row.
         MissingExtraError: openpyxl is not installed.
     """
-    sheet, text = read_excel(path)
+    sheet, text = read_excel(path, cameras)
     if text is None:
         return read_brought(sheet, path, unit)
     try:
@@ -336,12 +338,13 @@ def _sheet_of_columns(path: Path, header: list[str], columns: list[list[str]]) -
     return Sheet(str(path), header, rows, unit="row", first=0)
 
 
-def read_parquet(path: Path, unit: str | None = None) -> Dataset:
+def read_parquet(path: Path, unit: str | None = None, cameras: Sequence[str] = ()) -> Dataset:
     """Read a wide table from Parquet.
 
     Args:
         path: The file.
         unit: The length unit where the file has no description; else it is not used.
+        cameras: Names that cameras are known to have; not used either where there is a description.
 
     Raises:
         DatasetError: It is no readable Parquet file, the unit is not stated, or it has a mistake.
@@ -366,7 +369,7 @@ def read_parquet(path: Path, unit: str | None = None) -> Dataset:
             raise DatasetError(f"{path}: the column {column[:60]!r} is there {times} times.", fix="leave one out")
     if description is None:
         text = [[cell_text(value) for value in column] for column in columns.values()]
-        return read_brought(_sheet_of_columns(path, names, text), path, unit)
+        return read_brought(replace(_sheet_of_columns(path, names, text), cameras=tuple(cameras)), path, unit)
     layout = _described_layout(names, description, path)
     numeric = set(layout.numbers())
     numbers = {c: _read_numbers(v, c, path) for c, v in columns.items() if c in numeric}

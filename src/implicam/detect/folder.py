@@ -37,7 +37,7 @@ from implicam.detect.sheets import draw_sheets
 from implicam.errors import DatasetError, ImageError, UsageError, did_you_mean
 from implicam.files import replacing, toml_text, write_text
 from implicam.formatting import list_some
-from implicam.images import one_thread_each
+from implicam.images import Stored, one_thread_each, stored_jpeg
 from implicam.picture_names import find_pictures, in_order, sort_pictures
 from implicam.progress import Progress, silent
 from implicam.simulate.truth import limit_of_detection
@@ -246,7 +246,7 @@ class _Rig(RigFolder):
         usable, notes = _choose_usable({camera.name for camera in cameras}, found, path)
         return cls(
             path=path, name=name, unit=said, cameras=cameras, extra=extra, known=read_known(path), pictures=usable,
-            notes=(*read, *notes),
+            notes=(*read, *notes, *note_turned(usable)),
         )  # fmt: skip
 
 
@@ -342,6 +342,35 @@ def _choose_usable(
             fix=f"give the folders the cameras' names, or correct {DESCRIPTION}",
         )
     return usable, notes + _note_missing(cameras, usable)
+
+
+def note_turned(pictures: Mapping[View, Path]) -> list[str]:
+    """What EXIF tags say that pictures are to be shown turned, which is not done here: a sentence for each camera.
+
+    Args:
+        pictures: The file of each view.
+    """
+    found: dict[str, Counter[Stored]] = {}
+    for view, path in pictures.items():
+        stored = stored_jpeg(path) if path.suffix.lower() in (".jpg", ".jpeg") else None
+        if stored is not None:
+            found.setdefault(view.camera, Counter())[stored] += 1
+    notes = []
+    for camera, kinds in found.items():
+        if all(stored.orientation == 1 for stored in kinds):
+            continue
+        told = [
+            f"{n} as {stored.orientation} ({' x '.join(map(str, stored.size))} stored, "
+            f"{' x '.join(map(str, stored.shown))} shown)"
+            for stored, n in kinds.items()
+        ]
+        several = len({stored.orientation for stored in kinds}) > 1
+        notes.append(
+            f"camera {camera!r}: EXIF says that pictures are to be shown turned: {list_some(told)}. They are read as "
+            "they are stored, as the sensor saw them; pixels from viewers, or from cv2.imread, are of turned pictures"
+            + ("; and the camera was turned between its pictures, or its tag slipped." if several else ".")
+        )
+    return notes
 
 
 def _note_missing(cameras: Iterable[str], usable: Iterable[View]) -> list[str]:

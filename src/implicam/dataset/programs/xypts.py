@@ -54,7 +54,7 @@ def read_argus(path: Path, positions: Sequence[Numbers]) -> Views:
 
 
 def _read(path: Path, positions: Sequence[Numbers], form: re.Pattern[str], example: str) -> Views:
-    writing = find_separator(path, lambda header: form.fullmatch(header[0]) is not None)
+    writing = find_separator(path, lambda rows: 0 if form.fullmatch(rows[0][0].strip()) else None)
     rows = list(rows_of(path, writing))
     if not rows:
         raise DatasetError(f"{path} is empty.", fix=f"its first line names columns such as {example}")
