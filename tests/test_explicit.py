@@ -43,14 +43,14 @@ from implicam.simulate import (
 @cache
 def pair(lens_error: float = 0.0) -> tuple[Rig, Dataset]:
     rig = build_rig("bar6", seed=2, frame="random", lens_error=lens_error, cameras="2R2W")
-    return rig, simulate_boards(rig, each_and_pairs(rig, 8, 4), seed=3)
+    return rig, simulate_boards(rig, each_and_pairs(rig, 6, 3), seed=3)
 
 
 @cache
 def fisheyes() -> tuple[Rig, Dataset]:
     """Lenses that are in the family: where a lens is not, its own frame is a matter of taste."""
     rig = build_rig("bar6", seed=2, frame="random", lens_error=0.0, cameras="cam1,cam4,cam5")
-    return rig, simulate_boards(rig, each_and_pairs(rig, 10, 5), seed=3)
+    return rig, simulate_boards(rig, each_and_pairs(rig, 8, 4), seed=3)
 
 
 @cache
