@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +133,7 @@ def test_no_lens_model_explains_the_smooth_error() -> None:
 
 
 def vars_of(lens: object) -> dict[str, float]:
-    return {key: value for key, value in vars(lens).items() if not key.startswith("_")}
+    return {field.name: getattr(lens, field.name) for field in fields(lens)}  # type: ignore[arg-type]
 
 
 def triangulated(rig: Rig, uv: np.ndarray, seen: np.ndarray, start: np.ndarray) -> np.ndarray:
