@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from implicam.dataset import read_dataset
-from implicam.detect.folder import detect_folder
+from implicam.detect.folder import _note_missing, detect_folder
 from implicam.detect.journal import Entry, Journal, Key
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.overlay import STATES, Result, draw_overlay, draw_thumbnail
@@ -258,6 +258,8 @@ def test_cameras_and_shots_without_pictures_are_named(tmp_path):
         "camera 'cam2' has no picture of the shots p2, p3, p4, p5, p6 and 3 more, which others have.",
         "camera 'cam3' has no picture.",
     )
+    notes = _note_missing(["a", "b"], [View("a", "000"), View("a", "10"), View("b", "0"), View("b", "10")])
+    assert notes[0].endswith("It has '000': rename that to '0' where the two are one instant.")
     assert [camera.name for camera in read_dataset(tmp_path).cameras] == ["cam1", "cam2", "cam3"]
     for name in ("cam1", "cam2"):
         (tmp_path / "images" / name).rename(tmp_path / "images" / f"x{name}")

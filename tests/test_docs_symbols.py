@@ -40,7 +40,7 @@ CONSTANTS = "## Constants"
 SUFFIXES = {
     "log",
     "avi", "cpp", "cti", "csv", "db", "hpp", "html", "implicam", "jpg", "json", "jsonl", "md", "npz", "parquet",
-    "onnx", "png", "table", "tif", "toml", "txt", "xml", "yaml", "yml",
+    "onnx", "png", "table", "tif", "toml", "tsv", "txt", "xml", "yaml", "yml",
 }  # fmt: skip
 """What files end in that the documentation names."""
 

@@ -97,6 +97,8 @@ def test_cameras_that_are_known_are_found_in_the_names(tmp_path):
 def test_folders_whose_files_carry_the_camera_are_joined(tmp_path):
     names = ["left/left_001.png", "left/left_002.png", "right/right_001.png", "right/right_002.png"]
     assert read(tmp_path / "a", *names) == {"left": ["001", "002"], "right": ["001", "002"]}
+    names = ["left/000.png", "left/001.png", "right/0.png", "right/1.png"]
+    assert read(tmp_path / "zeros", *names) == {"left": ["0", "1"], "right": ["0", "1"]}
     names = ["1/imgL01.png", "1/imgL02.png", "2/imgR01.png", "2/imgR02.png"]
     assert read(tmp_path / "b", *names) == {"1": ["01", "02"], "2": ["01", "02"]}
     names = ["1/a.png", "1/b.png", "2/c.png", "2/d.png"]  # boards shown to one camera at a time

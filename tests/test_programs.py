@@ -66,6 +66,51 @@ def test_several_points_of_dltdv_are_named_by_frame_and_point(tmp_path: Path) ->
     assert read_program(path, "dltdv", MM, tmp_path / "xyz.csv").xyz.tolist() == [[0, 0, 0], [1, 1, 1]]
 
 
+def test_sparse_tables_of_dltdv_are_the_flat_ones(tmp_path: Path) -> None:
+    """A title, then rows, columns, entries; the offsets beside it have a column for each camera."""
+    path = tmp_path / "a_xypts.tsv"
+    path.write_text("DLTdv8a sparse data\n3\t8\t6\n1\t1\t11.5\n1\t2\t21.5\n3\t3\t31.5\n3\t4\t41.5\n2\t7\t5\n2\t8\t6\n")
+    with pytest.raises(DatasetError, match="how many cameras") as caught:
+        read_program(path, "dltdv")
+    assert "a_offsets.tsv" in caught.value.fix
+    (tmp_path / "a_offsets.tsv").write_text("title\n3\t2\t0\n")
+    read = read_program(path, "dltdv")
+    assert read.points.tolist() == ["1 pt1", "2 pt2", "3 pt1"]
+    nan = [np.nan, np.nan]
+    np.testing.assert_array_equal(read.observations.uv, [[[10.5, 20.5], nan], [nan, [4, 5]], [nan, [30.5, 40.5]]])
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [("easywand", "pt1_cam3_X,pt1_cam3_Y"), ("argus", "track_cam_3_x,track_cam_3_y")]
+)
+def test_a_table_without_headings_says_which_it_may_need(kind: str, name: str, tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("1,2,3,4,5,6\n7,8,9,10,11,NaN\n")
+    with pytest.raises(DatasetError, match="6 columns of numbers, and no headings") as caught:
+        read_program(tmp_path / "x.csv", kind)
+    assert caught.value.fix.endswith(name)
+
+
+def test_positions_may_have_headings(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("pt1_cam1_X,pt1_cam1_Y\n1,2\n3,4\n")
+    (tmp_path / "xyz.csv").write_text('"X",Y,Z\n0,0,0\n1,1,1\n')
+    assert read_program(tmp_path / "x.csv", "dltdv", MM, tmp_path / "xyz.csv").xyz.tolist() == [[0, 0, 0], [1, 1, 1]]
+
+
+def test_the_camera_of_a_file_of_sleap_is_its_video_and_two_files_of_one_are_named(tmp_path: Path) -> None:
+    head = "track,frame_idx,instance.score,head.x,head.y,head.score\n"
+    for name in ("labels.v001.000_cam1.analysis", "labels.v002.slp.001_cam2.analysis", "cam3.analysis", "left_000"):
+        (tmp_path / f"{name}.csv").write_text(head + "t0,0,.9,1,2,.8\n")
+    assert sorted(read_program(tmp_path, "sleap").camera_names) == ["cam1", "cam2", "cam3", "left_000"]
+    (tmp_path / "b").mkdir()
+    for name in ("cam1DLC_x", "cam1DLC_x_filtered"):
+        (tmp_path / "b" / f"{name}.csv").write_text("scorer,s,s\nbodyparts,nose,nose\ncoords,x,y\n0,1,2\n")
+    with pytest.raises(
+        DatasetError, match=r"cam1DLC_x.csv and cam1DLC_x_filtered.csv are both of camera 'cam1'"
+    ) as caught:
+        read_program(tmp_path / "b", "deeplabcut")
+    assert "move cam1DLC_x_filtered.csv" in caught.value.fix
+
+
 def test_key_points_without_pixels_are_missing_whatever_their_likelihood(tmp_path: Path) -> None:
     """DeepLabCut issue 1650: NaN, NaN with the likelihood 1."""
     head = "scorer,s,s,s,s,s,s\nbodyparts,nose,nose,nose,tail,tail,tail\ncoords,x,y,likelihood,x,y,likelihood\n"

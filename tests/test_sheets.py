@@ -198,7 +198,7 @@ REFUSED = {
     ),
     "commas and points": (
         "x;y;z;u_a;v_a\n0,234;2.345;3,456;10;20\n",
-        "lines 2 and 2",
+        "line 2: one number",
         "all numbers with decimal points",
     ),
     "thousands and decimals": (

@@ -18,7 +18,7 @@ from implicam.dataset.units import metres_per
 from implicam.dataset.written_table import write_table
 from implicam.errors import UsageError, did_you_mean, import_extra
 from implicam.files import write_text
-from implicam.formatting import decimal_number, number_with_sd
+from implicam.formatting import decimal_number, list_some, number_with_sd
 from implicam.plotted import Plotted
 
 MEASURED_COLUMNS = (
@@ -192,7 +192,9 @@ class Measurement(Plotted):
             found = np.flatnonzero(self.points == which)
             if not len(found):
                 near = did_you_mean(which, map(str, self.points))
-                raise UsageError(f"there is no point {which!r}{near}.", fix="`points` has the names")
+                raise UsageError(
+                    f"there is no point {which!r}{near}.", fix=f"the points are {list_some(self.points.tolist())}"
+                )
             which = int(found[0])
         if not isinstance(which, int | np.integer):
             raise UsageError(

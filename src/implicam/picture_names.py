@@ -230,7 +230,10 @@ def _join_folders(found: Pictures) -> SortedPictures:
         numbers = re.findall(r"\d+", one.shot)
         return numbers[-1] if numbers else one.shot
 
-    for shorten in (without_camera, last_number):
+    def its_value(one: _Named) -> str:
+        return last_number(one).lstrip("0") or "0"
+
+    for shorten in (without_camera, last_number, its_value):
         named = [one._replace(shot=shorten(one)) for one in every]
         if len({one[:2] for one in named}) == len(named) and _shared_part(named) >= MIN_SHARED_PART:
             shot = next(shot for shot, n in Counter(one.shot for one in named).items() if n > 1)

@@ -150,9 +150,9 @@ def look_at_numbers(
                 words[cell] += 1
     if "," in first and "." in first:
         (a, comma), (b, point) = first[","], first["."]
+        where = f"{unit} {a}" if a == b else f"{unit}s {a} and {b}"
         raise DatasetError(
-            f"{place}, {unit}s {a} and {b}: one number has a comma and one has a point: {comma[:30]!r} and "
-            f"{point[:30]!r}.",
+            f"{place}, {where}: one number has a comma and one has a point: {comma[:30]!r} and {point[:30]!r}.",
             why="it cannot be told which is the decimal mark, and whether the other separates thousands",
             fix="write all numbers with decimal points, and without marks between thousands",
         )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from implicam.dataset.model import TRUTH_COLUMNS, Dataset, Floats, Names
 from implicam.errors import UsageError, did_you_mean
+from implicam.formatting import list_some
 
 MAX_NOT_RIGID = 1e-6
 """How far a matrix may be from a rotation, entry by entry: more than rounding in a text file with seven digits."""
@@ -60,7 +61,10 @@ def keep_others(points: Names, names: Iterable[str]) -> NDArray[np.bool_]:
     known = set(points.tolist())
     for name in leave:
         if name not in known:
-            raise UsageError(f"there is no point {name!r}{did_you_mean(name, known)}.", fix="`points` has the names")
+            raise UsageError(
+                f"there is no point {name!r}{did_you_mean(name, known)}.",
+                fix=f"the points are {list_some(list(known))}",
+            )
     return ~np.isin(points, leave)
 
 

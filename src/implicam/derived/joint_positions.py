@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from implicam.dataset import Floats
 from implicam.errors import UsageError, did_you_mean
+from implicam.formatting import list_some
 from implicam.gp.linalg import covariance_root
 from implicam.measurement import Measurement
 
@@ -75,7 +76,9 @@ def find_point(measurement: Measurement, point: str | int) -> int:
         if len(found):
             return int(found[0])
         near = did_you_mean(point, map(str, measurement.points))
-        raise UsageError(f"there is no point {point!r}{near}.", fix="`points` has the names")
+        raise UsageError(
+            f"there is no point {point!r}{near}.", fix=f"the points are {list_some(measurement.points.tolist())}"
+        )
     if isinstance(point, int | np.integer) and -len(measurement) <= point < len(measurement):
         return int(point) % len(measurement)
     raise UsageError(f"there is no point {point!r}.", fix=f"give a name, or a number from 0 to {len(measurement) - 1}")

@@ -386,8 +386,14 @@ def _note_missing(cameras: Iterable[str], usable: Iterable[View]) -> list[str]:
             notes.append(f"camera {camera!r} has no picture.")
         elif lacking:
             plural = "s" if len(lacking) > 1 else ""
+            own = {shot.lstrip("0"): shot for shot in shots[camera] if shot.isdecimal()}
+            alike = next(
+                ((own[shot.lstrip("0")], shot) for shot in lacking if shot.isdecimal() and shot.lstrip("0") in own),
+                None,
+            )
+            cure = f" It has {alike[0]!r}: rename that to {alike[1]!r} where the two are one instant." if alike else ""
             notes.append(
-                f"camera {camera!r} has no picture of the shot{plural} {list_some(lacking)}, which others have."
+                f"camera {camera!r} has no picture of the shot{plural} {list_some(lacking)}, which others have.{cure}"
             )
     return notes
 

@@ -57,7 +57,8 @@ def read_program(
         path: The file or folder.
         kind: A name of `PROGRAMS`.
         options: The unit, and how pixels are counted, where it is not as the program does.
-        positions: A file of known positions, x, y, z in each row, without a header; None where there is none.
+        positions: A file of known positions, x, y, z in each row, with or without a line x,y,z above them; None where
+            there is none.
 
     Raises:
         UsageError: There is no such program.
@@ -114,7 +115,7 @@ def _find(kind: str) -> Program:
 def _read_positions(path: Path) -> list[Numbers]:
     if not path.is_file():
         raise DatasetError(f"{path} does not exist.", fix="give a file of x, y, z, a row for each known point")
-    found = list(rows_of_numbers(path, (3,), "x, y, z"))
+    found = list(rows_of_numbers(path, (3,), "x, y, z", header=["x", "y", "z"]))
     for place, position in found:
         if any(value != value for value in position):
             raise DatasetError(f"{place}: a known position has no number.", fix="fill it in, or remove the point")

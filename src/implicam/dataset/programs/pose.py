@@ -8,7 +8,7 @@ count the first pixel as 0. A body part without pixels is missing, whatever its 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,7 @@ def read_deeplabcut(path: Path, positions: Sequence[Numbers]) -> Views:
     """
     _refuse_positions(positions)
     views = Views()
-    for file in files_of(path, ["*.csv"], "tables (.csv)"):
+    for camera, file in _one_a_camera(path, lambda file: re.split("DLC", file.stem)[0].rstrip("_- ") or file.stem):
         rows = list(split_lines(file))
         heads = {row[0].strip().lower(): row for _, row in rows[:4]}
         if "bodyparts" not in heads or "coords" not in heads:
@@ -53,7 +53,7 @@ def read_deeplabcut(path: Path, positions: Sequence[Numbers]) -> Views:
             frame = row[first - 1].strip()
             for animal, part, _ in (key for key in at if key[2] == "x"):
                 name = " ".join(word for word in (frame, animal, part) if word)
-                _add(views, name, re.split("DLC", file.stem)[0].rstrip("_- ") or file.stem, f"{file}, line {line}", {
+                _add(views, name, camera, f"{file}, line {line}", {
                     axis: row[at[animal, part, axis]] for axis in ("x", "y", "likelihood") if (animal, part, axis) in at
                 })  # fmt: skip
                 views.describe(name, frame=frame, marker=" ".join(word for word in (animal, part) if word))
@@ -61,7 +61,7 @@ def read_deeplabcut(path: Path, positions: Sequence[Numbers]) -> Views:
 
 
 def read_sleap(path: Path, positions: Sequence[Numbers]) -> Views:
-    """Read the analysis tables of SLEAP; the camera is the file's name.
+    """Read the analysis tables of SLEAP; the camera is the file's name, of LABELS.000_VIDEO.analysis.csv the video's.
 
     Args:
         path: The folder, with the files of cameras that ran in step.
@@ -72,7 +72,7 @@ def read_sleap(path: Path, positions: Sequence[Numbers]) -> Views:
     """
     _refuse_positions(positions)
     views = Views()
-    for file in files_of(path, ["*.csv"], "tables (.csv)"):
+    for camera, file in _one_a_camera(path, _video_of_sleap):
         rows = list(split_lines(file))
         header = [cell.strip() for cell in rows[0][1]] if rows else []
         nodes = [column[:-2] for column in header if column.endswith(".x")]
@@ -89,9 +89,28 @@ def read_sleap(path: Path, positions: Sequence[Numbers]) -> Views:
                 name = " ".join(word for word in (frame, track, node) if word)
                 values = {"x": cells[f"{node}.x"], "y": cells[f"{node}.y"]}
                 values |= {"likelihood": cells[f"{node}.score"]} if f"{node}.score" in cells else {}
-                _add(views, name, file.stem, f"{file}, line {line}", values)
+                _add(views, name, camera, f"{file}, line {line}", values)
                 views.describe(name, frame=frame, marker=" ".join(word for word in (track, node) if word))
     return views
+
+
+def _one_a_camera(path: Path, camera_of: Callable[[Path], str]) -> list[tuple[str, Path]]:
+    """The tables of a folder, each with its camera."""
+    found: dict[str, Path] = {}
+    for file in files_of(path, ["*.csv"], "tables (.csv)"):
+        first = found.setdefault(camera_of(file), file)
+        if first != file:
+            raise DatasetError(
+                f"{first} and {file.name} are both of camera {camera_of(file)!r}.",
+                why="DeepLabCut leaves what it filtered beside what it found" if "_filtered" in file.stem else "",
+                fix=f"keep one of each camera in the folder: move {file.name}, and others like it, to another",
+            )
+    return list(found.items())
+
+
+def _video_of_sleap(file: Path) -> str:
+    video = re.search(r"(?:^|\.)\d{3}_(.+)\.analysis$", file.stem)
+    return video[1] if video else file.stem.removesuffix(".analysis")
 
 
 def write_deeplabcut(data: Dataset, path: Path) -> list[str]:

@@ -145,13 +145,16 @@ def pixel_number(text: str, place: str, column: str) -> float:
     return read_number(text, place, column, cure_nan="write NaN where the view is missing", missing=("", "nan"))
 
 
-def rows_of_numbers(path: Path, widths: Sequence[int], columns: str) -> Iterator[tuple[str, Numbers]]:
+def rows_of_numbers(
+    path: Path, widths: Sequence[int], columns: str, *, header: Sequence[str] = ()
+) -> Iterator[tuple[str, Numbers]]:
     """The rows of a table without a header: numbers with spaces, tabs or commas between them.
 
     Args:
         path: The file.
         widths: How many numbers a row may have.
         columns: What they are, for the error.
+        header: What a first line may be that holds no numbers, in small letters.
 
     Yields:
         File and line, and the numbers.
@@ -161,7 +164,7 @@ def rows_of_numbers(path: Path, widths: Sequence[int], columns: str) -> Iterator
     """
     for line, text in enumerate(read_lines(path), 1):
         place, cells = f"{path}, line {line}", text.replace(",", " ").split()
-        if not cells:
+        if not cells or (line == 1 and header and [cell.strip('"').lower() for cell in cells] == list(header)):
             continue
         if len(cells) not in widths:
             raise DatasetError(

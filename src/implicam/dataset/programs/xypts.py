@@ -1,27 +1,33 @@
 """`dltdv`, `easywand`, `argus`: one table of pixels, a row a frame, two columns for each point and camera.
 
 DLTdv 8 and easyWand call them pt1_cam1_X, pt1_cam1_Y (v from the top, the first pixel is 1), Argus NAME_cam_1_x,
-NAME_cam_1_y; NaN is a point that was not clicked. DLTdv 5 and older Argus count v from below: --v-up. The known
-positions of calibration points are another file (`xyz`, no header): of the rows of the table, or of the points of its
-only row.
+NAME_cam_1_y; NaN is a point that was not clicked. DLTdv's sparse tables have a title, a line of rows, columns and
+entries, and a line of row, column and value for each number that is not 0, separated by tabs; how many cameras there
+are is in PREFIXoffsets.tsv beside them, which has a column for each. DLTdv 5 and older Argus count v from below:
+--v-up. The known positions of calibration points are another file (`xyz`): of the rows of the table, or of the points
+of its only row.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 from implicam.dataset.dialect import find_separator, rows_of
 from implicam.dataset.folder import csv_text, format_cells
 from implicam.dataset.model import Dataset
 from implicam.dataset.programs.views import Numbers, Views, pixel_number
-from implicam.dataset.tables import check_width
+from implicam.dataset.tables import Row, check_width, read_lines, read_number
 from implicam.errors import DatasetError, did_you_mean
 from implicam.files import write_text
 
 DLTDV = re.compile(r"(?P<point>pt\d+)_(?P<camera>cam\d+)_(?P<axis>[xy])", re.IGNORECASE)
 ARGUS = re.compile(r"(?P<point>.+)_(?P<camera>cam_\d+)_(?P<axis>[xy])", re.IGNORECASE)
+
+MAX_SPARSE_LINES, MAX_SPARSE_CELLS = 5_000_000, 20_000_000
+_WHOLE = "write a whole number"
 
 Columns = dict[tuple[str, str], dict[str, int]]
 """(point, camera) -> axis -> number of the column."""
@@ -54,10 +60,55 @@ def read_argus(path: Path, positions: Sequence[Numbers]) -> Views:
 
 
 def _read(path: Path, positions: Sequence[Numbers], form: re.Pattern[str], example: str) -> Views:
+    sparse = _read_sparse(path) if form is DLTDV else None
+    if sparse is not None:
+        return _views(path, [(1, sparse[0]), *enumerate(sparse[1:], 2)], positions, form, example)
     writing = find_separator(path, lambda rows: 0 if form.fullmatch(rows[0][0].strip()) else None)
     rows = list(rows_of(path, writing))
     if not rows:
         raise DatasetError(f"{path} is empty.", fix=f"its first line names columns such as {example}")
+    return _views(path, rows, positions, form, example)
+
+
+def _read_sparse(path: Path) -> list[list[str]] | None:
+    """The headings and rows that a sparse table of DLTdv stands for; None of another file."""
+    lines = [text.split("\t") for text in islice(read_lines(path), MAX_SPARSE_LINES)]
+    if len(lines) < 2 or len(lines[0]) > 1 or not all(len(line) == 3 for line in lines[1:]):
+        return None
+    frames, width, _ = (int(read_number(cell, f"{path}, line 2", "size", cure_nan=_WHOLE)) for cell in lines[1])
+    beside = path.with_name(path.name.replace("xypts", "offsets"))
+    if beside == path or not beside.is_file():
+        raise DatasetError(
+            f"{path}: how many cameras there are is not known.",
+            why=f"a sparse table has {width} columns without names, 2 for each point and camera; {beside.name}, "
+            "which has one for each camera, is not beside it",
+            fix=f"put {beside.name} there, or save the points from DLTdv as flat tables (CSV)",
+        )
+    size = next(islice(read_lines(beside), 1, 2), "").split("\t")
+    cameras = int(read_number(size[1], f"{beside}, line 2", "cameras", cure_nan=_WHOLE)) if len(size) == 3 else 0
+    if cameras < 1 or width % (2 * cameras) or not 0 < frames * width <= MAX_SPARSE_CELLS:
+        raise DatasetError(
+            f"{path}: {frames} rows of {width} columns are no pixels of {cameras} cameras.",
+            why=f"{beside.name} states the cameras, and each has 2 columns for each point",
+            fix="give both files as DLTdv saved them",
+        )
+    points = width // (2 * cameras)
+    names = [f"pt{p + 1}_cam{c + 1}_{axis}" for p in range(points) for c in range(cameras) for axis in "XY"]
+    table = [["NaN"] * width for _ in range(frames)]
+    for number, cells in enumerate(lines[2:], 3):
+        place = f"{path}, line {number}"
+        row, column = (
+            int(read_number(cell, place, what, cure_nan=_WHOLE))
+            for cell, what in zip(cells, ("row", "column"), strict=False)
+        )
+        if not (1 <= row <= frames and 1 <= column <= width):
+            raise DatasetError(f"{place}: row {row}, column {column} of {frames} x {width}.", fix="correct the line")
+        table[row - 1][column - 1] = cells[2].strip()
+    return [names, *table]
+
+
+def _views(path: Path, rows: list[Row], positions: Sequence[Numbers], form: re.Pattern[str], example: str) -> Views:
+    _refuse_no_headings(path, rows[0], example)
     columns = _pairs([cell.strip() for cell in rows[0][1]], form, example, f"{path}, line {rows[0][0]}")
     points = list(dict.fromkeys(point for point, _ in columns))
     frames = rows[1:]
@@ -74,6 +125,24 @@ def _read(path: Path, positions: Sequence[Numbers], form: re.Pattern[str], examp
                 i = frame - 1 if len(points) == 1 else points.index(point)
                 views.place_point(name, positions[i], place)
     return views
+
+
+def _refuse_no_headings(path: Path, first: Row, example: str) -> None:
+    """EasyWand reads tables without headings; how many cameras there are cannot be told from them."""
+    line, cells = first
+    try:
+        for cell in cells:
+            float(cell)
+    except ValueError:
+        return
+    columns = len(cells)
+    names = [example.replace("cam1", f"cam{c + 1}").replace("cam_1", f"cam_{c + 1}") for c in range(columns // 2)]
+    pairs = ",".join(f"{name},{name[:-1]}{'Y' if name.endswith('X') else 'y'}" for name in names[:8])
+    raise DatasetError(
+        f"{path}, line {line}: the table has {columns} columns of numbers, and no headings.",
+        why="which columns are of which point and camera is then not known",
+        fix=f"write a first line; of one point and {columns // 2} cameras: {pairs}{', ...' if columns > 16 else ''}",
+    )
 
 
 def _names(points: list[str], frames: int, positions: Sequence[Numbers], path: Path) -> list[list[str]]:
