@@ -619,9 +619,10 @@ def example_files(tmp_path, kind):
     """Files of a kind that are whole, to be damaged."""
     rig = a_pair() if kind in ("opencv-stereo", "ros") else random_rig(5, fisheye=False)
     path = tmp_path / kind
-    export_cameras(rig, kind, path if kind in ("ros", "easymocap") else path.with_suffix(".toml"))
+    ending = (*FORMATS[kind].endings, "")[0]
+    export_cameras(rig, kind, path if kind in ("ros", "easymocap") else path.with_suffix(ending))
     return (
-        [path] if kind == "easymocap" else sorted(path.glob("*.yaml")) if kind == "ros" else [path.with_suffix(".toml")]
+        [path] if kind == "easymocap" else sorted(path.glob("*.yaml")) if kind == "ros" else [path.with_suffix(ending)]
     )
 
 
