@@ -70,6 +70,8 @@ def test_sparse_tables_of_dltdv_are_the_flat_ones(tmp_path: Path) -> None:
     """A title, then rows, columns, entries; the offsets beside it have a column for each camera."""
     path = tmp_path / "a_xypts.tsv"
     path.write_text("DLTdv8a sparse data\n3\t8\t6\n1\t1\t11.5\n1\t2\t21.5\n3\t3\t31.5\n3\t4\t41.5\n2\t7\t5\n2\t8\t6\n")
+    with pytest.raises(DatasetError, match="is a sparse table, which is not read"):
+        read_program(path, "argus")
     with pytest.raises(DatasetError, match="how many cameras") as caught:
         read_program(path, "dltdv")
     assert "a_offsets.tsv" in caught.value.fix

@@ -60,7 +60,7 @@ def read_argus(path: Path, positions: Sequence[Numbers]) -> Views:
 
 
 def _read(path: Path, positions: Sequence[Numbers], form: re.Pattern[str], example: str) -> Views:
-    sparse = _read_sparse(path) if form is DLTDV else None
+    sparse = _read_sparse(path, form)
     if sparse is not None:
         return _views(path, [(1, sparse[0]), *enumerate(sparse[1:], 2)], positions, form, example)
     writing = find_separator(path, lambda rows: 0 if form.fullmatch(rows[0][0].strip()) else None)
@@ -70,11 +70,13 @@ def _read(path: Path, positions: Sequence[Numbers], form: re.Pattern[str], examp
     return _views(path, rows, positions, form, example)
 
 
-def _read_sparse(path: Path) -> list[list[str]] | None:
+def _read_sparse(path: Path, form: re.Pattern[str]) -> list[list[str]] | None:
     """The headings and rows that a sparse table of DLTdv stands for; None of another file."""
     lines = [text.split("\t") for text in islice(read_lines(path), MAX_SPARSE_LINES)]
     if len(lines) < 2 or len(lines[0]) > 1 or not all(len(line) == 3 for line in lines[1:]):
         return None
+    if form is not DLTDV:
+        raise DatasetError(f"{path} is a sparse table, which is not read.", fix='save the points as "Dense .csv"')
     frames, width, _ = (int(read_number(cell, f"{path}, line 2", "size", cure_nan=_WHOLE)) for cell in lines[1])
     beside = path.with_name(path.name.replace("xypts", "offsets"))
     if beside == path or not beside.is_file():
