@@ -37,8 +37,8 @@ _WORLD_WORDS = frozenset((
     "world", "pos", "position", "coord", "coordinate", "ref", "reference", "known", "object", "global", "welt", "3d",
 ))  # fmt: skip
 _POINT_WORDS = frozenset((
-    "point", "points", "pt", "pointname", "pointid", "name", "id", "marker", "markername", "markerid", "label", "target",
-    "punkt", "punktname", "punktnr", "pointno", "nr", "no", "number", "nummer", "nom", "nombre",
+    "point", "points", "pt", "pointname", "pointid", "name", "id", "marker", "markername", "markerid", "label",
+    "target", "punkt", "punktname", "punktnr", "pointno", "nr", "no", "number", "nummer", "nom", "nombre",
 ))  # fmt: skip
 _TIME_WORDS = frozenset((
     "frame", "frames", "framenumber", "frameno", "frameid", "time", "t", "bild", "bildnr", "image", "imagenumber",
