@@ -680,6 +680,7 @@ def test_the_command_prints_tables_or_json_and_goes_on_from_what_is_there(
 ) -> None:
     monkeypatch.setattr("implicam.experiments.plan.QUICK", replace(TINY, name="quick", boards=(2,)))
     monkeypatch.setattr("implicam.experiments.board.METHODS", (GP, FORWARD))
+    monkeypatch.setattr("implicam.cli.show.FIRST_LINE_SECONDS", 3600.0)  # of work that takes long on a busy machine
     words = ["board", "--quick", "--jobs", "1", "--data", str(measured(tmp_path / "mine")), "-o", str(tmp_path / "out")]
     code, out, err = command(*words, capsys=capsys)
     assert (code, err) == (0, "")
