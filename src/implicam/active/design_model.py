@@ -21,7 +21,8 @@ from scipy.special import chdtri
 
 from implicam.calibrators import CALIBRATORS, Calibration, HasPositionProcesses, PredictsPixels
 from implicam.calibrators.position_processes import PositionProcesses
-from implicam.dataset import Dataset, Floats, Observations
+from implicam.dataset import Dataset, Floats
+from implicam.dataset.image_bounds import are_on_image
 from implicam.errors import UsageError
 from implicam.rig_model import Sensitivity
 
@@ -75,34 +76,6 @@ class Places:
             data: A dataset with known positions.
         """
         return cls(data.xyz, data.observations.uv, data.observations.seen)
-
-
-UNKNOWN_SIZE_MARGIN_SHARE = 0.25
-"""Where the size of a picture is not known, it is taken to reach beyond what was seen by this part of its extent."""
-
-
-def are_on_image(observations: Observations, uv: Floats) -> Bools:
-    """Which pixels are in the picture; where its size is not known, which are near those that were seen.
-
-    Args:
-        observations: The cameras, with their image sizes where known, and what they saw.
-        uv: (n, cameras, 2) pixels.
-
-    Returns:
-        (n, cameras), false for NaN and for a camera of unknown size that saw nothing.
-    """
-    seen = np.zeros(uv.shape[:2], dtype=np.bool_)
-    for c, camera in enumerate(observations.cameras):
-        if camera.width is not None and camera.height is not None:
-            low, high = np.array([-0.5, -0.5]), np.array([camera.width, camera.height]) - 0.5
-        elif observations.seen[:, c].any():
-            pixels = observations.uv[observations.seen[:, c], c]
-            margin = UNKNOWN_SIZE_MARGIN_SHARE * np.ptp(pixels, axis=0)
-            low, high = pixels.min(axis=0) - margin, pixels.max(axis=0) + margin
-        else:
-            continue
-        seen[:, c] = ((uv[:, c] >= low) & (uv[:, c] <= high)).all(axis=1)
-    return seen
 
 
 @dataclass(frozen=True, eq=False)

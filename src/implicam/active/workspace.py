@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from implicam.active.design_model import are_on_image
 from implicam.calibrators import PredictsPixels
 from implicam.dataset import Floats
+from implicam.dataset.image_bounds import are_on_image
 from implicam.errors import HardwareError, UsageError
 from implicam.hardware.csv_player import read_positions
 from implicam.simulate import Box

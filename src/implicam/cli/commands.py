@@ -384,10 +384,11 @@ def report_command(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     dataset: Annotated[Path | None, typer.Argument(help="Known points; without, its own by 10-fold.")] = None,
     output: Annotated[Path, typer.Option("--output", "-o", help="The page to write.")] = Path("report.html"),
+    by: Annotated[str, typer.Option("--by", metavar="NAME", help="Who reports, for the head of the page.")] = "",
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
-    """Write a one-page HTML report with an interactive 3D view."""
+    """Write a one-page HTML report: accuracy, error bars, where the uncertainty comes from, every camera, advice."""
     must_not_replace(output, calibration, dataset)
     must_be_page(output)
     fitted = load_calibration(calibration)
@@ -396,7 +397,7 @@ def report_command(
     with show.progress(json) as progress:
         data = None if dataset is None else read(dataset, table, calibration=fitted)
         sha256 = calibration_file.checksum(calibration)
-        evaluation = report(fitted, output, data=data, checksum=sha256, progress=progress)
+        evaluation = report(fitted, output, data=data, checksum=sha256, by=by, progress=progress)
     if json:
         show.emit_json({"report": str(output), "how": evaluation.how})
     else:

@@ -24,6 +24,7 @@ def report(
     data: Dataset | None = None,
     title: str = "",
     checksum: str = "",
+    by: str = "",
     seed: int = 0,
     progress: Progress = silent,
 ) -> Evaluation:
@@ -37,6 +38,7 @@ def report(
         data: Known points to judge a calibration by; None for its own, by 10-fold cross-validation.
         title: Of the page.
         checksum: The SHA-256 of the calibration file, for the page; of a calibration it is found out.
+        by: Who reports, for the page.
         seed: Of the folds.
         progress: Told how far it is.
 
@@ -57,5 +59,6 @@ def report(
     if not (checksum or isinstance(what, Evaluation)):
         checksum = calibration_file.checksum(what)
     title = title or f"{evaluation.data.name}, measured with {evaluation.method}"
-    write_report(path, report_of(evaluation, title, checksum))
+    calibration = None if isinstance(what, Evaluation) else what
+    write_report(path, report_of(evaluation, title, checksum, calibration=calibration, by=by))
     return evaluation

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
+from implicam.calibrators import Calibration, RigCalibration
 from implicam.coverage import Coverage
 from implicam.dataset import Floats
 from implicam.errors import UsageError
 from implicam.evaluation import Evaluation
 from implicam.measurement import Measurement
+from implicam.report.instrument import Instrument
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +26,7 @@ class ReportData:
     true_xyz: (n, 3) where its points really were, NaN where unknown. coverage: `implicam.coverage.assess` of the same
     points, the base of the headline and of the verdict. known_xyz: (m, 3) points the rig was calibrated from.
     cameras: name -> (3,) centre. facts: label and value pairs for the head (rig, method, date, ...). notes: sentences
-    for "how it was computed".
+    for "how it was computed". instrument: the cameras themselves.
     """
 
     title: str
@@ -36,6 +38,7 @@ class ReportData:
     known_xyz: Floats | None = None
     cameras: Mapping[str, ArrayLike] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    instrument: Instrument | None = None
 
     def __post_init__(self) -> None:
         n = len(self.measurement)
@@ -90,13 +93,17 @@ class ReportData:
         return [(str(self.measurement.points[i]), reason) for i, reason in reasons]
 
 
-def report_of(evaluation: Evaluation, title: str, checksum: str = "") -> ReportData:
+def report_of(
+    evaluation: Evaluation, title: str, checksum: str = "", *, calibration: Calibration | None = None, by: str = ""
+) -> ReportData:
     """What a report says of an evaluation.
 
     Args:
         evaluation: As `evaluate` or `cross_validate` gives it.
         title: Of the page.
         checksum: The SHA-256 of the calibration file; empty where there is none.
+        calibration: What is reported on; None where there are only its measurements.
+        by: Who reports; empty for nobody.
     """
     data = evaluation.data
     facts = (
@@ -107,7 +114,11 @@ def report_of(evaluation: Evaluation, title: str, checksum: str = "") -> ReportD
         ("Judged on", evaluation.how),
         ("Length unit", data.length_unit),
         *([("Calibration file, SHA-256", checksum)] if checksum else []),
+        *([("By", by)] if by else []),
     )
+    what: object = calibration
+    instrument = Instrument(what) if isinstance(what, RigCalibration) and what.data.known is not None else None
+    own_notes = [] if calibration is None else [note for note in calibration.notes if note not in evaluation.notes]
     return ReportData(
         title,
         evaluation.measurement,
@@ -115,5 +126,7 @@ def report_of(evaluation: Evaluation, title: str, checksum: str = "") -> ReportD
         coverage=evaluation.coverage,
         true_xyz=evaluation.true_xyz,
         known_xyz=evaluation.known_xyz,
-        notes=(f"Errors are taken against {evaluation.against}.", *evaluation.notes),
+        notes=(f"Errors are taken against {evaluation.against}.", *evaluation.notes, *own_notes),
+        cameras={} if instrument is None else instrument.calibration.centres(),
+        instrument=instrument,
     )

@@ -9,6 +9,7 @@ From data to a fitted rig, in the order of the modules: `training_data` (known p
 mathematics: docs/method.md.
 """
 
+from implicam.rig_model.budget import SOURCES, Budget
 from implicam.rig_model.camera import (
     CentralCamera,
     Image,
@@ -47,6 +48,8 @@ __all__ = [
     "MAX_NAMED_IN_NOTE",
     "MIN_POINTS_PER_CAMERA",
     "NUMBERS",
+    "SOURCES",
+    "Budget",
     "CameraModel",
     "CameraSettings",
     "CameraViews",

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from implicam.dataset import Dataset, Names, Observations
 from implicam.dataset.requirements import match_cameras, observations_of
-from implicam.geometry import Floats
+from implicam.geometry import Bools, Floats
 from implicam.measurement import Measurement, SharedErrors
 from implicam.rig_model.alarm import Table, alarm_of
+from implicam.rig_model.budget import Budget, uncertainty_budget
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
 from implicam.rig_model.movement import Check, CheckedRig, check_movement
@@ -263,6 +264,24 @@ class FittedRig:
             return parts
         together = (np.concatenate([part[i] for part in parts], axis=1) for i in range(1, len(Sensitivity._fields)))
         return [Sensitivity(self.cameras, *together)]
+
+    def budget(self, xyz: Floats, seen: Bools) -> Budget:
+        """Where the uncertainty of positions would come from, if they were measured.
+
+        Args:
+            xyz: (n, 3) in the world.
+            seen: (n, calibrated cameras) which see them.
+
+        Returns:
+            In squared length units.
+        """
+        points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
+        seen = seen & np.isfinite(self._pixels(points)).all(axis=2)
+        loss = information_loss(self.degrees)
+        noise = np.array([model.noise for model in self.posterior.models]) * np.sqrt(loss)
+        misfit = np.array([self.misfit(number) for number in range(len(noise))])
+        found = uncertainty_budget(self.posterior, points, noise, misfit, seen, self.labels)
+        return Budget(found.cov * self.frame.scale**2)
 
     def slopes(self, xyz: Floats) -> Iterator[tuple[Floats, float, int]]:
         """How the pixels of each calibrated camera depend on positions.

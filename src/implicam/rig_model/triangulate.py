@@ -355,6 +355,25 @@ def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen
     return x - known @ labels.unknowns.mean, cov + own + tied + tied.swapaxes(1, 2) + unknown
 
 
+def covariance_of_world(
+    posterior: Posterior, points: Floats, noise: Floats, seen: Bools, cov: Floats, labels: Labels
+) -> Floats:
+    """What the world as labelled adds to the covariance of positions, eq. (22).
+
+    Args:
+        posterior: What is known of the C cameras.
+        points: (n, 3) in the working frame.
+        noise: (n, C) of each view, in pixels.
+        seen: (n, C) the views in use.
+        cov: (n, 3, 3) without it.
+        labels: How known positions are off.
+
+    Returns:
+        (n, 3, 3) in the working frame.
+    """
+    return _as_labelled(_Weights(posterior, points, noise, seen), labels, points, cov, seen)[1] - cov
+
+
 def meet_lines(centres: Floats, directions: Floats, seen: Bools) -> Floats:
     """Where lines of sight meet best.
 

@@ -14,6 +14,14 @@ function fit(layout) {
     const half = Math.ceil(words.length / 2);
     if (half) title.text = `${words.slice(0, half).join(" ")}<br>${words.slice(half).join(" ")}`;
   }
+  if (layout.yaxis3) {  // slices side by side: one below the other
+    ["", "2", "3"].forEach((k, i) => {
+      const low = (2 - i) * 0.36;
+      layout[`xaxis${k}`].domain = [0, 0.86];
+      layout[`yaxis${k}`].domain = [low, low + 0.25];
+      Object.assign(layout.annotations[i], {x: 0.43, y: low + 0.25});
+    });
+  }
   if (layout.scene) {
     layout.scene.domain = {x: [0, 0.82], y: [0.06, 0.86]};
     const eye = layout.scene.camera?.eye ?? {x: 1.25, y: 1.25, z: 1.25};
