@@ -7,10 +7,9 @@ from pathlib import Path
 
 from implicam import calibration_file
 from implicam.calibrators import Calibration
-from implicam.calibrators.inverse_gp import InverseGPCalibration
 from implicam.calibrators.protocol import RigCalibration
 from implicam.deploy.onnx_cameras import forward_graph
-from implicam.deploy.onnx_inverse import inverse_graph
+from implicam.deploy.onnx_inverse import MapsPixels, inverse_graph
 from implicam.errors import UsageError
 from implicam.files import replacing
 
@@ -42,7 +41,7 @@ def write_onnx(calibration: Calibration, path: str | Path, checksum: str = "") -
         ImplicamError: The file cannot be written.
     """
     notes = []
-    if isinstance(calibration, InverseGPCalibration):
+    if isinstance(calibration, MapsPixels):
         graph, what = inverse_graph(calibration), INVERSE
         cameras, noise = calibration.used.observations.cameras, {}
     elif isinstance(calibration, RigCalibration):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any, Protocol, runtime_checkable
+
 import numpy as np
 
-from implicam.calibrators.inverse_gp import InverseGPCalibration
 from implicam.calibrators.inverse_maps import Map, SmoothMap, ThreeMaps
 from implicam.calibrators.pixel_cloud import PixelCloud
 from implicam.dataset import Floats
@@ -12,7 +13,30 @@ from implicam.deploy.onnx_graph import Graph, Value, kernel, side_by_side, solve
 from implicam.gp.linalg import solve_lower as solve_lower_now
 
 
-def inverse_graph(calibration: InverseGPCalibration) -> Graph:
+@runtime_checkable
+class MapsPixels(Protocol):
+    """What the graph is made of: Gaussian processes from standardised pixels to standardised positions, and from where
+    on pixels are unlike those learned from (`smoothness` None: nowhere)."""
+
+    used: Any
+    pixels: Any
+    positions: Any
+    smoothness: Any
+
+    @property
+    def map(self) -> Map:
+        """The processes."""
+
+    @property
+    def cloud(self) -> PixelCloud:
+        """The pixels learned from."""
+
+    @property
+    def farthest(self) -> float:
+        """From them, that is still measured."""
+
+
+def inverse_graph(calibration: MapsPixels) -> Graph:
     """The graph of an `inverse-gp` calibration: what `measure` computes.
 
     Inputs: `uv_NAME` (n, 2) for each camera. Outputs: `xyz` (n, 3), `covariance` (n, 3, 3) and `sd` (n, 3), NaN where
