@@ -114,6 +114,26 @@ def test_errors_of_known_positions_are_told_and_not_taken_for_a_smudge() -> None
     assert "smudge" not in said
 
 
+def test_a_camera_that_was_put_right_is_not_taken_for_a_dirty_one() -> None:
+    """What it saw when it was calibrated is held against where it stood then."""
+    calibration = calibrated(120)
+    views = _others().observations
+    uv = views.uv.copy()
+    uv[:, 2] += [6.0, -4.0]
+    moved = replace(_others(), known=None, observations=replace(views, uv=uv))
+    repaired = ic.check_calibration(calibration, moved).repair().calibration
+    assert [page.rms for page in Instrument(repaired).cameras] == [page.rms for page in Instrument(calibration).cameras]
+    assert "smudge" not in " ".join(Instrument(repaired).advice())
+
+
+def test_cameras_without_known_points_of_their_own_are_reported_on_too() -> None:
+    """Of another program, or from boards alone: there is no box of known points to look at."""
+    fitted = ic.Explicit().fit(known(40))
+    bare = replace(fitted, data=fitted.data.select([]))
+    text = page(report_of(ic.evaluate(fitted, _others()), "rig", calibration=bare))
+    assert "Where the uncertainty comes from" not in text
+
+
 def test_a_camera_whose_views_scatter_is_named() -> None:
     data = known(60)
     uv = data.observations.uv.copy()

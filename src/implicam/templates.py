@@ -6,6 +6,9 @@ from typing import Any
 
 from implicam.errors import import_extra
 
+SHARED_PACKAGE = "implicam.report"
+"""Whose templates the pages of others import, as `report/NAME`."""
+
 
 class Markup(str):
     """Text that is HTML already, by the convention of Jinja2: a template does not escape it."""
@@ -32,7 +35,9 @@ def render(package: str, name: str, **values: Any) -> str:
     """
     jinja2 = import_extra("jinja2", "report", "a report")
     environment = jinja2.Environment(
-        loader=jinja2.PackageLoader(package),
+        loader=jinja2.ChoiceLoader(
+            [jinja2.PackageLoader(package), jinja2.PrefixLoader({"report": jinja2.PackageLoader(SHARED_PACKAGE)})]
+        ),
         autoescape=name.endswith(".html"),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

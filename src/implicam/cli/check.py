@@ -16,7 +16,6 @@ from implicam.cli.options import with_table_options
 from implicam.dataset import TableOptions
 from implicam.dataset.table_options import DOCUMENTED
 from implicam.errors import UsageError
-from implicam.figures.check_history import check_history_figure
 from implicam.formatting import decimal_number, number_with_sd
 from implicam.stability import (
     BIASED,
@@ -69,7 +68,7 @@ def check_command(
     if log is not None:
         append_to_log(log, found, data.name)
     if log is not None and figure is not None:
-        check_history_figure(read_log(log)).savefig(figure, dpi=150)
+        _draw_history(log, figure)
     repaired = None
     if repair is not None and found.verdict == MOVED:
         repaired = found.repair()
@@ -97,6 +96,13 @@ def _check_names(log: Path | None, repair: Path | None, figure: Path | None) -> 
         raise UsageError(f"{log} is no name for a history, which is a CSV.", fix="end it in .csv")
     if repair is not None:
         must_be_calibration(repair)
+
+
+def _draw_history(log: Path, figure: Path) -> None:
+    from implicam.figures.check_history import check_history_figure
+    from implicam.figures.printed import save_figure
+
+    save_figure(check_history_figure(read_log(log)), figure)
 
 
 def _tell(found: CalibrationCheck) -> None:

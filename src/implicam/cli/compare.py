@@ -30,7 +30,6 @@ from implicam.compare import (
 from implicam.dataset import Dataset, TableOptions
 from implicam.dataset.table_options import DOCUMENTED
 from implicam.errors import UsageError
-from implicam.files import replacing
 
 
 @command("compare")
@@ -124,7 +123,6 @@ def _sizes(text: str | None, n: int) -> list[int]:
 
 def _write_figure(trials: Sequence[Trial], unit: str, path: Path) -> None:
     from implicam.figures import compare_figure
+    from implicam.figures.printed import save_figure
 
-    figure = compare_figure([asdict(trial) for trial in trials], unit=unit)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=160)
+    save_figure(compare_figure([asdict(trial) for trial in trials], unit=unit), path)

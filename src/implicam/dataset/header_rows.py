@@ -62,7 +62,7 @@ def is_header(header: Sequence[str], cameras: Sequence[str] = ()) -> bool:
 
 def _is_title(row: Sequence[str]) -> bool:
     filled = [cell for cell in row if cell]
-    return row[0].startswith("#") or (len(filled) < 3 and not any(map(_is_number, filled[:1])))
+    return row[0].startswith("#") or (len(filled) < 3 and not any(map(is_number, filled[:1])))
 
 
 def _title(row: Sequence[str]) -> str:
@@ -72,7 +72,7 @@ def _title(row: Sequence[str]) -> str:
 def _joined(above: Sequence[str], below: Sequence[str]) -> list[str]:
     """Headings of two rows, the upper of which spans columns: "Camera 1" above "u" and "v"."""
     below = [cell.strip() for cell in below]
-    if len(below) > len(above) or any(map(_is_number, below)) or sum(map(bool, below)) < 2 or "" not in above:
+    if len(below) > len(above) or any(map(is_number, below)) or sum(map(bool, below)) < 2 or "" not in above:
         return []
     joined, over = [], ""
     for i, upper in enumerate(above):
@@ -81,7 +81,12 @@ def _joined(above: Sequence[str], below: Sequence[str]) -> list[str]:
     return joined if len(set(joined)) == len(joined) else []
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether a cell is a number, with a decimal point or comma.
+
+    Args:
+        text: Of the cell.
+    """
     try:
         float(text.replace(",", "."))
     except ValueError:

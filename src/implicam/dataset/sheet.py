@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from implicam.dataset.dialect import AS_DOCUMENTED, Writing, find_separator, look_at_numbers, rows_of
-from implicam.dataset.header_rows import MAX_TITLE_ROWS, HeaderRows, find_header
+from implicam.dataset.header_rows import MAX_TITLE_ROWS, HeaderRows, find_header, is_number
 from implicam.dataset.headings import Headings, read_headings, squeezed
 from implicam.dataset.long_table import Brought, pivot
 from implicam.dataset.model import SD_POINT, SD_VIEW
@@ -221,7 +221,7 @@ def _with_index_named(sheet: Sheet) -> Sheet:
         named = read_headings(sheet.header[1:], "", sheet.cameras).point
     except DatasetError:
         return sheet
-    if named or len(set(cells)) < len(cells) or any(map(_is_number, cells)):
+    if named or len(set(cells)) < len(cells) or any(map(is_number, cells)):
         return sheet
     return replace(sheet, header=["point", *sheet.header[1:]], said=(*sheet.said, "the first column names the points"))
 
@@ -242,19 +242,11 @@ def _refuse_alike(found: Brought, place: str) -> None:
 
 
 def _refuse_numbers(sheet: Sheet) -> None:
-    if sum(map(_is_number, sheet.header)) > len(sheet.header) / 2:
+    if sum(map(is_number, sheet.header)) > len(sheet.header) / 2:
         raise DatasetError(
             f"{sheet.header_place}: the first {sheet.unit} holds numbers, and no names of columns.",
             fix="write x,y,z,u_cam1,v_cam1,u_cam2,v_cam2, ... as its first line",
         )
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace(",", "."))
-    except ValueError:
-        return False
-    return True
 
 
 def _name_points(table: Columns, headings: Headings, sheet: Sheet) -> tuple[list[str] | None, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from implicam.dataset import Floats
 from implicam.errors import import_extra
 from implicam.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
+from implicam.files import replacing
 
 PURPOSE = "a figure for print"
 # Marker and dash differ wherever the colour does, so that methods are told apart in grey too.
@@ -130,3 +132,17 @@ def place_legend(figure: Any, panels: Iterable[Any], title: str, columns: int = 
     if found:
         where = {"loc": "outside lower center", "ncols": min(len(found), columns), "frameon": False, "fontsize": 9}
         figure.legend(list(found.values()), list(found), title=title, title_fontsize=9, handlelength=3.2, **where)
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a figure, whole or not at all.
+
+    Args:
+        figure: A matplotlib Figure.
+        path: Of the file, .png, .pdf or .svg; it is replaced.
+
+    Raises:
+        ImplicamError: The file cannot be written.
+    """
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=160)

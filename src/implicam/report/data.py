@@ -117,7 +117,7 @@ def report_of(
         *([("By", by)] if by else []),
     )
     what: object = calibration
-    instrument = Instrument(what) if isinstance(what, RigCalibration) and what.data.known is not None else None
+    instrument = Instrument(what) if isinstance(what, RigCalibration) and len(what.data.xyz) else None
     own_notes = [] if calibration is None else [note for note in calibration.notes if note not in evaluation.notes]
     return ReportData(
         title,

@@ -189,12 +189,12 @@ class Instrument:
         return list(self._camera_pages())
 
     def _camera_pages(self) -> Iterator[CameraPage]:
-        calibration, rig = self.calibration, self.calibration.map
+        calibration, rig = self.calibration, self.calibration.fitted_map  # no camera had moved then
         observations = calibration.data.observations
-        predicted, workspace = rig.predict(calibration.data.xyz), rig.predict(self.places)
+        predicted, workspace = rig.predict(calibration.data.xyz), calibration.map.predict(self.places)
         rejected = {(one.point, one.camera) for one in calibration.rejected}
         fitted = calibration.cameras
-        measured = rig.predict(calibration.measure(observations).xyz)
+        measured = rig.predict(rig.measure(observations).xyz)
         enough = observations.seen.sum(axis=1) >= 3
         for row, c in enumerate(rig.cameras):
             name = rig.trained.camera_names[c]
