@@ -480,10 +480,19 @@ def test_names_as_people_give_them(tmp_path: Path, scenes: Any) -> None:
 # ------------------------------------------------------------------------------------------------ for real
 
 
+LABEL = """
+import signal, sys
+from implicam.cli import main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background of a shell ignores it
+main(sys.argv[1:])
+"""
+
+
 @pytest.fixture
 def served(folder: Path) -> Any:
     """`implicam label` in a process of its own: the process and the address."""
-    command = [sys.executable, "-m", "implicam", "label", str(folder), "--no-browser", "--port", "0"]
+    command = [sys.executable, "-c", LABEL, "label", str(folder), "--no-browser", "--port", "0"]
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "COLUMNS": "200"}
     )
