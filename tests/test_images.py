@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import threading
+import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +15,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from implicam import images
 from implicam.detect.folder import note_turned
 from implicam.detect.model import View
 from implicam.errors import ImageError, UsageError
 from implicam.images import blank, eight_bit, one_thread_each, read_picture, stored_jpeg, write_picture
+from implicam.picture_heads import read_head
 from implicam.picture_names import find_pictures, in_order
 
 cv2 = pytest.importorskip("cv2")
@@ -312,3 +317,141 @@ def test_the_order_depends_on_the_names_only(names):
 @given(st.lists(st.integers(0, 5000), unique=True))
 def test_numbers_count(numbers):
     assert in_order([f"img{n}" for n in numbers]) == [f"img{n}" for n in sorted(numbers)]
+
+
+# small files that unpack to huge pictures
+
+
+def zeros_png(width: int, height: int, rows: int = 1) -> bytes:
+    """A grey PNG that declares a size; so many of its rows are there."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    packed = zlib.compressobj()
+    pixels = b"".join(packed.compress(bytes(width + 1)) for _ in range(rows)) + packed.flush()
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+
+
+def tiff(width: int, height: int, order: str = "<", big: bool = False, **more: int) -> bytes:
+    """The head of a TIFF; the size is there twice, the smaller one first."""
+    tags = [(256, 4, 8), (256, 4, width), (257, 4, height), (277, 3, 1), *((int(k[1:]), 4, v) for k, v in more.items())]
+    wide, count = ("Q", "Q") if big else ("I", "H")
+    begin = (b"II" if order == "<" else b"MM") + struct.pack(
+        order + ("HHHQ" if big else "HI"), *((43, 8, 0, 16) if big else (42, 8))
+    )
+    out = begin + struct.pack(order + count, len(tags))
+    for tag, kind, value in tags:
+        cell = struct.pack(order + ("H" if kind == 3 else "I"), value).ljust(8 if big else 4, b"\0")
+        out += struct.pack(order + "HH" + wide, tag, kind, 1) + cell
+    return out + bytes(64)
+
+
+def with_size(jpeg: bytes, width: int, height: int) -> bytes:
+    at = jpeg.index(b"\xff\xc0") + 5
+    return jpeg[:at] + struct.pack(">HH", height, width) + jpeg[at + 4 :]
+
+
+def bombs() -> dict[str, bytes]:
+    jpeg = cv2.imencode(".jpg", scene())[1].tobytes()
+    huge = with_size(jpeg, 65_500, 65_500)
+    hidden = jpeg_with(bytes(60_000), with_size(jpeg, 40_000, 40_000))
+    for _ in range(5):  # beyond what a look at the beginning reads
+        hidden = jpeg_with(bytes(60_000), hidden)
+    return {
+        "a.png": zeros_png(32_000, 32_000),
+        "b.png": zeros_png(2**31 - 1, 2**31 - 1, rows=0),
+        "c.jpg": huge,
+        "d.jpg": hidden,
+        "e.jpg": huge[:20] + b"rubbish" * 9 + huge[20:],  # between two segments, where decoders skip it
+        "f.tif": tiff(32_000, 32_000),
+        "g.tif": tiff(32_000, 32_000, ">", big=True),
+        "h.tif": tiff(64, 48, t322=32_000, t323=32_000),  # a tile larger than the picture
+        "i.tif": cv2.imencode(".tif", scene())[1]
+        .tobytes()
+        .replace(struct.pack("<HHII", 256, 3, 1, 64), struct.pack("<HHII", 256, 4, 1, 10**7)),
+    }
+
+
+def test_a_small_file_that_unpacks_to_a_huge_picture_is_refused_by_its_head(tmp_path, monkeypatch):
+    """cases/png-bomb: a PNG of 1 MB cost 2 GiB and a minute."""
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
+    for name, content in bombs().items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ImageError, match="160 million pixels at most") as told:
+            read_picture(tmp_path / name)
+        assert name in told.value.what
+        assert " x " in told.value.what
+
+
+def test_what_cannot_be_measured_is_not_unpacked(tmp_path, monkeypatch):
+    """OpenCV would read a WebP or a BMP under any name."""
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was unpacked"))
+    for ending in (".bmp", ".webp"):
+        (tmp_path / "a.png").write_bytes(cv2.imencode(ending, scene())[1].tobytes())
+        with pytest.raises(ImageError, match="not a picture that can be read"):
+            read_picture(tmp_path / "a.png")
+    (tmp_path / "a.tif").write_bytes(tiff(64, 48)[:10])
+    with pytest.raises(ImageError, match="damaged or cut off"):
+        read_picture(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("ending", [".png", ".tif", ".jpg"])
+def test_a_head_says_what_the_decoder_makes(ending, channels):
+    for image in (scene((30, 50), 8, channels), scene((30, 50), 16, channels)):
+        if ending == ".jpg" and image.dtype != np.uint8:
+            continue
+        data = cv2.imencode(ending, image)[1]
+        head, made = read_head(data.tobytes()), cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        assert (head.height, head.width) == made.shape[:2]
+        assert head.channels >= (1 if made.ndim == 2 else made.shape[2])
+        assert head.unpacking_bytes >= made.nbytes + 30 * 50 * 4
+
+
+@settings(max_examples=300)
+@given(st.sampled_from(["png", "jpg", "tif", "big"]), st.data())
+def test_any_damage_to_a_head_is_refused_or_declared(kind, data):
+    """Bytes changed anywhere in the first 300: what is decoded is never larger than its head said."""
+    whole = tiff(8, 8, big=True) if kind == "big" else cv2.imencode(f".{kind}", scene((16, 16)))[1].tobytes()
+    content = bytearray(whole)
+    for at, value in data.draw(st.lists(st.tuples(st.integers(0, 299), st.integers(0, 255)), max_size=4)):
+        content[at % len(content)] = value
+    head = read_head(bytes(content))
+    assert head is None or (head.width > 0 and head.height > 0)
+    if head is not None and head.width * head.height < 10**6:
+        with contextlib.suppress(cv2.error):
+            made = cv2.imdecode(
+                np.frombuffer(bytes(content), np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+            )
+            if made is not None and bytes(content[:3]) in (b"\x89PN", b"\xff\xd8\xff", b"II*"):
+                assert made.shape[0] * made.shape[1] <= head.width * head.height
+
+
+def test_pictures_side_by_side_wait_for_room(tmp_path, monkeypatch):
+    """Ten threads read pictures of which two fit at a time."""
+    path = saved(tmp_path / "a.png", scene())
+    room = images._Room(2 * read_head(path.read_bytes()).unpacking_bytes)
+    monkeypatch.setattr(images, "_ROOM", room)
+    inside, most, lock, decode = 0, 0, threading.Lock(), cv2.imdecode
+
+    def counted(*words):
+        nonlocal inside, most
+        with lock:
+            inside += 1
+            most = max(most, inside)
+        time.sleep(0.01)
+        try:
+            return decode(*words)
+        finally:
+            with lock:
+                inside -= 1
+
+    monkeypatch.setattr(cv2, "imdecode", counted)
+    with ThreadPoolExecutor(10) as pool:
+        assert all(grey.shape == (48, 64) for grey in pool.map(read_picture, [path] * 20))
+    assert most == 2
+    assert room._free == room.size
+    monkeypatch.setattr(images, "_ROOM", images._Room(10))  # one that never fits is read alone
+    assert read_picture(path).shape == (48, 64)

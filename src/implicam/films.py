@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.errors import ImageError
-from implicam.images import Grey, opencv, to_grey
+from implicam.images import Grey, check_size, opencv, to_grey
 from implicam.picture_names import in_order
 
 FILM_ENDINGS = (
@@ -184,6 +184,7 @@ def _opened(path: Path) -> Iterator[Any]:
                 fix="copy it again from where it was recorded; where the recording was interrupted, a repair tool may "
                 "rebuild the table; else convert it: ffmpeg -i FILE -c:v mjpeg -q:v 2 out.avi",
             )
+        check_size(int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)), path)
         yield capture
     finally:
         capture.release()

@@ -10,19 +10,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from threading import Condition
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from implicam.errors import ImageError, UsageError, import_extra
 from implicam.files import replacing
+from implicam.picture_heads import BEGINNINGS, JPEG, PNG, jpeg_segments, read_head
 
 Grey = NDArray[np.float32]
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-MAX_PIXELS = 400_000_000
+MAX_PIXELS = 160_000_000
+"""Of a picture; the largest cameras have 151 million."""
+
 MAX_BYTES = 2_000_000_000
+MAX_UNPACKING_BYTES = 2_300_000_000
+"""What all pictures that are unpacked at the same time in one process may take together, enough for the largest one of
+16 bits and four channels; further ones wait."""
 
 
 def opencv() -> Any:
@@ -60,32 +67,37 @@ def read_picture(path: Path) -> Grey:
         (height, width) grey values from 0 to 1.
 
     Raises:
-        ImageError: It cannot be read, is cut off, or has another form.
+        ImageError: It cannot be read, is cut off, has another form, or too many pixels, which its head says before
+            anything is unpacked.
     """
     cv2 = opencv()
     data = _read_bytes(path)
-    image = None
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
-        raise ImageError(f"{path} cannot be read.", why=str(error), fix="export it again as PNG or TIFF") from error
-    if image is None and data.startswith(_BEGINNINGS):
-        raise ImageError(
-            f"{path} is damaged or cut off.",
-            why=f"it begins as a picture does, but its {len(data):,} bytes cannot be decoded",
-            fix="copy it again from where it was recorded",
-        )
-    if image is None:
+    if not data.startswith(BEGINNINGS):  # others could not be measured before they are unpacked
         raise ImageError(
             f"{path} is not a picture that can be read.",
             why=f"{len(data):,} bytes, and no PNG, JPEG or TIFF",
             fix="export it again as PNG, JPEG or TIFF",
         )
-    return to_grey(image, path)
+    head = read_head(data)
+    if head is None:
+        raise _damaged_error(path, data)
+    check_size(head.width, head.height, path)
+    with _ROOM.taking(head.unpacking_bytes):
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        except cv2.error as error:
+            raise ImageError(f"{path} cannot be read.", why=str(error), fix="export it again as PNG or TIFF") from error
+        if image is None:
+            raise _damaged_error(path, data)
+        return to_grey(image, path)
 
 
-_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
-_BEGINNINGS = (_PNG, _JPEG, b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+def _damaged_error(path: Path, data: bytes) -> ImageError:
+    return ImageError(
+        f"{path} is damaged or cut off.",
+        why=f"it begins as a picture does, but its {len(data):,} bytes cannot be decoded",
+        fix="copy it again from where it was recorded",
+    )
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -99,7 +111,7 @@ def _read_bytes(path: Path) -> bytes:
     if not data:
         raise ImageError(f"{path} is empty.", fix="copy it again from where it was recorded")
     # Some decoders fill what is missing with grey and report no error.
-    if (data.startswith(_PNG) and b"IEND" not in data) or (data.startswith(_JPEG) and not _ends_jpeg(data)):
+    if (data.startswith(PNG) and b"IEND" not in data) or (data.startswith(JPEG) and not _ends_jpeg(data)):
         raise ImageError(
             f"{path} is cut off.",
             why=f"it ends after {len(data):,} bytes, before the picture does",
@@ -110,14 +122,9 @@ def _read_bytes(path: Path) -> bytes:
 
 def _ends_jpeg(data: bytes) -> bool:
     """Whether the end mark is there. Segments before the pixels are skipped: a preview among them has its own."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        if data[at + 1] == 0xFF:  # a fill byte
-            at += 1
-        elif data[at + 1] == 0xDA:  # the pixels begin; what follows the end mark, a film perhaps, does not matter
-            return data.find(b"\xff\xd9", at) > 0
-        else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    for marker, start, _ in jpeg_segments(data):
+        if marker == 0xDA:  # the pixels begin; what follows the end mark, a film perhaps, does not matter
+            return data.find(b"\xff\xd9", start) > 0
     return False
 
 
@@ -145,35 +152,60 @@ def stored_jpeg(path: Path) -> Stored | None:
     """
     try:
         with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES)
+            data = file.read(_HEAD_BYTES)
     except OSError:
         return None
-    at, orientation = 2, 1
-    while head.startswith(_JPEG) and at + 9 < len(head) and head[at] == 0xFF:
-        marker, length = head[at + 1], int.from_bytes(head[at + 2 : at + 4], "big")
-        if marker == 0xE1 and head[at + 4 : at + 10] == b"Exif\0\0":
-            orientation = _exif_orientation(head[at + 10 : at + 2 + length])
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # the frame: its height, then its width
-            height, width = (int.from_bytes(head[at + i : at + i + 2], "big") for i in (5, 7))
-            return Stored((width, height), orientation)
-        at += 1 if marker == 0xFF else 2 + length
-    return None
+    head = read_head(data) if data.startswith(JPEG) else None
+    return None if head is None else Stored((head.width, head.height), head.orientation)
 
 
 _HEAD_BYTES = 1 << 18
 """EXIF with its preview has at most 64 KiB, and the frame comes soon after it."""
 
 
-def _exif_orientation(tiff: bytes) -> int:
-    """The tag 0x0112 of the first directory; 1 where it is not there."""
-    order: Literal["little", "big"] = "little" if tiff[:2] == b"II" else "big"
-    start = int.from_bytes(tiff[4:8], order)
-    for i in range(int.from_bytes(tiff[start : start + 2], order)):
-        entry = tiff[start + 2 + 12 * i : start + 14 + 12 * i]
-        if int.from_bytes(entry[:2], order) == 0x0112:
-            found = int.from_bytes(entry[8:10], order)
-            return found if 1 <= found <= 8 else 1
-    return 1
+def check_size(width: int, height: int, path: Path | str) -> None:
+    """Refuse a picture that is too large, before it is unpacked.
+
+    Args:
+        width: In pixels, as the file's head declares it.
+        height: In pixels.
+        path: The file, or what else the picture comes from, for the message.
+
+    Raises:
+        ImageError: It has more than `MAX_PIXELS`.
+    """
+    if width * height > MAX_PIXELS:
+        raise ImageError(
+            f"{path} has {width:,} x {height:,} pixels.",
+            why=f"pictures may have {MAX_PIXELS // 1_000_000} million pixels at most, and this would be "
+            f"{width * height / 1e6:,.0f} million once unpacked; it was not",
+            fix="export it smaller, or cut out the part that is needed",
+        )
+
+
+class _Room:
+    """So many bytes for pictures that are being unpacked; who finds too few waits until others are done."""
+
+    def __init__(self, size: int) -> None:
+        self.size = self._free = size
+        self._changed = Condition()
+
+    @contextmanager
+    def taking(self, amount: int) -> Iterator[None]:
+        """A context that holds so many bytes; all of them where more are asked for."""
+        amount = min(amount, self.size)
+        with self._changed:
+            self._changed.wait_for(lambda: self._free >= amount)
+            self._free -= amount
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._free += amount
+                self._changed.notify_all()
+
+
+_ROOM = _Room(MAX_UNPACKING_BYTES)
 
 
 def to_grey(image: NDArray[Any], path: Path) -> Grey:
@@ -191,8 +223,7 @@ def to_grey(image: NDArray[Any], path: Path) -> Grey:
         raise ImageError(
             f"{path} holds {image.dtype} numbers.", why="pictures have 8 or 16 bits", fix="export it with 8 or 16 bits"
         )
-    if image.size > MAX_PIXELS:
-        raise ImageError(f"{path} has {image.size:,} values.", fix="pictures may have 400 million at most")
+    check_size(image.shape[1], image.shape[0], path)
     if image.ndim == 3 and image.shape[2] in (3, 4):
         image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
     elif image.ndim == 3:

@@ -16,10 +16,10 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.errors import HardwareError
+from implicam.errors import HardwareError, ImplicamError
 from implicam.films import FILM_ENDINGS
 from implicam.hardware.protocol import Frame, Grey
-from implicam.images import opencv
+from implicam.images import check_size, opencv
 
 STREAM_PREFIXES = ("rtsp://", "rtsps://", "http://", "https://", "udp://")
 STALE_DEVICE_PICTURES, STALE_STREAM_PICTURES = 1, 2
@@ -75,7 +75,7 @@ class OpenCVCamera:
         self._grabber: _Grabber | None = None  # of a live camera
 
     def open(self) -> None:
-        """Open the device, the stream or the file; HardwareError where OpenCV cannot."""
+        """Open the device, stream or file; HardwareError where OpenCV cannot, ImageError where it is too large."""
         if self._capture is not None or (self._grabber is not None and self._grabber.running):
             return
         self.close()
@@ -121,10 +121,15 @@ class OpenCVCamera:
                 capture = cv2.VideoCapture(self.source, cv2.CAP_FFMPEG, [] if self._film else limits)
                 if not capture.isOpened() and self._film:
                     capture = cv2.VideoCapture(self.source, cv2.CAP_ANY)
-        if capture.isOpened():
-            return capture
-        capture.release()
-        raise self._cannot_open_error()
+        try:
+            if not capture.isOpened():
+                raise self._cannot_open_error()
+            size = [int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+            check_size(size[0], size[1], f"camera {self.name}: {self._source_text}")
+        except ImplicamError:
+            capture.release()
+            raise
+        return capture
 
     def _cannot_open_error(self) -> HardwareError:
         if self._film:
