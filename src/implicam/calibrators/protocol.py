@@ -31,6 +31,7 @@ from implicam.progress import Progress, silent
 from implicam.rig_model import (
     NUMBERS,
     FittedRig,
+    MeasuredPixels,
     Motion,
     Posterior,
     Repair,
@@ -615,6 +616,21 @@ class RigCalibration(CalibrationBase):
             DatasetError: None of the cameras is one of the calibration, or one has images of another size.
         """
         return self.map.measure(observations)
+
+    def measure_pixels(self, uv: ArrayLike, noise: ArrayLike | None = None) -> MeasuredPixels:
+        """Measure points given as an array, each with the views it has, two or more: arrays in, arrays out.
+
+        Args:
+            uv: (n, C, 2) pixels of the calibrated cameras, in the order of `camera_names`; NaN where not seen.
+            noise: Standard uncertainty of the views in pixels: a number, (C,) or (n, C); None for the usual one.
+
+        Returns:
+            Positions in the world with covariances, as arrays; reasons in words when they are asked for.
+
+        Raises:
+            UsageError: An array has another shape.
+        """
+        return self.map.measure_pixels(uv, noise)
 
     def predict(self, xyz: Floats) -> Floats:
         """Where the cameras see positions, in pixels without noise.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -166,10 +167,16 @@ class Observations:
                     f"there is no camera {name!r}{did_you_mean(name, known)}.",
                     fix=f"the cameras are {', '.join(known)}",
                 )
+        if tuple(names) == known:
+            return self
         i = [known.index(name) for name in names]
         extra = {key: value[:, i] for key, value in self.extra.items()}
         cameras = tuple(self.cameras[j] for j in i)
-        return Observations(self.points, cameras, self.uv[:, i], self.sd[:, i], extra)
+        if not i or len(set(i)) < len(i):  # says what is wrong
+            return Observations(self.points, cameras, self.uv[:, i], self.sd[:, i], extra)
+        fewer = copy(self)  # what was checked once is not checked again
+        _freeze(fewer, cameras=cameras, uv=self.uv[:, i], sd=self.sd[:, i], extra=extra)
+        return fewer
 
 
 @dataclass(frozen=True, eq=False)

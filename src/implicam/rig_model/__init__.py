@@ -5,8 +5,8 @@ From data to a fitted rig, in the order of the modules: `training_data` (known p
 `normal_equations`, `schur`, `tied`, `posterior` and `linearise` (what is known of all cameras), `leave_one_out` and
 `diagnostics` (views that contradict the others), `shot_errors`, `level_errors`, `position_errors` and `heavy_tails`
 (how positions and pixels are off), `fit_result`; then `rig`, `triangulate`, `wrong_views` and `alarm` (measuring),
-`movement` and `repair` (cameras that moved since). All of it by what `settings` take for usual and for clear. The
-mathematics: docs/method.md.
+`reasons` and `measured_pixels` (what became of the points), `movement` and `repair` (cameras that moved since). All of
+it by what `settings` take for usual and for clear. The mathematics: docs/method.md.
 """
 
 from implicam.rig_model.budget import SOURCES, Budget
@@ -28,11 +28,12 @@ from implicam.rig_model.initialise import (
 )
 from implicam.rig_model.leave_one_out import update_inliers
 from implicam.rig_model.linearise import iterate_linearisation
+from implicam.rig_model.measured_pixels import MeasuredPixels
 from implicam.rig_model.movement import NUMBERS, Check, Evidence, Motion
 from implicam.rig_model.normal_equations import solve_normal
 from implicam.rig_model.posterior import Posterior, condition
 from implicam.rig_model.repair import Repair, all_repaired, errors_with_and_without, find_repair, white_unknowns
-from implicam.rig_model.rig import FittedRig, Sensitivity
+from implicam.rig_model.rig import FittedRig, Locator, Sensitivity
 from implicam.rig_model.settings import CameraSettings, RigModelSettings
 from implicam.rig_model.training_data import (
     MIN_POINTS_PER_CAMERA,
@@ -65,6 +66,8 @@ __all__ = [
     "Image",
     "InitialCamera",
     "Labels",
+    "Locator",
+    "MeasuredPixels",
     "Motion",
     "Posterior",
     "Prior",

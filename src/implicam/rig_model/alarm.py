@@ -138,10 +138,12 @@ def _surprising_level(p: Floats, views: NDArray[np.int64], settings: RigModelSet
     """The level below which the most surprising number of p-values (n,) lies, and it; None where none does."""
     if not len(p):
         return None
-    degrees = 2 * views - 3
+    several, points = np.unique(views, return_counts=True)
+    degrees = 2 * several - 3
     found = []
     for level in settings.alarm_p_values:
-        usual = float(np.mean(chdtrc(degrees, chdtri(degrees, level) / settings.tolerated_error_bar_ratio**2)))
+        beyond = chdtrc(degrees, chdtri(degrees, level) / settings.tolerated_error_bar_ratio**2)
+        usual = float(beyond @ points / len(p))
         count = int((p < level).sum())
         some = min(len(p), settings.max_independent_points)
         found.append((_tail(count * some // len(p), some, usual), level, count))

@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from implicam.dataset import Dataset, Names, Observations
+from implicam.dataset import Dataset, Observations
 from implicam.dataset.requirements import match_cameras, observations_of
+from implicam.errors import UsageError
 from implicam.geometry import Bools, Floats
 from implicam.measurement import Measurement, SharedErrors
 from implicam.rig_model.alarm import Table, alarm_of
 from implicam.rig_model.budget import Budget, uncertainty_budget
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
+from implicam.rig_model.measured_pixels import MeasuredPixels
 from implicam.rig_model.movement import Check, CheckedRig, check_movement
 from implicam.rig_model.posterior import Posterior
+from implicam.rig_model.reasons import reason_codes, reasons_in_words
 from implicam.rig_model.repair import Repair, all_repaired
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
 from implicam.rig_model.triangulate import Labels, Located, locate, shared_errors
+
+Locator = Callable[[Floats, Floats], Located]
+"""Finds where points are from pixels (n, C, 2) and noise (n, C), in the working frame."""
 
 LENS_KINDS = ("ordinary", "aspect")
 """Kinds of cameras that cannot follow anything that lenses do not do."""
@@ -80,11 +86,12 @@ class FittedRig:
         """Whether every camera is of a kind that cannot follow anything that lenses do not do."""
         return all(model.family in LENS_KINDS for model in self.posterior.models)
 
-    def measure(self, observations: Observations | Dataset) -> Measurement:
+    def measure(self, observations: Observations | Dataset, locator: Locator | None = None) -> Measurement:
         """Measure each point with the views it has, two or more.
 
         Args:
             observations: What the cameras saw, by their names; or a dataset that has it.
+            locator: What finds the positions; None for `locate`, which is exact.
 
         Returns:
             Positions in the world with error bars, and of each point without one the reason; and the alarm, if there is
@@ -95,33 +102,107 @@ class FittedRig:
         """
         observations = self._matched(observations)
         uv, noise = self.views(observations)
-        found = locate(self.posterior, uv, noise, self.labels, self.degrees, self.settings)
+        found = (locator or self.locate)(uv, noise)
         seen = np.asarray(np.isfinite(uv).all(axis=2))
+        usable = seen.sum(axis=1)
+        codes = reason_codes(np.isfinite(found.xyz[:, 0]), found.p, usable, observations.seen.sum(axis=1))
         measured = Measurement(
             observations.points,
             self.frame.to_world(found.xyz),
             found.cov * self.frame.scale**2,
-            seen.sum(axis=1) - found.left_out.sum(axis=1),
+            usable - found.left_out.sum(axis=1),
             found.p,
-            self._reasons(observations, seen, found),
+            reasons_in_words(codes, seen, found.left_out, self.camera_names),
             self.length_unit,
             share_calibration=found.share,
             shared=SharedErrors(partial(self._shared_errors, uv, noise, found), np.arange(len(uv)), np.eye(3)),
         )
-        cameras = tuple(self.trained.cameras[c] for c in self.cameras)
-        table = Table(
-            cameras,
-            uv,
-            noise,
-            found.p,
-            found.left_out,
-            self._agree,
-            self._lines,
-            self._pixels,
-            checked=len(self.trained) > 0,
-            settings=self.settings,
+        return measured.with_alarm(self._alarm(uv, noise, found))
+
+    def measure_pixels(
+        self, uv: ArrayLike, noise: ArrayLike | None = None, locator: Locator | None = None
+    ) -> MeasuredPixels:
+        """Measure points given as an array, each with the views it has, two or more.
+
+        Args:
+            uv: (n, C, 2) pixels of the calibrated cameras, in the order of `camera_names`; NaN where not seen.
+            noise: Standard uncertainty of the views in pixels: a number, (C,) or (n, C); None for the usual one.
+            locator: What finds the positions; None for `locate`, which is exact.
+
+        Returns:
+            Positions in the world with error bars, as arrays.
+
+        Raises:
+            UsageError: An array has another shape.
+        """
+        pixels = np.asarray(uv, dtype=np.float64)
+        C = len(self.cameras)
+        if pixels.ndim != 3 or pixels.shape[1:] != (C, 2):
+            raise UsageError(
+                f"pixels of the shape {pixels.shape} do not fit; (points, {C}, 2) is wanted.",
+                why=f"the calibrated cameras are {', '.join(self.camera_names)}",
+                fix="give u and v of each camera in this order, NaN where it did not see the point",
+            )
+        sd = self.noise_of_pixels(noise, len(pixels))
+        found = (locator or self.locate)(pixels, sd)
+        measured = np.isfinite(found.xyz[:, 0])
+        codes = np.zeros(len(pixels), dtype=np.int8)
+        lost = np.flatnonzero(~measured)
+        if len(lost):
+            usable = np.isfinite(pixels[lost]).all(axis=2).sum(axis=1)
+            codes[lost] = reason_codes(measured[lost], found.p[lost], usable, usable)
+        return MeasuredPixels(
+            self.frame.to_world(found.xyz), found.cov * self.frame.scale**2, found.p, codes, found.left_out,
+            found.share, pixels, self.camera_names, self.length_unit, partial(self._alarm, pixels, sd, found),
+        )  # fmt: skip
+
+    def noise_of_pixels(self, noise: ArrayLike | None, n: int) -> Floats:
+        """(n, C) the noise of views given as arrays, corrected; of all points alike it is not repeated in memory.
+
+        Args:
+            noise: As of `measure_pixels`.
+            n: How many points.
+
+        Raises:
+            UsageError: It has another shape.
+        """
+        C = len(self.cameras)
+        given = np.asarray(np.nan if noise is None else noise, dtype=np.float64)
+        if given.shape not in ((), (C,), (n, C)):
+            raise UsageError(
+                f"the noise of pixels has the shape {given.shape}; a number, ({C},) or ({n}, {C}) is wanted."
+            )
+        rows = given if given.ndim == 2 else np.broadcast_to(given, (1, C))
+        return np.broadcast_to(self.corrected_noise(rows), (n, C))
+
+    def locate(self, uv: Floats, noise: Floats) -> Located:
+        """Where points are, exactly.
+
+        Args:
+            uv: (n, C, 2) pixels of the calibrated cameras.
+            noise: (n, C) of the views.
+
+        Returns:
+            In the working frame.
+        """
+        return locate(self.posterior, uv, noise, self.labels, self.degrees, self.settings)
+
+    def _alarm(self, uv: Floats, noise: Floats, found: Located) -> str:
+        """What is wrong with a table as a whole."""
+        return alarm_of(
+            Table(
+                tuple(self.trained.cameras[c] for c in self.cameras),
+                uv,
+                noise,
+                found.p,
+                found.left_out,
+                self._agree,
+                self._lines,
+                self._pixels,
+                checked=len(self.trained) > 0,
+                settings=self.settings,
+            )
         )
-        return measured.with_alarm(alarm_of(table))
 
     def _shared_errors(self, uv: Floats, noise: Floats, found: Located, rows: NDArray[np.int64]) -> Floats:
         """(k, 3, q) of located points, in the world."""
@@ -171,14 +252,11 @@ class FittedRig:
         Returns:
             Pixels (n, C, 2), NaN where not seen, and the noise (n, C) of each view, pixels.
         """
-        n, C = len(observations), len(self.camera_names)
-        uv, noise = np.full((n, C, 2), np.nan), np.ones((n, C))
-        for c, name in enumerate(self.camera_names):
-            if name in observations.camera_names:
-                k = observations.camera_names.index(name)
-                uv[:, c] = observations.uv[:, k]
-                noise[:, c] = self._noise(observations, c, k)
-        return uv, noise
+        names = observations.camera_names
+        column = np.array([names.index(name) if name in names else -1 for name in self.camera_names])
+        uv = observations.uv[:, column]
+        uv[:, column < 0] = np.nan
+        return uv, self.corrected_noise(np.where(column < 0, np.nan, view_noise(observations)[:, column]))
 
     def movement(self, observations: Observations | Dataset, *, level: float, seed: int = 0) -> Check | None:
         """Whether a camera moved since the calibration, from what the cameras saw of points that nobody knows.
@@ -313,14 +391,25 @@ class FittedRig:
         centre, rays = self.posterior.models[self.camera_names.index(camera)].camera.lines(uv)
         return self.frame.to_world(centre), rays
 
-    def _noise(self, observations: Observations, c: int, k: int) -> Floats:
-        """(n,) of camera c's views, in pixels: as they state it, corrected as the calibration's own views were."""
-        usual, stated = self.posterior.models[c].noise, self._stated[self.cameras[c]]
-        given = view_noise(observations)[:, k]
-        corrected = given * (usual / stated) if np.isfinite(stated) else given
-        if self.misfit_adds and usual > stated:
-            corrected = np.sqrt(given**2 + usual**2 - stated**2)
-        return np.where(np.isfinite(given) & (given > 0), corrected, usual)
+    def corrected_noise(self, given: Floats) -> Floats:
+        """The noise of views, in pixels: as they state it, corrected as the calibration's own views were.
+
+        Args:
+            given: (n, C) of the calibrated cameras, as the views state it; NaN where they do not.
+
+        Returns:
+            (n, C), the usual noise of a camera where a view states none.
+        """
+        usual, stated = np.array([model.noise for model in self.posterior.models]), self.usual_stated_noise
+        states = np.isfinite(given) & (given > 0)
+        if not states.any():
+            return np.broadcast_to(usual, given.shape)
+        with np.errstate(invalid="ignore"):
+            corrected = np.where(np.isfinite(stated), given * (usual / stated), given)
+            if self.misfit_adds:
+                added = np.sqrt(np.maximum(given**2 + usual**2 - stated**2, 0.0))
+                corrected = np.where(usual > stated, added, corrected)
+        return np.where(states, corrected, usual)
 
     def misfit(self, number: int) -> float:
         """What a camera's lens model leaves of its views, besides their noise.
@@ -343,24 +432,3 @@ class FittedRig:
     @cached_property
     def _stated(self) -> Floats:
         return stated_noise(self.trained)
-
-    def _reasons(self, observations: Observations, seen: NDArray[np.bool_], found: Located) -> Names:
-        every = observations.seen.sum(axis=1)
-        usable = seen.sum(axis=1)
-        reasons = []
-        for i in range(len(seen)):
-            if np.isfinite(found.xyz[i, 0]):
-                away = " and ".join(self.camera_names[c] for c in np.flatnonzero(found.left_out[i]))
-                reasons.append(f"measured without {away}, whose view contradicts the others" if away else "")
-            elif every[i] == 0:
-                reasons.append("no camera saw it")
-            elif usable[i] == 0:
-                reasons.append("no calibrated camera saw it")
-            elif usable[i] == 1:
-                only = self.camera_names[int(np.argmax(seen[i]))]
-                reasons.append(f"only {only} saw it; a position takes two cameras")
-            elif np.isfinite(found.p[i]):
-                reasons.append("its views contradict each other: a wrong match in one of them")
-            else:
-                reasons.append("no position explains its views: a wrong match, or a place that a camera cannot see")
-        return np.array(reasons, dtype=np.str_)

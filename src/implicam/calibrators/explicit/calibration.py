@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from implicam.calibrators.explicit import saved
 from implicam.calibrators.explicit.align import ICP, MATCHING
@@ -56,7 +56,7 @@ from implicam.lenses import LENSES
 from implicam.measurement import Measurement
 from implicam.mistakes import explain_fit_error
 from implicam.progress import Progress, silent
-from implicam.rig_model import FittedRig, Repair
+from implicam.rig_model import FittedRig, MeasuredPixels, Repair
 from implicam.threads import blas_threads
 
 
@@ -275,6 +275,27 @@ class ExplicitCalibration(RigCalibration):
         if self.fitted.inflation is None:
             return self.map.measure(observations)
         return measure_linearly(self.fitted, self.map, observations_of(observations))
+
+    def measure_pixels(self, uv: ArrayLike, noise: ArrayLike | None = None) -> MeasuredPixels:
+        """As of `RigCalibration`; the paper's presets, which triangulate in a way of their own, do not offer it.
+
+        Args:
+            uv: (n, C, 2) pixels of the calibrated cameras, in the order of `camera_names`; NaN where not seen.
+            noise: Standard uncertainty of the views in pixels: a number, (C,) or (n, C); None for the usual one.
+
+        Returns:
+            Positions in the world with covariances, as arrays.
+
+        Raises:
+            UsageError: An array has another shape, or the calibration is of a preset of the paper.
+        """
+        if self.fitted.inflation is not None:
+            raise UsageError(
+                f"the preset {self.calibrator.preset} measures observations, not arrays.",
+                why="it triangulates as the paper did",
+                fix="measure(ic.Dataset.from_arrays(uv)), or calibrate with explicit",
+            )
+        return super().measure_pixels(uv, noise)
 
     @property
     def unused(self) -> tuple[Unused, ...]:
