@@ -160,6 +160,26 @@ class ToyRobot:
         )
 
 
+class Line:
+    """The wire from the trigger to the cameras."""
+
+    def __init__(self) -> None:
+        self._pulses, self._heard = 0, threading.Condition()
+
+    def pulse(self) -> None:
+        with self._heard:
+            self._pulses += 1
+            self._heard.notify_all()
+
+    def wait_for_pulse(self, timeout: float) -> bool:
+        with self._heard:
+            before = self._pulses
+            return self._heard.wait_for(lambda: self._pulses > before, timeout)
+
+
+LINE = Line()
+
+
 class ToyCamera:
     """A camera that looks at the axes."""
 
@@ -185,6 +205,8 @@ class ToyCamera:
         pass
 
     def frame(self, timeout: float = 5.0) -> Frame:
+        if not self.live and not LINE.wait_for_pulse(timeout):
+            raise HardwareError(f"camera {self.name}: no picture within {timeout:g} s.", why="it waits for its trigger")
         self._ball.move(AXES.place())
         return self._camera.frame(timeout)
 
@@ -211,6 +233,7 @@ class ToyTrigger:
 
     def fire(self) -> None:
         self.fired += 1
+        LINE.pulse()
 
     def close(self) -> None:
         pass

@@ -7,12 +7,15 @@ robot.move(xyz); frame = camera.frame()
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from implicam.errors import UsageError, did_you_mean
+from implicam.formatting import list_some
 from implicam.hardware.csv_player import CsvPlayer
+from implicam.hardware.device_settings import changed_settings, shared_device
 from implicam.hardware.folder_camera import FolderCamera
 from implicam.hardware.genicam import GenICamCamera
 from implicam.hardware.guard import GuardedRobot, guard_robot
@@ -26,12 +29,13 @@ from implicam.hardware.protocol import (
     Robot,
     RobotDriver,
     RobotOptions,
+    TellsSettings,
     Trigger,
     TriggerDriver,
     take_frames,
 )
 from implicam.hardware.simulated import PhotographingCamera, SimulatedRobot, simulated_rig
-from implicam.hardware.trigger import NetworkTrigger, TCPTrigger, TriggerSimulator
+from implicam.hardware.trigger import NetworkTrigger, TCPTrigger, TriggerBoxes, TriggerSimulator
 from implicam.hardware.ur import URRobot
 from implicam.registry import Registry, offers
 
@@ -53,16 +57,23 @@ __all__ = [
     "Robot",
     "RobotOptions",
     "SimulatedRobot",
+    "TellsSettings",
     "Trigger",
+    "TriggerBoxes",
     "TriggerSimulator",
     "URRobot",
     "camera_from",
+    "compare_settings",
     "guard_robot",
+    "keep_settings",
     "list_specs",
+    "refuse_one_device_twice",
     "robot_from",
     "simulated_rig",
     "take_frames",
+    "tell_settings",
     "trigger_from",
+    "triggers_from",
 ]
 
 CAMERAS: Registry[type[CameraDriver]] = Registry(
@@ -167,6 +178,126 @@ def trigger_from(spec: str) -> Trigger:
     """
     driver, rest = _find_driver(TRIGGERS, spec)
     return driver.from_spec(rest)
+
+
+def triggers_from(specs: Sequence[str], cameras: Sequence[str]) -> Trigger | None:
+    """The trigger of all cameras that the words of a command line name; nothing is connected.
+
+    Args:
+        specs: Of one box for all cameras, as `trigger_from` takes it; or of several, each with its cameras:
+            "udp://192.168.0.50:4000=cam1,cam2".
+        cameras: The names of all cameras.
+
+    Returns:
+        One trigger, whatever the number of boxes; None where there is no spec.
+
+    Raises:
+        UsageError: A camera hangs on no box or on two, a name is of no camera, or a spec names no trigger.
+    """
+    if not specs:
+        return None
+    wired = [_read_wires(spec, cameras, alone=len(specs) == 1) for spec in specs]
+    box_of: dict[str, str] = {}
+    for address, names in wired:
+        for name in names:
+            if name in box_of:
+                raise UsageError(
+                    f"camera {name} hangs on two trigger boxes, {box_of[name]} and {address}.",
+                    why="a camera listens to one line",
+                    fix="name it in one --trigger only",
+                )
+            box_of[name] = address
+    idle = [name for name in cameras if name not in box_of]
+    if idle:
+        raise UsageError(
+            f"on no trigger box hangs {list_some(idle)}.",
+            why="the pictures of a set are of the same pulse, so all cameras are triggered or none",
+            fix=f"add it to a box: --trigger {wired[0][0]}={','.join([*wired[0][1], *idle])}",
+        )
+    if len(wired) == 1:
+        return trigger_from(wired[0][0])
+    addresses = [address for address, _ in wired]
+    twice = next((address for address in addresses if addresses.count(address) > 1), None)
+    if twice is not None:
+        raise UsageError(f"the trigger box {twice} is there twice.", fix="name all its cameras in one --trigger")
+    return TriggerBoxes([(trigger_from(address), names) for address, names in wired])
+
+
+def _read_wires(spec: str, cameras: Sequence[str], *, alone: bool) -> tuple[str, tuple[str, ...]]:
+    """The address of a box and the cameras on it."""
+    address, equals, words = spec.rpartition("=")
+    if not equals:
+        if alone:
+            return spec, tuple(cameras)
+        raise UsageError(
+            f"--trigger {spec} does not say which cameras hang on it.",
+            why="there are several trigger boxes",
+            fix=f"write --trigger {spec}=cam1,cam2",
+        )
+    names = tuple(dict.fromkeys(name.strip() for name in words.split(",") if name.strip()))
+    for name in names:
+        if name not in cameras:
+            raise UsageError(
+                f"--trigger {spec} names {name!r}, and there is no such camera{did_you_mean(name, cameras)}.",
+                fix=f"the cameras are {', '.join(cameras)}",
+            )
+    if not names:
+        raise UsageError(f"--trigger {spec} names no camera.", fix=f"write --trigger {address}=cam1,cam2")
+    return address, names
+
+
+def tell_settings(cameras: Sequence[FrameSource]) -> list[str]:
+    """What the cameras were set to when they were opened, in sentences.
+
+    Args:
+        cameras: Those that cannot tell are left out.
+    """
+    return [text for camera in cameras if isinstance(camera, TellsSettings) for text in camera.tell_settings()]
+
+
+def keep_settings(cameras: Sequence[FrameSource]) -> dict[str, dict[str, str]]:
+    """The same for a later session to compare with: camera -> "device" and "settings".
+
+    Args:
+        cameras: Those that cannot tell are left out.
+    """
+    told = {camera.name: camera.keep_settings() for camera in cameras if isinstance(camera, TellsSettings)}
+    return {name: kept for name, kept in told.items() if kept}
+
+
+def compare_settings(before: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """What is other than in an earlier session, in sentences.
+
+    Args:
+        before: As `keep_settings` gave it then.
+        now: As it gives it now.
+    """
+    told = []
+    for name in before:
+        then, today = before[name], now.get(name, {})
+        if then.get("device") and today.get("device") and then["device"] != today["device"]:
+            told.append(
+                f"camera {name} is another device than before: it was {then['device']}, and is {today['device']}"
+            )
+        told += [
+            f"camera {name}: {text}" for text in changed_settings(then.get("settings", ""), today.get("settings", ""))
+        ]
+    return told
+
+
+def refuse_one_device_twice(cameras: Sequence[FrameSource]) -> None:
+    """UsageError where two cameras are one device, under two of its names.
+
+    Args:
+        cameras: Not opened yet.
+    """
+    devices = [(camera.name, camera.source) for camera in cameras if isinstance(camera, OpenCVCamera) and camera.device]
+    both = shared_device(devices)
+    if both is not None:
+        raise UsageError(
+            f"the cameras {both[0]} and {both[1]} are one and the same device.",
+            fix="give each its own: `ls -l /dev/v4l/by-id /dev/v4l/by-path` lists them",
+        )
 
 
 Driver = TypeVar("Driver")

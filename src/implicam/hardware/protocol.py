@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, wait
+from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
@@ -34,6 +34,7 @@ __all__ = [
     "Robot",
     "RobotDriver",
     "RobotOptions",
+    "TellsSettings",
     "Trigger",
     "TriggerDriver",
     "check_position",
@@ -81,6 +82,17 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Release the camera. Closing twice is harmless; `open` opens it again."""
+
+
+@runtime_checkable
+class TellsSettings(Protocol):
+    """A `FrameSource` that is set when it is opened, and says what has become of it."""
+
+    def tell_settings(self) -> list[str]:
+        """What the camera was set to when it was opened last, in sentences; empty where that is not known."""
+
+    def keep_settings(self) -> dict[str, str]:
+        """The same for a later session to compare with: "device", a name that lasts, and "settings", in words."""
 
 
 class CameraDriver(Protocol):
@@ -379,15 +391,39 @@ def take_frames(cameras: Sequence[FrameSource], trigger: Trigger | None, timeout
         A frame of each camera, in their order.
 
     Raises:
-        HardwareError: The trigger or a camera failed; of a camera, once all have answered, because a camera answers one
-            thread at a time.
+        HardwareError: The trigger or a camera failed, or a camera did not wait for the trigger; once all have answered,
+            because a camera answers one thread at a time. After it, triggered cameras are closed: nothing of this
+            pulse is left for the next.
     """
-    waiting = [pool.submit(camera.frame, timeout) for camera in cameras]
     if trigger is not None:
+        list(pool.map(lambda camera: camera.open(), cameras))  # a camera that is being opened hears no pulse
+    waiting = [pool.submit(camera.frame, timeout) for camera in cameras]
+    if trigger is None:
+        wait(waiting)
+        return [one.result() for one in waiting]
+    try:
         time.sleep(ARMING_SECONDS)
+        _refuse_early(cameras, waiting)
         trigger.fire()
-    wait(waiting)
-    return [one.result() for one in waiting]
+        wait(waiting)
+        return [one.result() for one in waiting]
+    except HardwareError:
+        wait(waiting)
+        for camera in cameras:
+            camera.close()
+        raise
+
+
+def _refuse_early(cameras: Sequence[FrameSource], waiting: Sequence[Future[Frame]]) -> None:
+    """HardwareError where a picture is there before the pulse: it is of another one, or of none."""
+    for camera, one in zip(cameras, waiting, strict=True):
+        if one.done():
+            one.result()  # its own error
+            raise HardwareError(
+                f"camera {camera.name} gave a picture before its trigger fired.",
+                why="it runs freely, or something else fires the trigger",
+                fix="set the camera to wait for its trigger, in its maker's program; or leave --trigger out",
+            )
 
 
 Value = TypeVar("Value")

@@ -16,11 +16,14 @@ import secrets
 import socket
 import threading
 import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import ClassVar, Self
 from urllib.parse import urlsplit
 
 from implicam.errors import HardwareError, UsageError, did_you_mean
+from implicam.hardware.protocol import Trigger
 
 GREETING_PREFIX = "IMPLICAM-TRIGGER 1 "
 PULSE_NUMBERS = 2**31
@@ -156,6 +159,49 @@ def _split_address(address: str) -> tuple[str, int, bool]:
             fix="write udp://host:port or tcp://host:port, for example udp://192.168.0.50:4000",
         )
     return host, port, parts.scheme == "udp"
+
+
+class TriggerBoxes:
+    """Several boxes as one `Trigger`, each for its own cameras: all are told at the same time, in a thread each.
+
+    boxes: The box, and the cameras that hang on it, for messages.
+    """
+
+    def __init__(self, boxes: Sequence[tuple[Trigger, Sequence[str]]]) -> None:
+        self.boxes = tuple((box, tuple(cameras)) for box, cameras in boxes)
+
+    def open(self) -> None:
+        """Connect to all; after an error to none."""
+        try:
+            self._all("open")
+        except HardwareError:
+            self.close()
+            raise
+
+    def fire(self) -> None:
+        """Pulse all boxes once; HardwareError where one of them does not answer, after all have been told."""
+        self._all("fire")
+
+    def close(self) -> None:
+        """Disconnect from all."""
+        for box, _ in self.boxes:
+            box.close()
+
+    def _all(self, what: str) -> None:
+        together = threading.Barrier(len(self.boxes))
+
+        def tell(box: Trigger, cameras: Sequence[str]) -> None:
+            together.wait()
+            try:
+                getattr(box, what)()
+            except HardwareError as error:
+                why = f"{error.why}; the cameras on it are {', '.join(cameras)}" if cameras else error.why
+                raise HardwareError(error.what, why=why, fix=error.fix) from error
+
+        with ThreadPoolExecutor(len(self.boxes)) as pool:
+            told = [pool.submit(tell, box, cameras) for box, cameras in self.boxes]
+        for one in told:
+            one.result()
 
 
 class TriggerSimulator:

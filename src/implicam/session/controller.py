@@ -80,6 +80,7 @@ class Equipment:
         timeout: Seconds for a picture.
         dry_run: The robot is never told to move, so nothing is kept.
         unit: The session's length unit.
+        pulse_every: Seconds from one pulse of the trigger for the live pictures to the next; 0 for no such pulse.
     """
 
     cameras: Sequence[FrameSource]
@@ -90,6 +91,7 @@ class Equipment:
     timeout: float = 10.0
     dry_run: bool = False
     unit: str = "mm"
+    pulse_every: float = 0.0
 
     def __post_init__(self) -> None:
         if not isinstance(self.robot, GuardedRobot) or (self.dry_run and not self.robot.dry_run):
@@ -145,7 +147,9 @@ class SessionController:
         self._halted = threading.Event()  # stop was pressed: nothing moves until `go`
         self._ending = threading.Event()  # the session is being left: nothing moves, whoever says go
         self._targets_without_ball = 0
-        self._live = equipment.trigger is None and all(source.live for source in equipment.cameras)
+        pulsed = equipment.trigger is not None and equipment.pulse_every > 0
+        self._live = pulsed or (equipment.trigger is None and all(source.live for source in equipment.cameras))
+        self._next_pulse = 0.0  # time.monotonic() before which none is fired for live pictures
         loop.history = _read_history(session)
         for skipped in session.skipped:
             loop.refuse(skipped.xyz, skipped.reason)
@@ -368,12 +372,22 @@ class SessionController:
 
     def live(self) -> None:
         """Take new pictures with all cameras to be shown; nothing happens where the session is busy, a picture is being
-        judged, or the cameras do not run freely (a film, a folder, a trigger)."""
+        judged, the cameras do not run freely (a film, a folder), or the trigger has fired for live pictures just now.
+
+        A pulse for live pictures is over when all cameras have given theirs, and a shot waits for that.
+        """
         phase = self.state.phase
-        if not self._live or phase not in ("aim", "done") or not self._camera_lock.acquire(blocking=False):
+        if not self._live or phase not in ("aim", "done") or time.monotonic() < self._next_pulse:
+            return
+        if not self._camera_lock.acquire(blocking=False):
             return
         try:
-            looks = self._detect_all(self._take_frames(None))
+            if self.state.phase != phase:  # a command began just now, and waits for the cameras
+                return
+            frames = self._take_frames(self.equipment.trigger)
+            if self.equipment.trigger is not None:
+                self._next_pulse = time.monotonic() + self.equipment.pulse_every
+            looks = self._detect_all(frames)
             if self.state.phase == phase:
                 self._show(looks=looks)
         except Exception as error:

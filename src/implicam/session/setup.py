@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_na
 from implicam.dataset import Camera, Floats
 from implicam.dataset.units import METRES_PER_UNIT
 from implicam.detect import Ball
-from implicam.errors import UsageError, did_you_mean
+from implicam.errors import HardwareError, UsageError, did_you_mean
 from implicam.hardware import (
     CAMERAS,
     ROBOTS,
@@ -38,13 +38,18 @@ from implicam.hardware import (
     FrameSource,
     Person,
     Robot,
+    TellsSettings,
     Trigger,
     camera_from,
+    compare_settings,
+    keep_settings,
     list_specs,
+    refuse_one_device_twice,
     robot_from,
     simulated_rig,
     take_frames,
-    trigger_from,
+    tell_settings,
+    triggers_from,
 )
 from implicam.registry import Option
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
@@ -52,6 +57,9 @@ from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
 from implicam.session.journal import Session
 from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
+
+CAMERAS_KEY = "camera_settings"
+"""The setting of a session that holds what its cameras were set to, as `keep_settings` gives it."""
 
 SIMULATED = "simulated"
 SIMULATED_SPEED = 0.4
@@ -90,7 +98,13 @@ class Setup:
         _real(lambda: f"One a camera; WHAT is {list_specs(CAMERAS)}", "NAME=WHAT", flags="--camera", kind=list[str]),
     ] = ()
     robot: Annotated[str, _real(lambda: f"{list_specs(ROBOTS)} (default {Person.spec})", "WHAT")] = ""
-    trigger: Annotated[str | None, _real(partial(list_specs, TRIGGERS), "WHAT")] = None
+    trigger: Annotated[
+        tuple[str, ...],
+        _real(lambda: f"{list_specs(TRIGGERS)}; several boxes: one each, =cam1,cam2", "WHAT", kind=list[str]),
+    ] = ()
+    pulse_every: Annotated[float, _real("With a trigger: between pulses for live pictures, 0: none", "SECONDS", 0)] = (
+        1.0
+    )
     speed: Annotated[float | None, _real("Of the robot", "M/S")] = None
     sd: Annotated[float | None, _real("Standard uncertainty of known positions", "LENGTH")] = None
     tool: Annotated[Tool | None, _real("ur: the ball's centre, from the flange", "X,Y,Z", kind=str)] = None
@@ -111,6 +125,9 @@ class Setup:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "cameras", tuple(map(_camera, self.cameras)))
+        _refuse_twice([name for name, _ in self.cameras])
+        trigger: Any = self.trigger or ()  # older sessions have None, or one
+        object.__setattr__(self, "trigger", (trigger,) if isinstance(trigger, str) else tuple(trigger))
         object.__setattr__(self, "tool", None if self.tool is None else _tool(self.tool))
         if self.unit not in METRES_PER_UNIT:
             raise UsageError(
@@ -178,6 +195,12 @@ def _camera(camera: str | Sequence[str]) -> tuple[str, str]:
     return name, spec
 
 
+def _refuse_twice(names: Sequence[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"there are two cameras {name!r}.", fix="give each camera its own name")
+
+
 def _tool(tool: str | Sequence[float]) -> Tool:
     return tuple(position_from_text(tool, "--tool").tolist()) if isinstance(tool, str) else tuple(map(float, tool))
 
@@ -230,6 +253,7 @@ def open_session(
         try:
             now = _continued(session, setup)
             with _connected(_found_again(session, now, say)) as hardware:
+                _compare_cameras(session, hardware[0], say)
                 controller = _made(session, now, hardware, auto)
                 kept = session.settings
                 for key, value in now.as_settings().items():  # once it is known that it works
@@ -241,14 +265,36 @@ def open_session(
             raise
     setup = setup or Setup()
     with _connected(_hardware(setup, say)) as hardware:
+        sized = _sized(setup, hardware[0], say)
         session = Session.create(
             folder,
             name=folder.absolute().name,
             length_unit=setup.unit,
-            cameras=_sized(setup, hardware[0], say),
-            settings=setup.as_settings(),
+            cameras=sized,
+            settings={**setup.as_settings(), CAMERAS_KEY: keep_settings(hardware[0])},
         )
         return _made(session, setup, hardware, auto)
+
+
+def _compare_cameras(session: Session, cameras: Sequence[FrameSource], say: Callable[[str], None]) -> None:
+    """Say which devices are set otherwise than when the session was begun, or are others; one that does not open is the
+    page's to tell."""
+    telling = [camera for camera in cameras if isinstance(camera, TellsSettings)]
+    if not telling:
+        return
+    with ThreadPoolExecutor(len(telling)) as pool:
+        list(pool.map(_opened_once, telling))
+    now = keep_settings(telling)
+    if now:
+        for text in (*tell_settings(telling), *compare_settings(session.settings.get(CAMERAS_KEY, {}), now)):
+            say(text)
+        session.set(CAMERAS_KEY, {**session.settings.get(CAMERAS_KEY, {}), **now})
+
+
+def _opened_once(camera: FrameSource) -> None:
+    with suppress(HardwareError):
+        camera.open()
+    camera.close()
 
 
 @contextmanager
@@ -273,7 +319,7 @@ def _found_again(session: Session, setup: Setup, say: Callable[[str], None]) -> 
             raise
         words = [f"--camera {name}={spec}" for name, spec in before.cameras]
         words += [f"--robot {before.robot}"] if before.robot else []
-        words += [f"--trigger {before.trigger}"] if before.trigger else []
+        words += [f"--trigger {spec}" for spec in before.trigger]
         raise UsageError(
             f"the session in {session.folder} cannot go on: {error.what}",
             why=f"it was begun with {' '.join(words)}; what was measured is kept"
@@ -301,15 +347,16 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
 
 def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> SessionController:
     cameras, robot, workspace = hardware
-    trigger = None if setup.trigger is None else trigger_from(setup.trigger)
+    trigger = _trigger(setup)
     radius = setup.radius
     if radius is None and setup.simulated:
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
     waits = trigger is None and not all(source.live for source in cameras)
     timeout = PICTURE_TIMEOUT_SECONDS if waits else LIVE_TIMEOUT_SECONDS
     equipment = Equipment(
-        cameras, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run, setup.unit
-    )
+        cameras, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run, setup.unit,
+        setup.pulse_every,
+    )  # fmt: skip
     loop = Loop(
         calibrator_from_name(setup.method),
         workspace,
@@ -324,7 +371,7 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
 def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
     if setup.simulated:
         return _simulated(setup)
-    cameras = [camera_from(name, spec, triggered=setup.trigger is not None) for name, spec in setup.cameras]
+    cameras = cameras_of(setup)
     robot = _robot(setup, say)
     if setup.workspace:
         return cameras, robot, workspace_from(setup.workspace, None)
@@ -339,8 +386,31 @@ def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
     return cameras, robot, Workspace.only(places)
 
 
+def cameras_of(setup: Setup) -> list[FrameSource]:
+    """The cameras of a setup with hardware, not opened yet.
+
+    Args:
+        setup: With `cameras`.
+
+    Raises:
+        UsageError: A spec names no camera, or two are one device.
+    """
+    cameras = [camera_from(name, spec, triggered=bool(setup.trigger)) for name, spec in setup.cameras]
+    refuse_one_device_twice(cameras)
+    _trigger(setup)  # what is wrong with its words is said at once
+    return cameras
+
+
+def _trigger(setup: Setup) -> Trigger | None:
+    return triggers_from(setup.trigger, [name for name, _ in setup.cameras])
+
+
 def _simulated(setup: Setup) -> Hardware:
     rig = setup.built()
+    if setup.trigger:
+        raise UsageError(
+            "simulated cameras wait for no trigger.", fix="give cameras (--camera NAME=WHAT), or leave --trigger out"
+        )
     if setup.robot not in ("", SIMULATED):
         raise UsageError(
             f"the robot {setup.robot!r} does not move in front of simulated cameras.",
@@ -378,7 +448,7 @@ def _sized(setup: Setup, cameras: list[FrameSource], say: Callable[[str], None])
     """The cameras with the size of their pictures: one of each is taken, and they are closed again."""
     if setup.simulated:
         return [Camera(camera.name, camera.width, camera.height) for camera in setup.built().cameras]
-    trigger = None if setup.trigger is None else trigger_from(setup.trigger)
+    trigger = _trigger(setup)
     if trigger is None and not all(source.live for source in cameras):
         say("waiting for one picture of each camera, to learn its size")
     with ExitStack() as devices, ThreadPoolExecutor(len(cameras)) as pool:
@@ -388,6 +458,8 @@ def _sized(setup: Setup, cameras: list[FrameSource], say: Callable[[str], None])
             device.open()
         timeout = PICTURE_TIMEOUT_SECONDS if trigger is None else LIVE_TIMEOUT_SECONDS
         frames = take_frames(cameras, trigger, timeout, pool)
+        for text in tell_settings(cameras):
+            say(text)
         sizes = [frame.picture.shape for frame in frames]
     return [Camera(source.name, width, height) for source, (height, width) in zip(cameras, sizes, strict=True)]
 
