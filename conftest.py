@@ -1,9 +1,11 @@
 """Examples in docstrings and Markdown write their files into a folder of their own; the browser of the page tests; how
 much work tests take."""
 
+import atexit
 import os
 import pickle
 import shutil
+import tempfile
 from collections import Counter
 from typing import Any
 
@@ -12,6 +14,9 @@ import pytest
 
 hypothesis.settings.register_profile("any machine", deadline=None)  # on a busy one an example may take a second
 hypothesis.settings.load_profile("any machine")
+
+os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="implicam-state-")  # what was trusted; not the user's
+atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 CPU_SECONDS_OF_A_TEST = 20.0
 CPU_SECONDS_OF_A_FILE = 40.0

@@ -13,6 +13,8 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import TextIO
 
+from implicam.errors import UsageError
+
 LOG = "implicam.log"
 """The file in which a long command tells what it does, in the folder that it writes to."""
 
@@ -43,7 +45,16 @@ def log_to_file(path: Path, begin: str) -> Iterator[None]:
     Args:
         path: The file; its folder is made.
         begin: The first line, such as the command.
+
+    Raises:
+        UsageError: The file is a link: where to is not for a folder from elsewhere to say.
     """
+    if path.is_symlink():
+        raise UsageError(
+            f"{path} is a link to another file.",
+            why="the log would be written there",
+            fix="remove the link; look where the folder comes from",
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     handler = RotatingFileHandler(path, maxBytes=MAX_BYTES, backupCount=1, encoding="utf-8", delay=True)
     handler.setFormatter(_FORMAT)

@@ -154,6 +154,9 @@ def _acquire(
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.", rich_help_panel=_PAGE)
     ] = True,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Use the equipment that a session from elsewhere names: look at it first.")
+    ] = False,
     json: Json = False,
     **options: Any,
 ) -> None:
@@ -181,7 +184,9 @@ def _acquire(
                     why="--unattended is for the simulated rig",
                     fix="use the page: leave --unattended out",
                 )
-            with open_session(folder, None if setup == before else setup, say=show.say) as controller:
+            named = {key for key, value in options.items() if value is not None}
+            wanted = None if setup == before else setup
+            with open_session(folder, wanted, named=named, trust=trust, say=show.say) as controller:
                 if unattended:
                     _run(controller, json)
                 else:

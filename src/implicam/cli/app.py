@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
+from implicam.addresses import HIDDEN, without_secrets
 from implicam.calibration_file import package_version
 from implicam.calibrators import DEFAULT_METHOD, Calibration
 from implicam.dataset import Dataset, TableOptions, read_dataset
@@ -53,8 +54,11 @@ EXAMPLES = {
 
 
 def command_line() -> str:
-    """What was typed, for a log."""
-    return f"implicam {package_version()}: {shlex.join(sys.argv[1:])}"
+    """What was typed, for a log; no passwords and tokens."""
+    words = sys.argv[1:]
+    for i, word in enumerate(words):
+        words[i] = HIDDEN if i and words[i - 1] == "--token" else without_secrets(word)
+    return f"implicam {package_version()}: {shlex.join(words)}"
 
 
 CALIBRATION_SUFFIX = ".implicam"

@@ -7,7 +7,6 @@ device_settings.py.
 from __future__ import annotations
 
 import os
-import re
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.addresses import without_secrets
 from implicam.errors import HardwareError, ImplicamError
 from implicam.films import FILM_ENDINGS
 from implicam.hardware.device_settings import (
@@ -96,7 +96,7 @@ class OpenCVCamera:
         self.name = name
         text = str(source)
         self.source: int | str = int(text) if text.isdecimal() else text
-        self._source_text = re.sub("//[^/]*@", "//...@", text)  # no password in a message
+        self._source_text = without_secrets(text)  # no password in a message
         self.device = isinstance(self.source, int) or _is_device(text)
         self._film = not self.device and not text.startswith(STREAM_PREFIXES)
         self.live = not (triggered or self._film)
@@ -251,7 +251,7 @@ class OpenCVCamera:
         good, image = self._capture.read()
         if not good:
             raise HardwareError(
-                f"camera {self.name}: the film {self.source} is over.",
+                f"camera {self.name}: the film {self._source_text} is over.",
                 why=f"it gave {self._number} pictures",
                 fix="end the session, or close and open it to begin again",
             )

@@ -20,9 +20,10 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
+import time
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,14 @@ from implicam.formatting import json_default
 
 DATABASE = "session.db"
 TABLES_VERSION = 1
+MAX_DATABASE_BYTES = 1_000_000_000
+"""Of a session.db that is opened: some thousand boards of a hundred corners for a rig of 24 cameras."""
+
+MAX_VALUE_BYTES = 64_000_000
+"""Of one text in it."""
+
+MAX_OPENING_SECONDS = 120.0
+"""For which a database may be read until its points are there; one made to be read for ever is refused."""
 APPLICATION_ID = int.from_bytes(b"impc", "big")
 
 # Numbers have no declared type: a column that is REAL turns -0.0 into 0.0, and what is accepted comes back bit by bit.
@@ -134,8 +143,10 @@ class Database:
                 why=f"it has no {path.name}, or may not be looked into",
                 fix="name the folder of a session, or begin one there",
             )
+        _check_files(path)
         database = cls._connect(path, "rw")
         with database._closing_on_error():
+            database._limit_reading()
             database.run("BEGIN EXCLUSIVE")
             database._check()
             database.run("UPDATE session SET opened = ?", now())  # a disk that cannot be written to shows now
@@ -160,9 +171,22 @@ class Database:
             raise _explain_sqlite_error(path, error) from error
         database = cls(path, connection)
         with database._closing_on_error():
-            for setting in ("trusted_schema = OFF", "locking_mode = EXCLUSIVE", "synchronous = EXTRA"):
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
+            connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+            for setting in (
+                "trusted_schema = OFF", "cell_size_check = ON", "secure_delete = ON", "locking_mode = EXCLUSIVE",
+                "synchronous = EXTRA",
+            ):  # fmt: skip
                 database.run(f"PRAGMA {setting}")
         return database
+
+    def _limit_reading(self) -> None:
+        end = time.monotonic() + MAX_OPENING_SECONDS
+        self._connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
+
+    def end_of_reading(self) -> None:
+        """What was opened has been read: from here on nothing limits how long a statement may take."""
+        self._connection.set_progress_handler(None, 0)
 
     def _check(self) -> None:
         (application,), (version,) = self.rows("PRAGMA application_id") + self.rows("PRAGMA user_version")
@@ -182,12 +206,28 @@ class Database:
                 why=f"its tables have the version {version}; this one knows up to {TABLES_VERSION}",
                 fix="update implicam: pip install --upgrade implicam",
             )
+        self._check_schema()
         faults = self.rows("PRAGMA integrity_check(1)")
         if faults != [("ok",)]:
             raise damaged_error(self._path, str(faults[0][0]))
         (pages,), (page_bytes,) = self.rows("PRAGMA page_count") + self.rows("PRAGMA page_size")
         if self._path.stat().st_size < pages * page_bytes:  # SQLite would take zeros for the rest of the last page
             raise damaged_error(self._path, "its end is cut off")
+
+    def _check_schema(self) -> None:
+        """Refuse all but the eight tables as they are made here: a view can be endless, a trigger can do anything."""
+        query = "SELECT type, name, tbl_name, sql FROM sqlite_master"
+        with closing(sqlite3.connect(":memory:")) as made:
+            for table in _TABLES:
+                made.execute(table)
+            ours = set(made.execute(query))
+        found = self.rows(f"{query} LIMIT {2 * len(ours)}")
+        odd = sorted({f"{kind} {str(name)[:60]!r}" for kind, name, *_ in set(found) ^ ours})
+        if odd:
+            raise damaged_error(self._path, f"its tables are not as implicam makes them: {', '.join(odd[:5])}")
+        ((mode,),) = self.rows("PRAGMA journal_mode")
+        if mode != "delete":
+            raise damaged_error(self._path, f"another program changed its journal to {str(mode)[:20]!r}")
 
     def run(self, sql: str, *values: Any) -> None:
         """Execute one statement.
@@ -247,11 +287,32 @@ class Database:
             raise
 
 
+def _check_files(path: Path) -> None:
+    """Refuse what SQLite must not even begin to open; session.db itself is not opened here (`Database._connect`).
+
+    A journal may name a second one of several databases, which SQLite deletes once all is played back, whatever file
+    it is. Ours never has one.
+    """
+    size = path.stat().st_size
+    if size > MAX_DATABASE_BYTES:
+        raise damaged_error(path, f"it has {size:,} bytes, and a session at most {MAX_DATABASE_BYTES:,}")
+    journal = path.with_name(f"{path.name}-journal")
+    with suppress(OSError), journal.open("rb") as file:
+        file.seek(-len(_JOURNAL_MAGIC), os.SEEK_END)
+        if file.read() == _JOURNAL_MAGIC:
+            raise damaged_error(path, f"{journal.name} beside it names another file, which would be deleted")
+
+
+_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")
+
+
 def _explain_sqlite_error(path: Path, error: sqlite3.Error) -> ImplicamError:
     """SQLite's errors, by their names, as ours."""
     name, why = getattr(error, "sqlite_errorname", None) or "", str(error)
     if isinstance(error, sqlite3.ProgrammingError) and "closed" in why:
         return UsageError(f"the session in {path.parent} is closed.", fix="open it again")
+    if name.startswith("SQLITE_INTERRUPT"):
+        return damaged_error(path, f"reading it takes longer than {MAX_OPENING_SECONDS:g} s")
     if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
         return UsageError(
             f"the session in {path.parent} is open elsewhere.",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
@@ -57,7 +56,8 @@ def stale_tables(folder: Path, data: Dataset | None, empty: Dataset) -> dict[str
         File name -> text.
     """
     files = folder_files(data) if data else {DESCRIPTION: description_text(empty)}
-    return {name: text for name, text in files.items() if _read_or_none(folder / name) != text.encode()}
+    ours = {name: text.encode() for name, text in files.items()}
+    return {name: files[name] for name, text in ours.items() if _read_or_none(folder / name, len(text)) != text}
 
 
 def write_beside(beside: ExitStack, folder: Path, files: Mapping[str, str]) -> None:
@@ -92,7 +92,7 @@ def rewrite_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
 
 
 def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
-    """Copy a table that someone changed by hand to undone/ before it is written again.
+    """Move a table that someone changed by hand to undone/ before it is written again; a longer one is not read.
 
     Args:
         folder: Of the session.
@@ -103,9 +103,9 @@ def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> No
     if data is None:  # these two will be removed
         right |= {VIEWS: "", POINTS: ""}
     for name, text in right.items():
-        old = _read_or_none(folder / name)
-        if old and not text.encode().startswith(old):  # else only the last points are missing, after a kill
-            shutil.copyfile(folder / name, _find_free_path(folder / UNDONE / name))
+        file, ours = folder / name, text.encode()
+        if file.is_file() and file.stat().st_size and not ours.startswith(_read_or_none(file, len(ours)) or b"\0"):
+            file.rename(_find_free_path(folder / UNDONE / name))  # else only the last points are missing, after a kill
 
 
 def remove_partial(folder: Path, cameras: Sequence[Camera]) -> None:
@@ -233,8 +233,9 @@ def _choose_bits(picture: Grey) -> int:
     return 8 if np.array_equal(steps * np.float32(1 / 255), picture) else 16
 
 
-def _read_or_none(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+def _read_or_none(path: Path, most: int) -> bytes | None:
+    """What is in a file; None where there is none, or it is longer."""
+    return path.read_bytes() if path.is_file() and path.stat().st_size <= most else None
 
 
 def _find_free_path(path: Path) -> Path:

@@ -75,9 +75,14 @@ class Session:
         with self._reporting_damage():
             ((self.name, self.length_unit),) = database.rows("SELECT name, length_unit FROM session")
             self.cameras = read_cameras(database)
+            for camera in self.cameras:
+                files.check_file_name(camera.name, "camera")
+            for (shot,) in database.rows("SELECT name FROM shots"):
+                files.check_file_name(shot, "shot")
             self._empty = _make_empty_dataset(self.name, self.length_unit, self.cameras)
             self._data = read_accepted(database, self._empty)
             self._settings = {key: json.loads(text) for key, text in database.rows("SELECT key, value FROM settings")}
+        database.end_of_reading()
 
     @classmethod
     def create(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, fields, replace
@@ -26,11 +26,12 @@ from implicam.active import (
 )  # fmt: skip
 from implicam.active.acquisitions import ACQUISITIONS, DEFAULT_ACQUISITION
 from implicam.active.design_model import can_design_experiments, design_error, design_methods
+from implicam.addresses import without_secrets
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
 from implicam.dataset.units import METRES_PER_UNIT
 from implicam.detect import Ball
-from implicam.errors import HardwareError, UsageError, did_you_mean
+from implicam.errors import DatasetError, HardwareError, UsageError, did_you_mean
 from implicam.hardware import (
     CAMERAS,
     ROBOTS,
@@ -56,6 +57,14 @@ from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
 from implicam.session.journal import Session
+from implicam.session.trust import (
+    DEVICES,
+    check_nothing_native,
+    check_passwords,
+    check_trusted,
+    in_words,
+    remember,
+)
 from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
 
 CAMERAS_KEY = "camera_settings"
@@ -154,13 +163,31 @@ class Setup:
 
         Args:
             settings: Plain values; what this version does not know is left out.
+
+        Raises:
+            DatasetError: A value is of another kind.
         """
-        known = {field.name for field in fields(cls)}
-        return cls(**{key: value for key, value in settings.items() if key in known})
+        known = {field.name: field.default for field in fields(cls)}
+        try:
+            for key, default in known.items():
+                if isinstance(default, str) and not isinstance(settings.get(key, ""), str):
+                    raise TypeError(f"{key} is no text")
+            return cls(**{key: value for key, value in settings.items() if key in known})
+        except (TypeError, ValueError, AttributeError) as error:
+            raise DatasetError(
+                "the settings of this session cannot be read.",
+                why=str(error),
+                fix="bring back a copy of session.db, or begin another session",
+            ) from error
 
     def as_settings(self) -> dict[str, Any]:
-        """As plain values, for the session's own table."""
-        return asdict(self)
+        """As plain values, for the session's own table: without passwords."""
+        kept = asdict(self)
+        kept["cameras"] = [[name, without_secrets(spec)] for name, spec in self.cameras]
+        kept["robot"] = without_secrets(self.robot)
+        kept["trigger"] = list(map(without_secrets, self.trigger))
+        kept["tool"] = None if self.tool is None else list(self.tool)
+        return kept
 
     @property
     def simulated(self) -> bool:
@@ -231,7 +258,13 @@ Hardware = tuple[list[FrameSource], Robot, Workspace]
 
 
 def open_session(
-    folder: Path, setup: Setup | None, *, auto: bool = False, say: Callable[[str], None] = print
+    folder: Path,
+    setup: Setup | None,
+    *,
+    auto: bool = False,
+    named: Collection[str] | None = None,
+    trust: bool = False,
+    say: Callable[[str], None] = print,
 ) -> SessionController:
     """The controller of a new session, or of the one in the folder.
 
@@ -242,16 +275,25 @@ def open_session(
         folder: Of the session.
         setup: What to begin it with, or what to change; None for what it was begun with.
         auto: Go on without being asked.
+        named: The fields of `setup` that a person has named just now; None for all where there is a setup. What is left
+            must have been confirmed on this machine before (trust.py).
+        trust: The person confirms all equipment of the session.
         say: Shows a line of text.
 
     Raises:
-        UsageError: The folder is in use or holds something else, or the setup is not possible.
+        UsageError: The folder is in use or holds something else, the setup is not possible, or equipment of a session
+            from elsewhere was not confirmed.
         HardwareError: The robot, or in a new session a camera, does not answer.
     """
     if is_session(folder):
         session = Session.open(folder)
         try:
             now = _continued(session, setup)
+            if named is None:
+                named = () if setup is None else now.as_settings()
+            check_nothing_native(folder, asdict(now))
+            check_trusted(folder, now.as_settings(), named=named, trust=trust)
+            check_passwords(folder, asdict(now))
             with _connected(_found_again(session, now, say)) as hardware:
                 _compare_cameras(session, hardware[0], say)
                 controller = _made(session, now, hardware, auto)
@@ -273,6 +315,7 @@ def open_session(
             cameras=sized,
             settings={**setup.as_settings(), CAMERAS_KEY: keep_settings(hardware[0])},
         )
+        remember(folder, setup.as_settings())
         return _made(session, setup, hardware, auto)
 
 
@@ -317,13 +360,10 @@ def _found_again(session: Session, setup: Setup, say: Callable[[str], None]) -> 
     except UsageError as error:
         if (setup.cameras, setup.robot, setup.trigger) != (before.cameras, before.robot, before.trigger):
             raise
-        words = [f"--camera {name}={spec}" for name, spec in before.cameras]
-        words += [f"--robot {before.robot}"] if before.robot else []
-        words += [f"--trigger {spec}" for spec in before.trigger]
+        words = in_words({key: value for key, value in before.as_settings().items() if key in DEVICES})
         raise UsageError(
             f"the session in {session.folder} cannot go on: {error.what}",
-            why=f"it was begun with {' '.join(words)}; what was measured is kept"
-            + (f". {error.why}" if error.why else ""),
+            why=f"it was begun with {words}; what was measured is kept" + (f". {error.why}" if error.why else ""),
             fix=f"install the package again that brought what is missing, or name another: {error.fix}",
         ) from error
 

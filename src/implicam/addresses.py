@@ -1,0 +1,65 @@
+"""Addresses without their secrets: for what is stored, logged, shown, or sent to somebody else."""
+
+from __future__ import annotations
+
+import re
+
+HIDDEN = "***"
+"""Stands for a user name with its password, or another secret."""
+
+_SCHEME = r"[A-Za-z][A-Za-z0-9+.-]*://"
+_ADDRESS = re.compile(rf"({_SCHEME})([^\s\"'<>\\]*)")
+_DRIVER = re.compile(r"^([A-Za-z]\w*:)([^/@:]+:[^@]*)@(?!.*\.cti$)")  # a driver's user:password@; serial numbers stay
+_SECRET_VALUE = re.compile(
+    r"((?:^|[?&;/_#,\s-])[\w.-]*(?:pass|pwd|psw|token|secret|auth|key|sig|user|usr|login|account|credential|sid)"
+    r"[\w.-]*[=:])[^&;/#\s\"']+",
+    re.IGNORECASE,
+)  # some cameras want user=..._password=... in the path
+
+
+def without_secrets(spec: str) -> str:
+    """An address or another spec of equipment, with `HIDDEN` for user name and password and for values of keys that
+    sound like secrets; all else stays as it is.
+
+    Args:
+        spec: As a command line names a camera, a robot or a trigger.
+
+    >>> without_secrets("rtsp://admin:1234@192.168.0.21:554/main?channel=1&token=abc")
+    'rtsp://***@192.168.0.21:554/main?channel=1&token=***'
+    >>> without_secrets("genicam:22004351@/opt/maker/driver.cti")
+    'genicam:22004351@/opt/maker/driver.cti'
+    """
+
+    def hide(text: str) -> str:
+        return _SECRET_VALUE.sub(rf"\1{HIDDEN}", text)
+
+    scheme = re.search(_SCHEME, spec)
+    if scheme is None:
+        return hide(_DRIVER.sub(rf"\1{HIDDEN}@", spec))
+    before, rest = spec[: scheme.end()], spec[scheme.end() :]
+    authority = re.split(r"[/?#]", rest, maxsplit=1)[0]
+    if "@" in rest and ("@" in authority or not re.fullmatch(r"[^:]*(?::[0-9]*)?|\[.*", authority)):
+        # the last @ ends it: passwords may have others, and slashes
+        return f"{before}{HIDDEN}@{hide(rest[rest.rindex('@') + 1 :])}"
+    return before + authority + hide(rest[len(authority) :])
+
+
+def only_hosts(text: str) -> str:
+    """A text in which addresses are only scheme and host: what follows may be a secret, too, such as a stream's key.
+
+    Args:
+        text: Any, such as lines of a log.
+
+    >>> only_hosts("camera left: rtsp://admin:1234@192.168.0.21:554/main cannot be opened.")
+    'camera left: rtsp://192.168.0.21:554/*** cannot be opened.'
+    """
+
+    def bare(found: re.Match[str]) -> str:
+        scheme, rest = found.groups()
+        authority, more = re.match(r"([^/?#]*)(.*)", rest, re.DOTALL).groups()  # type: ignore[union-attr]
+        host = authority.rpartition("@")[2]
+        if "@" in more or not re.fullmatch(r"[\w.-]*(?::[0-9]{1,5})?[.,;:)]*|\[[0-9A-Fa-f:.]*\](?::[0-9]{1,5})?", host):
+            return f"{scheme}{HIDDEN}"
+        return f"{scheme}{host}" + (f"/{HIDDEN}" if more.strip("/.,;:)") else more)
+
+    return _SECRET_VALUE.sub(rf"\1{HIDDEN}", _ADDRESS.sub(bare, text))
