@@ -1,4 +1,4 @@
-"""Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium); `... verify` draws one of them.
+"""Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium); with `verify` or `view`, one of them.
 
 Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of the demo's
 overlays, and two of simulated boards; compares all methods, which takes minutes.
@@ -17,9 +17,11 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
+from implicam.calibrators import ForwardGP
 from implicam.dataset import read_dataset
 from implicam.detect.labelling import Labelling
 from implicam.detect.model import View
+from implicam.viewer.calibration_page import LiveView
 from implicam.viewer.label_page import open_page
 
 IMAGES = Path(__file__).parent / "images"
@@ -56,6 +58,23 @@ def label(target: Path) -> None:
         browser.close()
 
 
+def view(folder: Path) -> None:
+    """The page of `implicam view`, of six simulated cameras that took photographs."""
+    rig = folder / "rig"
+    implicam("simulate", str(rig), "--images", "--positions", "random", "--points", "60", "--check", "100")
+    calibration = ForwardGP().fit(read_dataset(rig))
+    with LiveView(calibration, pictures=rig / "images", browser=False) as live, sync_playwright() as playwright:
+        live.add(calibration.measure(read_dataset(rig / "check")))
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        page = browser.new_page(viewport={"width": 1440, "height": 900})
+        page.goto(live.url)
+        page.wait_for_selector("body[data-ready]")
+        page.wait_for_selector("body[data-pictures='6']")
+        page.wait_for_timeout(2000)
+        page.screenshot(path=IMAGES / "view.png")
+        browser.close()
+
+
 def implicam(*words: str) -> None:
     """Run a command."""
     subprocess.run([sys.executable, "-m", "implicam", *words], check=True)
@@ -76,9 +95,9 @@ def verify(folder: Path) -> None:
 
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
-    if sys.argv[1:] == ["verify"]:
+    if sys.argv[1:] in (["verify"], ["view"]):
         with tempfile.TemporaryDirectory() as folder:
-            verify(Path(folder))
+            {"verify": verify, "view": view}[sys.argv[1]](Path(folder))
         return
     if sys.argv[1:]:
         label(Path(sys.argv[1]))
@@ -98,6 +117,7 @@ def main() -> None:
         overlay = Image.open(covered / "detections" / "overlays" / "cam5" / "board01.jpg")
         overlay.crop((430, 250, 800, 560)).resize((740, 620)).save(IMAGES / "detect-covered.jpg", quality=85)
         verify(Path(folder))
+        view(Path(folder))
         six = Path(folder) / "six"
         implicam("simulate", str(six), "--positions", "random", "--points", "200", "--check", "300")
         implicam("compare", str(six), "--train", "17,35,87,157", "--seeds", "3", "--check", str(six / "check"),

@@ -53,6 +53,7 @@ MAKES = {
     "verify": {"verify.html", "verify.csv"},
     "compare": {"compare.png"},
     "report": {"report.html"},
+    "view": set(),
     "convert": {"my-rig.csv", "my-rig.csv.toml"},
     "export": {"cameras.toml"},
     "import": {"cameras.implicam"},
@@ -112,8 +113,8 @@ HEAVY_EXAMPLES = ("demo", "compare", "report", "acquire", "paper")
 """Those that take 7 to 50 seconds of work each: with `make test-slow`."""
 
 
-ASKS_A_PERSON = ("label",)
-"""Those that end when a person does: tests/test_labelling.py runs it with a browser."""
+ASKS_A_PERSON = ("label", "view")
+"""Those that end when a person does: tests/test_labelling.py and test_view.py run them with a browser."""
 
 
 def example(command: str, folder: Path, run: Callable[[str, Path], Ran] = real) -> Ran:

@@ -76,6 +76,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.verification import CalibratedLength as CalibratedLength
     from implicam.verification import Verification as Verification
     from implicam.verification import verify as verify
+    from implicam.viewer.calibration_page import LiveView as LiveView
 
     __version__: str
 
@@ -103,6 +104,7 @@ _NAMES = {
     "implicam.stability": ("CalibrationCheck", "CalibrationRepair", "CalibrationWatch", "check_calibration"),
     "implicam.verdict": ("Verdict", "judge"),
     "implicam.verification": ("CalibratedLength", "Verification", "verify"),
+    "implicam.viewer.calibration_page": ("LiveView",),
 }  # fmt: skip
 """Module -> the public names it has."""
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -15,7 +15,8 @@ from implicam.addresses import HIDDEN, without_secrets
 from implicam.calibration_file import package_version
 from implicam.calibrators import DEFAULT_METHOD, Calibration
 from implicam.dataset import Dataset, TableOptions, read_dataset
-from implicam.errors import UsageError, import_extra
+from implicam.dataset.wide import is_unit_missing
+from implicam.errors import DatasetError, UsageError, import_extra
 from implicam.files import is_file_name, refuse_folder
 
 app = typer.Typer(
@@ -41,6 +42,7 @@ EXAMPLES = {
     "verify": "implicam verify my-rig.implicam my-rig/lengths --mpe '0.5 + L/500'",
     "compare": "implicam compare my-rig --train 35,87 --seeds 3 -o compare.png",
     "report": "implicam report my-rig.implicam -o report.html",
+    "view": "implicam view my-rig.implicam my-rig/check",
     "convert": "implicam convert my-rig my-rig.csv",
     "export": "implicam export my-rig.implicam --to aniposelib -o cameras.toml",
     "import": "implicam import cameras.toml -o cameras.implicam",
@@ -105,6 +107,16 @@ def read(
     """The dataset, with the cameras that were asked for; a calibration knows the names that cameras have."""
     names = () if calibration is None else calibration.data.camera_names
     return chosen(read_dataset(path, **asdict(table), cameras=names), cameras, without)
+
+
+def read_to_measure(path: Path, table: TableOptions, fitted: Calibration) -> Dataset:
+    """The unit of data to be measured does not matter; a table that states none is read as in the calibration's."""
+    try:
+        return read(path, table, calibration=fitted)
+    except DatasetError as error:
+        if not is_unit_missing(error):
+            raise
+        return read(path, replace(table, unit=fitted.data.length_unit), calibration=fitted)
 
 
 def chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:

@@ -25,7 +25,8 @@ import implicam.cli.detect
 import implicam.cli.label
 import implicam.cli.paper
 import implicam.cli.simulate
-import implicam.cli.verify  # noqa: F401  these register their commands
+import implicam.cli.verify
+import implicam.cli.view  # noqa: F401  these register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.explicit.boards import has_boards
@@ -50,6 +51,7 @@ from implicam.cli.app import (
     must_be_shot,
     must_not_replace,
     read,
+    read_to_measure,
 )
 from implicam.cli.options import OptionsOfParts, calibrator_from_options, options_of_calibrators, with_table_options
 from implicam.cli.settings import (
@@ -64,10 +66,9 @@ from implicam.dataset import Dataset, TableOptions, write_dataset
 from implicam.dataset.programs import PROGRAMS, read_program, write_program
 from implicam.dataset.table_options import DOCUMENTED
 from implicam.dataset.units import metres_per
-from implicam.dataset.wide import is_unit_missing
 from implicam.dataset.written_table import check_table_name
 from implicam.derived.table import distance_rows, distances_text, read_pairs
-from implicam.errors import DatasetError, UsageError
+from implicam.errors import UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import refuse_folder, toml_text, write_text
 from implicam.formatting import decimal_number, percent
@@ -211,7 +212,7 @@ def measure_command(
     if unit != fitted.data.length_unit:
         metres_per(unit)  # refused before the work
         metres_per(fitted.data.length_unit)
-    data = _read_to_measure(dataset, replace(table, unit=None), fitted)
+    data = read_to_measure(dataset, replace(table, unit=None), fitted)
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
         measured = fitted.measure(data.observations).with_columns(data.further_columns())
@@ -253,16 +254,6 @@ def measure_command(
     if measured.alarm:
         show.alarm(f"{measured.alarm}{'' if measured.alarm.endswith('?') else '.'} Every row says that it is doubtful.")
     raise typer.Exit(int(bool(measured.alarm)))
-
-
-def _read_to_measure(path: Path, table: TableOptions, fitted: Calibration) -> Dataset:
-    """The unit of data to be measured does not matter; a table that states none is read as in the calibration's."""
-    try:
-        return read(path, table, calibration=fitted)
-    except DatasetError as error:
-        if not is_unit_missing(error):
-            raise
-        return read(path, replace(table, unit=fitted.data.length_unit), calibration=fitted)
 
 
 def _typical(sd: Any) -> list[float]:

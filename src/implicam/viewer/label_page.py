@@ -1,19 +1,15 @@
 """The page of `implicam label`: pictures, the drawing of the target, and the labels, which are saved at every click.
 
-A Starlette application on a port of this machine that nobody is told, behind the door of `front.py`, which asks for a
-token. All that is kept is a `Labelling`; the page itself is three files in `templates/`.
+A Starlette application behind the door (`web.py`). All that is kept is a `Labelling`; the page itself is three files in
+`templates/`.
 """
 
 from __future__ import annotations
 
-import json
-import secrets
-import socket
 import threading
 import webbrowser
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,19 +17,14 @@ import numpy as np
 from implicam.detect.labelling import MIN_LABELS_TO_GUESS, Guess, Labelling
 from implicam.detect.labels import MIN_LABELS
 from implicam.detect.model import View
-from implicam.errors import ImplicamError, UsageError, import_extra
+from implicam.errors import UsageError
 from implicam.formatting import short_names
-from implicam.images import brighten, eight_bit, opencv
-from implicam.viewer.front import Front
+from implicam.viewer.web import Endpoint, answer, behind_door, jpeg
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
-    from starlette.requests import Request
-    from starlette.responses import Response
 
-FILES = {"/": "label.html", "/label.css": "label.css", "/label.js": "label.js"}
-
-JPEG_QUALITY = 92
+FILES = {"/": "label.html", "/page.css": "page.css", "/label.css": "label.css", "/label.js": "label.js"}
 
 
 class LabelPage:
@@ -108,68 +99,34 @@ class LabelPage:
     def jpeg(self, view: View, bright: bool) -> bytes:
         """A picture to be shown; it is kept, since it does not change."""
         if (view, bright) not in self._jpegs:
-            grey = eight_bit(self._labelling.picture(view))
-            grey = brighten(grey) if bright else grey
-            cv2 = opencv()
-            done, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-            if not done:
-                raise ImplicamError("the picture cannot be shown.", fix="export it again as PNG")
-            self._jpegs[view, bright] = encoded.tobytes()
+            self._jpegs[view, bright] = jpeg(self._labelling.picture(view), bright=bright)
         return self._jpegs[view, bright]
 
     def application(self, origin: str) -> Starlette:
         """The web application, for those who come by the door that says it is `origin`."""
         from starlette.applications import Starlette
-        from starlette.concurrency import run_in_threadpool
-        from starlette.responses import JSONResponse, Response
+        from starlette.responses import Response
         from starlette.routing import Route
 
-        def answer(
-            work: Callable[[View, Mapping[str, Any]], dict[str, Any]],
-        ) -> Callable[[Request], Awaitable[Response]]:
-            async def endpoint(request: Request) -> Response:
-                if request.headers.get("origin") != origin:
-                    return Response("Come by the front door.", 403)
-                try:
-                    given = dict(request.query_params)
-                    if request.method == "POST":
-                        given = _table(await request.body())
-                    view = View(str(given.get("camera", "")), str(given.get("shot", "")))
-                    return JSONResponse(await run_in_threadpool(work, view, given))
-                except ImplicamError as error:
-                    return JSONResponse({"error": error.what, "why": error.why, "fix": error.fix}, 400)
+        def call(work: Callable[[View, Mapping[str, Any]], dict[str, Any]]) -> Endpoint:
+            return answer(origin, lambda given: work(_view(given), given))
 
-            return endpoint
-
-        async def photograph(request: Request) -> Response:
-            if request.headers.get("origin") != origin:
-                return Response("Come by the front door.", 403)
-            view = View(request.query_params.get("camera", ""), request.query_params.get("shot", ""))
-            try:
-                bright = request.query_params.get("bright") != "0"
-                return Response(await run_in_threadpool(self.jpeg, view, bright), media_type="image/jpeg")
-            except ImplicamError as error:
-                return Response(str(error), 400)
+        def photograph(given: Mapping[str, Any]) -> Response:
+            return Response(self.jpeg(_view(given), given.get("bright") != "0"), media_type="image/jpeg")
 
         reads = (self.labels, self.picture, self.guess)
         writes = (self.place, self.remove, self.skip, self.undo, self.finish)
         return Starlette(
             routes=[
-                *(Route(f"/api/{work.__name__}", answer(work), methods=["GET"]) for work in reads),
-                *(Route(f"/api/{work.__name__}", answer(work), methods=["POST"]) for work in writes),
-                Route("/picture.jpg", photograph),
+                *(Route(f"/api/{work.__name__}", call(work), methods=["GET"]) for work in reads),
+                *(Route(f"/api/{work.__name__}", call(work), methods=["POST"]) for work in writes),
+                Route("/picture.jpg", answer(origin, photograph)),
             ]
         )
 
 
-def _table(body: bytes) -> dict[str, Any]:
-    try:
-        table = json.loads(body)
-    except (ValueError, RecursionError) as error:
-        raise UsageError("the page sent something that is no JSON.", why=str(error), fix="reload it") from error
-    if not isinstance(table, dict):
-        raise UsageError("the page sent something else than a table.", fix="reload it")
-    return table
+def _view(given: Mapping[str, Any]) -> View:
+    return View(str(given.get("camera", "")), str(given.get("shot", "")))
 
 
 def _number(given: Mapping[str, Any], name: str) -> float:
@@ -205,31 +162,11 @@ def open_page(
         MissingExtraError: The web server is not installed.
         ImplicamError: The port is taken.
     """
-    uvicorn = import_extra("uvicorn", "label", "the page of implicam label")
-    import_extra("starlette", "label", "the page of implicam label")
-    page, origin = LabelPage(labelling, then), f"http://{secrets.token_hex(16)}.invalid"
-    inner = socket.create_server(("127.0.0.1", 0))
-    options = {"log_config": None, "access_log": False, "lifespan": "off", "timeout_graceful_shutdown": 2}
-    server = uvicorn.Server(uvicorn.Config(page.application(origin), **options))
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [inner]}, name="implicam-label", daemon=True)
-    with resources.as_file(resources.files("implicam.viewer") / "templates") as folder:
-        front = Front(
-            host="127.0.0.1",
-            port=port,
-            behind=inner.getsockname(),
-            token=secrets.token_urlsafe(16) if token is None else token,
-            files={path: folder / name for path, name in FILES.items()},
-            origin=origin,
-            command="implicam label",
-            stake="it can change your labels",
-        )
-        with inner, front:
-            thread.start()
-            try:
-                yield front.url, page
-            finally:
-                server.should_exit = True
-                thread.join(timeout=5)
+    page = LabelPage(labelling, then)
+    with behind_door(
+        page.application, FILES, port=port, token=token, command="implicam label", stake="it can change your labels"
+    ) as url:
+        yield url, page
 
 
 def serve(

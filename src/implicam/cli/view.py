@@ -1,0 +1,135 @@
+"""`implicam view`: a calibration in three dimensions, in the browser."""
+
+from __future__ import annotations
+
+import time
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from implicam.calibrators import Calibration, load_calibration
+from implicam.cli import show
+from implicam.cli.app import Json, Pattern, command, read_to_measure
+from implicam.cli.options import with_table_options
+from implicam.dataset import Dataset, TableOptions
+from implicam.dataset.table_options import DOCUMENTED
+from implicam.errors import DatasetError, UsageError
+
+LOOK_SECONDS = 0.25
+"""Between two looks at a file that grows."""
+SETTLED_SECONDS = 1.0
+"""A file that has not grown for so long is complete: until then its last point may still get views."""
+
+_PAGE = "The page"
+
+
+@command("view")
+@with_table_options
+def view_command(
+    calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
+    dataset: Annotated[
+        Path | None, typer.Argument(help="What the cameras saw: its points are measured and shown.")
+    ] = None,
+    follow: Annotated[bool, typer.Option("--follow", help="Go on reading DATASET as it grows.")] = False,
+    pictures: Annotated[
+        Path | None, typer.Option("--pictures", metavar="FOLDER", help="Of the cameras (default DATASET/images).")
+    ] = None,
+    pattern: Pattern = None,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free.", rich_help_panel=_PAGE)] = 8092,
+    token: Annotated[
+        str | None, typer.Option("--token", help="What the page asks for (default: a new one).", rich_help_panel=_PAGE)
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.", rich_help_panel=_PAGE)
+    ] = True,
+    table: TableOptions = DOCUMENTED,
+    json: Json = False,
+) -> None:
+    """Look at a calibration in three dimensions: cameras, pictures, uncertainty, and what is measured with it.
+
+    The page is for this machine only. It ends with its button or Ctrl-C.
+    """
+    from implicam.viewer.calibration_page import Pictures, find_camera_pictures, open_page
+
+    if follow and dataset is None:
+        raise UsageError("--follow needs a dataset that grows.", fix="name it after the calibration")
+    fitted = load_calibration(calibration)
+    folder = pictures if pictures is not None else dataset / "images" if dataset is not None else None
+    found: Pictures = {}
+    url, points = "", 0
+    if folder is not None and (pictures is not None or folder.is_dir()):
+        found = find_camera_pictures(folder, pattern, fitted.data.camera_names)
+    first = None if dataset is None else read_to_measure(dataset, table, fitted)
+    try:
+        with open_page(fitted, found, port=port, token=token) as (url, page):
+            show.say(f"Look at it at {url}")
+            show.say("Ctrl-C ends it.")
+            if browser:
+                webbrowser.open(url)
+            if first is not None:
+                measured = fitted.measure(first.observations)
+                page.add(measured)
+                points = len(measured)
+            if follow and dataset is not None and first is not None:
+                follower = _Follower(dataset, table, fitted, first)
+                while not page.closed.wait(LOOK_SECONDS):
+                    new = follower.look()
+                    if new is not None:
+                        page.add(fitted.measure(new.observations))
+                        points += len(new.observations)
+            else:
+                page.closed.wait()
+    except KeyboardInterrupt:
+        pass
+    if json:
+        show.emit_json({"url": url, "cameras": list(fitted.data.camera_names), "points": points})
+    else:
+        show.line(f"ended; {points} measured points were shown")
+
+
+class _Follower:
+    """Points that are new in a dataset since the last look."""
+
+    def __init__(self, path: Path, table: TableOptions, fitted: Calibration, first: Dataset) -> None:
+        self._path, self._table, self._fitted = path, table, fitted
+        self._seen = {str(name) for name in first.observations.points}
+        self._stamp: tuple[tuple[str, int, int], ...] = self._now()
+        self._read, self._changed = self._stamp, time.monotonic()
+        self._told = ""
+
+    def look(self) -> Dataset | None:
+        """Those that have all their views: the last one only where nothing has been written for a while."""
+        stamp = self._now()
+        if stamp != self._stamp:
+            self._stamp, self._changed = stamp, time.monotonic()
+        settled = time.monotonic() - self._changed > SETTLED_SECONDS
+        if self._read == (*stamp, ("settled", int(settled), 0)):
+            return None
+        try:
+            data = read_to_measure(self._path, self._table, self._fitted)
+        except DatasetError as error:  # perhaps half a line is written
+            if settled and self._told != str(error):
+                self._told = str(error)
+                show.note(f"{error.what} {error.why}".strip())
+            return None
+        self._read = (*stamp, ("settled", int(settled), 0))
+        names = [str(name) for name in data.observations.points]
+        new = [row for row, name in enumerate(names) if name not in self._seen]
+        if not settled and new and new[-1] == len(names) - 1:
+            new = new[:-1]
+        self._seen.update(names[row] for row in new)
+        return data.select(np.array(new)) if new else None
+
+    def _now(self) -> tuple[tuple[str, int, int], ...]:
+        files = sorted(self._path.iterdir()) if self._path.is_dir() else [self._path]
+        found = []
+        for file in files:
+            try:
+                about = file.stat()
+            except OSError:  # it is being replaced
+                continue
+            found.append((file.name, about.st_size, about.st_mtime_ns))
+        return tuple(found)
