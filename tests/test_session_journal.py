@@ -23,6 +23,7 @@ from implicam.dataset import Camera, Dataset, KnownPositions, Observations, join
 from implicam.errors import DatasetError, ImageError, ImplicamError, UsageError
 from implicam.images import read_picture
 from implicam.session import Session, is_session
+from implicam.session.folder import Tables
 
 pytest.importorskip("cv2")
 
@@ -148,6 +149,27 @@ def test_a_session_comes_back_as_it_was(tmp_path):
         assert (event.what, event.more) == ("camera lost", {"camera": "right", "after": 3})
         assert skipped.time <= event.time
         assert event.time.utcoffset() is not None
+
+
+def test_tables_grow_by_rows_and_say_what_all_points_say(tmp_path, monkeypatch):
+    """Only the rows of a new shot are written, unless it has other columns: the text is the same to the byte."""
+    counted: list[int] = []
+    plain = Tables.of
+
+    def count(data, empty):
+        counted.append(len(data))
+        return plain(data, empty)
+
+    shots = [shot("p001", 1, extra="a, b"), shot("p002", 2, extra="a, b"), shot("p003", 3, n=3, extra="a, b")]
+    shots += [shot("p004", 4), shot("p005", 5, sd=False), shot("p006", 6, extra="lamp, é"), shot("p007", 7)]
+    with begin(tmp_path / "s") as session:
+        monkeypatch.setattr(Tables, "of", count)
+        for one in shots:
+            session.accept(one)
+            assert session._tables.content == plain(session.data, session.data).content
+            assert_same(files_of(tmp_path / "s"), session.data)
+    # of each its own rows; and of the first, and of those with other columns (sd_y from p003 on), all rows
+    assert counted == [1, 1, 1, 3, 5, 1, 6, 1, 7, 1, 8, 1, 9]
 
 
 def test_people_can_read_the_database(tmp_path):
@@ -315,13 +337,14 @@ def assert_whole(session: Session) -> None:
     assert {p.name for p in folder.iterdir()} <= tops
 
 
-def test_every_point_that_was_accepted_survives_kill_9(tmp_path):
+@pytest.mark.parametrize("kills", [6, pytest.param(60, marks=pytest.mark.slow)])
+def test_every_point_that_was_accepted_survives_kill_9(tmp_path, kills):
     folder, rng = tmp_path / "s", np.random.default_rng(7)
     begin(folder).close()
     (folder / "images" / "right").mkdir(parents=True)
     (folder / "images" / "té st").mkdir()
     accepted: list[str] = []
-    for _ in range(6):
+    for _ in range(kills):
         with child(ACCEPTING, folder) as process:
             assert process.stdout is not None
             assert process.stdout.readline() == "open\n"

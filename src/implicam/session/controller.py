@@ -61,7 +61,8 @@ STOP_REPEAT_SECONDS = 2.0
 """For so long a robot that is to stop is told so again and again."""
 
 HISTORY_KEY = "history"
-"""The setting of the session that holds the curve of the uncertainty."""
+"""The settings of the session that hold the curve of the uncertainty: "history 12" after 12 points. Older sessions have
+all of it in "history"."""
 
 MIN_REPORTED_POINTS = 12
 """Known points from which a report by cross-validation says anything."""
@@ -488,7 +489,8 @@ class SessionController:
         if data is not None and self.equipment.radius is not None:
             data = self._correct_outlines(data)
         self.loop.reset(data)
-        self.session.set(HISTORY_KEY, [json_safe(asdict(step)) for step in self.loop.history])
+        for step in self.loop.history[-1:]:  # those before are there
+            self.session.set(f"{HISTORY_KEY} {step.points}", json_safe(asdict(step)))
         self._show(
             data=data, calibration=self.loop.calibration, predicted=self.loop.predicted,
             history=tuple(self.loop.history), stop=self.loop.stop,
@@ -603,10 +605,17 @@ def _make_notes(state: State) -> Mapping[str, Any]:
 def _read_history(session: Session) -> list[Step]:
     """The curve as far as it was when the session was left; the last point is computed again."""
     kept = 0 if session.data is None else len(session.data) - 1
-    rows = session.settings.get(HISTORY_KEY, [])
-    known: list[dict[str, Any]] = [{key: math.nan if x is None else x for key, x in row.items()} for row in rows]
-    steps = [Step(**row) for row in known]
-    return [step for step in steps if step.points <= kept]
+    settings = session.settings
+    found = [
+        *settings.get(HISTORY_KEY, []),
+        *(row for key, row in settings.items() if key.startswith(f"{HISTORY_KEY} ")),
+    ]
+    try:
+        known: list[dict[str, Any]] = [{key: math.nan if x is None else x for key, x in row.items()} for row in found]
+        steps = {row["points"]: Step(**row) for row in known}
+        return [steps[points] for points in sorted(steps) if points <= kept]
+    except (TypeError, KeyError, AttributeError):  # another version's: the curve begins anew
+        return []
 
 
 def _evaluate(calibration: Calibration) -> Any:

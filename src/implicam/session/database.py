@@ -455,7 +455,8 @@ def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
 
 def _read_extra_columns(rows: list[tuple[Any, ...]], shape: tuple[int, ...], at: Any = slice(None)) -> dict[str, Names]:
     """The further columns, from the last cell of each row, spread over `shape`; empty where a row has none."""
-    cells = [json.loads(row[-1]) for row in rows]
+    texts = {text: json.loads(text) for text in {row[-1] for row in rows}}  # mostly one: {}
+    cells = [texts[row[-1]] for row in rows]
     columns = {}
     for key in dict.fromkeys(key for table in cells for key in table):
         text = np.array([table.get(key, "") for table in cells], dtype=np.str_)

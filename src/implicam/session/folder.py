@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -44,68 +45,87 @@ def writing_into(folder: Path) -> AbstractContextManager[None]:
     return convert_write_errors(f"into {folder}", "the permissions and the free space")
 
 
-def stale_tables(folder: Path, data: Dataset | None, empty: Dataset) -> dict[str, str]:
-    """The dataset's files that say something else than the data, as they should be.
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """The dataset's files as the session's points say them: an export, written whole and never read back.
 
-    Args:
-        folder: Of the session.
-        data: The accepted points; None where there is none, and then only dataset.toml should be there.
-        empty: The same dataset without points.
-
-    Returns:
-        File name -> text.
+    Attributes:
+        content: File name -> bytes; a file that is not named should not be there.
     """
-    files = folder_files(data) if data else {DESCRIPTION: description_text(empty)}
-    ours = {name: text.encode() for name, text in files.items()}
-    return {name: files[name] for name, text in ours.items() if _read_or_none(folder / name, len(text)) != text}
 
+    content: Mapping[str, bytes]
 
-def write_beside(beside: ExitStack, folder: Path, files: Mapping[str, str]) -> None:
-    """Write files under other names first; `beside` renames them when it closes, the last first.
+    @classmethod
+    def of(cls, data: Dataset | None, empty: Dataset) -> Tables:
+        """The tables of all points.
 
-    A new point so gets its position before its views, and an undone one loses them in the other order: who reads
-    between the two finds a dataset at any time.
+        Args:
+            data: The accepted points; None where there is none, and then there is only dataset.toml.
+            empty: The same dataset without points.
+        """
+        files = folder_files(data) if data else {DESCRIPTION: description_text(empty)}
+        return cls({name: text.encode() for name, text in files.items()})
 
-    Args:
-        beside: An open stack of contexts; an error inside it leaves the old files.
-        folder: Of the session.
-        files: File name -> text.
-    """
-    for name, text in files.items():
-        temporary = beside.enter_context(replacing(folder / name))
-        temporary.write_text(text, encoding="utf-8", newline="")
+    def with_shot(self, shot: Dataset, data: Dataset) -> Tables:
+        """The tables after one shot more, whose rows alone are written where the columns stay the same.
 
+        Args:
+            shot: The new points.
+            data: All points with them.
+        """
+        more = Tables.of(shot, shot).content
+        if more.keys() != self.content.keys():
+            return Tables.of(data, data)
+        grown = {DESCRIPTION: more[DESCRIPTION]}
+        for name in more.keys() - {DESCRIPTION}:
+            rows = more[name].index(b"\n") + 1  # no heading has a line break
+            if self.content[name][:rows] != more[name][:rows]:
+                return Tables.of(data, data)
+            grown[name] = self.content[name] + more[name][rows:]
+        return Tables({name: grown[name] for name in more})
 
-def rewrite_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
-    """Make the dataset's files say what the data say, after points were taken away.
+    def write_beside(self, beside: ExitStack, folder: Path, before: Mapping[str, bytes]) -> None:
+        """Write what has changed under other names first; `beside` renames the files when it closes, the last first.
 
-    Args:
-        folder: Of the session.
-        data: The accepted points; None where there is none.
-        empty: The same dataset without points.
-    """
-    with ExitStack() as beside:
-        write_beside(beside, folder, dict(reversed(stale_tables(folder, data, empty).items())))
-    if data is None:
+        A new point so gets its position before its views, and who reads between the two finds a dataset at any time.
+
+        Args:
+            beside: An open stack of contexts; an error inside it leaves the old files.
+            folder: Of the session.
+            before: What is in the files now.
+        """
+        for name, content in self.content.items():
+            if before.get(name) != content:
+                beside.enter_context(replacing(folder / name)).write_bytes(content)
+
+    def rewrite(self, folder: Path) -> None:
+        """Make the files say the same, after points were taken away, or when a session is opened.
+
+        An undone point loses its views first, where a new one gets its position first.
+
+        Args:
+            folder: Of the session.
+        """
+        wrong = {name: text for name, text in self.content.items() if _read_or_none(folder / name, len(text)) != text}
+        with ExitStack() as beside:
+            for name in reversed(wrong):
+                beside.enter_context(replacing(folder / name)).write_bytes(wrong[name])
         for name in (VIEWS, POINTS):
-            (folder / name).unlink(missing_ok=True)
+            if name not in self.content:
+                (folder / name).unlink(missing_ok=True)
 
+    def keep_edited(self, folder: Path) -> None:
+        """Move a table that someone changed by hand to undone/ before it is written again; a longer one is not read.
 
-def keep_edited_tables(folder: Path, data: Dataset | None, empty: Dataset) -> None:
-    """Move a table that someone changed by hand to undone/ before it is written again; a longer one is not read.
-
-    Args:
-        folder: Of the session.
-        data: The accepted points; None where there is none.
-        empty: The same dataset without points.
-    """
-    right = stale_tables(folder, data, empty)
-    if data is None:  # these two will be removed
-        right |= {VIEWS: "", POINTS: ""}
-    for name, text in right.items():
-        file, ours = folder / name, text.encode()
-        if file.is_file() and file.stat().st_size and not ours.startswith(_read_or_none(file, len(ours)) or b"\0"):
-            file.rename(_find_free_path(folder / UNDONE / name))  # else only the last points are missing, after a kill
+        Args:
+            folder: Of the session.
+        """
+        for name in (DESCRIPTION, VIEWS, POINTS):
+            file, ours = folder / name, self.content.get(name, b"")
+            if file.is_file() and file.stat().st_size and not ours.startswith(_read_or_none(file, len(ours)) or b"\0"):
+                file.rename(
+                    _find_free_path(folder / UNDONE / name)
+                )  # else only the last points are missing, after a kill
 
 
 def remove_partial(folder: Path, cameras: Sequence[Camera]) -> None:

@@ -1,7 +1,7 @@
-"""A guided session on disk: a dataset folder, and session.db, which is the truth.
+"""A guided session on disk: session.db is the one store, the dataset's files beside it are an export.
 
-An accepted point is in the database when `accept` returns, and the dataset's files follow. The order makes a kill
-harmless at any moment:
+An accepted point is in the database when `accept` returns, and the files follow; nothing is read back from them
+(docs/decisions/0025-one-store.md). The order makes a kill harmless at any moment:
   1. The new points.csv and observations.csv are written beside the old ones, so that a full disk shows before 2.
   2. The shot's name is committed as `begun`, then its pictures are written (only where there are pictures).
   3. The point is committed. From here on it is accepted.
@@ -81,6 +81,7 @@ class Session:
                 files.check_file_name(shot, "shot")
             self._empty = _make_empty_dataset(self.name, self.length_unit, self.cameras)
             self._data = read_accepted(database, self._empty)
+            self._tables = files.Tables.of(self._data, self._empty)
             self._settings = {key: json.loads(text) for key, text in database.rows("SELECT key, value FROM settings")}
         database.end_of_reading()
 
@@ -183,7 +184,7 @@ class Session:
             noted = json_text(dict(notes), "a note")
             data = join(self._data, shot) if self._data else shot
             try:
-                with self._adding(data):
+                with self._adding(self._tables.with_shot(shot, data)):
                     if pictures:
                         self._commit_begun(name)
                         files.write_pictures(self.folder, name, pictures)
@@ -204,7 +205,8 @@ class Session:
             with self._database.transaction():
                 self._database.run("UPDATE shots SET state = 'undone', time = ? WHERE name = ?", now(), last)
             self._data = read_accepted(self._database, self._empty)
-            self._run_after_commit(self._rewrite_tables)
+            self._tables = files.Tables.of(self._data, self._empty)
+            self._run_after_commit(lambda: self._tables.rewrite(self.folder))
             self._run_after_commit(self._set_pictures_aside)
             return last
 
@@ -320,11 +322,12 @@ class Session:
             self._database.run("INSERT INTO shots (name, state, time) VALUES (?, 'begun', ?)", shot, now())
 
     @contextmanager
-    def _adding(self, data: Dataset) -> Iterator[None]:
+    def _adding(self, tables: files.Tables) -> Iterator[None]:
         """Write the tables of one point more, let the caller commit, and rename them into place."""
         with ExitStack() as beside:
-            files.write_beside(beside, self.folder, files.stale_tables(self.folder, data, self._empty))
+            tables.write_beside(beside, self.folder, self._tables.content)
             yield
+            self._tables = tables
             self._run_after_commit(beside.close)
 
     def _run_after_commit(self, step: Callable[[], None]) -> None:
@@ -334,9 +337,6 @@ class Session:
         except (ImplicamError, OSError) as error:
             with suppress(ImplicamError):
                 self.log("files", problem=str(error))
-
-    def _rewrite_tables(self) -> None:
-        files.rewrite_tables(self.folder, self._data, self._empty)
 
     def _set_pictures_aside(self) -> None:
         """Move the pictures of shots that are no points to undone/, and forget the shots that were only begun."""
@@ -356,8 +356,8 @@ class Session:
         with files.writing_into(self.folder):
             files.remove_partial(self.folder, self.cameras)
             self._set_pictures_aside()
-            files.keep_edited_tables(self.folder, self._data, self._empty)
-            self._rewrite_tables()
+            self._tables.keep_edited(self.folder)
+            self._tables.rewrite(self.folder)
 
 
 def _make_empty_dataset(name: str, length_unit: str, cameras: Sequence[Camera]) -> Dataset:
