@@ -43,9 +43,18 @@ from implicam.hardware import (
     take_frames,
 )
 from implicam.images import blank
+from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
 from implicam.session.detections import Look, reject_implausible
 from implicam.session.journal import Session
+from implicam.session.typed import (
+    TYPED_COLUMN,
+    PositionQuestion,
+    TypedPosition,
+    parse_position,
+    questions_after,
+    questions_before,
+)
 
 _LOG = logging.getLogger(__name__)
 
@@ -105,13 +114,15 @@ class State:
     """All that a page shows. phase: starting, aim, moving, shown, fitting, trouble, done.
 
     message: what to do now, or what went wrong. position: (3,) where the robot says the ball is, or what the person
-    typed; NaN where unknown. looks: the pictures that are being judged (phase shown) or live. stop: why to stop now.
+    typed; NaN where unknown. typed: what the person typed, as it was understood. looks: the pictures that are being
+    judged (phase shown) or live. stop: why to stop now.
     """
 
     phase: str = "starting"
     message: str = ""
     target: Target | None = None
     position: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    typed: TypedPosition | None = None
     looks: tuple[Look, ...] = ()
     history: tuple[Step, ...] = ()
     stop: str = ""
@@ -188,21 +199,44 @@ class SessionController:
             where = self.equipment.robot.move(target.xyz)
             self._take_pictures(where)
 
-    def report_position(self, xyz: Floats) -> None:
+    def report_position(self, position: Floats | Sequence[str] | TypedPosition, *, confirmed: bool = False) -> None:
         """Say where the ball is, as measured by a person, and take pictures of it.
 
+        Numbers are taken as they are. What a person typed is asked about where it is odd: outside of the workspace, far
+        from the target, or far from what the calibration measures there.
+
         Args:
-            xyz: (3,) in the session's length unit, world frame.
+            position: (3,) in the session's length unit, world frame; or the texts of x, y and z; or these as they were
+                understood.
+            confirmed: The person was asked, and it is so.
+
+        Raises:
+            PositionQuestion: The person is to be asked; nothing was done. The same again with `confirmed` takes it.
+            UsageError: A text is no length, or may mean two.
         """
+        typed = None
+        if isinstance(position, TypedPosition):
+            typed = position
+        elif not isinstance(position, np.ndarray):
+            typed = parse_position(position, self.equipment.unit)
+        xyz = np.asarray(position if typed is None else typed.xyz, dtype=np.float64)
+        asks = typed is not None and not confirmed
+        if asks:
+            self._ask(questions_before(xyz, self.equipment.unit, self.loop.workspace, self.state.target))
         with self._working("moving", "looking"):
             if isinstance(self.equipment.robot, MovedByHand):
-                self.equipment.robot.set_position(np.asarray(xyz, dtype=np.float64))
-            self._take_pictures(self.equipment.robot.position())
+                self.equipment.robot.set_position(xyz)
+            self._take_pictures(self.equipment.robot.position(), typed=typed, asks=asks)
+
+    def _ask(self, questions: Sequence[str]) -> None:
+        if questions:
+            _LOG.info("asked: %s", "; ".join(questions))
+            raise PositionQuestion(questions)
 
     def redo(self) -> None:
         """Take pictures again, at the same position."""
         with self._working("moving", "looking again"):
-            self._take_pictures(self.equipment.robot.position())
+            self._take_pictures(self.equipment.robot.position(), typed=self.state.typed)
 
     def accept(self) -> None:
         """Keep what is shown: write it to disk, fit again, and propose the next target."""
@@ -423,11 +457,15 @@ class SessionController:
     @property
     def measured_live(self) -> Floats:
         """(3,) where the calibration sees the ball in the live pictures; NaN where it cannot."""
-        calibration = self.state.calibration
-        if calibration is None or len(self.state.cameras_with_ball) < 2:
-            return np.full(3, np.nan)
-        measured = calibration.measure(self._make_observations("live", self.state.looks))
-        return np.asarray(measured.xyz[0], dtype=np.float64)
+        state = self.state
+        measured = self._measure(state.looks, state.calibration)
+        return np.full(3, np.nan) if measured is None else np.asarray(measured.xyz[0], dtype=np.float64)
+
+    def _measure(self, looks: Sequence[Look], calibration: Calibration | None) -> Measurement | None:
+        """The ball by what the cameras see; None where they cannot tell."""
+        if calibration is None or sum(len(look.found) > 0 for look in looks) < 2:
+            return None
+        return calibration.measure(self._make_observations("live", looks))
 
     # private
 
@@ -535,18 +573,20 @@ class SessionController:
         missing = [name for name in seen if name not in calibration.camera_names]
         return "".join(f". {name} is not calibrated yet: it has seen {seen[name]} points" for name in missing)
 
-    def _take_pictures(self, where: Floats) -> None:
+    def _take_pictures(self, where: Floats, *, typed: TypedPosition | None = None, asks: bool = False) -> None:
         with self._camera_lock:
             frames = self._take_frames(self.equipment.trigger)
         self._check_standing(where)
-        looks = reject_implausible(
-            self._detect_all(frames), where, np.nan_to_num(self.equipment.robot.sd), self.loop.calibration
-        )
+        seen, sd = self._detect_all(frames), np.array(self.equipment.robot.sd, dtype=np.float64)
+        if asks:
+            measured = self._measure(seen, self.loop.calibration)
+            self._ask(questions_after(where, sd, self.equipment.unit, self.loop.workspace, measured))
+        looks = reject_implausible(seen, where, np.nan_to_num(sd), self.loop.calibration)
         count = sum(len(look.found) > 0 for look in looks)
         words = f"found in {count} of {len(looks)} cameras"
         if not count:
             words = "the ball was not found in any camera: redo, or skip this target"
-        self._show(phase="shown", looks=looks, position=where, message=words)
+        self._show(phase="shown", looks=looks, position=where, typed=typed, message=words)
 
     def _check_standing(self, where: Floats) -> None:
         """HardwareError where the robot has left a position while it was photographed."""
@@ -582,7 +622,8 @@ class SessionController:
         name = state.target.name
         observations = self._make_observations(name, state.looks)
         sd = np.array([self.equipment.robot.sd], dtype=np.float64)
-        known = KnownPositions(np.array([name]), state.position[None], sd)
+        columns = {} if state.typed is None else {TYPED_COLUMN: np.array([state.typed.as_typed])}
+        known = KnownPositions(np.array([name]), state.position[None], sd, columns)
         return Dataset(self.session.name, self.session.length_unit, observations, known)
 
     def _make_observations(self, name: str, looks: Sequence[Look]) -> Observations:
