@@ -44,6 +44,7 @@ MAKES = {
     "demo": {"implicam-demo"},
     "simulate": {"my-rig"},
     "board": {"board.pdf"},
+    "shoot": {"my-shots"},
     "detect": set(),
     "label": set(),
     "calibrate": {"my-rig.implicam"},
@@ -201,6 +202,7 @@ def json_commands(made: Path) -> dict[str, list[str]]:
     return {
         "simulate": ["simulate", "out", "--missing", "0.3", "--positions", "random", "--points", "10", "--check", "5"],
         "board": ["board", "print", "--board", "6x9", "--square", "20"],
+        "shoot": ["shoot", "shots", "--cameras", "2R", "--count", "2"],
         "detect": ["detect", str(made / "photos"), "--no-overlays"],
         "calibrate": ["calibrate", rig, "-o", "out.implicam"],
         "measure": ["measure", file, check],

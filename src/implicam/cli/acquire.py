@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from implicam.calibrators import load_calibration
 from implicam.cli import show
 from implicam.cli.app import Json, Seed, command, command_line, must_not_replace
-from implicam.cli.options import Options, OptionsOfParts, options_of_fields
+from implicam.cli.options import OptionsOfParts, options_of_setup
 from implicam.dataset import Floats
 from implicam.dataset.written_table import check_table_name, write_table
 from implicam.errors import ImplicamError, UsageError, import_extra
@@ -30,13 +30,6 @@ from implicam.logs import LOG, log_to_file
 
 if TYPE_CHECKING:
     from implicam.session.controller import SessionController
-
-
-def _setup_options(*names: str) -> Options:
-    """Those of a session, or some of them."""
-    from implicam.session.setup import Setup
-
-    return {"": options_of_fields(Setup, *names)}
 
 
 def _suggest(
@@ -114,7 +107,7 @@ def _suggest(
         show.line(f"{output}: {len(found.targets)} targets")
 
 
-_shared_options = partial(_setup_options, "acquisition", "reach")
+_shared_options = partial(options_of_setup, "acquisition", "reach")
 suggest_command = command("suggest")(OptionsOfParts(_suggest, "workspace", _shared_options))
 
 
@@ -199,7 +192,7 @@ def _acquire(
         raise typer.Exit(130) from None
 
 
-acquire_command = command("acquire")(OptionsOfParts(_acquire, "folder", _setup_options))
+acquire_command = command("acquire")(OptionsOfParts(_acquire, "folder", options_of_setup))
 
 
 @contextmanager

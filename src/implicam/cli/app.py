@@ -33,6 +33,7 @@ EXAMPLES = {
     "demo": "implicam demo",
     "simulate": "implicam simulate my-rig --positions random --points 157 --check 300",
     "board": "implicam board print --board 8x11 --square 16 -o board.pdf",
+    "shoot": "implicam shoot my-shots --cameras 2R --every 100ms --count 3",
     "detect": "implicam detect my-photos --target ball --radius 8",
     "label": "implicam label my-tank",
     "calibrate": "implicam calibrate my-rig -o my-rig.implicam",

@@ -24,6 +24,7 @@ import implicam.cli.design
 import implicam.cli.detect
 import implicam.cli.label
 import implicam.cli.paper
+import implicam.cli.shoot
 import implicam.cli.simulate
 import implicam.cli.verify
 import implicam.cli.view  # noqa: F401  these register their commands

@@ -103,6 +103,17 @@ def options_of_fields(made: type, *names: str) -> dict[str, inspect.Parameter]:
     return found
 
 
+def options_of_setup(*names: str) -> Options:
+    """Those of a guided session, or some of them.
+
+    Args:
+        names: of some of its fields.
+    """
+    from implicam.session.setup import Setup  # late: of few commands
+
+    return {"": options_of_fields(Setup, *names)}
+
+
 def with_table_options(function: Function) -> Function:
     """A command whose parameter `table` is made of the options that tables without a description need.
 

@@ -57,7 +57,7 @@ class OpenCVCamera:
     be set to, as `device_settings.parse_settings` gives it.
     """
 
-    spec: ClassVar[str] = "0, /dev/video0,1280x800,MJPG,fps=60,exposure=200, rtsp://..., http://..., film.avi"
+    spec: ClassVar[str] = "0, /dev/video0,1280x800,MJPG, rtsp://..., http://..., film.avi"
 
     @classmethod
     def takes(cls, spec: str) -> bool:

@@ -111,9 +111,7 @@ class Setup:
         tuple[str, ...],
         _real(lambda: f"{list_specs(TRIGGERS)}; several boxes: one each, =cam1,cam2", "WHAT", kind=list[str]),
     ] = ()
-    pulse_every: Annotated[float, _real("With a trigger: between pulses for live pictures, 0: none", "SECONDS", 0)] = (
-        1.0
-    )
+    pulse_every: Annotated[float, _real("With a trigger: between pulses for live pictures, 0: none", "S")] = 1.0
     speed: Annotated[float | None, _real("Of the robot", "M/S")] = None
     sd: Annotated[float | None, _real("Standard uncertainty of known positions", "LENGTH")] = None
     tool: Annotated[Tool | None, _real("ur: the ball's centre, from the flange", "X,Y,Z", kind=str)] = None
@@ -152,6 +150,8 @@ class Setup:
             value = getattr(self, what)
             if value is not None and not 0 < value < np.inf:
                 raise UsageError(f"{what} = {value:g} is not possible.", fix="give a number greater than zero")
+        if not 0 <= self.pulse_every < np.inf:
+            raise UsageError(f"--pulse-every {self.pulse_every:g} is no time.", fix="give seconds, or 0 for no pulse")
         if self.budget < MIN_POINTS_PER_CAMERA:
             raise UsageError(
                 f"{self.budget} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
@@ -387,7 +387,7 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
 
 def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> SessionController:
     cameras, robot, workspace = hardware
-    trigger = _trigger(setup)
+    trigger = trigger_of(setup)
     radius = setup.radius
     if radius is None and setup.simulated:
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
@@ -426,31 +426,41 @@ def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
     return cameras, robot, Workspace.only(places)
 
 
-def cameras_of(setup: Setup) -> list[FrameSource]:
+def cameras_of(setup: Setup, *, triggered: bool = False) -> list[FrameSource]:
     """The cameras of a setup with hardware, not opened yet.
 
     Args:
         setup: With `cameras`.
+        triggered: Whether another trigger than the setup's exposes them.
 
     Raises:
-        UsageError: A spec names no camera, or two are one device.
+        UsageError: A spec names no camera or no trigger, or two cameras are one device.
     """
-    cameras = [camera_from(name, spec, triggered=bool(setup.trigger)) for name, spec in setup.cameras]
+    triggered = triggered or trigger_of(setup) is not None
+    cameras = [camera_from(name, spec, triggered=triggered) for name, spec in setup.cameras]
     refuse_one_device_twice(cameras)
-    _trigger(setup)  # what is wrong with its words is said at once
     return cameras
 
 
-def _trigger(setup: Setup) -> Trigger | None:
+def trigger_of(setup: Setup) -> Trigger | None:
+    """The trigger of a setup, all its boxes as one, not connected yet; None where it has none.
+
+    Args:
+        setup: Its cameras say which names the boxes may have.
+
+    Raises:
+        UsageError: A spec names no trigger, a camera hangs on no box or on two, or the cameras are simulated.
+    """
+    if setup.trigger and setup.simulated:
+        raise UsageError(
+            "simulated cameras wait for no trigger.", fix="give cameras (--camera NAME=WHAT), or leave --trigger out"
+        )
     return triggers_from(setup.trigger, [name for name, _ in setup.cameras])
 
 
 def _simulated(setup: Setup) -> Hardware:
     rig = setup.built()
-    if setup.trigger:
-        raise UsageError(
-            "simulated cameras wait for no trigger.", fix="give cameras (--camera NAME=WHAT), or leave --trigger out"
-        )
+    trigger_of(setup)  # there must be none
     if setup.robot not in ("", SIMULATED):
         raise UsageError(
             f"the robot {setup.robot!r} does not move in front of simulated cameras.",
@@ -488,7 +498,7 @@ def _sized(setup: Setup, cameras: list[FrameSource], say: Callable[[str], None])
     """The cameras with the size of their pictures: one of each is taken, and they are closed again."""
     if setup.simulated:
         return [Camera(camera.name, camera.width, camera.height) for camera in setup.built().cameras]
-    trigger = _trigger(setup)
+    trigger = trigger_of(setup)
     if trigger is None and not all(source.live for source in cameras):
         say("waiting for one picture of each camera, to learn its size")
     with ExitStack() as devices, ThreadPoolExecutor(len(cameras)) as pool:
