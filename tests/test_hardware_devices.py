@@ -279,6 +279,8 @@ def test_a_camera_is_known_by_a_name_that_lasts(tmp_path: Path, monkeypatch: pyt
         f"camera left is another device than before: it was {by_id / 'usb-Maker_A1'}, and is {by_path / 'usb-0:3'}",
         "camera left: exposure was 200, and is 156",
     ]
+    for nonsense in ([], {"left": 3}, {"left": {"settings": 3}}, {"left": {"settings": "a thousand words"}}):
+        assert compare_settings(nonsense, now) == []  # of a file
     monkeypatch.setattr(device_settings, "device_path", lambda source: Path(source))
     cameras = [OpenCVCamera(name, source) for name, source in (("a", "/dev/x"), ("b", "/dev/y"))]
     refuse_one_device_twice(cameras)

@@ -265,16 +265,19 @@ def keep_settings(cameras: Sequence[FrameSource]) -> dict[str, dict[str, str]]:
     return {name: kept for name, kept in told.items() if kept}
 
 
-def compare_settings(before: Mapping[str, Mapping[str, str]], now: Mapping[str, Mapping[str, str]]) -> list[str]:
+def compare_settings(before: object, now: Mapping[str, Mapping[str, str]]) -> list[str]:
     """What is other than in an earlier session, in sentences.
 
     Args:
-        before: As `keep_settings` gave it then.
+        before: As `keep_settings` gave it then; from a file, so that what is no such thing says nothing.
         now: As it gives it now.
     """
     told = []
-    for name in before:
-        then, today = before[name], now.get(name, {})
+    kept: Mapping[Any, Any] = before if isinstance(before, Mapping) else {}
+    for name, today in now.items():
+        then = kept.get(name)
+        if not isinstance(then, Mapping) or not all(isinstance(text, str) for text in then.values()):
+            continue
         if then.get("device") and today.get("device") and then["device"] != today["device"]:
             told.append(
                 f"camera {name} is another device than before: it was {then['device']}, and is {today['device']}"

@@ -190,7 +190,10 @@ def changed_settings(before: str, now: str) -> list[str]:
         before: Settings as `settings_words` gave them then.
         now: As it gives them now.
     """
-    then, today = (parse_settings(words.split(","), words) if words else {} for words in (before, now))
+    try:
+        then, today = (parse_settings(words.split(","), words) if words else {} for words in (before, now))
+    except UsageError:  # somebody wrote something else there
+        return []
     keys = [key for key in then if key in today and not _same(key, then[key], today[key])]
     return [f"{key} was {_say(then[key])}, and is {_say(today[key])}" for key in keys]
 

@@ -331,7 +331,7 @@ def _compare_cameras(session: Session, cameras: Sequence[FrameSource], say: Call
     if now:
         for text in (*tell_settings(telling), *compare_settings(session.settings.get(CAMERAS_KEY, {}), now)):
             say(text)
-        session.set(CAMERAS_KEY, {**session.settings.get(CAMERAS_KEY, {}), **now})
+        session.set(CAMERAS_KEY, now)
 
 
 def _opened_once(camera: FrameSource) -> None:

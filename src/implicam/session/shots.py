@@ -254,7 +254,7 @@ class ShotFolder:
 
     def tell(self) -> None:
         """Say what USB cameras, which are open, are set to, and whether they were set otherwise before."""
-        before = {camera.name: {key: str(text) for key, text in camera.extra.items()} for camera in self.cameras}
+        before = {camera.name: camera.extra for camera in self.cameras}
         for text in (*tell_settings(self._sources), *compare_settings(before, keep_settings(self._sources))):
             self._say(text)
 
