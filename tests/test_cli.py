@@ -63,6 +63,7 @@ MAKES = {
     "acquire": {"my-session"},
     "paper": {"implicam-paper"},
     "info": set(),
+    "bugreport": {"my-rig-bugreport.zip"},
 }
 
 
@@ -217,6 +218,7 @@ def json_commands(made: Path) -> dict[str, list[str]]:
         "suggest": ["suggest", file, "-n", "3"],
         "design": ["design", "stereo", "--points", "20"],
         "info": ["info", file],
+        "bugreport": ["bugreport", rig],
     }
 
 

@@ -89,8 +89,9 @@ def test_what_may_mean_two_is_refused_with_both(text: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", " ", "abc", "1 2", "12 5", "1,2,3", "1.2.3", "1,23.4", "1.2,3.4", "1,,5", "--3", "0x1F", "nan", "inf", "1_000", "1e",
-     "1e99", "1e999999999", "5 parsec", "３", "10²", "½", "1;2", "=1+1", ".", ",", "-", "mm", "1" * 61, "1,2345,678"],
+    ["", " ", "abc", "1 2", "12 5", "1,2,3", "1.2.3", "1,23.4", "1.2,3.4", "1,,5", "--3", "0x1F", "nan", "inf", "1_000",
+     "1e", "1e99", "1e999999999", "5 parsec",
+     "３", "10²", "½", "1;2", "=1+1", ".", ",", "-", "mm", "1" * 61, "1,2345,678"],
 )  # fmt: skip
 def test_what_is_no_length_is_refused_with_the_cure(text: str) -> None:
     with pytest.raises(UsageError) as told:

@@ -7,12 +7,12 @@ import re
 HIDDEN = "***"
 """Stands for a user name with its password, or another secret."""
 
-_SCHEME = r"[A-Za-z][A-Za-z0-9+.-]*://"
+_SCHEME = r"[A-Za-z][A-Za-z0-9+.-]{0,20}://"
 _ADDRESS = re.compile(rf"({_SCHEME})([^\s\"'<>\\]*)")
 _DRIVER = re.compile(r"^([A-Za-z]\w*:)([^/@:]+:[^@]*)@(?!.*\.cti$)")  # a driver's user:password@; serial numbers stay
 _SECRET_VALUE = re.compile(
-    r"((?:^|[?&;/_#,\s-])[\w.-]*(?:pass|pwd|psw|token|secret|auth|key|sig|user|usr|login|account|credential|sid)"
-    r"[\w.-]*[=:])[^&;/#\s\"']+",
+    r"((?:^|[?&;/_#,\s-])[\w.-]{0,40}(?:pass|pwd|psw|token|secret|auth|key|sig|user|usr|login|account|credential|sid)"
+    r"[\w.-]{0,40}[=:])[^&;/#\s\"']+",
     re.IGNORECASE,
 )  # some cameras want user=..._password=... in the path
 
@@ -42,6 +42,28 @@ def without_secrets(spec: str) -> str:
         # the last @ ends it: passwords may have others, and slashes
         return f"{before}{HIDDEN}@{hide(rest[rest.rindex('@') + 1 :])}"
     return before + authority + hide(rest[len(authority) :])
+
+
+def secrets_of(text: str, *, whole: bool = False) -> set[str]:
+    """The passwords, user names and other secrets that stand in addresses, for a search for them elsewhere.
+
+    Args:
+        text: Any, such as lines of a log.
+        whole: All of it is one address or spec: then a password may have blanks and quotes.
+
+    >>> sorted(secrets_of("opened rtsp://admin:1234@h/x?token=abc twice"))
+    ['1234', 'abc', 'admin']
+    """
+    found = set()
+    for spec in [text] if whole else [one.group(0) for one in _ADDRESS.finditer(text)]:
+        scheme = re.search(_SCHEME, spec)
+        rest = spec[scheme.end() :] if scheme else spec
+        if without_secrets(spec) != spec and "@" in rest:
+            start = 0 if scheme else rest.index(":") + 1  # after a driver's name
+            user, _, password = rest[start : rest.rindex("@")].partition(":")
+            found |= {user, password}
+        found |= {one.group(0)[len(one.group(1)) :] for one in _SECRET_VALUE.finditer(rest)}
+    return {secret for secret in found if secret not in ("", HIDDEN)}
 
 
 def only_hosts(text: str) -> str:

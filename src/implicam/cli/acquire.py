@@ -148,7 +148,8 @@ def _acquire(
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.", rich_help_panel=_PAGE)
     ] = True,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Use the equipment that a session from elsewhere names: look at it first.")
+        bool,
+        typer.Option("--trust", help="Use what a session from elsewhere names", rich_help_panel="Cameras and robot"),
     ] = False,
     json: Json = False,
     **options: Any,

@@ -52,6 +52,7 @@ EXAMPLES = {
     "design": "implicam design bar6 grid9 --points 36 -o design.html",
     "paper": "implicam paper board --quick",
     "info": "implicam info my-rig.implicam",
+    "bugreport": "implicam bugreport my-rig",
 }
 """Command -> an example, in an order in which they can be run."""
 

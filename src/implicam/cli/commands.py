@@ -17,6 +17,7 @@ import typer
 
 import implicam.cli.acquire
 import implicam.cli.board
+import implicam.cli.bugreport
 import implicam.cli.cameras
 import implicam.cli.check
 import implicam.cli.compare

@@ -42,6 +42,7 @@ from implicam.hardware import (
     guard_robot,
     take_frames,
 )
+from implicam.hardware.protocol import format_position
 from implicam.images import blank
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
@@ -252,7 +253,9 @@ class SessionController:
         point = self._make_point(state)
         pictures = {look.camera: look.frame.picture for look in state.looks if look.frame is not None}
         with self._working("fitting", "fitting with everything"):
+            begun = time.monotonic()
             self.session.accept(point, pictures=pictures, notes=_make_notes(state))
+            _LOG.info("%s accepted: on disk after %.3f s", point.points[0], time.monotonic() - begun)
             self._targets_without_ball = 0
             self._fit()
             self._aim()
@@ -267,6 +270,7 @@ class SessionController:
             UsageError: There is no target now.
         """
         target = self._require_target()
+        _LOG.info("%s skipped: %s", target.name, reason)
         with self._working("fitting", "choosing another target"):
             self.session.skip(target.xyz, reason)
             self.loop.refuse(target.xyz, reason)
@@ -482,11 +486,12 @@ class SessionController:
 
     @contextmanager
     def _working(self, phase: str, message: str) -> Iterator[None]:
-        before = self.state
+        before, begun = self.state, time.monotonic()
         _LOG.info("%s: %s", phase, message)
         self._show(phase=phase, message=message)
         try:
             yield
+            _LOG.info("%s took %.2f s", phase, time.monotonic() - begun)
         except ImplicamError as error:
             if isinstance(error, UsageError):  # nothing was done: show the phase before
                 self._show(phase=before.phase, message=before.message)
@@ -528,6 +533,9 @@ class SessionController:
             data = self._correct_outlines(data)
         self.loop.reset(data)
         for step in self.loop.history[-1:]:  # those before are there
+            if math.isfinite(step.usual):
+                unit = self.equipment.unit
+                _LOG.info("%d points: %.3g %s in 95 %% of the workspace", step.points, step.usual, unit)
             self.session.set(f"{HISTORY_KEY} {step.points}", json_safe(asdict(step)))
         self._show(
             data=data, calibration=self.loop.calibration, predicted=self.loop.predicted,
@@ -574,14 +582,21 @@ class SessionController:
         return "".join(f". {name} is not calibrated yet: it has seen {seen[name]} points" for name in missing)
 
     def _take_pictures(self, where: Floats, *, typed: TypedPosition | None = None, asks: bool = False) -> None:
+        begun = time.monotonic()
         with self._camera_lock:
             frames = self._take_frames(self.equipment.trigger)
+        taken = time.monotonic()
         self._check_standing(where)
         seen, sd = self._detect_all(frames), np.array(self.equipment.robot.sd, dtype=np.float64)
         if asks:
             measured = self._measure(seen, self.loop.calibration)
             self._ask(questions_after(where, sd, self.equipment.unit, self.loop.workspace, measured))
         looks = reject_implausible(seen, where, np.nan_to_num(sd), self.loop.calibration)
+        _LOG.info(
+            "%s at %s: %s; pictures took %.2f s, finding the ball %.2f s",
+            self.state.target.name if self.state.target else "no target", format_position(where),
+            ", ".join(map(_look_in_words, looks)), taken - begun, time.monotonic() - taken,
+        )  # fmt: skip
         count = sum(len(look.found) > 0 for look in looks)
         words = f"found in {count} of {len(looks)} cameras"
         if not count:
@@ -633,6 +648,13 @@ class SessionController:
                 uv[0, c], sd[0, c] = look.found.uv[0], look.found.sd[0]
         cameras: Sequence[Camera] = self.session.cameras
         return Observations(np.array([name]), tuple(cameras), uv, sd)
+
+
+def _look_in_words(look: Look) -> str:
+    if not len(look.found):
+        return f"{look.camera} missed it ({look.found.reason or 'no ball'})"
+    u, v = look.uv
+    return f"{look.camera} ({u:.2f}, {v:.2f})"
 
 
 def _make_notes(state: State) -> Mapping[str, Any]:

@@ -22,7 +22,7 @@ import os
 import sqlite3
 import time
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -326,6 +326,27 @@ def _explain_sqlite_error(path: Path, error: sqlite3.Error) -> ImplicamError:
             fix="check the permissions and the free space; every point accepted before is kept",
         )
     return damaged_error(path, why)
+
+
+def copy_database(source: Database, path: Path, change: Callable[[str], str]) -> None:
+    """Write the rows of a database into another file, and nothing else that the file may still hold.
+
+    Args:
+        source: An open one.
+        path: The new file.
+        change: Text of a cell -> text to be written.
+    """
+    with closing(sqlite3.connect(path, isolation_level=None)) as copy:
+        copy.execute("BEGIN")
+        for table in _TABLES:
+            copy.execute(table)
+            name = table.split()[2]
+            for row in source.rows(f"SELECT * FROM {name}"):
+                cells = [change(cell) if isinstance(cell, str) else cell for cell in row]
+                copy.execute(f"INSERT OR IGNORE INTO {name} VALUES ({', '.join('?' * len(cells))})", cells)
+        copy.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        copy.execute(f"PRAGMA user_version = {TABLES_VERSION}")
+        copy.execute("COMMIT")
 
 
 def damaged_error(path: Path, why: str) -> DatasetError:

@@ -88,8 +88,8 @@ def parse_position(texts: Sequence[str], unit: str) -> TypedPosition:
 def parse_length(text: str, unit: str, what: str = "") -> float:
     """The length that a person typed, as the nearest number there is.
 
-    A comma or a point is the decimal sign; the other one, an apostrophe or a thin space may stand between groups of three
-    digits. `1,234` alone may mean either, and is refused.
+    A comma or a point is the decimal sign; the other one, an apostrophe or a thin space may stand between groups of
+    three digits. `1,234` alone may mean either, and is refused.
 
     Args:
         text: Such as "-0.38296", "0,25", "1e-3", "12,5 cm" or "1,234.5".
