@@ -72,12 +72,14 @@ $(VENV)/bin/python:
 	@$(PYTHON) -m venv $(VENV) || \
 	  { echo "Python has no venv module here. On Debian or Ubuntu: apt install python3-venv"; rm -rf $(VENV); exit 1; }
 
-$(VENV)/.demo: pyproject.toml constraints.txt | $(VENV)/bin/python
+KERNEL := setup.py src/implicam/tabulated/kernel.c src/implicam/tabulated/kernel_body.h
+
+$(VENV)/.demo: pyproject.toml constraints.txt $(KERNEL) | $(VENV)/bin/python
 	@echo "Setting up (once) ..."
 	@$(PIP) --editable ".[app]"
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/.dev: pyproject.toml constraints.txt $(KERNEL) | $(VENV)/bin/python
 	@echo "Setting up (once, a few minutes: the tests compare with PyTorch, scikit-learn and OpenCV) ..."
 	@$(PIP) --editable ".[dev]"
 	@touch $@

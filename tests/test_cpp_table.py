@@ -24,9 +24,9 @@ from implicam.calibrators import Calibration
 from implicam.calibrators.protocol import RigCalibration
 from implicam.deploy import cpp_table, write_cpp
 from implicam.deploy.cpp_table import EXAMPLE_FILE, HEADER_FILE, TABLE_FILE
-from implicam.deploy.spline_table import MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR, tabulate
 from implicam.errors import UsageError
 from implicam.simulate import build_rig, random_positions, simulate
+from implicam.tabulated.spline_table import MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR, tabulate
 
 COMPILERS = [name for name in ("g++", "clang++") if shutil.which(name)]
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C++ compiler (g++ or clang++)")

@@ -5,6 +5,7 @@ Every help text ends with an example that a test runs.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -465,6 +466,10 @@ def info_command(
 def _version(shown: bool) -> None:
     if shown:
         typer.echo(f"implicam {calibration_file.package_version()}")
+        if logging.getLogger("implicam").isEnabledFor(logging.INFO):  # -v
+            from implicam.tabulated.library import how_it_measures
+
+            typer.echo(f"many points are measured by tables: {how_it_measures()}")
         raise typer.Exit
 
 

@@ -22,25 +22,18 @@ from numpy.typing import NDArray
 from implicam import calibration_file
 from implicam.calibrators import Calibration
 from implicam.calibrators.protocol import RigCalibration
-from implicam.deploy.spline_table import MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR, SplineTable, tabulate
 from implicam.errors import FitError, UsageError
 from implicam.files import replacing_folder
 from implicam.formatting import percent
-from implicam.geometry import Floats
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig
 from implicam.rig_model.shot_errors import WORLD_POLYNOMIAL_TERMS
+from implicam.tabulated.spline_table import MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR, SplineTable, box_of, tabulate
 
 TABLE_FILE, HEADER_FILE, EXAMPLE_FILE = "rig.table", "implicam.hpp", "example.cpp"
 TABLE_VERSION = 1
-BOX_MARGIN = 0.1
-"""By which the box of the table is larger than that of the known points, on each side, in its sides."""
-
 MAX_NOT_TABULATED = 0.5
 """Of a camera: part of the cells in which the table may be not accurate enough."""
-
-CHANNELS = 8
-"""Of a camera in the section grid: five are used."""
 
 _HEADER, _ENTRY, _ALIGN, _MAX_RANK = 64, 88, 64, 6
 _TYPES = {np.dtype("<f8"): 1, np.dtype("<f4"): 2, np.dtype("u1"): 3}
@@ -76,7 +69,7 @@ def write_cpp(
     The table is exact to 0.3 % of a view's sd and 0.5 % of its variance
     """
     rig = _rig(calibration)
-    low, high = _box(rig, calibration.data.xyz)
+    low, high = box_of(rig, calibration.data.xyz)
     table = tabulate(rig, low, high, progress)
     notes = _notes(rig, table)
     content = table_bytes(rig, table, checksum or calibration_file.checksum(calibration))
@@ -121,14 +114,6 @@ def checked_rig(rig: FittedRig, known_points: int) -> FittedRig:
             fix="calibrate from known points",
         )
     return rig
-
-
-def _box(rig: FittedRig, xyz: Floats) -> tuple[Floats, Floats]:
-    """The box of known points and a margin, in the working frame; a side that is thin has that of the widest."""
-    points = rig.frame.to_working(xyz)
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = BOX_MARGIN * np.maximum(high - low, 0.2 * np.max(high - low))
-    return low - margin, high + margin
 
 
 def _notes(rig: FittedRig, table: SplineTable) -> list[str]:
@@ -182,8 +167,6 @@ def table_bytes(rig: FittedRig, table: SplineTable, checksum: str) -> bytes:
 def _sections(rig: FittedRig, table: SplineTable) -> dict[str, NDArray[Any]]:
     models, C = rig.posterior.models, len(rig.cameras)
     cameras = [rig.trained.cameras[c] for c in rig.cameras]
-    grid = np.zeros((*table.own.shape[:4], CHANNELS), dtype=np.float32)
-    grid[..., :5] = table.own
     marks = np.packbits(table.marked, axis=3, bitorder="little")
     accuracy = [table.pixel_error, table.variance_error, float(table.marked.mean()), table.places]
     s = rig.settings
@@ -201,7 +184,7 @@ def _sections(rig: FittedRig, table: SplineTable) -> dict[str, NDArray[Any]]:
         "sensors": np.array(sensors, dtype=np.float64),
         "projections": table.projections.reshape(C, 12),
         "marks": marks,
-        "grid": grid,
+        "grid": table.grid(),
     }
     if table.ties.shape[3]:
         found["ties"] = table.ties

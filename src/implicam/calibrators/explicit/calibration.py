@@ -259,12 +259,13 @@ class ExplicitCalibration(RigCalibration):
             )
         return super().with_repair(repair)
 
-    def measure(self, observations: Observations | Dataset) -> Measurement:
+    def measure(self, observations: Observations | Dataset, *, exact: bool | None = None) -> Measurement:
         """Measure each point with the views it has, two or more: by maximum likelihood; with the paper's presets by
         linear triangulation.
 
         Args:
             observations: What the cameras saw, by their names; or a dataset that has it.
+            exact: As of `RigCalibration`; the paper's presets are always.
 
         Returns:
             Positions in the world with error bars, and of each point without one the reason.
@@ -273,15 +274,16 @@ class ExplicitCalibration(RigCalibration):
             DatasetError: None of the cameras is one of the calibration, or one has images of another size.
         """
         if self.fitted.inflation is None:
-            return self.map.measure(observations)
+            return super().measure(observations, exact=exact)
         return measure_linearly(self.fitted, self.map, observations_of(observations))
 
-    def measure_pixels(self, uv: ArrayLike, noise: ArrayLike | None = None) -> MeasuredPixels:
+    def measure_pixels(self, uv: ArrayLike, noise: ArrayLike | None = None, *, exact: bool = False) -> MeasuredPixels:
         """As of `RigCalibration`; the paper's presets, which triangulate in a way of their own, do not offer it.
 
         Args:
             uv: (n, C, 2) pixels of the calibrated cameras, in the order of `camera_names`; NaN where not seen.
             noise: Standard uncertainty of the views in pixels: a number, (C,) or (n, C); None for the usual one.
+            exact: As of `RigCalibration`.
 
         Returns:
             Positions in the world with covariances, as arrays.
@@ -295,7 +297,7 @@ class ExplicitCalibration(RigCalibration):
                 why="it triangulates as the paper did",
                 fix="measure(ic.Dataset.from_arrays(uv)), or calibrate with explicit",
             )
-        return super().measure_pixels(uv, noise)
+        return super().measure_pixels(uv, noise, exact=exact)
 
     @property
     def unused(self) -> tuple[Unused, ...]:

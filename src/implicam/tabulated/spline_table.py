@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from implicam.geometry import Bools, Floats
 from implicam.progress import Progress, silent
-from implicam.rig_model import FittedRig
+from implicam.rig_model import FittedRig, apply_covariance_root
+from implicam.threads import side_by_side
 
 MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR = 0.003, 0.005
 """Of the table: in standard deviations of a view, and in its variance."""
@@ -36,16 +37,21 @@ CHECKED_PLACES, CHECK_ROUNDS = 2000, 4
 
 ROWS_AT_A_TIME = 512
 
+CHANNELS = 8
+"""Of a camera in `SplineTable.grid`: five are used."""
+
 
 class Exact(NamedTuple):
     """What C cameras see of n places.
 
-    mean (n, C, 2) pixels; covariance (n, 2C, 2C) of what is unknown of the cameras, without the noise of a view;
+    mean (n, C, 2) pixels; own (n, C, 2, 2) covariance of what is unknown of each camera, without the noise of a view;
+    joint (n, C, 2, C, 2) the same of all together, where errors of known positions tie the cameras, else None;
     through (n, 2C, k) covariance with the unknowns of the labels.
     """
 
     mean: Floats
-    covariance: Floats
+    own: Floats
+    joint: Floats | None
     through: Floats
 
 
@@ -59,32 +65,33 @@ def look(rig: FittedRig, points: Floats) -> Exact:
     Returns:
         NaN where a camera has no answer.
     """
-    parts = [_look(rig, points[i : i + ROWS_AT_A_TIME]) for i in range(0, len(points), ROWS_AT_A_TIME)]
-    return Exact(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    some = [points[i : i + ROWS_AT_A_TIME] for i in range(0, len(points), ROWS_AT_A_TIME)]
+    mean, own, joint, through = zip(*side_by_side(lambda part: _look(rig, part), some), strict=True)
+    together = np.concatenate(joint) if rig.posterior.tied else None
+    return Exact(np.concatenate(mean), np.concatenate(own), together, np.concatenate(through))
 
 
 def _look(rig: FittedRig, points: Floats) -> Exact:
-    n, C = len(points), len(rig.cameras)
-    covariance = np.zeros((n, C, 2, C, 2))
+    n, C, posterior = len(points), len(rig.cameras), rig.posterior
     unknowns = None if rig.labels is None else rig.labels.unknowns
     through = np.zeros((n, 2 * C, 0 if unknowns is None else len(unknowns.mean)))
+    mean, own = np.empty((n, C, 2)), np.empty((n, C, 2, 2))
+    halves = []
     with np.errstate(all="ignore"):
-        mean = np.stack([model.predict(points)[0] for model in rig.posterior.models], axis=1)
-        found = rig.sensitivities(rig.frame.to_world(points))
-        if rig.posterior.tied:
-            of = found[0]
-            covariance = (of.half @ of.half.swapaxes(1, 2)).reshape(n, C, 2, C, 2)
-            rest = of.rest.reshape(n, C, 2)
-            if unknowns is not None:
-                through = of.half @ unknowns.cross
-        else:
-            rest = np.stack([of.rest for of in found], axis=1)
-            for c, of in enumerate(found):
-                covariance[:, c, :, c] = of.half @ of.half.swapaxes(1, 2)
+        for c, model in enumerate(posterior.models):
+            rows = model.rows(points)
+            half = apply_covariance_root(rows, posterior.root(c))
+            mean[:, c] = rows.mean
+            own[:, c] = half @ half.swapaxes(1, 2) + rows.rest[:, None, None] * np.eye(2)
+            if posterior.tied:
+                halves.append(half)
+        if not posterior.tied:
+            return Exact(mean, own, None, through)
+        every = np.concatenate(halves, axis=1)
+        joint = (every @ every.swapaxes(1, 2)).reshape(n, C, 2, C, 2)
         for c in range(C):
-            for k in range(2):
-                covariance[:, c, k, c, k] += rest[:, c, k]
-    return Exact(mean, covariance.reshape(n, 2 * C, 2 * C), through)
+            joint[:, c, :, c] = own[:, c]
+        return Exact(mean, own, joint, through if unknowns is None else every @ unknowns.cross)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +139,9 @@ class SplineTable:
         """
         t = np.clip((points - self.low) / self.step, 0, self.cells)
         cell = np.minimum(t.astype(np.int64), self.cells - 1)
-        weights = _weights(t - cell)  # (n, 3, 4)
+        each = weights(t - cell)  # (n, 3, 4)
         near = cell[:, :, None] + np.arange(4)
-        w = weights[:, 0, :, None, None] * weights[:, 1, None, :, None] * weights[:, 2, None, None, :]
+        w = each[:, 0, :, None, None] * each[:, 1, None, :, None] * each[:, 2, None, None, :]
         index = near[:, 0, :, None, None], near[:, 1, None, :, None], near[:, 2, None, None, :]
 
         def interpolated(table: NDArray[np.float32]) -> Floats:
@@ -147,14 +154,43 @@ class SplineTable:
 
         own, ties, C = interpolated(self.own), interpolated(self.ties), len(self.projections)
         mean = own[..., :2] + _project(self.projections, points)
-        covariance = np.zeros((len(points), C, 2, C, 2))
-        for c in range(C):
-            covariance[:, c, :, c] = own[:, c][:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-        for pair, (c, d) in enumerate(_pairs(C) if self.ties.shape[3] else []):
-            covariance[:, c, :, d] = ties[:, pair].reshape(-1, 2, 2)
-            covariance[:, d, :, c] = ties[:, pair].reshape(-1, 2, 2).swapaxes(1, 2)
+        covariance = own[..., [2, 3, 3, 4]].reshape(len(points), C, 2, 2)
+        joint = None
+        if self.ties.shape[3]:
+            joint = np.zeros((len(points), C, 2, C, 2))
+            for c in range(C):
+                joint[:, c, :, c] = covariance[:, c]
+            for pair, (c, d) in enumerate(_pairs(C)):
+                joint[:, c, :, d] = ties[:, pair].reshape(-1, 2, 2)
+                joint[:, d, :, c] = joint[:, c, :, d].swapaxes(1, 2)
         through = interpolated(self.through).reshape(len(points), 2 * C, -1)
-        return Exact(mean, covariance.reshape(-1, 2 * C, 2 * C), through), cell
+        return Exact(mean, covariance, joint, through), cell
+
+    def grid(self) -> NDArray[np.float32]:
+        """(nx, ny, nz, C, CHANNELS) `own` and zeros, so that one load brings all of a camera at a node."""
+        padded = np.zeros((*self.own.shape[:4], CHANNELS), dtype=np.float32)
+        padded[..., :5] = self.own
+        return padded
+
+
+BOX_MARGIN = 0.1
+"""By which the box of a table is larger than that of the known points, on each side, in its sides."""
+
+
+def box_of(rig: FittedRig, xyz: Floats) -> tuple[Floats, Floats]:
+    """The box of known points and a margin; a side that is thin has that of the widest.
+
+    Args:
+        rig: The cameras.
+        xyz: (n, 3) known points, in the world.
+
+    Returns:
+        The lowest and the highest corner, in the working frame.
+    """
+    points = rig.frame.to_working(xyz)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = BOX_MARGIN * np.maximum(high - low, 0.2 * np.max(high - low))
+    return low - margin, high + margin
 
 
 def tabulate(rig: FittedRig, low: Floats, high: Floats, progress: Progress = silent) -> SplineTable:
@@ -224,17 +260,18 @@ class _Comparison:
     def off(self, found: Exact, exact: Exact) -> tuple[Floats, Floats]:
         """(n, C) errors of pixels over the sd of a view, and of the covariances of each camera over its variance."""
         n, C = exact.mean.shape[:2]
-        S = np.einsum("nii->ni", exact.covariance).reshape(n, C, 2) + self.noise[:, None] ** 2
-        sd = np.sqrt(S)
-        flat = sd.reshape(n, 2 * C)
+        sd = np.sqrt(np.einsum("ncii->nci", exact.own) + self.noise[:, None] ** 2)
         pixel = np.max(np.abs(found.mean - exact.mean) / sd, axis=2)
-        relative = np.abs(found.covariance - exact.covariance) / (flat[:, :, None] * flat[:, None, :])
-        relative = np.where(np.isfinite(relative), relative, 0.0)  # of a pair whose other camera does not see it
-        variance = relative.reshape(n, C, 2, 2 * C).max(axis=(2, 3))
+        variance = np.abs(found.own - exact.own) / (sd[..., :, None] * sd[..., None, :])
+        worst = np.asarray(variance.max(axis=(2, 3)))
+        if exact.joint is not None and found.joint is not None:
+            ties = np.abs(found.joint - exact.joint) / (sd[:, :, :, None, None] * sd[:, None, None])
+            ties = np.where(np.isfinite(ties), ties, 0.0)  # of a pair whose other camera does not see it
+            worst = np.maximum(worst, ties.max(axis=(2, 3, 4)))
         if exact.through.shape[2]:
-            ties = np.abs(found.through - exact.through) / flat[:, :, None]
-            variance = np.maximum(variance, ties.reshape(n, C, -1).max(axis=2))
-        return pixel, variance
+            off = np.abs(found.through - exact.through) / sd.reshape(n, 2 * C, 1)
+            worst = np.maximum(worst, off.reshape(n, C, -1).max(axis=2))
+        return np.asarray(pixel), worst
 
     def errors(self, table: SplineTable, places: Floats) -> tuple[Floats, Floats, NDArray[np.int64], Bools]:
         """At places (n, 3): both errors (n, C), zero where a camera does not see a place; the cells (n, 3); and
@@ -283,48 +320,83 @@ def _pairs(C: int) -> list[tuple[int, int]]:
     return [(c, d) for c in range(C) for d in range(c + 1, C)]
 
 
-def _weights(f: Floats) -> Floats:
-    """(..., 4) weights of uniform cubic B-splines at the part f of a cell."""
+def weights(f: Floats) -> Floats:
+    """Weights of uniform cubic B-splines.
+
+    Args:
+        f: (...) the part of a cell.
+
+    Returns:
+        (..., 4).
+    """
     g = 1 - f
     both = [g**3, 3 * f**3 - 6 * f**2 + 4, -3 * f**3 + 3 * f**2 + 3 * f + 1, f**3]
     return np.stack(both, axis=-1) / 6
 
 
-def _sites(cells: int) -> Floats:
-    """(cells + 3,) where a spline takes its values, in cells: the nodes, and the middles of the outermost cells."""
+def slopes(f: Floats) -> Floats:
+    """Slopes of `weights` by f.
+
+    Args:
+        f: (...) the part of a cell.
+
+    Returns:
+        (..., 4) per cell.
+    """
+    return np.stack([-((1 - f) ** 2), 3 * f**2 - 4 * f, -3 * f**2 + 2 * f + 1, f**2], axis=-1) / 2
+
+
+def sites(cells: int) -> Floats:
+    """Where a spline takes its values: the nodes, and the middles of the outermost cells.
+
+    Args:
+        cells: How many there are.
+
+    Returns:
+        (cells + 3,) in cells.
+    """
     return np.sort(np.append(np.arange(cells + 1.0), [0.5, cells - 0.5]))
 
 
-def _coefficients(cells: int) -> Floats:
-    """(cells + 3, cells + 3) coefficients from the values at the sites."""
-    return np.asarray(np.linalg.inv(_basis(_sites(cells), cells)))
+def coefficients(cells: int) -> Floats:
+    """Coefficients from the values at the sites.
+
+    Args:
+        cells: How many there are.
+
+    Returns:
+        (cells + 3, cells + 3).
+    """
+    return np.asarray(np.linalg.inv(_basis(sites(cells), cells)))
 
 
 def _basis(t: Floats, cells: int) -> Floats:
     """(n, cells + 3) weights of all coefficients at t, in cells."""
     cell = np.minimum(t.astype(np.int64), cells - 1)
     out = np.zeros((len(t), cells + 3))
-    out[np.arange(len(t))[:, None], cell[:, None] + np.arange(4)] = _weights(t - cell)
+    out[np.arange(len(t))[:, None], cell[:, None] + np.arange(4)] = weights(t - cell)
     return out
 
 
-def _channels(exact: Exact, projections: Floats, points: Floats, tied: bool) -> Floats:
+def _channels(exact: Exact, projections: Floats, points: Floats) -> Floats:
     """(n, channels) all that is tabulated: own, ties and through, one after the other."""
     n, C = exact.mean.shape[:2]
-    S = exact.covariance.reshape(n, C, 2, C, 2)
-    own = np.stack(
-        [
-            np.column_stack([mean, S[:, c, :, c].reshape(n, 4)[:, [0, 1, 3]]])
-            for c, mean in enumerate((exact.mean - _project(projections, points)).swapaxes(0, 1))
-        ],
-        axis=1,
+    own = np.concatenate(
+        [exact.mean - _project(projections, points), exact.own.reshape(n, C, 4)[:, :, [0, 1, 3]]], axis=2
     )
-    ties = [S[:, c, :, d].reshape(n, 4) for c, d in _pairs(C)] if tied else []
+    ties = [] if exact.joint is None else [exact.joint[:, c, :, d].reshape(n, 4) for c, d in _pairs(C)]
     return np.column_stack([own.reshape(n, -1), *ties, exact.through.reshape(n, -1)])
 
 
-def _filled(values: Floats) -> Floats:
-    """(nx, ny, nz) with what is NaN filled smoothly from around: the mean of the neighbours, again and again."""
+def filled(values: Floats) -> Floats:
+    """With what is NaN filled smoothly from around: the mean of the neighbours, again and again.
+
+    Args:
+        values: (nx, ny, nz).
+
+    Returns:
+        (nx, ny, nz), zero where there is nothing at all.
+    """
     hole = ~np.isfinite(values)
     if not hole.any() or hole.all():
         return np.where(hole, 0.0, values)
@@ -340,24 +412,25 @@ def _build(
     rig: FittedRig, low: Floats, high: Floats, cells: tuple[int, ...], projections: Floats, compare: _Comparison
 ) -> SplineTable:
     step = (high - low) / np.array(cells)
-    axes = [a + _sites(count) * size for a, count, size in zip(low, cells, step, strict=True)]
+    axes = [a + sites(count) * size for a, count, size in zip(low, cells, step, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     sides = points.shape[:3]
     exact = look(rig, points.reshape(-1, 3))
-    tied, C, k = rig.posterior.tied, len(projections), exact.through.shape[2]
+    C, k = len(projections), exact.through.shape[2]
     near = compare.visible(exact.mean, MAX_TABLE_HALVES)
-    rows = np.repeat(near, 2, axis=1)
+    every = near[:, :, None, None, None] & near[:, None, None, :, None]
     exact = Exact(
         np.where(near[..., None], exact.mean, np.nan),
-        np.where(rows[:, :, None] & rows[:, None, :], exact.covariance, np.nan),
-        np.where(rows[:, :, None], exact.through, np.nan),
+        np.where(near[..., None, None], exact.own, np.nan),
+        None if exact.joint is None else np.where(every, exact.joint, np.nan),
+        np.where(np.repeat(near, 2, axis=1)[:, :, None], exact.through, np.nan),
     )
-    values = _channels(exact, projections, points.reshape(-1, 3), tied).reshape(*sides, -1)
+    values = _channels(exact, projections, points.reshape(-1, 3)).reshape(*sides, -1)
     for channel in np.flatnonzero(~np.isfinite(values).all(axis=(0, 1, 2))):
-        values[..., channel] = _filled(values[..., channel])
+        values[..., channel] = filled(values[..., channel])
     for axis, count in enumerate(cells):
-        values = np.moveaxis(np.tensordot(_coefficients(count), values, axes=(1, axis)), 0, axis)
-    pairs = len(_pairs(C)) if tied else 0
+        values = np.moveaxis(np.tensordot(coefficients(count), values, axes=(1, axis)), 0, axis)
+    pairs = len(_pairs(C)) if rig.posterior.tied else 0
     own, ties, through = np.split(values.astype(np.float32), [5 * C, 5 * C + 4 * pairs], axis=3)
     return SplineTable(
         low, step, projections, own.reshape(*sides, C, 5), ties.reshape(*sides, pairs, 4),
@@ -379,7 +452,7 @@ def _cells(rig: FittedRig, low: Floats, high: Floats, projections: Floats, compa
             lines.append(points)
         every = np.concatenate(lines)
         exact = look(rig, every)
-        channels = _channels(exact, projections, every, rig.posterior.tied).reshape(LINES, len(t), -1)
+        channels = _channels(exact, projections, every).reshape(LINES, len(t), -1)
         scale = _scales(exact, compare, rig.posterior.tied).reshape(LINES, len(t), -1)
         enough = cells_are_enough(channels, scale)
         needed.append(next((count for count in CELLS if enough(count)), CELLS[-1]))
@@ -400,8 +473,8 @@ def cells_are_enough(channels: Floats, scale: Floats) -> Callable[[int], bool]:
 
     def enough(cells: int) -> bool:
         t = np.linspace(0, cells, LINE_STEPS + 1)
-        at = np.round(_sites(cells) * LINE_STEPS / cells).astype(np.int64)
-        turn = _basis(t, cells) @ _coefficients(cells)
+        at = np.round(sites(cells) * LINE_STEPS / cells).astype(np.int64)
+        turn = _basis(t, cells) @ coefficients(cells)
         for line, exact, allowed in zip(lines, channels, scale, strict=True):
             off = np.abs(turn @ line[at] - exact) / allowed
             off = off[np.isfinite(off)]
@@ -423,7 +496,7 @@ def _filled_line(line: Floats) -> Floats:
 def _scales(exact: Exact, compare: _Comparison, tied: bool) -> Floats:
     """(n, channels) what each channel may be off; NaN where a camera does not see a place."""
     n, C = exact.mean.shape[:2]
-    S = np.einsum("nii->ni", exact.covariance).reshape(n, C, 2) + compare.noise[:, None] ** 2
+    S = np.einsum("ncii->nci", exact.own) + compare.noise[:, None] ** 2
     S = np.where(compare.visible(exact.mean, MAX_IMAGE_HALVES)[..., None], S, np.nan)
     sd = np.sqrt(S)
     pairs = np.array([[0, 0], [0, 1], [1, 1]])

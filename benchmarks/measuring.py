@@ -1,0 +1,149 @@
+"""How fast points are measured: by tables, compiled and by NumPy, and exactly; beside OpenCV's undistortPoints and
+triangulatePoints of two views in the same process, with the accuracy and coverage of what was timed.
+
+python benchmarks/measuring.py            # two minutes; --points 1000000 for a million of each
+
+Rates are points per second of CPU time, the best of several runs by turns, so that other programs on the machine change
+them little; *together* is by the clock with all cores, a median. *over OpenCV* is the ratio of CPU rates; OpenCV has no
+triangulation of more than two views, so that of two is beside every row. *off* is the largest distance from the
+exact path, in standard deviations of the position, and the largest error of its covariance, of 2,000 points;
+*same views* how many points have the same views left out;
+*coverage* the share of 95 % ellipsoids that hold the true position, of all points measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from scipy.special import chdtri
+
+import implicam as ic
+from implicam.calibrators.protocol import RigCalibration
+from implicam.rig_model import MeasuredPixels
+from implicam.simulate import build_rig, random_positions, simulate
+from implicam.tabulated import RigTable
+from implicam.tabulated.library import how_it_measures, kernel
+
+COMPARED = 2000
+RUNS = 7
+
+
+def seconds(work: Callable[[], object], runs: int = RUNS) -> tuple[float, float]:
+    """Least CPU time of the process, and median time by the clock."""
+    spent = []
+    for _ in range(runs):
+        cpu, clock = time.process_time(), time.perf_counter()
+        work()
+        spent.append((time.process_time() - cpu, time.perf_counter() - clock))
+    return min(cpu for cpu, _ in spent), float(np.median([clock for _, clock in spent]))
+
+
+def opencv(points: int) -> Callable[[], object]:
+    """Two cameras with five coefficients of distortion, and n points that both see."""
+    cv2.setNumThreads(1)
+    K, k = np.array([[1000.0, 0, 640], [0, 1000, 480], [0, 0, 1]]), np.array([-0.1, 0.02, 1e-3, 1e-3, 0])
+    X = np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 6], (points, 3))
+    P = [np.column_stack([np.eye(3), [x, 0, 0]]) for x in (0.0, -1.0)]
+    uv = [cv2.projectPoints(X, np.zeros(3), p[:, 3], K, k)[0] for p in P]
+
+    def work() -> object:
+        left, right = (cv2.undistortPoints(pixels, K, k)[:, 0].T for pixels in uv)
+        found = cv2.triangulatePoints(P[0], P[1], left, right)
+        return (found[:3] / found[3]).T
+
+    return work
+
+
+def off(found: MeasuredPixels, exact: MeasuredPixels) -> tuple[float, float]:
+    both = found.measured & exact.measured
+    root = np.linalg.inv(np.linalg.cholesky(exact.cov[both]))
+    away = np.linalg.norm((root @ (found.xyz - exact.xyz)[both][..., None])[..., 0], axis=1)
+    sizes = np.linalg.eigvalsh(root @ found.cov[both] @ root.swapaxes(1, 2))
+    return float(away.max()), float(np.abs(sizes - 1).max())
+
+
+def coverage(found: MeasuredPixels, truth: np.ndarray) -> float:
+    good = found.measured
+    error = (found.xyz - truth)[good]
+    distance = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.cov[good]), error)
+    return float(np.mean(distance < chdtri(3, 0.05)))
+
+
+def spoilt(uv: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One view of each point wrong by 20 px, towards the middle of the image."""
+    out, row = uv.copy(), np.arange(len(uv))
+    wrong = rng.integers(0, uv.shape[1], len(uv))
+    towards = np.nanmean(uv, axis=(0, 1)) - uv[row, wrong]
+    out[row, wrong] += 20 * towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    return out
+
+
+def row(
+    name: str, made: RigCalibration, tables: RigTable | None, uv: np.ndarray, truth: np.ndarray, peer: float
+) -> str:
+    locator = None if tables is None else tables.locate
+    n = len(uv) if locator else COMPARED
+    found = made.map.measure_pixels(uv[:n], None, locator)
+    least, clock = seconds(lambda: made.map.measure_pixels(uv[:n], None, locator), RUNS if locator else 1)
+    exact = made.map.measure_pixels(uv[:COMPARED])
+    few = made.map.measure_pixels(uv[:COMPARED], None, locator)
+    away, part = off(few, exact)
+    alike = float((few.left_out == exact.left_out).all(axis=1).mean())
+    return (
+        f"| {name} | {uv.shape[1]} | {n / least:,.0f} | {n / clock:,.0f} | {peer * n / least:.2f} | {away:.4f} | "
+        f"{part:.4f} | {100 * alike:.2f} % | {100 * coverage(found, truth[:n]):.1f} % |"
+    )
+
+
+def live(made: RigCalibration, uv: np.ndarray) -> str:
+    one, spent = made.live(), []
+    for k in range(20000):
+        start = time.perf_counter()
+        one.measure(uv[k % len(uv)])
+        spent.append(time.perf_counter() - start)
+    middle, last = np.quantile(spent, [0.5, 0.99])
+    return f"{1e6 * middle:.1f} us, 99th percentile {1e6 * last:.1f} us"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--points", type=int, default=40_000)
+    parser.add_argument("--rigs", default="stereo,bar4,bar6,dome8")
+    options = parser.parse_args()
+    peer = opencv(20_000)
+    usual = min(seconds(peer, 15)[0], seconds(peer, 15)[0]) / 20_000
+    print(f"tables: {how_it_measures()}; OpenCV {cv2.__version__}: {1 / usual:,.0f} points/s of two views\n")
+    heads = ("by", "views", "points/s", "together", "over OpenCV", "off, sd", "covariance", "same views", "coverage")
+    print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|", flush=True)
+    notes = []
+    for name in options.rigs.split(","):
+        rig = build_rig(name, seed=1)
+        known = simulate(rig, random_positions(rig, 157, np.random.default_rng(1)), seed=1)
+        new = simulate(rig, random_positions(rig, options.points, np.random.default_rng(2)), seed=2)
+        made: RigCalibration = ic.ForwardGP().fit(known)
+        start = time.process_time()
+        tables = RigTable.of(made.map, known.xyz)
+        notes.append(f"{name}: tables made in {time.process_time() - start:.2f} s of CPU time")
+        assert new.truth is not None
+        uv, truth = np.ascontiguousarray(new.observations.uv), new.truth.xyz
+        wrong = spoilt(uv, np.random.default_rng(3))
+        cases = [(f"{name}, NumPy", replace(tables, compiled=None), uv), (f"{name}, exact", None, uv)]
+        if kernel():
+            cases.insert(0, (f"{name}, compiled", tables, uv))
+            if len(made.camera_names) > 3:
+                cases.insert(1, (f"{name}, compiled, one wrong view in each", tables, wrong))
+            notes.append(f"{name}: live, one shot {live(made, uv)}")
+        for what, by, pixels in cases:
+            again = seconds(peer, 5)[0] / 20_000
+            usual = min(usual, again)
+            print(row(what, made, by, pixels, truth, usual), flush=True)
+    print("\n" + "\n".join(notes))
+
+
+if __name__ == "__main__":
+    main()
