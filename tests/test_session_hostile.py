@@ -13,11 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from command_line import Cli, cli  # noqa: F401  a fixture
 from implicam.addresses import HIDDEN, without_secrets
-from implicam.dataset import Camera, read_dataset
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
 from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.hardware import CAMERAS, TRIGGERS, genicam
 from implicam.session import Session, database
@@ -338,6 +339,30 @@ def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path, sql: str)
         connection.execute(sql)
     connection.close()
     with pytest.raises(DatasetError, match=r"cannot name a (file|folder)"):
+        Session.open(db.parent)
+
+
+@pytest.mark.parametrize(
+    ("sql", "why"),
+    [
+        ("UPDATE points SET point = ?", "more than 1000 characters"),  # an array of texts is as wide as its longest
+        ("UPDATE views SET more = json_object('k', ?) WHERE rowid = 1", "more than 1000 characters"),
+        ("UPDATE points SET more = NULL, x = length(?)", "damaged"),
+    ],
+)
+def test_texts_that_would_fill_the_memory_are_refused(tmp_path: Path, sql: str, why: str) -> None:
+    db = _ours(tmp_path / "s")
+    with Session.open(db.parent) as session:
+        uv = np.full((1, 2, 2), 7.0) + np.arange(2)[:, None]
+        seen = Observations(np.array(["p001"]), session.cameras, uv, np.full((1, 2, 2), np.nan))
+        known = KnownPositions(np.array(["p001"]), np.zeros((1, 3)), np.full((1, 3), np.nan))
+        session.accept(Dataset("s", "mm", seen, known))
+    with sqlite3.connect(db) as connection:
+        connection.execute(sql, ["x" * 10**6])
+        if "point =" in sql:
+            connection.execute("UPDATE views SET point = ?", ["x" * 10**6])
+    connection.close()
+    with pytest.raises(DatasetError, match=why):
         Session.open(db.parent)
 
 

@@ -18,12 +18,14 @@ images/<camera>/<shot>.png. `PRAGMA user_version` is the version of these tables
 from __future__ import annotations
 
 import json
+import math
 import os
 import sqlite3
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,7 @@ import numpy as np
 
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Names, Observations
 from implicam.dataset.folder import POINTS, VIEWS
+from implicam.dataset.model import MAX_CELL_CHARACTERS
 from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.files import toml_text
 from implicam.formatting import json_default
@@ -43,6 +46,11 @@ MAX_DATABASE_BYTES = 1_000_000_000
 
 MAX_VALUE_BYTES = 64_000_000
 """Of one text in it."""
+
+MAX_CELLS = 50_000_000
+"""Of a table of points and cameras, and of all further columns together."""
+
+_CHUNK_ROWS = 10_000
 
 MAX_OPENING_SECONDS = 120.0
 """For which a database may be read until its points are there; one made to be read for ever is refused."""
@@ -253,8 +261,22 @@ class Database:
         Returns:
             The rows.
         """
+        return [row for some in self.chunks(sql, *values) for row in some]
+
+    def chunks(self, sql: str, *values: Any) -> Iterator[list[tuple[Any, ...]]]:
+        """As `rows`, some at a time, so that not all are in memory at once.
+
+        Args:
+            sql: The statement, with a question mark for each value.
+            values: In their order.
+
+        Yields:
+            Some rows.
+        """
         try:
-            return self._connection.execute(sql, values).fetchall()
+            cursor = self._connection.execute(sql, values)
+            while some := cursor.fetchmany(_CHUNK_ROWS):
+                yield some
         except sqlite3.Error as error:
             raise _explain_sqlite_error(self._path, error) from error
         except (UnicodeEncodeError, OverflowError) as error:
@@ -447,40 +469,74 @@ def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
             from rows that do not fit together; `Session` takes all of them for damage.
     """
     of_accepted = "JOIN shots ON shots.name = shot WHERE state = 'accepted' ORDER BY shots.number,"
-    points = database.rows(
-        f"SELECT shot, point, x, y, z, sd_x, sd_y, sd_z, more FROM points {of_accepted} points.number"
+    points = _read_columns(
+        database, f"SELECT x, y, z, sd_x, sd_y, sd_z, more, shot, point FROM points {of_accepted} points.number", 6
     )
-    views = database.rows(f"SELECT shot, point, camera, u, v, sd_u, sd_v, more FROM views {of_accepted} views.rowid")
+    views = _read_columns(
+        database, f"SELECT u, v, sd_u, sd_v, more, shot, point, camera FROM views {of_accepted} views.rowid", 4
+    )
     shots = [name for (name,) in database.rows("SELECT name FROM shots WHERE state = 'accepted' ORDER BY number")]
-    if not (shots == list(dict.fromkeys(row[0] for row in points)) == list(dict.fromkeys(row[0] for row in views))):
+    if not (shots == list(dict.fromkeys(points.shots)) == list(dict.fromkeys(views.shots))):
         raise ValueError("an accepted shot has no points, or no views")
     if not shots:
         return None
-    names = [point for _, point, *_ in points]
-    numbers = np.array([row[2:8] for row in points], dtype=np.float64)
+    names, n, c = points.names, len(points.names), len(empty.cameras)
     known = KnownPositions(
-        np.array([row[0] for row in points], dtype=np.str_),
-        numbers[:, :3],
-        numbers[:, 3:],
-        _read_extra_columns(points, (len(points),)),
+        _text(points.shots), points.numbers[:, :3], points.numbers[:, 3:], _read_extra_columns(points.more, (n,))
     )
     row_of = {name: i for i, name in enumerate(names)}
     camera_of = {name: k for k, name in enumerate(empty.observations.camera_names)}
-    i, k = np.array([(row_of[row[1]], camera_of[row[2]]) for row in views], dtype=np.intp).reshape(-1, 2).T
-    table = np.full((len(names), len(camera_of), 4), np.nan)
-    table[i, k] = np.array([row[3:7] for row in views], dtype=np.float64).reshape(-1, 4)
-    extra = _read_extra_columns(views, table.shape[:2], (i, k))
-    observations = Observations(np.array(names), empty.cameras, table[..., :2], table[..., 2:], extra)
+    i = np.array([row_of[name] for name in views.names], dtype=np.intp)
+    k = np.array([camera_of[name] for name in views.cameras], dtype=np.intp)
+    if n * c > MAX_CELLS:
+        raise ValueError(f"{n:,} points and {c:,} cameras are too many")
+    table = np.full((n, c, 4), np.nan)
+    table[i, k] = views.numbers
+    observations = Observations(
+        _text(names), empty.cameras, table[..., :2], table[..., 2:], _read_extra_columns(views.more, (n, c), (i, k))
+    )
     return Dataset(empty.name, empty.length_unit, observations, known)
 
 
-def _read_extra_columns(rows: list[tuple[Any, ...]], shape: tuple[int, ...], at: Any = slice(None)) -> dict[str, Names]:
-    """The further columns, from the last cell of each row, spread over `shape`; empty where a row has none."""
-    texts = {text: json.loads(text) for text in {row[-1] for row in rows}}  # mostly one: {}
-    cells = [texts[row[-1]] for row in rows]
+@dataclass
+class _Columns:
+    """Rows of points or views, column by column; a text that is there often is kept once."""
+
+    numbers: Floats
+    more: list[str]
+    shots: list[str]
+    names: list[str]
+    cameras: list[str]
+
+
+def _read_columns(database: Database, sql: str, count: int) -> _Columns:
+    """The rows of a query: so many numbers, then `more`, then the names of shot, point and camera, where it has one."""
+    numbers: list[Floats] = []
+    texts: list[list[str]] = [[], [], [], []]
+    once: dict[str, str] = {}
+    for rows in database.chunks(sql):
+        numbers.append(np.array([row[:count] for row in rows], dtype=np.float64))
+        for at, column in zip(range(count, len(rows[0])), texts, strict=False):
+            column += [once.setdefault(row[at], row[at]) for row in rows]
+    return _Columns(np.concatenate(numbers) if numbers else np.empty((0, count)), *texts)
+
+
+def _text(cells: list[str]) -> Names:
+    """Texts as an array, which takes as much for each as for the longest."""
+    if max(map(len, cells)) > MAX_CELL_CHARACTERS:
+        raise ValueError(f"a text has more than {MAX_CELL_CHARACTERS} characters")
+    return np.array(cells, dtype=np.str_)
+
+
+def _read_extra_columns(more: list[str], shape: tuple[int, ...], at: Any = slice(None)) -> dict[str, Names]:
+    """The further columns, from the JSON of each row, spread over `shape`; empty where a row has none."""
+    texts = {text: json.loads(text) for text in set(more)}  # mostly one: {}
+    keys = list(dict.fromkeys(key for text in dict.fromkeys(more) for key in texts[text]))
+    if len(keys) * math.prod(shape) > MAX_CELLS:
+        raise ValueError(f"{len(keys):,} further columns of {math.prod(shape):,} cells are too many")
     columns = {}
-    for key in dict.fromkeys(key for table in cells for key in table):
-        text = np.array([table.get(key, "") for table in cells], dtype=np.str_)
+    for key in keys:
+        text = _text([texts[row].get(key, "") for row in more])
         columns[key] = np.full(shape, "", dtype=text.dtype)
         columns[key][at] = text
     return columns

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 import sys
 from collections.abc import Collection, Mapping
 from contextlib import suppress
@@ -184,7 +185,8 @@ def _paths_in(spec: str) -> list[Path]:
 
 
 def _file(folder: Path) -> Path:
-    return _state_folder() / "trusted" / f"{hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()}.json"
+    place = os.fsencode(platform.node()) + b"\0" + os.fsencode(folder.resolve())  # a home may be that of many machines
+    return _state_folder() / "trusted" / f"{hashlib.sha256(place).hexdigest()}.json"
 
 
 def _state_folder() -> Path:
