@@ -23,6 +23,7 @@ from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.hardware import CAMERAS, TRIGGERS, genicam
 from implicam.session import Session, database
 from implicam.session.setup import Setup, open_session
+from implicam.session.trust import check_nothing_native
 
 pytestmark = pytest.mark.usefixtures("looks_kept")
 
@@ -147,28 +148,50 @@ def test_on_the_command_line(cli: Cli, tmp_path: Path, opened: list[str]) -> Non
 # native code
 
 
+@pytest.mark.parametrize("name", ["driver.cti", "driver.bin", "driver.cti ", "driver"])
 @pytest.mark.parametrize("link", [False, True])
 def test_nothing_native_inside_the_folder_is_loaded_whoever_trusts_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opened: list[str], link: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opened: list[str], link: bool, name: str
 ) -> None:
     """cases/session-runs-native-code: genicam:1@shared-session/images/left/driver.cti."""
     monkeypatch.chdir(tmp_path)
-    spec = "genicam:1@shared-session/images/left/driver.cti"
+    spec = f"genicam:1@shared-session/images/left/{name}"
     setup = Setup(cameras=(("left", spec),), workspace=WORKSPACE)
     folder = from_elsewhere(tmp_path / "shared-session", setup)
-    library = folder / "images" / "left" / "driver.cti"
+    library = folder / "images" / "left" / name
     library.parent.mkdir(parents=True)
     library.write_bytes(b"\x7fELF")
     if link:  # a name that is elsewhere, and leads into the folder
         (tmp_path / "link.cti").symlink_to(library)
         setup = Setup(cameras=(("left", "genicam:1@link.cti"),), workspace=WORKSPACE)
     for words in ({}, {"trust": True}):
-        with pytest.raises(UsageError, match="is code inside of the session's folder"):
+        with pytest.raises(UsageError, match="is inside of the session's folder, and may be code"):
             open_session(folder, setup, **words)
     if not link:
-        with pytest.raises(UsageError, match="is code inside of the session's folder"):
+        with pytest.raises(UsageError, match="is inside of the session's folder, and may be code"):
             open_session(folder, None, trust=True)
     assert opened == []
+
+
+def test_pictures_films_and_cameras_by_number_are_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "s"
+    (folder / "images" / "left").mkdir(parents=True)
+    monkeypatch.chdir(folder)
+    for name in ("left.avi", "places.csv"):
+        (folder / name).write_bytes(b"x")
+    for spec in (
+        "0",
+        "left.avi",
+        "images/left",
+        "opencv:left.avi",
+        "/dev/video0,1280x800",
+        "rtsp://h/x",
+        "~nobody/x",
+        "x" * 999,
+    ):
+        check_nothing_native(
+            Path("."), {"cameras": [["left", spec]], "robot": "csv:places.csv", "trigger": ["udp://h:1"]}
+        )
 
 
 # passwords

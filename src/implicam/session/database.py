@@ -279,6 +279,8 @@ class Database:
                 yield some
         except sqlite3.Error as error:
             raise _explain_sqlite_error(self._path, error) from error
+        except UnicodeDecodeError as error:  # of SQLite's own message, too, which quotes what is there
+            raise damaged_error(self._path, str(error)) from error
         except (UnicodeEncodeError, OverflowError) as error:
             raise UsageError(
                 "a text or a number cannot be kept in a session.", why=str(error), fix="correct the text or the number"

@@ -21,7 +21,9 @@ from typing import Any
 from implicam.addresses import HIDDEN
 from implicam.errors import ImplicamError, UsageError
 from implicam.files import write_text
+from implicam.films import FILM_ENDINGS
 from implicam.hardware import Person
+from implicam.images import ENDINGS
 
 DEVICES = ("cameras", "robot", "trigger")
 """The settings that name what is opened."""
@@ -31,8 +33,11 @@ LIMITS = ("workspace", "speed", "tool", "dry_run", "unit")
 
 _AS_IF_NOT_SAID = (None, False, "", "mm")
 
-NATIVE_ENDINGS = (".cti", ".so", ".dll", ".dylib", ".pyd", ".sys")
+NATIVE_ENDINGS = (".cti", ".so", ".dll", ".dylib", ".pyd")
 """Of files with code that a driver would load."""
+
+DATA_ENDINGS = (*ENDINGS, *FILM_ENDINGS, ".csv", ".toml")
+"""Of the only files inside of a session's folder that equipment may name: a driver loads a library by any name."""
 
 _FILES = {"rig": (".toml",), "workspace": (".csv",)}
 """Settings that may name a file to be read, by its endings."""
@@ -164,11 +169,11 @@ def check_nothing_native(folder: Path, settings: Mapping[str, Any]) -> None:
     specs = [spec for _, spec in settings.get("cameras") or ()] + [settings.get("robot") or "", *_triggers(settings)]
     for spec in specs:
         for part in _paths_in(spec):
-            if part.suffix.lower() in NATIVE_ENDINGS and (
-                inside in part.resolve().parents or inside in Path(os.path.abspath(part)).parents
-            ):
+            ending = os.path.splitext(part)[1].lower()
+            code = ending in NATIVE_ENDINGS or (ending not in DATA_ENDINGS and os.path.isfile(part))
+            if code and any(inside in Path(place).parents for place in (os.path.realpath(part), os.path.abspath(part))):
                 raise UsageError(
-                    f"{part} is code inside of the session's folder, and is never loaded.",
+                    f"{part} is inside of the session's folder, and may be code: it is never loaded.",
                     why="it came with the data, and would run as you",
                     fix="name the one that the camera's maker installs, outside of the folder",
                 )
@@ -179,9 +184,11 @@ def _triggers(settings: Mapping[str, Any]) -> list[str]:
     return [given] if isinstance(given, str) else list(given)
 
 
-def _paths_in(spec: str) -> list[Path]:
-    """What may be a path in a spec: all of it, and what follows a colon or an @."""
-    return [Path(spec[i:]).expanduser() for i in range(len(spec)) if i == 0 or spec[i - 1] in ":@="]
+def _paths_in(spec: str) -> list[str]:
+    """What may be a path in a spec: all of it, or what follows a colon, an @ or a comma; to a comma, or to the end."""
+    starts = [i for i in range(len(spec)) if i == 0 or spec[i - 1] in ":@=,"]
+    texts = [text for i in starts for text in (spec[i:], spec[i:].partition(",")[0]) if text and "\0" not in text]
+    return [path for text in texts for path in (text, os.path.expanduser(text))]
 
 
 def _file(folder: Path) -> Path:
