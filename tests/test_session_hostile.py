@@ -231,6 +231,15 @@ def test_the_log_has_no_password_and_no_token(cli: Cli, tmp_path: Path, monkeypa
     log = (tmp_path / "s" / "implicam.log").read_text()
     assert f"left=rtsp://{HIDDEN}@127.0.0.1:9/x" in log
     assert SECRET not in log + ran.err
+    blank = f"two words {SECRET}"
+    words = ["acquire", "s", "--no-browser", "--camera", f"left=rstp://a:{blank}@127.0.0.1:9/x"]  # an error quotes it
+    monkeypatch.setattr(sys, "argv", ["implicam", *words])
+    assert cli(*words).code == 2
+    log = (tmp_path / "s" / "implicam.log").read_text()
+    assert "names no camera" in log
+    assert "ended by UsageError" in log
+    assert SECRET not in log
+    assert "two words" not in log
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Callable, Iterable
+from urllib.parse import quote, quote_plus, unquote
 
 HIDDEN = "***"
 """Stands for a user name with its password, or another secret."""
@@ -64,6 +67,48 @@ def secrets_of(text: str, *, whole: bool = False) -> set[str]:
             found |= {user, password}
         found |= {one.group(0)[len(one.group(1)) :] for one in _SECRET_VALUE.finditer(rest)}
     return {secret for secret in found if secret not in ("", HIDDEN)}
+
+
+_LONG_CHARACTERS = 7
+"""From which on a secret is looked for inside of words, too; a shorter one, such as 1234, stands alone."""
+
+
+def replacing_secrets(known: Iterable[str]) -> Callable[[str], str]:
+    """What puts `HIDDEN` for secrets wherever they stand in a text, however they are written there.
+
+    Args:
+        known: As `secrets_of` gives them.
+
+    Returns:
+        Text -> text.
+    """
+    patterns = []
+    for secret in sorted({way for one in known for way in _ways_to_write(one)}, key=len, reverse=True):
+        alone = len(secret) < _LONG_CHARACTERS or re.fullmatch(r"[0-9.,]+", secret)
+        word = rf"(?:(?<![\w.])|(?<=%[0-9A-Fa-f]{{2}})){re.escape(secret)}(?![\w.])"
+        patterns.append(word if alone else re.escape(secret))
+    found = re.compile("|".join(patterns)) if patterns else None
+    return lambda text: text if found is None else found.sub(HIDDEN, text)
+
+
+def _ways_to_write(secret: str) -> set[str]:
+    """As it is, in an address, in JSON, in Python."""
+    plain = {secret, unquote(secret)}
+    ways = {way for one in plain for way in (one, quote(one, safe=""), quote(one), quote_plus(one))}
+    ways |= {text[1:-1] for one in plain for text in (json.dumps(one), json.dumps(one, ensure_ascii=False), repr(one))}
+    return {way for way in ways if len(way) > 1}
+
+
+def without_secrets_in(text: str) -> str:
+    """A text whose addresses are as `without_secrets` leaves them.
+
+    Args:
+        text: Any, such as lines of a log.
+
+    >>> without_secrets_in("camera left: rtsp://admin:1234@192.168.0.21/main cannot be opened.")
+    'camera left: rtsp://***@192.168.0.21/main cannot be opened.'
+    """
+    return _ADDRESS.sub(lambda found: without_secrets(found.group(0)), text)
 
 
 def only_hosts(text: str) -> str:

@@ -13,6 +13,7 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 from typing import TextIO
 
+from implicam.addresses import replacing_secrets, secrets_of, without_secrets_in
 from implicam.errors import UsageError
 
 LOG = "implicam.log"
@@ -22,7 +23,22 @@ MAX_BYTES = 10_000_000
 """A log file that is larger is put aside as FILE.1, and another is begun."""
 
 _LOG = logging.getLogger("implicam")
-_FORMAT = logging.Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
+
+
+class _Formatter(logging.Formatter):
+    """Lines of a log file, tracebacks too, without the passwords that were typed or stand in addresses."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line, or lines, of one record.
+
+        Args:
+            record: What was logged.
+        """
+        typed = {secret for word in sys.argv[1:] for secret in secrets_of(word, whole=True)}
+        return without_secrets_in(replacing_secrets(typed)(super().format(record)))
+
+
+_FORMAT = _Formatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s")
 
 
 @contextmanager

@@ -19,9 +19,8 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, quote_plus, unquote
 
-from implicam.addresses import HIDDEN, only_hosts, secrets_of
+from implicam.addresses import only_hosts, replacing_secrets, secrets_of
 from implicam.calibration_file import package_version
 from implicam.dataset.folder import DESCRIPTION, IMAGES, POINTS, VIEWS
 from implicam.errors import ImplicamError, UsageError
@@ -39,9 +38,6 @@ MAX_TABLE_BYTES = 50_000_000
 
 MAX_LISTED = 5_000
 """Names of files in the list."""
-
-_LONG_CHARACTERS = 7
-"""From which on a secret is looked for inside of words, too; a shorter one, such as 1234, stands alone."""
 
 
 @dataclass
@@ -137,19 +133,12 @@ def hider(known: Iterable[str]) -> Callable[[str], str]:
         Text -> text, without these in any way of writing, with addresses cut to scheme and host, without the name of
         the user in paths.
     """
-    patterns = []
-    for secret in sorted({way for one in known for way in _ways_to_write(one)}, key=len, reverse=True):
-        alone = len(secret) < _LONG_CHARACTERS or re.fullmatch(r"[0-9.,]+", secret)
-        word = rf"(?:(?<![\w.])|(?<=%[0-9A-Fa-f]{{2}})){re.escape(secret)}(?![\w.])"
-        patterns.append(word if alone else re.escape(secret))
-    secrets = re.compile("|".join(patterns)) if patterns else None
+    replace = replacing_secrets(known)
     home, user = str(Path.home()), re.escape(_user())
     places = re.compile(rf"(?<=[/\\]){user}(?=[/\\])") if user else None
 
     def hide(text: str) -> str:
-        if secrets is not None:
-            text = secrets.sub(HIDDEN, text)
-        text = only_hosts(text)
+        text = only_hosts(replace(text))
         text = text.replace(home, "~") if len(home) > 1 else text
         return places.sub("~", text) if places is not None else text
 
@@ -185,14 +174,6 @@ def _user() -> str:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):  # of no account
         return ""
-
-
-def _ways_to_write(secret: str) -> set[str]:
-    """As it is, in an address, in JSON, in Python."""
-    plain = {secret, unquote(secret)}
-    ways = {way for one in plain for way in (one, quote(one, safe=""), quote(one), quote_plus(one))}
-    ways |= {text[1:-1] for one in plain for text in (json.dumps(one), json.dumps(one, ensure_ascii=False), repr(one))}
-    return {way for way in ways if len(way) > 1}
 
 
 def _stored_secrets(database: Database) -> set[str]:
