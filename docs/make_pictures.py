@@ -1,4 +1,4 @@
-"""Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium); with `verify` or `view`, one of them.
+"""Draw the pictures of the docs: `python docs/make_pictures.py` (needs Chromium); or one: `verify`, `view`, `acquire`.
 
 Runs the demo in a temporary folder, opens its report in a real browser and photographs it; keeps one of the demo's
 overlays, and two of simulated boards; compares all methods, which takes minutes.
@@ -21,6 +21,8 @@ from implicam.calibrators import ForwardGP
 from implicam.dataset import read_dataset
 from implicam.detect.labelling import Labelling
 from implicam.detect.model import View
+from implicam.session.setup import Setup, open_session
+from implicam.viewer import bench_page
 from implicam.viewer.calibration_page import LiveView
 from implicam.viewer.label_page import open_page
 
@@ -75,6 +77,25 @@ def view(folder: Path) -> None:
         browser.close()
 
 
+def acquire(folder: Path) -> None:
+    """The page of `implicam acquire` with eleven points."""
+    with (
+        open_session(folder / "session", Setup(rig="bar6", speed=1e6)) as controller,
+        bench_page.open_page(controller) as (url, _),
+        sync_playwright() as playwright,
+    ):
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        page = browser.new_page(viewport={"width": 1440, "height": 900}, color_scheme="dark")
+        page.goto(url)
+        for _ in range(11):
+            page.click("#go:enabled", timeout=60_000)
+            page.click("#accept:enabled", timeout=60_000)
+        page.wait_for_selector("#go:enabled", timeout=60_000)
+        page.wait_for_timeout(4000)
+        page.screenshot(path=IMAGES / "acquire.png")
+        browser.close()
+
+
 def implicam(*words: str) -> None:
     """Run a command."""
     subprocess.run([sys.executable, "-m", "implicam", *words], check=True)
@@ -95,9 +116,9 @@ def verify(folder: Path) -> None:
 
 def main() -> None:
     IMAGES.mkdir(exist_ok=True)
-    if sys.argv[1:] in (["verify"], ["view"]):
+    if sys.argv[1:] in (["verify"], ["view"], ["acquire"]):
         with tempfile.TemporaryDirectory() as folder:
-            {"verify": verify, "view": view}[sys.argv[1]](Path(folder))
+            {"verify": verify, "view": view, "acquire": acquire}[sys.argv[1]](Path(folder))
         return
     if sys.argv[1:]:
         label(Path(sys.argv[1]))
@@ -118,6 +139,7 @@ def main() -> None:
         overlay.crop((430, 250, 800, 560)).resize((740, 620)).save(IMAGES / "detect-covered.jpg", quality=85)
         verify(Path(folder))
         view(Path(folder))
+        acquire(Path(folder))
         six = Path(folder) / "six"
         implicam("simulate", str(six), "--positions", "random", "--points", "200", "--check", "300")
         implicam("compare", str(six), "--train", "17,35,87,157", "--seeds", "3", "--check", str(six / "check"),

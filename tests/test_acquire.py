@@ -114,7 +114,7 @@ TEARDOWN_SECONDS = 3.0
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can answer")
 def test_sigterm_closes_the_page_as_ctrl_c_does(tmp_path: Path) -> None:
-    pytest.importorskip("viser")
+    pytest.importorskip("starlette")
     process = begun("acquire s --rig stereo --no-browser --port 0", "The session is at", tmp_path)
     seconds, code, said = ended(process)
     assert (code, "point 1" in said or "nothing measured" in said or "connecting" in said) == (0, True), said
@@ -144,7 +144,7 @@ def test_sigterm_ends_a_session_that_goes_by_itself(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTERM that a process can answer")
 def test_sigterm_cuts_off_what_waits_for_a_camera(tmp_path: Path) -> None:
-    pytest.importorskip("viser")
+    pytest.importorskip("starlette")
     (tmp_path / "pictures").mkdir()
     words = "acquire s --camera left=pictures/ --workspace=0:1,0:1,0:1 --no-browser --port 0"
     process = begun(words, "waiting for one picture", tmp_path)
@@ -156,8 +156,8 @@ def test_sigterm_cuts_off_what_waits_for_a_camera(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_stops_a_robot_that_is_on_its_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("viser")
-    from implicam.viewer import page
+    pytest.importorskip("starlette")
+    from implicam.viewer import bench_page
 
     class Interrupted(threading.Event):
         """What the main thread waits for: Ctrl-C comes when the robot is on its way."""
@@ -165,23 +165,23 @@ def test_ctrl_c_stops_a_robot_that_is_on_its_way(tmp_path: Path, monkeypatch: py
         def wait(self, timeout: float | None = None) -> bool:
             while controller.state.phase != "aim":
                 time.sleep(0.01)
-            pages[0]._press("go", None)
+            pages[0].do({"word": "go"})
             while controller.state.phase != "moving":
                 time.sleep(0.01)
             raise KeyboardInterrupt
 
     pages = []
-    plain = page.Page.__init__
+    plain = bench_page.BenchPage.__init__
 
-    def watched(self: page.Page, *words: object) -> None:
+    def watched(self: bench_page.BenchPage, *words: object) -> None:
         plain(self, *words)  # type: ignore[arg-type]
         self.closed = Interrupted()
         pages.append(self)
 
-    monkeypatch.setattr(page.Page, "__init__", watched)
+    monkeypatch.setattr(bench_page.BenchPage, "__init__", watched)
     with open_session(tmp_path / "s", Setup(rig="stereo", speed=1e-4)) as controller:  # hours to get there
         begin = time.monotonic()
-        page.serve(controller, port=0, open_browser=False, say=lambda text: None)
+        bench_page.serve(controller, port=0, open_browser=False, say=lambda text: None)
         assert time.monotonic() - begin < 30
         assert controller.state.phase == "trouble"
         assert "stopped" in controller.state.message

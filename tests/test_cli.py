@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("looks_kept")
 
 COMMANDS = sorted(command.name for command in app.registered_commands)
 HEAVY = [
-    "viser",
+    "starlette",
     "plotly",
     "matplotlib",
     "torch",

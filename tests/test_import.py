@@ -18,7 +18,7 @@ import implicam
 from implicam import errors
 
 HEAVY = (
-    "torch", "gpytorch", "cv2", "matplotlib", "plotly", "starlette", "uvicorn", "websockets", "viser", "joblib",
+    "torch", "gpytorch", "cv2", "matplotlib", "plotly", "starlette", "uvicorn", "websockets", "joblib",
     "distributed", "pyarrow", "PIL", "yaml", "rich", "typer", "sqlite3", "scipy.stats", "scipy.optimize",
 )  # fmt: skip
 

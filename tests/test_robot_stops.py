@@ -31,13 +31,13 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 import toy_robot
 from implicam.cli import main
 from implicam.hardware import CAMERAS, ROBOTS
-from implicam.viewer.page import Page
+from implicam.viewer.bench_page import BenchPage
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background of a shell ignores it
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and after nohup
 CAMERAS.register("toy", toy_robot.ToyCamera)
 ROBOTS.register("toy", toy_robot.ToyRobot)
-begin = Page.start
+begin = BenchPage.start
 
 def start(page):
     begin(page)
@@ -46,12 +46,13 @@ def start(page):
 def press_go(page):
     while page._controller.state.phase != "aim":
         time.sleep(0.01)
-    page._press("go", None)
+    asked = page.do(dict(word="go"))["ask"]
+    page.do(dict(word="go", yes=asked["number"]))
     while True:
         print(time.monotonic(), *toy_robot.AXES.place(), flush=True)
         time.sleep(0.02)
 
-Page.start = start
+BenchPage.start = start
 main(sys.argv[1:])
 """
 
@@ -80,7 +81,7 @@ def test_the_arm_halts_when_the_session_is_ended(
     tmp_path: Path,
     sent: str,
 ) -> None:
-    pytest.importorskip("viser")
+    pytest.importorskip("starlette")
     process = begun(tmp_path, f"ur:{HOST}", "0:600,0:600,0:600")
     waited(lambda: bool(controller.tell()["moving"]), 60)
     process.send_signal(signal.Signals[sent])
@@ -97,7 +98,7 @@ def test_the_arm_halts_when_the_session_is_ended(
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
 def test_a_robot_of_a_package_halts_at_ctrl_c(tmp_path: Path) -> None:
-    pytest.importorskip("viser")
+    pytest.importorskip("starlette")
     corners = RIG.volume.world_from_box.apply((np.mgrid[0:2, 0:2, 0:2].reshape(3, -1).T - 0.5) * RIG.volume.size)
     workspace = ",".join(f"{a:.1f}:{b:.1f}" for a, b in zip(corners.min(axis=0), corners.max(axis=0), strict=True))
     process = begun(tmp_path, "toy:1", workspace)

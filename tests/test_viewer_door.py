@@ -1,62 +1,38 @@
-"""The page of viser itself, through the door of test_viewer_front.py, in a real browser too."""
+"""A page of ours through the door of test_viewer_front.py, in a real browser."""
 
-import asyncio
 import socket
+import threading
 
 import pytest
 
 from implicam.viewer.front import Front
-from test_viewer_front import cookie_of, get
-
-# viser itself
 
 
-@pytest.fixture(scope="module")
-def viser_page():
-    viser = pytest.importorskip("viser")
-    import rich
+@pytest.fixture
+def behind():
+    """The address of a web application that shows a sentence."""
+    uvicorn, applications = pytest.importorskip("uvicorn"), pytest.importorskip("starlette.applications")
+    from starlette.responses import HTMLResponse
+    from starlette.routing import Route
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rich, "print", lambda *_, **__: None)
-        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-        server.gui.add_markdown("## Put the ball here")
-        yield server
-        server.stop()
+    async def page(request):
+        return HTMLResponse("<h2>Put the ball here</h2>")
 
-
-def test_viser_talks_through_the_door(viser_page):
-    viser = pytest.importorskip("viser")
-    from websockets.asyncio.client import connect as dial
-    from websockets.exceptions import InvalidStatus
-
-    async def first_message(front: Front, origin: str, cookie: str = "") -> bytes:
-        headers = {"Cookie": cookie} if cookie else {}
-        protocol = f"viser-v{viser.__version__}"
-        async with dial(
-            f"ws://localhost:{front.port}/", origin=origin, subprotocols=[protocol], additional_headers=headers,
-            compression=None, proxy=None, max_size=None,
-        ) as line:  # fmt: skip
-            return await asyncio.wait_for(line.recv(), 10)
-
-    behind = ("127.0.0.1", viser_page.get_port())
-    with Front(host="127.0.0.1", port=0, behind=behind, token="secret", files={}) as front:
-        status, answer = get(front, "/?token=secret")
-        cookie, ours = cookie_of(front, answer), f"http://localhost:{front.port}"
-        status, answer = get(front, "/", f"Cookie: {cookie}\r\n")
-        assert status == 200
-        assert "<html" in answer
-        assert len(asyncio.run(first_message(front, ours, cookie))) > 100
-        for origin, sent, expected in [("http://evil.example", cookie, 403), (ours, "", 401)]:
-            with pytest.raises(InvalidStatus) as refused:
-                asyncio.run(first_message(front, origin, sent))
-            assert refused.value.response.status_code == expected
+    inner = socket.create_server(("127.0.0.1", 0))
+    application = applications.Starlette(routes=[Route("/", page)])
+    server = uvicorn.Server(uvicorn.Config(application, log_config=None, lifespan="off"))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [inner]}, daemon=True)
+    thread.start()
+    yield inner.getsockname()
+    server.should_exit = True
+    thread.join(10)
+    inner.close()
 
 
 @pytest.mark.slow
 @pytest.mark.browser
-def test_a_browser_shows_the_page_but_not_in_a_foreign_frame_nor_for_a_foreign_server(viser_page, chromium, tmp_path):
+def test_a_browser_shows_the_page_but_not_in_a_foreign_frame_nor_for_a_foreign_server(behind, chromium, tmp_path):
     sync_api = pytest.importorskip("playwright.sync_api")
-    behind = ("127.0.0.1", viser_page.get_port())
     with (
         Front(host="127.0.0.1", port=0, behind=behind, token="a b;c", files={}) as front,
         socket.create_server(("127.0.0.1", 0)) as foreign,
@@ -71,7 +47,7 @@ def test_a_browser_shows_the_page_but_not_in_a_foreign_frame_nor_for_a_foreign_s
         assert page.url == f"http://localhost:{front.port}/"
         assert page.evaluate("document.cookie") == ""
 
-        # viser's client connects to whatever its ?websocket= names; the policy on the page does not let it
+        # whatever a page is talked into connecting to, the policy on it does not let it
         opening = """(address) => new Promise((done) => {
             document.addEventListener("securitypolicyviolation", (event) => done(event.effectiveDirective));
             new WebSocket(address);

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from implicam.errors import UsageError, did_you_mean
-from implicam.formatting import percent
+from implicam.formatting import decimal_number, percent
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,15 @@ class Rule:
             The reason in words; empty where it is not time to stop.
         """
         raise NotImplementedError
+
+    def progress(self, history: Sequence[Step], unit: str = "") -> str:
+        """How far it is from stopping, in words: "1.34 of 1.20 mm everywhere"; empty where there is nothing to say.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+        """
+        return ""
 
     def __and__(self, other: Rule) -> Rule:
         return Both(self, other)
@@ -131,6 +140,18 @@ class Below(Rule):
         if not 0 < self.value < math.inf:
             raise UsageError(f"a stop below {self.value} is never reached.", fix="give a length greater than zero")
 
+    def progress(self, history: Sequence[Step], unit: str = "") -> str:
+        """How far it is from stopping.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+        """
+        now = getattr(history[-1], self.of) if history else math.nan
+        if not math.isfinite(now):
+            return ""
+        return f"{decimal_number(now, 3)} of {decimal_number(self.value, 3)} {unit} {UNCERTAINTY_PLACES[self.of]}"
+
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """Why to stop now: the uncertainty is small enough.
 
@@ -167,6 +188,16 @@ class Within(Rule):
             raise UsageError(
                 f"a stop within {self.times} times the noise is never reached.", fix="give more than 1, such as 1.2"
             )
+
+    def progress(self, history: Sequence[Step], unit: str = "") -> str:
+        """How far it is from stopping.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+        """
+        now = history[-1].excess if history else math.nan
+        return f"{now:.2f} of {self.times:.2f} times what pixel noise leaves" if math.isfinite(now) else ""
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """Why to stop now: pixel noise dominates.
@@ -220,6 +251,15 @@ class AtLeast(Rule):
 
     points: int
 
+    def progress(self, history: Sequence[Step], unit: str = "") -> str:
+        """How far it is from stopping.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+        """
+        return f"{history[-1].points if history else 0} of {self.points} points"
+
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """Why to stop now: there are enough points.
 
@@ -255,6 +295,15 @@ class Time(Rule):
     """When so many seconds have passed since the beginning."""
 
     seconds: float
+
+    def progress(self, history: Sequence[Step], unit: str = "") -> str:
+        """How far it is from stopping.
+
+        Args:
+            history: The steps so far.
+            unit: Of lengths, for the words.
+        """
+        return f"{history[-1].seconds if history else 0:.0f} of {self.seconds:.0f} s"
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """Why to stop now: the time is over.

@@ -164,7 +164,7 @@ def _acquire(
     with_options(Setup(), **options)  # what is wrong with the words is said before anything is begun
     opencv()
     if not unattended:
-        import_extra("viser", "viewer", "the page of implicam acquire")
+        import_extra("starlette", "viewer", "the page of implicam acquire")
     if not is_session(folder):
         make_folder(folder)
     log = folder / LOG

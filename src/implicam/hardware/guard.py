@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +56,27 @@ class GuardedRobot:
         if name == "driver":  # while it is being copied, or made
             raise AttributeError(name)
         return getattr(self.driver, name)
+
+    @property
+    def speed(self) -> float | None:
+        """m/s that was asked for; None for the driver's own."""
+        return self._options.speed
+
+    @property
+    def limits(self) -> str:
+        """Where it may go, in words."""
+        if self._box is None:
+            return "anywhere it can reach"
+        low, high = (format_position(np.asarray(corner)) for corner in self._options.box)  # type: ignore[union-attr]
+        return f"in the box from {low} to {high} {self._options.unit}"
+
+    def ask_before_moving(self, confirm: Callable[[Floats, Floats], bool]) -> None:
+        """Ask before each move from now on.
+
+        Args:
+            confirm: Is given here and there, each (3,); only True lets it move.
+        """
+        self._options = replace(self._options, confirm=confirm)
 
     @property
     def sd(self) -> tuple[float, float, float]:

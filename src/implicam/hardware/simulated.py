@@ -25,7 +25,7 @@ class SimulatedRobot:
     The true position is the reported one plus N(0, sd²) along each axis. fail_next_move: the next move stops half way.
     """
 
-    moves = alone = True
+    moves = alone = simulated = True
 
     def __init__(self, start: Floats, *, sd: float, speed: float, rng: np.random.Generator) -> None:
         self.sd = (sd, sd, sd) if sd > 0 else (np.nan, np.nan, np.nan)

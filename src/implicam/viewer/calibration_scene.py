@@ -16,7 +16,7 @@ from implicam.formatting import list_some
 from implicam.measurement import Measurement
 from implicam.report.instrument import Instrument
 from implicam.rig_model import SOURCES, FittedRig
-from implicam.viewer.space import Placing, eyes, turned_up, upwards
+from implicam.viewer.space import Placing, upwards
 
 ROWS, COLUMNS = 9, 12
 """Cells of a picture: it is bent as the lens bends it, so that points lie on their images from where the camera is."""
@@ -38,10 +38,8 @@ def scene(calibration: Calibration) -> dict[str, Any]:
         calibration: By any method; one without cameras has none to show.
     """
     known = calibration.data.xyz
-    cameras = [] if not isinstance(calibration, RigCalibration) else _cameras(calibration)
+    cameras = list_cameras(calibration)
     low, high = _box(known, cameras)
-    up = upwards(eyes(calibration) if len(known) else [])
-    placing = Placing((low + high) / 2, 2.0 / float(np.linalg.norm(high - low)), turned_up(up))
     rejected = {view.point for view in calibration.rejected}
     unused = {entry.point for entry in calibration.unused}
     notes = []
@@ -55,9 +53,7 @@ def scene(calibration: Calibration) -> dict[str, Any]:
         "unit": calibration.data.length_unit,
         "name": calibration.data.name,
         "method": calibration.method,
-        "placing": {
-            "centre": placing.centre.tolist(), "scale": placing.scale, "rotation": placing.rotation.tolist(),
-        },
+        "placing": Placing.of(low, high, up_of(cameras)).table,
         "box": [low.tolist(), high.tolist()],
         "cameras": cameras,
         "grid": [ROWS, COLUMNS],
@@ -132,8 +128,34 @@ def _box(known: Floats, cameras: list[dict[str, Any]]) -> tuple[Floats, Floats]:
     return middle - reach, middle + reach
 
 
-def _cameras(calibration: RigCalibration) -> list[dict[str, Any]]:
-    """Name, lens, noise, centre, whether it is too far to be drawn, and the places of a grid over its picture."""
+def up_of(cameras: list[dict[str, Any]]) -> Floats:
+    """(3,) which way is up in the world, as the pictures of cameras have it.
+
+    Args:
+        cameras: As `list_cameras` gives them.
+    """
+    up: list[Floats] = []
+    along: list[Floats] = []
+    for row in cameras:
+        grid = np.array([[np.nan if v is None else v for v in place] for place in row["picture"]])
+        grid = grid.reshape(ROWS + 1, COLUMNS + 1, 3)
+        r, c = ROWS // 2, COLUMNS // 2
+        for found, way in ((up, grid[r, c] - grid[r + 1, c]), (along, grid[r, c] - row["centre"])):
+            found.append(way / max(float(np.linalg.norm(way)), 1e-300))
+    good = np.isfinite(np.array(up).reshape(-1, 3)).all(axis=1) & np.isfinite(np.array(along).reshape(-1, 3)).all(
+        axis=1
+    )
+    return upwards(np.array(up).reshape(-1, 3)[good], np.array(along).reshape(-1, 3)[good])
+
+
+def list_cameras(calibration: object) -> list[dict[str, Any]]:
+    """Name, lens, noise, centre, whether it is too far to be drawn, and the places of a grid over its picture.
+
+    Args:
+        calibration: By any method; one without cameras, or none, has none.
+    """
+    if not isinstance(calibration, RigCalibration):
+        return []
     rig, described = calibration.map, calibration.cameras
     known = calibration.data.xyz[np.isfinite(calibration.data.xyz).all(axis=1)]
     size = float(np.linalg.norm(np.ptp(known, axis=0))) if len(known) > 1 else 0.0

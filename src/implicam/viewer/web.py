@@ -13,6 +13,8 @@ import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from implicam.errors import ImplicamError, UsageError, import_extra
@@ -87,7 +89,9 @@ def jpeg(picture: Grey, *, bright: bool = True, width: int | None = None) -> byt
 def behind_door(
     application: Callable[[str], Starlette],
     files: Mapping[str, str],
+    own: Mapping[str, Path] = MappingProxyType({}),
     *,
+    host: str = "127.0.0.1",
     port: int,
     token: str | None,
     command: str,
@@ -98,6 +102,8 @@ def behind_door(
     Args:
         application: Makes it, given the Origin of those who come by the door.
         files: Path of the address -> file in `templates/`, served as it is.
+        own: Path of the address -> any file, served as it is then.
+        host: What to listen on.
         port: Where people find it; 0 for any free one.
         token: What opens it; None for a new one.
         command: What printed the address, as `implicam label`; its last word is the extra that brings the server.
@@ -108,9 +114,9 @@ def behind_door(
 
     Raises:
         MissingExtraError: The web server is not installed.
-        ImplicamError: The port is taken.
+        ImplicamError: The port is taken, or the host is not this machine.
     """
-    extra = command.split()[-1]
+    extra = {"acquire": "viewer"}.get(command.split()[-1], command.split()[-1])
     uvicorn = import_extra("uvicorn", extra, f"the page of {command}")
     import_extra("starlette", extra, f"the page of {command}")
     origin = f"http://{secrets.token_hex(16)}.invalid"
@@ -121,11 +127,11 @@ def behind_door(
     thread = threading.Thread(target=server.run, kwargs={"sockets": [inner]}, name=name, daemon=True)
     with resources.as_file(resources.files("implicam.viewer") / "templates") as folder:
         front = Front(
-            host="127.0.0.1",
+            host=host,
             port=port,
             behind=inner.getsockname(),
             token=secrets.token_urlsafe(16) if token is None else token,
-            files={path: folder / file for path, file in files.items()},
+            files={**{path: folder / file for path, file in files.items()}, **own},
             origin=origin,
             command=command,
             stake=stake,

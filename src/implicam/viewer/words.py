@@ -1,30 +1,29 @@
-"""What the page says, and which buttons make sense: from a State to words and HTML, without a browser."""
+"""What the page says, and which buttons make sense: from a State to words, without a browser."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from html import escape
+import re
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from implicam.active import Step
 from implicam.dataset import Floats
-from implicam.figures.style import BLUE, GREEN, ORANGE, VERMILLION
 from implicam.formatting import number
 from implicam.session.controller import State
+from implicam.session.detections import Look
 
-BUSY = ("starting", "moving", "fitting")
-IDLE = "#5b6270"
+ON_TARGET_PX = 12.0
+"""Pixels: a ball so near to its reticle is where it has to be."""
 
 
 @dataclass(frozen=True)
 class Headline:
-    """One line in large type, one below it, and the colour of the phase."""
+    """One line in large type, one below it, and whether that is good, bad, busy, or asks for something."""
 
     title: str
     detail: str
-    colour: str
+    kind: str
 
 
 def headline(state: State, moves: bool) -> Headline:
@@ -34,110 +33,64 @@ def headline(state: State, moves: bool) -> Headline:
     if state.phase == "aim":
         return _aim(state, point, moves)
     if state.phase == "shown" and not state.cameras_with_ball:
-        return Headline("The ball was not found", "Redo it when the ball is in sight, or skip this target.", VERMILLION)
+        return Headline("The ball was not found", "Redo it when the ball is in sight, or skip this target.", "bad")
     if state.phase == "trouble":
         problem = state.problem
-        return Headline("Something needs you", problem.what if problem is not None else state.message, VERMILLION)
+        return Headline("Something needs you", problem.what if problem is not None else state.message, "bad")
     if state.phase == "moving":
-        return Headline(f"{point}: the robot moves …" if moves else f"{point}: looking …", "", BLUE)
+        return Headline(f"{point}: the robot moves …" if moves else f"{point}: looking …", "", "busy")
     return {
-        "shown": Headline(f"{found}: accept?", "Accept keeps the point; redo looks again.", GREEN),
-        "fitting": Headline("Calculating …", state.message, BLUE),
-        "done": Headline("Done: the rig is calibrated", "", GREEN),
-    }.get(state.phase, Headline("Connecting …", state.message, BLUE))
+        "shown": Headline(f"{found}: accept?", "Accept keeps the point; redo looks again.", "good"),
+        "fitting": Headline("Calculating …", state.message, "busy"),
+        "done": Headline("Done: the rig is calibrated", "", "good"),
+    }.get(state.phase, Headline("Connecting …", state.message, "busy"))
 
 
 def _aim(state: State, point: str, moves: bool) -> Headline:
     if state.stop:
-        return Headline(f"Good enough: {state.stop}", "Finish now, or go on for even better.", GREEN)
+        return Headline(f"Good enough: {state.stop}", "Finish now, or go on for even better.", "good")
     if state.target is None:
-        return Headline("No place is left to measure", state.message, ORANGE)
+        return Headline("No place is left to measure", state.message, "ask")
     if state.auto:
-        return Headline(f"{point}: by itself", "The next target is gone to without asking.", BLUE)
+        return Headline(f"{point}: by itself", "The next target is gone to without asking.", "busy")
     if moves:
-        return Headline(f"{point}: press Go", "The robot takes the ball to the circle.", ORANGE)
-    return Headline(f"{point}: put the ball here", "Into the circle in every picture; then say where it is.", ORANGE)
+        return Headline(f"{point}: press Go", "The robot takes the ball to the circle.", "ask")
+    return Headline(f"{point}: put the ball here", "Into the circle in every picture; then say where it is.", "ask")
 
 
-def way(here: Floats, there: Floats, unit: str) -> str:
-    """The way that is left from here to there, both (3,): along each axis, with its sign; HTML."""
+def way(here: Floats, there: Floats, unit: str) -> dict[str, Any]:
+    """The way that is left.
+
+    Args:
+        here: (3,).
+        there: (3,).
+        unit: Of both.
+
+    Returns:
+        `total`, and `axes`: of x, y and z with its sign, in words.
+    """
     step = there - here
     length = float(np.linalg.norm(step))
     digits = int(np.clip(1 - np.floor(np.log10(max(length, 1e-9))), 0, 4))  # two digits of the whole way
-    cells = "".join(
-        f"<span><i>{axis}</i> {'+' if d >= 0 else '−'}{abs(float(d)):.{digits}f} {escape(unit)}</span>"
-        for axis, d in zip("xyz", step, strict=True)
-    )
-    return f"<div class='way'><span><b>{length:.{digits}f} {escape(unit)}</b> to go</span>{cells}</div>"
+    axes = {a: f"{'+' if d >= 0 else '−'}{abs(float(d)):.{digits}f} {unit}" for a, d in zip("xyz", step, strict=True)}
+    return {"total": f"{length:.{digits}f} {unit}", "axes": axes}
 
 
-def to_go(state: State, measured: Floats, unit: str) -> str:
-    """How far the ball is from its target, HTML; in pixels where the calibration cannot measure it yet."""
-    if state.target is None or state.phase not in ("aim", "moving", "shown"):
-        return ""
-    here = state.position if state.phase == "shown" else measured
-    if state.phase == "shown" and np.isfinite(here).all():
-        return f"<div class='detail'>ball at {escape(place(here, unit))}</div>"
-    if np.isfinite(here).all():
-        return way(here, state.target.xyz, unit)
+def to_go(state: State, measured: Floats, unit: str) -> dict[str, Any] | None:
+    """How far the ball is from its target, as `way`; in pixels where the calibration cannot measure it yet.
+
+    Args:
+        state: Of the controller.
+        measured: (3,) where the calibration sees the ball; NaN for nowhere.
+        unit: Of lengths.
+    """
+    if state.target is None or state.phase not in ("aim", "moving"):
+        return None
+    if np.isfinite(measured).all():
+        return way(measured, state.target.xyz, unit)
     offs = [float(np.linalg.norm(look.uv - look.expected)) for look in state.looks]
     offs = [off for off in offs if np.isfinite(off)]
-    if offs:
-        return f"<div class='way'><b>{np.mean(offs):.0f} px</b> to go</div>"
-    return ""
-
-
-def place(xyz: Floats, unit: str) -> str:
-    """A position in words."""
-    cells = ", ".join(f"{axis} {number(float(value), 4)}" for axis, value in zip("xyz", xyz, strict=True))
-    return f"{cells} {unit}"
-
-
-def banner(state: State, measured: Floats, unit: str, moves: bool) -> str:
-    """The head of the pictures, HTML: what to do, in type that is read from two metres; a problem with its cure."""
-    head = headline(state, moves)
-    lines = [f"<div class='title'>{escape(head.title)}</div>"]
-    if head.detail:
-        lines.append(f"<div class='detail'>{escape(head.detail)}</div>")
-    if state.phase == "trouble" and state.problem is not None:
-        lines += [
-            f"<div class='detail'><b>{word}</b> {escape(text)}</div>"
-            for word, text in (("why:", state.problem.why), ("to do:", state.problem.fix))
-            if text
-        ]
-        lines.append("<div class='detail'>Nothing is lost. Press Try again when it is mended.</div>")
-    if state.phase == "done":
-        lines.append(_results(state))
-    if state.phase == "aim" and state.target is not None:
-        lines.append(f"<div class='detail'>target: {escape(place(state.target.xyz, unit))}</div>")
-    lines.append(to_go(state, measured, unit))
-    return f"<div class='banner' style='border-color:{head.colour}'>{''.join(lines)}</div>"
-
-
-def _results(state: State) -> str:
-    links = "<a class='file' href='/calibration.implicam' download>Download the calibration</a>"
-    if state.report is not None:
-        links += "<a class='file' href='/report.html' target='_blank' rel='noopener'>Open the report</a>"
-    else:
-        links += "<span class='detail'>Too few points for a report.</span>"
-    return f"<div class='detail'>{escape(state.message)}</div><div>{links}</div>"
-
-
-def numbers(history: Sequence[Step], unit: str, skipped: int) -> str:
-    """What is known so far: points, and the 95 % uncertainty; HTML."""
-    step = history[-1] if history else Step(0)
-    rest = f" · {skipped} skipped" if skipped else ""
-    if not np.isfinite(step.usual):
-        return (
-            f"<div class='numbers'><div><b>{step.points}</b> points{rest}</div>"
-            "<div class='small'>no calibration yet: the first points are spread evenly</div></div>"
-        )
-    return (
-        f"<div class='numbers'><div><b>{step.points}</b> points{rest}</div>"
-        f"<div><b>{number(step.usual, 2)} {escape(unit)}</b> in 95 % of the workspace</div>"
-        f"<div><b>{number(step.worst, 2)} {escape(unit)}</b> everywhere</div>"
-        "<div class='small'>95 % uncertainty of a measured position</div></div>"
-    )
+    return {"total": f"{np.mean(offs):.0f} px", "axes": {}} if offs else None
 
 
 def allowed(state: State, moves: bool) -> dict[str, bool]:
@@ -173,3 +126,39 @@ def labels(state: State, moves: bool, unit: str) -> dict[str, str]:
     worst = state.history[-1].worst if state.history else np.nan
     reached = f": {number(worst, 2)} {unit} everywhere" if np.isfinite(worst) else ""
     return {"go": go, "finish": f"Stop now{reached}"}
+
+
+def trouble_of(state: State, camera: str) -> str:
+    """What is wrong with this camera, in words; empty where nothing is known to be."""
+    problem = state.problem
+    if state.phase != "trouble" or problem is None or not re.search(rf"\b{re.escape(camera)}\b", problem.what):
+        return ""
+    return problem.what
+
+
+def current(state: State) -> State:
+    """The state with the reticles of its target: pictures of the point before show where that one was."""
+    target = state.target
+    if state.phase != "aim" or target is None or len(target.uv) != len(state.looks):
+        return state
+    return replace(state, looks=tuple(replace(a, expected=uv) for a, uv in zip(state.looks, target.uv, strict=True)))
+
+
+def away(look: Look) -> float:
+    """Pixels from the ball to where the target is expected; NaN where either is not known."""
+    return float(np.linalg.norm(look.uv - look.expected))
+
+
+def verdict(state: State, look: Look) -> tuple[str, str]:
+    """What there is to say of one camera, in a few words, and whether it is good, bad, idle, or asks for something."""
+    found, planned = len(look.found) > 0, state.target is not None and bool(np.isfinite(look.expected).all())
+    if found and planned:
+        distance = away(look)
+        if state.phase == "shown":
+            return f"found, {distance:.0f} px from the circle", "good"
+        return ("on target", "good") if distance <= ON_TARGET_PX else (f"{distance:.0f} px to go", "ask")
+    if state.calibration is not None and not planned and state.target is not None:
+        return "target not in view", "idle"
+    if found:
+        return "ball found", "good"
+    return ("ball not found", "bad") if state.phase == "shown" else ("no ball seen", "idle")

@@ -12,6 +12,8 @@ const FINER = 3;                           // steps between two places of the ma
 const CIVIDIS = [[0, 32, 76], [0, 49, 111], [57, 72, 107], [87, 92, 109], [112, 113, 115], [138, 134, 120],
   [165, 157, 116], [195, 181, 105], [226, 206, 84], [255, 233, 69]];
 
+const GROUPS = ["box", "cameras", "pictures", "known", "volume", "measured", "ellipsoids", "cloud", "skipped", "target", "ball"];
+
 export const cividis = (part) => {
   const at = Math.min(Math.max(part, 0), 1) * (CIVIDIS.length - 1), k = Math.min(Math.floor(at), CIVIDIS.length - 2);
   return CIVIDIS[k].map((value, i) => (value + (at - k) * (CIVIDIS[k + 1][i] - value)) / 255);
@@ -34,19 +36,36 @@ export class Scene3D {
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.redraw());
     this.groups = {};
-    for (const name of ["box", "cameras", "pictures", "known", "volume", "measured", "ellipsoids"]) {
+    for (const name of GROUPS) {
       this.groups[name] = new THREE.Group();
       this.scene.add(this.groups[name]);
     }
     this.wanted = {};
+    this.magnified = 1;
+    this.reset(placing);
+    this.theme();
+    new ResizeObserver(() => this.fit()).observe(canvas.parentElement);
+  }
+
+  // Everything away; what is drawn then is placed anew.
+  reset(placing) {
+    this.placing = placing;
+    for (const group of Object.values(this.groups)) this.empty(group);
     this.pictures = {};
     this.centres = {};
     this.extent = [];
-    this.measured = {count: 0, xyz: [], cov: []};
-    this.magnified = 1;
     this.labels = [];
-    this.theme();
-    new ResizeObserver(() => this.fit()).observe(canvas.parentElement);
+    this.known = null;
+    this.measured = {xyz: [], cov: []};
+  }
+
+  empty(group) {
+    group.traverse((one) => {
+      one.geometry?.dispose();
+      one.material?.map?.dispose?.();
+      one.material?.dispose();
+    });
+    group.clear();
   }
 
   place([x, y, z]) {
@@ -256,13 +275,15 @@ export class Scene3D {
 
   // ---------------------------------------------------------------------------------------------- what is in the scene
 
-  setBox([low, high], unit, number) {
+  // edges: pairs of places, where the workspace is no box.
+  setBox([low, high], unit, number, edges = null) {
     const corner = (i) => this.place([0, 1, 2].map((axis) => (i >> axis & 1 ? high : low)[axis]));
     const corners = [...Array(8).keys()].map(corner);
     const pairs = [];
     for (let i = 0; i < 8; i++)
       for (const bit of [1, 2, 4]) if (!(i & bit)) pairs.push(corners[i], corners[i | bit]);
-    this.lines(pairs, "soft", this.groups.box, 0.7);
+    const hull = edges?.flat().map((place) => this.place(place));
+    this.lines(hull ?? pairs, "soft", this.groups.box, 0.7);
     ["x", "y", "z"].forEach((name, axis) => {
       const a = [...low], b = [...low], m = [...low], away = [0, 0, 0];
       b[axis] = high[axis];
@@ -379,7 +400,53 @@ export class Scene3D {
     if (some(false).length) this.points(some(false), "bad", this.groups.known);
   }
 
+  setMarks(name, xyz, colour) {
+    this.empty(this.groups[name]);
+    if (xyz.length) this.points(xyz.map((place) => this.place(place)), colour, this.groups[name], POINT_PX + 1);
+    this.redraw();
+  }
+
+  // Balls of a size of the scene, with a halo and a word where one is given: depth is hard to see else.
+  setBalls(name, xyz, colour, radius, word = "") {
+    const key = JSON.stringify([xyz, this.placing]);
+    if (this.balls?.[name] === key && this.groups[name].children.length) return;
+    this.balls = {...this.balls, [name]: key};
+    const group = this.groups[name];
+    this.labels = this.labels.filter((label) => label.sprite.parent !== group);
+    this.empty(group);
+    for (const place of xyz) {
+      const at = this.place(place);
+      for (const [times, opacity] of word ? [[1, 1], [2.2, 0.3]] : [[1, 1]]) {
+        const material = new THREE.MeshLambertMaterial({color: this.colour(colour), transparent: opacity < 1, opacity});
+        const ball = new THREE.Mesh(new THREE.SphereGeometry(times * radius, 24, 16), material);
+        ball.position.copy(at);
+        ball.userData.colour = colour;
+        group.add(ball);
+      }
+      if (word) this.label(word, at.clone().add(new THREE.Vector3(0, 0, 3 * radius)), group, colour);
+    }
+    this.redraw();
+  }
+
   // ------------------------------------------------------------------------------------- the region of the uncertainty
+
+  // Places coloured by a value, those from a level on; grey where there is none.
+  setCloud(xyz, values, low, high, level) {
+    const group = this.groups.cloud;
+    this.empty(group);
+    const shown = xyz.map((_, i) => i).filter((i) => values[i] === null || values[i] >= level);
+    if (shown.length) {
+      const drawn = this.points(shown.map((i) => this.place(xyz[i])), "soft", group, POINT_PX);
+      const grey = this.colour("soft");
+      const colours = shown.flatMap((i) => values[i] === null ? [grey.r, grey.g, grey.b]
+        : [...new THREE.Color().setRGB(...cividis((values[i] - low) / Math.max(high - low, 1e-300)), THREE.SRGBColorSpace)]);
+      drawn.geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 3));
+      Object.assign(drawn.material, {vertexColors: true, transparent: true, opacity: 0.8});
+      drawn.material.color.set(0xffffff);
+      drawn.userData.colour = "";
+    }
+    this.redraw();
+  }
 
   // axes: x, y and z; values: x slowest, null where there is none.
   setMap(axes, values) {
@@ -413,7 +480,7 @@ export class Scene3D {
   // The boundary of where the map is at least `level`, or has no value: dual vertices, one in each cell that it crosses.
   setThreshold(level) {
     const group = this.groups.volume;
-    for (const one of [...group.children]) { one.geometry.dispose(); one.material.dispose(); group.remove(one); }
+    this.empty(group);
     if (!this.map) return;
     const {axes, fine, field} = this.map;
     const padded = fine.map((n) => n + 2);
@@ -503,22 +570,16 @@ export class Scene3D {
       own.cov.push(cov[i]);
     });
     const group = this.groups.measured;
-    for (const one of [...group.children]) { one.geometry.dispose(); one.material.dispose(); group.remove(one); }
+    this.empty(group);
     this.points(own.xyz, "measured", group);
     this.setMagnified(this.magnified);
-  }
-
-  clearMeasured() {
-    this.measured = {count: 0, xyz: [], cov: []};
-    for (const name of ["measured", "ellipsoids"]) this.groups[name].clear();
-    this.redraw();
   }
 
   // Ellipsoids that hold 95 %, so many times larger; the last ones, where there are more than can be drawn.
   setMagnified(times) {
     this.magnified = times;
     const group = this.groups.ellipsoids, {xyz, cov} = this.measured;
-    for (const one of [...group.children]) { one.geometry.dispose(); one.material.dispose(); group.remove(one); }
+    this.empty(group);
     const first = Math.max(xyz.length - MAX_ELLIPSOIDS, 0), count = xyz.length - first;
     if (!count) return this.redraw();
     const sphere = new THREE.SphereGeometry(1, 16, 12);

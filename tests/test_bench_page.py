@@ -1,0 +1,210 @@
+"""The page of a session behind its door: what buttons do, when a robot may move, who is told what, and how fast."""
+
+from __future__ import annotations
+
+import json
+import time
+import urllib.error
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from implicam.errors import UsageError
+from implicam.hardware import SimulatedRobot
+from implicam.session.controller import SessionController
+from implicam.session.setup import Setup, open_session
+from test_view import Client
+
+pytest.importorskip("starlette")
+from implicam.viewer.bench_page import BenchPage, open_page
+
+SETUP = Setup(rig="stereo", budget=12, speed=1e6)
+
+
+class Arm(SimulatedRobot):
+    """A stand-in that does not say that it is one: the page has to treat it as a real arm."""
+
+    simulated = False
+
+    def __init__(self) -> None:
+        super().__init__(np.zeros(3), sd=0.0, speed=1e9, rng=np.random.default_rng(1))
+        self.went: list[Any] = []
+        self.stopped = 0
+
+    def move(self, xyz: Any) -> Any:
+        self.went.append(xyz)
+        return super().move(xyz)
+
+    def stop(self) -> None:
+        self.stopped += 1
+        super().stop()
+
+
+def until(happened: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Iterator[SessionController]:
+    with open_session(tmp_path / "session", SETUP) as made:
+        yield made
+
+
+@pytest.fixture
+def arm(controller: SessionController) -> Arm:
+    made = Arm()
+    made._reported = controller.equipment.robot.position()
+    robot: Any = controller.equipment.robot
+    robot._options = replace(robot._options, speed=0.1)
+    controller.equipment.robot.driver = made  # type: ignore[attr-defined]
+    return made
+
+
+@pytest.fixture
+def page(controller: SessionController) -> Iterator[BenchPage]:
+    made = BenchPage(controller)
+    made.start()
+    until(lambda: controller.state.phase == "aim")
+    yield made
+    made.close()
+
+
+# ------------------------------------------------------------------------------------------------ a robot that is real
+
+
+def test_a_real_robot_moves_once_for_each_yes(arm: Arm, controller: SessionController, page: BenchPage) -> None:
+    target = controller.state.target
+    assert target is not None
+    asked = page.do({"word": "go"})["ask"]
+    assert not arm.went
+    assert "Is the way free?" in asked["text"]
+    assert f"{target.xyz[0]:.6g}"[:5] in asked["text"]
+    assert page.do({"word": "go", "yes": "a guess"})["ask"]["number"] != asked["number"]
+    page.do({"word": "go", "yes": asked["number"]})
+    until(lambda: controller.state.phase == "shown")
+    assert len(arm.went) == 1
+    page.do({"word": "accept"})
+    until(lambda: controller.state.phase == "aim")
+    page.do({"word": "go", "yes": asked["number"]})  # the yes of before
+    assert "ask" in page.do({"word": "go"})
+    assert len(arm.went) == 1
+
+
+def test_a_move_that_nobody_let_it_do_is_refused_by_the_guard(
+    arm: Arm, controller: SessionController, page: BenchPage
+) -> None:
+    controller.go()
+    assert controller.state.phase == "trouble"
+    assert "was not confirmed" in str(controller.state.problem)
+    assert not arm.went
+
+
+def test_a_yes_does_not_outlive_a_stop_a_minute_or_the_target(
+    arm: Arm, controller: SessionController, page: BenchPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from implicam.viewer import bench_page
+
+    asked = page.do({"word": "go"})["ask"]["number"]
+    page.stop({})
+    assert arm.stopped
+    assert "ask" in page.do({"word": "go", "yes": asked})
+    asked = page.do({"word": "go"})["ask"]["number"]
+    before = controller.state.target
+    page.do({"word": "skip"})
+    until(lambda: controller.state.phase == "aim" and controller.state.target is not before)
+    assert "ask" in page.do({"word": "go", "yes": asked})  # it was for another target
+    monkeypatch.setattr(bench_page, "YES_SECONDS", 0.0)
+    asked = page.do({"word": "go"})["ask"]["number"]
+    assert "ask" in page.do({"word": "go", "yes": asked})
+    assert not arm.went
+
+
+def test_going_on_by_itself_needs_its_own_yes_and_ends_where_nobody_watches(
+    arm: Arm, controller: SessionController, page: BenchPage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from implicam.viewer import bench_page
+
+    monkeypatch.setattr(bench_page, "UNWATCHED_SECONDS", 0.5)
+    go = page.do({"word": "go"})["ask"]["number"]
+    assert "ask" in page.do({"word": "auto", "on": True, "yes": go})  # a yes to one move is none to all
+    asked = page.do({"word": "auto", "on": True})["ask"]
+    assert "anywhere it can reach" in asked["text"] or "in the box" in asked["text"]
+    assert "at 0.1 m/s" in asked["text"]
+    page.do({"word": "auto", "on": True, "yes": asked["number"]})
+    assert controller.state.auto
+    until(lambda: not controller.state.auto)
+    went = len(arm.went)
+    time.sleep(0.5)
+    assert len(arm.went) <= went + 1  # the one that was begun
+    assert "ask" in page.do({"word": "auto", "on": True})
+
+
+def test_a_simulated_robot_is_not_asked_about(controller: SessionController, page: BenchPage) -> None:
+    assert page.do({"word": "go"}) == {"begun": True}
+    until(lambda: controller.state.phase == "shown")
+
+
+def test_stop_takes_no_time(controller: SessionController, page: BenchPage) -> None:
+    before = time.monotonic()
+    page.stop({})
+    assert time.monotonic() - before < 0.2
+
+
+# ----------------------------------------------------------------------------------------------------- what is sent
+
+
+def states(client: Client) -> Iterator[dict[str, Any]]:
+    with client.opener.open(client.base + "api/state", timeout=60) as stream:
+        while line := stream.readline().decode():
+            if line.startswith("data: "):
+                yield json.loads(line[6:])
+
+
+def test_all_pages_are_told_and_pictures_come_as_they_are_shown(controller: SessionController) -> None:
+    with open_page(controller) as (url, _):
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            Client(url.partition("?")[0])
+        one, two = Client(url), Client(url)
+        about = json.loads(one.get("api/about"))
+        assert [camera["name"] for camera in about["cameras"]] == ["cam1", "cam2"]
+        first, second = states(one), states(two)
+        assert next(s for s in first if s["phase"] == "aim")["buttons"]["go"] == {
+            "enabled": True,
+            "next": True,
+            "label": "Go",
+        }
+        assert next(s for s in second if s["phase"] == "aim")
+        post(one, "api/do", {"word": "go"})
+        shown = next(s for s in second if s["phase"] == "shown")
+        assert [camera["says"] for camera in shown["cameras"]] == ["ball found"] * 2
+        assert next(s for s in first if s["phase"] == "shown")["version"] == shown["version"]
+        for width in ("480", "99999", "-1", "x"):
+            assert one.get(f"picture.jpg?camera=cam1&width={width}")[:3] == b"\xff\xd8\xff"
+        with pytest.raises(urllib.error.HTTPError, match="400"):
+            one.get("picture.jpg?camera=..%2F..")
+        scene = json.loads(one.get("api/scene"))
+        assert len(scene["edges"]) == 12
+        post(two, "api/do", {"word": "close"})
+
+
+def post(client: Client, path: str, body: Any) -> Any:
+    import urllib.request
+
+    request = urllib.request.Request(client.base + path, json.dumps(body).encode())
+    return json.loads(client.opener.open(request, timeout=60).read())
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{}, {"word": 3}, {"word": "stop it"}, {"word": "accept"}, {"word": ["go"]}, {"word": "undo"}, {"word": "do"}],
+)
+def test_nonsense_is_refused(page: BenchPage, given: Any) -> None:
+    with pytest.raises(UsageError):
+        page.do(given)
