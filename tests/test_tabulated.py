@@ -270,3 +270,19 @@ def test_a_file_that_is_no_kernel_leaves_it_to_numpy(
 def test_the_version_says_how_it_measures(cli: Cli) -> None:
     told = cli("--version", "-v").out
     assert "by tables: compiled" in told or "by tables: NumPy" in told
+
+
+@pytest.mark.slow
+def test_a_hundred_cameras(kernel: Kernel) -> None:
+    rig = build_rig("dome100", seed=1)
+    made: RigCalibration = ic.ForwardGP().fit(
+        simulate(rig, random_positions(rig, 60, np.random.default_rng(1)), seed=1)
+    )
+    tables, uv = RigTable.of(made.map, made.data.xyz), views_all_over(made, 200)
+    uv[np.random.default_rng(2).random(uv.shape[:2]) < 0.88] = np.nan
+    uv[3, np.flatnonzero(np.isfinite(uv[3, :, 0]))[:2]] += 25.0
+    exact, found = made.map.locate(uv, noise_of(made, uv)), tables._by_kernel(kernel, uv, noise_of(made, uv))
+    sure = found.code == MEASURED
+    assert sure.mean() > 0.95
+    agree(found, exact, sure)
+    assert exact.left_out[3].sum() == 2

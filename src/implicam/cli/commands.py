@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -179,6 +179,38 @@ def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path |
         show.say("no file is written; --force writes it nevertheless")
 
 
+def _measure_in_parts(
+    calibration: Path, source: Path, output: Path, chunk: int | None, *, others: Sequence[object], json: bool
+) -> None:
+    """A table of any length, if that is wanted, and leave."""
+    if chunk is None:
+        return
+    from implicam.bulk import measure_file
+
+    if any(others):
+        raise UsageError(
+            "--chunk goes with no other option of measure but -o and --json.",
+            why="a table of any length has the columns u_CAMERA, v_CAMERA and point, and nothing else is read",
+            fix="leave the other options out, or measure it as a whole",
+        )
+    fitted = load_calibration(calibration)
+    if not isinstance(fitted, RigCalibration):
+        raise UsageError(
+            f"{fitted.method} does not measure tables in parts.",
+            fix="measure it as a whole, or calibrate with forward-gp or explicit",
+        )
+    with show.progress(json) as progress:
+        found = measure_file(fitted, source, output, points_at_once=chunk, progress=progress)
+    if json:
+        show.emit_json({"measured": str(output), **asdict(found)})
+    else:
+        before = f", {found.resumed:,} of them before" if found.resumed else ""
+        show.line(f"{output}: {found.rows:,} rows, {found.measured:,} measured{before}")
+        for alarm in found.alarms:
+            show.alarm(f"{alarm}{'' if alarm.endswith('?') else '.'} These rows say that they are doubtful.")
+    raise typer.Exit(int(bool(found.alarms)))
+
+
 @command("measure")
 @with_table_options
 def measure_command(
@@ -194,6 +226,14 @@ def measure_command(
     pairs: Annotated[
         Path | None, typer.Option("--distances", metavar="CSV", help="The same for a table of pairs: a,b.")
     ] = None,
+    chunk: Annotated[
+        int | None,
+        typer.Option(
+            metavar="POINTS",
+            help="Measure a .csv, .parquet or .npz of any length in parts of so many points; killed, the same command "
+            "goes on.",
+        ),
+    ] = None,
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
@@ -204,6 +244,7 @@ def measure_command(
     """
     refuse_folder(output)
     must_not_replace(output, calibration, dataset)
+    _measure_in_parts(calibration, dataset, output, chunk, others=(table != DOCUMENTED, between, pairs), json=json)
     check_table_name(output)
     wanted = [*([between] if between else ()), *(read_pairs(pairs) if pairs else ())]
     beside = output.with_name("distances.csv")

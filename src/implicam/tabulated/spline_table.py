@@ -25,6 +25,9 @@ MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR = 0.003, 0.005
 CELLS = (6, 8, 12, 16, 24, 32, 48)
 """Cells along an axis to choose from."""
 
+AXIS_SHARE = 0.3
+"""What the splines along one axis may be off, in what the table may be, for it adds the errors of three."""
+
 LINE_STEPS, LINES = 192, 6
 """Places along a line, at which the sites of all `CELLS` lie, and lines along each axis."""
 
@@ -80,7 +83,7 @@ def _look(rig: FittedRig, points: Floats) -> Exact:
     with np.errstate(all="ignore"):
         for c, model in enumerate(posterior.models):
             rows = model.rows(points)
-            half = apply_covariance_root(rows, posterior.root(c))
+            half = apply_covariance_root(rows, posterior.root(c) if posterior.tied else posterior.alone[c])
             mean[:, c] = rows.mean
             own[:, c] = half @ half.swapaxes(1, 2) + rows.rest[:, None, None] * np.eye(2)
             if posterior.tied:
@@ -478,7 +481,7 @@ def cells_are_enough(channels: Floats, scale: Floats) -> Callable[[int], bool]:
         for line, exact, allowed in zip(lines, channels, scale, strict=True):
             off = np.abs(turn @ line[at] - exact) / allowed
             off = off[np.isfinite(off)]
-            if len(off) and np.quantile(off, 0.999) > 0.5:
+            if len(off) and np.quantile(off, 0.999) > AXIS_SHARE:
                 return False
         return True
 
