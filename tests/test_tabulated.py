@@ -278,7 +278,7 @@ def test_a_hundred_cameras(kernel: Kernel) -> None:
     made: RigCalibration = ic.ForwardGP().fit(
         simulate(rig, random_positions(rig, 60, np.random.default_rng(1)), seed=1)
     )
-    tables, uv = RigTable.of(made.map, made.data.xyz), views_all_over(made, 200)
+    tables, uv = tables_of(made), views_all_over(made, 200)
     uv[np.random.default_rng(2).random(uv.shape[:2]) < 0.88] = np.nan
     uv[3, np.flatnonzero(np.isfinite(uv[3, :, 0]))[:2]] += 25.0
     exact, found = made.map.locate(uv, noise_of(made, uv)), tables._by_kernel(kernel, uv, noise_of(made, uv))
