@@ -187,6 +187,28 @@ def test_undo_takes_back_the_last_point_only(controller: SessionController) -> N
     assert controller.state.phase == "aim"
 
 
+def test_any_point_can_be_taken_back_or_measured_again(after_ten: SessionController) -> None:
+    before = after_ten.session.data
+    assert before is not None
+    after_ten.remove("p003")
+    assert after_ten.state.message.startswith("point p003 is taken back. point 10")
+    after_ten.remove("p004", again=True)
+    assert after_ten.session.data is not None
+    left = [name for name in before.points.tolist() if name not in ("p003", "p004")]
+    assert after_ten.session.data.points.tolist() == left
+    assert after_ten.state.data is not None
+    assert len(after_ten.state.data) == 8
+    target = after_ten.state.target
+    assert target is not None
+    assert (target.name, target.xyz.tolist()) == ("p011", before.xyz[3].tolist())
+    assert (
+        np.nanmax(np.abs(target.uv - before.observations.uv[3])) < 10
+    )  # the outline's middle, and a calibration of eight points
+    with pytest.raises(UsageError, match="no point 'p003'"):
+        after_ten.remove("p003")
+    assert after_ten.state.phase == "aim"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["camera", "robot"])
 def test_trouble_is_shown_and_the_session_waits(controller: SessionController, part: str) -> None:

@@ -218,10 +218,29 @@ def test_an_undone_point_is_kept_and_its_name_is_not_used_again(tmp_path):
     db.close()
 
 
+def test_any_point_can_be_taken_back_and_its_pictures_are_found(tmp_path):
+    folder = tmp_path / "s"
+    with begin(folder) as session:
+        for i in (1, 2, 3):
+            session.accept(shot(f"p00{i}", i, n=i), pictures={"right": picture(i)})
+        assert session.pictures_of("p002") == {"right": folder / "images" / "right" / "p002.png"}
+        session.remove("p002")
+        assert session.pictures_of("p002") == {}
+        assert_same(session.data, expected([shot("p001", 1), shot("p003", 3, n=3)]))
+        assert_same(files_of(folder), session.data)
+        assert session.next_name() == "p004"
+        for name in ("p002", "p009"):
+            refused(UsageError, lambda name=name: session.remove(name), name)
+        assert (folder / "undone" / "right" / "p002.png").exists()
+    with Session.open(folder) as session:
+        assert_same(session.data, expected([shot("p001", 1), shot("p003", 3, n=3)]))
+
+
 STEPS = st.lists(
     st.one_of(
         st.tuples(st.just("accept"), st.integers(1, 4), st.sampled_from(["", "lamp", "a, b"]), st.booleans()),
         st.tuples(st.just("undo")),
+        st.tuples(st.just("remove"), st.integers(0, 20)),
         st.tuples(st.just("skip"), st.text(st.characters(exclude_categories=["Cs"]), max_size=20)),
         st.tuples(st.just("log"), st.dictionaries(st.sampled_from("abc"), st.floats(allow_nan=False) | st.text("é, ")))
         | st.tuples(st.just("set"), st.sampled_from("kl"), st.none() | st.integers() | st.lists(st.booleans())),
@@ -251,6 +270,10 @@ def test_any_sequence_does_as_a_list_does(steps):
                 session.accept(shots[-1])
             elif step[0] == "undo":
                 assert session.undo() == (str(shots.pop().shots[0]) if shots else None)
+            elif step[0] == "remove" and shots:
+                session.remove(str(shots.pop(step[1] % len(shots)).shots[0]))
+            elif step[0] == "remove":
+                continue
             elif step[0] == "skip":
                 skipped.append(step[1])
                 session.skip(np.array([len(skipped), 0.1, -1e300]), step[1])
@@ -414,6 +437,8 @@ while died:
             session = Session.open(folder)
             if start == "undo":
                 session.undo()
+            elif start == "remove":
+                session.remove("p001")
             else:
                 session.accept(shot("p003", 3), pictures={"right": picture(3), "té st": picture(3)})
         died = forked(act, at)
@@ -432,7 +457,8 @@ print(at, sorted(seen))
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("start", "sizes", "fewest"), [("accept", [2, 3], 40), ("undo", [1, 2], 25), ("create", [], 20)]
+    ("start", "sizes", "fewest"),
+    [("accept", [2, 3], 40), ("undo", [1, 2], 25), ("remove", [1, 2], 25), ("create", [], 20)],
 )
 def test_a_kill_between_any_two_steps_is_healed(tmp_path, start, sizes, fewest):
     """Every statement to SQLite, and every file written, flushed or renamed is a step."""

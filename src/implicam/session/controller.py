@@ -27,6 +27,7 @@ from implicam import calibration_file
 from implicam.active import Loop, PredictedCovariance, Step, Target
 from implicam.calibrators import Calibration, PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
+from implicam.dataset.image_bounds import are_on_image
 from implicam.dataset.units import METRES_PER_UNIT
 from implicam.detect import Detected, Detector, View, correct_outlines
 from implicam.errors import HardwareError, ImplicamError, UsageError
@@ -283,6 +284,33 @@ class SessionController:
             self._fit()
             self._aim(f"point {name} is taken back. " if name else "")
         return name
+
+    def remove(self, name: str, *, again: bool = False) -> None:
+        """Take any accepted point back.
+
+        Args:
+            name: Its name.
+            again: The next target is where it was, so that it can be measured anew.
+
+        Raises:
+            UsageError: There is no such point.
+        """
+        with self._working("fitting", f"taking {name} back"):
+            data = self.session.data
+            self.session.remove(name)
+            self._fit()
+            self._aim(f"point {name} is taken back. ")
+            if again and data is not None:
+                self._aim_at(data.xyz[data.shots == name][0])
+
+    def _aim_at(self, xyz: Floats) -> None:
+        """The next target, as a person wants it."""
+        uv = np.full((len(self.equipment.cameras), 2), np.nan)
+        calibration = self.loop.calibration
+        if isinstance(calibration, PredictsPixels):
+            predicted = calibration.predict(xyz[None])
+            uv = np.where(are_on_image(calibration.trained, predicted)[..., None], predicted, np.nan)[0]
+        self._show(target=Target(self.session.next_name(), xyz, uv))
 
     def retry(self) -> None:
         """After trouble: connect again, and go on."""

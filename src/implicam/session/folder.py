@@ -140,6 +140,17 @@ def remove_partial(folder: Path, cameras: Sequence[Camera]) -> None:
             partial.unlink()
 
 
+def picture_path(folder: Path, camera: str, shot: str) -> Path:
+    """Where a picture is: images/<camera>/<shot>.png.
+
+    Args:
+        folder: Of the session.
+        camera: Its name.
+        shot: Its name.
+    """
+    return folder / IMAGES / camera / f"{shot}.png"
+
+
 def write_pictures(folder: Path, shot: str, pictures: Mapping[str, Grey]) -> None:
     """Write images/<camera>/<shot>.png, whole, and flushed to the disk together with its name.
 
@@ -149,7 +160,7 @@ def write_pictures(folder: Path, shot: str, pictures: Mapping[str, Grey]) -> Non
         pictures: Camera name -> grey (height, width), from 0 to 1, or uint8.
     """
     for camera, picture in pictures.items():
-        path = folder / IMAGES / camera / f"{shot}.png"
+        path = picture_path(folder, camera, shot)
         write_picture(path, picture, bits=_choose_bits(picture))
         for place in (path.parent, folder / IMAGES, folder):
             flush_folder(place)
@@ -165,7 +176,7 @@ def set_pictures_aside(folder: Path, shots: Iterable[str], cameras: Sequence[Cam
     """
     for shot in shots:
         for camera in cameras:
-            picture = folder / IMAGES / camera.name / f"{shot}.png"
+            picture = picture_path(folder, camera.name, shot)
             if picture.exists():
                 picture.rename(_find_free_path(folder / UNDONE / camera.name / picture.name))
 

@@ -202,13 +202,36 @@ class Session:
             if self._data is None:
                 return None
             last = str(self._data.shots[-1])
+            self.remove(last)
+            return last
+
+    def remove(self, shot: str) -> None:
+        """Take any accepted shot back. It stays in the database as undone, and its pictures in undone/.
+
+        Args:
+            shot: Its name.
+
+        Raises:
+            UsageError: There is no accepted shot of this name.
+        """
+        with self._lock:
+            if self._data is None or shot not in self._data.shots.tolist():
+                raise UsageError(f"there is no point {shot!r} in the session.", fix="name one that was accepted")
             with self._database.transaction():
-                self._database.run("UPDATE shots SET state = 'undone', time = ? WHERE name = ?", now(), last)
+                self._database.run("UPDATE shots SET state = 'undone', time = ? WHERE name = ?", now(), shot)
             self._data = read_accepted(self._database, self._empty)
             self._tables = files.Tables.of(self._data, self._empty)
             self._run_after_commit(lambda: self._tables.rewrite(self.folder))
             self._run_after_commit(self._set_pictures_aside)
-            return last
+
+    def pictures_of(self, shot: str) -> dict[str, Path]:
+        """Where the pictures of an accepted shot are: camera name -> file.
+
+        Args:
+            shot: Its name; of another one there are none.
+        """
+        places = {camera.name: files.picture_path(self.folder, camera.name, shot) for camera in self.cameras}
+        return {camera: path for camera, path in places.items() if path.is_file()}
 
     def skip(self, xyz: ArrayLike, reason: str) -> None:
         """Keep that a target was not measured, and why.
