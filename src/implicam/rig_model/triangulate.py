@@ -344,14 +344,29 @@ class _Solution(NamedTuple):
 
 
 def _as_labelled(weights: _Weights, labels: Labels, x: Floats, cov: Floats, seen: Bools) -> tuple[Floats, Floats]:
-    """Positions (n, 3) and covariance in the world as labelled, eq. (22): a label near x is off, by what is known of
-    its shot, and where no shot is near, the world itself is known as well as its labels."""
+    unknowns = labels.unknowns
+    return as_labelled(labels, x, cov, None if unknowns is None else weights.with_cameras(x, cov, seen, unknowns.cross))
+
+
+def as_labelled(labels: Labels, x: Floats, cov: Floats, with_unknowns: Floats | None) -> tuple[Floats, Floats]:
+    """Positions and covariance in the world as labelled, eq. (22): a label near x is off, by what is known of its shot,
+    and where no shot is near, the world itself is known as well as its labels.
+
+    Args:
+        labels: How known positions are off.
+        x: (n, 3) positions, in the working frame.
+        cov: (n, 3, 3) of them.
+        with_unknowns: (n, 3, k) covariance of their errors with the unknowns of the labels, where there are any.
+
+    Returns:
+        The same of the labels that would be there.
+    """
     unknown = labels.world(x)
-    if labels.unknowns is None:
+    if labels.unknowns is None or with_unknowns is None:
         return x, cov + unknown
     known = np.nan_to_num(labels.shots.label_slope(x, labels.sd))
     own = known @ labels.unknowns.covariance @ known.swapaxes(1, 2)
-    tied = weights.with_cameras(x, cov, seen, labels.unknowns.cross) @ known.swapaxes(1, 2)
+    tied = with_unknowns @ known.swapaxes(1, 2)
     return x - known @ labels.unknowns.mean, cov + own + tied + tied.swapaxes(1, 2) + unknown
 
 

@@ -37,6 +37,9 @@ typedef struct {
   double min_p, disagree_p, agree_p, clearly_better;
   double step_sds;                 /* the last step in standard deviations */
   int64_t suspects_of_two;
+  const float *ties;               /* [x][y][z][pair][4]: covariances of two cameras; null where they are independent */
+  const float *through;            /* [x][y][z][camera][2][unknowns]: the same of a camera and unknowns of labels */
+  int64_t unknowns;
 } Map;
 
 /* One view of a point. */
@@ -56,8 +59,9 @@ typedef struct {
 } View;
 
 EXPORTED int64_t implicam_kernel_version(void) { return KERNEL_VERSION; }
-EXPORTED int64_t implicam_workspace_bytes(int64_t cameras) {
-  return cameras * (int64_t)(sizeof(View) + BLOCK * sizeof(Seen));
+EXPORTED int64_t implicam_workspace_bytes(int64_t cameras, int64_t unknowns) {
+  const int64_t views = cameras * (int64_t)(sizeof(View) + BLOCK * sizeof(Seen));
+  return views + 2 * cameras * (2 * cameras + 4 + unknowns) * (int64_t)sizeof(double);
 }
 EXPORTED int64_t implicam_map_bytes(void) { return (int64_t)sizeof(Map); }
 
@@ -116,17 +120,18 @@ EXPORTED int64_t implicam_has_avx2(void) {
 
 /* Points from pixels. uv [n][camera][2], not finite where not seen; noise [n][camera], or of all points alike where
    noise_stride is 0; xyz [n][3], cov [n][9], p [n], share [n], code [n], left_out [n][camera]. Where the code is not
-   MEASURED, numbers are NaN, but for p of a CONTRADICTION. workspace: implicam_workspace_bytes of it, for this call alone. simd: 0 for the code
+   MEASURED, numbers are NaN, but for p of a CONTRADICTION. tied [n][3][unknowns]: D^T S^-1 times the covariance with the
+   unknowns of the labels, where there are any; before any labels are taken into account, as all numbers. workspace: implicam_workspace_bytes of it, for this call alone. simd: 0 for the code
    that every processor can run, or what implicam_has_avx2 says. */
 EXPORTED void implicam_measure(const Map *map, int64_t n, const double *uv, const double *noise, int64_t noise_stride,
                                double *xyz, double *cov, double *p, double *share, int8_t *code, uint8_t *left_out,
-                               void *workspace, int64_t simd) {
+                               double *tied, void *workspace, int64_t simd) {
 #if defined(HAS_AVX2)
   if (simd) {
-    measure_avx2(map, n, uv, noise, noise_stride, xyz, cov, p, share, code, left_out, workspace);
+    measure_avx2(map, n, uv, noise, noise_stride, xyz, cov, p, share, code, left_out, tied, workspace);
     return;
   }
 #endif
   (void)simd;
-  measure_base(map, n, uv, noise, noise_stride, xyz, cov, p, share, code, left_out, workspace);
+  measure_base(map, n, uv, noise, noise_stride, xyz, cov, p, share, code, left_out, tied, workspace);
 }

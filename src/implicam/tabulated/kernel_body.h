@@ -149,64 +149,99 @@ static int NAME(meet)(const View *views, int64_t m, double x[3]) {
   return 1;
 }
 
-/* The normal equations of the views of a point at a place: H, g and squares; N is H by the noise alone. With `views`,
-   only those in use count, and what is found of each is kept, with `all` of the others, too. Returns 0 outside of the
-   box, and where the table is not accurate enough. */
-INLINE int NAME(normal)(const Map *map, const Seen *seen, View *views, int64_t m, const double x[3], int all,
-                        double H[6], double g[3], double N[6], double *squares) {
-  const int64_t C = map->cameras;
-  int64_t cell[3];
+/* Where a place lies in the table. */
+typedef struct {
+  const float *corner;             /* of its cell, in the grid */
+  const uint8_t *marks;            /* of its cell, null where nothing is marked */
+  int64_t node, sx, sy, sz;        /* number of the first node; strides in the grid */
   float w[3][4], d[3][4];
+} NAME(Spot);
+
+/* Returns 0 outside of the box. */
+INLINE int NAME(find)(const Map *map, const double x[3], NAME(Spot) *spot) {
+  int64_t cell[3];
   for (int a = 0; a < 3; ++a) {
     const double t = (x[a] - map->low[a]) * map->per_length[a];
     if (!(t >= 0 && t <= (double)map->cells[a])) return 0;
     cell[a] = (int64_t)t;
     if (cell[a] >= map->cells[a]) cell[a] = map->cells[a] - 1;
-    NAME(weights)(t - (double)cell[a], w[a], d[a]);
+    NAME(weights)(t - (double)cell[a], spot->w[a], spot->d[a]);
   }
-  const int64_t sz = C * WIDTH, sy = (map->cells[2] + 3) * sz, sx = (map->cells[1] + 3) * sy;
-  const float *corner = map->grid + cell[0] * sx + cell[1] * sy + cell[2] * sz;
-  const uint8_t *marks =
-      map->marked ? map->marked + ((cell[0] * map->cells[1] + cell[1]) * map->cells[2] + cell[2]) * C : NULL;
+  spot->sz = map->cameras * WIDTH;
+  spot->sy = (map->cells[2] + 3) * spot->sz;
+  spot->sx = (map->cells[1] + 3) * spot->sy;
+  spot->node = (cell[0] * (map->cells[1] + 3) + cell[1]) * (map->cells[2] + 3) + cell[2];
+  spot->corner = map->grid + spot->node * spot->sz;
+  spot->marks = map->marked
+      ? map->marked + ((cell[0] * map->cells[1] + cell[1]) * map->cells[2] + cell[2]) * map->cameras : NULL;
+  return 1;
+}
+
+/* What a camera sees there: the residual of a view and its slope, and the variance without noise, uu, uv, vv. */
+INLINE void NAME(look)(const Map *map, const NAME(Spot) *spot, const Seen *seen, const double x[3], double r[2],
+                       double D[2][3], double S[3]) {
+  const float *base = spot->corner + seen->camera * WIDTH;
+  const int64_t sx = spot->sx, sy = spot->sy, sz = spot->sz;
+  const float (*w)[4] = spot->w, (*d)[4] = spot->d;
+  Eight value = ZERO8, by_x = ZERO8, by_y = ZERO8, by_z = ZERO8;
+  for (int p = 0; p < 4; ++p) {
+    Eight a = ZERO8, ay = ZERO8, az = ZERO8;
+    const float *plane = base + p * sx;
+    for (int q = 0; q < 4; ++q) {
+      const float *row = plane + q * sy;
+      const Eight n0 = LOAD(row), n1 = LOAD(row + sz), n2 = LOAD(row + 2 * sz), n3 = LOAD(row + 3 * sz);
+      Eight along = ZERO8, slope = ZERO8;
+      MADD(along, w[2][0], n0); MADD(along, w[2][1], n1); MADD(along, w[2][2], n2); MADD(along, w[2][3], n3);
+      MADD(slope, d[2][0], n0); MADD(slope, d[2][1], n1); MADD(slope, d[2][2], n2); MADD(slope, d[2][3], n3);
+      MADD(a, w[1][q], along);
+      MADD(ay, d[1][q], along);
+      MADD(az, w[1][q], slope);
+    }
+    MADD(value, w[0][p], a);
+    MADD(by_x, d[0][p], a);
+    MADD(by_y, w[0][p], ay);
+    MADD(by_z, w[0][p], az);
+  }
+  const double *P = map->projections + 12 * seen->camera;
+  const double depth = 1 / (P[8] * x[0] + P[9] * x[1] + P[10] * x[2] + P[11]);
+  const double uv[2] = {(P[0] * x[0] + P[1] * x[1] + P[2] * x[2] + P[3]) * depth,
+                        (P[4] * x[0] + P[5] * x[1] + P[6] * x[2] + P[7]) * depth};
+  for (int k = 0; k < 2; ++k) {
+    r[k] = (k ? seen->v : seen->u) - uv[k] - LANE(value, k);
+    const double slopes[3] = {LANE(by_x, k), LANE(by_y, k), LANE(by_z, k)};
+    for (int a = 0; a < 3; ++a) D[k][a] = (P[4 * k + a] - uv[k] * P[8 + a]) * depth + slopes[a] * map->per_length[a];
+  }
+  S[0] = LANE(value, 2);
+  S[1] = LANE(value, 3);
+  S[2] = LANE(value, 4);
+}
+
+/* H (six numbers) += f D^T E of two rows each. */
+INLINE void NAME(add)(double H[6], double f, const double D[2][3], const double E[2][3]) {
+  H[0] += f * (D[0][0] * E[0][0] + D[1][0] * E[1][0]);
+  H[1] += f * (D[0][0] * E[0][1] + D[1][0] * E[1][1]);
+  H[2] += f * (D[0][0] * E[0][2] + D[1][0] * E[1][2]);
+  H[3] += f * (D[0][1] * E[0][1] + D[1][1] * E[1][1]);
+  H[4] += f * (D[0][1] * E[0][2] + D[1][1] * E[1][2]);
+  H[5] += f * (D[0][2] * E[0][2] + D[1][2] * E[1][2]);
+}
+
+/* The normal equations of the views of a point at a place: H, g and squares; N is H by the noise alone. With `views`,
+   only those in use count, and what is found of each is kept, with `all` of the others, too. Returns 0 outside of the
+   box, and where the table is not accurate enough. */
+INLINE int NAME(normal)(const Map *map, const Seen *seen, View *views, int64_t m, const double x[3], int all,
+                        double H[6], double g[3], double N[6], double *squares) {
+  NAME(Spot) spot;
+  if (!NAME(find)(map, x, &spot)) return 0;
   for (int k = 0; k < 6; ++k) H[k] = N[k] = 0;
   g[0] = g[1] = g[2] = 0;
   double sum = 0;
   for (int64_t i = 0; i < m; ++i) {
     if (views && !views[i].used && !all) continue;
-    const int64_t camera = seen[i].camera;
-    if (marks && marks[camera]) return 0;
-    const float *base = corner + camera * WIDTH;
-    Eight value = ZERO8, by_x = ZERO8, by_y = ZERO8, by_z = ZERO8;
-    for (int p = 0; p < 4; ++p) {
-      Eight a = ZERO8, ay = ZERO8, az = ZERO8;
-      const float *plane = base + p * sx;
-      for (int q = 0; q < 4; ++q) {
-        const float *row = plane + q * sy;
-        const Eight n0 = LOAD(row), n1 = LOAD(row + sz), n2 = LOAD(row + 2 * sz), n3 = LOAD(row + 3 * sz);
-        Eight along = ZERO8, slope = ZERO8;
-        MADD(along, w[2][0], n0); MADD(along, w[2][1], n1); MADD(along, w[2][2], n2); MADD(along, w[2][3], n3);
-        MADD(slope, d[2][0], n0); MADD(slope, d[2][1], n1); MADD(slope, d[2][2], n2); MADD(slope, d[2][3], n3);
-        MADD(a, w[1][q], along);
-        MADD(ay, d[1][q], along);
-        MADD(az, w[1][q], slope);
-      }
-      MADD(value, w[0][p], a);
-      MADD(by_x, d[0][p], a);
-      MADD(by_y, w[0][p], ay);
-      MADD(by_z, w[0][p], az);
-    }
-    const double *P = map->projections + 12 * camera;
-    const double depth = 1 / (P[8] * x[0] + P[9] * x[1] + P[10] * x[2] + P[11]);
-    const double uv[2] = {(P[0] * x[0] + P[1] * x[1] + P[2] * x[2] + P[3]) * depth,
-                          (P[4] * x[0] + P[5] * x[1] + P[6] * x[2] + P[7]) * depth};
-    double r[2], D[2][3], WD[2][3];
-    for (int k = 0; k < 2; ++k) {
-      r[k] = (k ? seen[i].v : seen[i].u) - uv[k] - LANE(value, k);
-      const double slopes[3] = {LANE(by_x, k), LANE(by_y, k), LANE(by_z, k)};
-      for (int a = 0; a < 3; ++a) D[k][a] = (P[4 * k + a] - uv[k] * P[8 + a]) * depth + slopes[a] * map->per_length[a];
-    }
-    const double variance = seen[i].variance;
-    const double S0 = LANE(value, 2) + variance, S1 = LANE(value, 3), S2 = LANE(value, 4) + variance;
+    if (spot.marks && spot.marks[seen[i].camera]) return 0;
+    double r[2], D[2][3], WD[2][3], S[3];
+    NAME(look)(map, &spot, seen + i, x, r, D, S);
+    const double variance = seen[i].variance, S0 = S[0] + variance, S1 = S[1], S2 = S[2] + variance;
     const double both = S0 * S2 - S1 * S1, f = 1 / (both * variance), less = both * f, inverse = variance * f;
     const double W0 = S2 * inverse, W1 = -S1 * inverse, W2 = S0 * inverse; /* less is 1 / variance */
     const double Wr0 = W0 * r[0] + W1 * r[1], Wr1 = W1 * r[0] + W2 * r[1], distance = r[0] * Wr0 + r[1] * Wr1;
@@ -224,23 +259,95 @@ INLINE int NAME(normal)(const Map *map, const Seen *seen, View *views, int64_t m
       memcpy(view->WD, WD, sizeof WD);
       if (!view->used) continue;
     }
-    H[0] += D[0][0] * WD[0][0] + D[1][0] * WD[1][0];
-    H[1] += D[0][0] * WD[0][1] + D[1][0] * WD[1][1];
-    H[2] += D[0][0] * WD[0][2] + D[1][0] * WD[1][2];
-    H[3] += D[0][1] * WD[0][1] + D[1][1] * WD[1][1];
-    H[4] += D[0][1] * WD[0][2] + D[1][1] * WD[1][2];
-    H[5] += D[0][2] * WD[0][2] + D[1][2] * WD[1][2];
-    N[0] += less * (D[0][0] * D[0][0] + D[1][0] * D[1][0]);
-    N[1] += less * (D[0][0] * D[0][1] + D[1][0] * D[1][1]);
-    N[2] += less * (D[0][0] * D[0][2] + D[1][0] * D[1][2]);
-    N[3] += less * (D[0][1] * D[0][1] + D[1][1] * D[1][1]);
-    N[4] += less * (D[0][1] * D[0][2] + D[1][1] * D[1][2]);
-    N[5] += less * (D[0][2] * D[0][2] + D[1][2] * D[1][2]);
+    NAME(add)(H, 1, D, WD);
+    NAME(add)(N, less, D, D);
     for (int a = 0; a < 3; ++a) g[a] += D[0][a] * Wr0 + D[1][a] * Wr1;
     sum += distance;
   }
   *squares = sum;
   return isfinite(sum);
+}
+
+/* The same of cameras that are tied together: the covariance of all views of a point is one matrix. tied: D^T S^-1 times
+   the covariance of what the cameras would see with the unknowns of the labels, [3][unknowns]. room: for (2 m)^2 +
+   (4 + unknowns) 2 m numbers. */
+static int NAME(normal_tied)(const Map *map, const Seen *seen, int64_t m, const double x[3], double H[6], double g[3],
+                             double N[6], double *squares, double *tied, double *room) {
+  NAME(Spot) spot;
+  if (!NAME(find)(map, x, &spot)) return 0;
+  const int64_t n = 2 * m, C = map->cameras, K = map->unknowns, pairs = C * (C - 1) / 2, columns = 4 + K;
+  double *L = room, *B = room + n * n; /* B: slope, residual, and unknowns of each row */
+  float w[64];
+  int64_t nodes[64];
+  for (int p = 0; p < 4; ++p)
+    for (int q = 0; q < 4; ++q)
+      for (int s = 0; s < 4; ++s) {
+        w[(p * 4 + q) * 4 + s] = spot.w[0][p] * spot.w[1][q] * spot.w[2][s];
+        nodes[(p * 4 + q) * 4 + s] = spot.node + (p * (map->cells[1] + 3) + q) * (map->cells[2] + 3) + s;
+      }
+  for (int k = 0; k < 6; ++k) N[k] = 0;
+  for (int64_t i = 0; i < m; ++i) {
+    const int64_t c = seen[i].camera;
+    if (spot.marks && spot.marks[c]) return 0;
+    double r[2], D[2][3], S[3];
+    NAME(look)(map, &spot, seen + i, x, r, D, S);
+    NAME(add)(N, 1 / seen[i].variance, D, D);
+    L[2 * i * n + 2 * i] = S[0] + seen[i].variance;
+    L[(2 * i + 1) * n + 2 * i] = S[1];
+    L[(2 * i + 1) * n + 2 * i + 1] = S[2] + seen[i].variance;
+    for (int64_t j = 0; j < i; ++j) { /* camera of j before c: the table has rows of it, and columns of c */
+      const int64_t b = seen[j].camera, pair = b * (2 * C - b - 1) / 2 + c - b - 1;
+      float sum[4] = {0};
+      for (int node = 0; node < 64; ++node) {
+        const float *at = map->ties + (nodes[node] * pairs + pair) * 4;
+        for (int l = 0; l < 4; ++l) sum[l] += w[node] * at[l];
+      }
+      L[2 * i * n + 2 * j] = sum[0];
+      L[(2 * i + 1) * n + 2 * j] = sum[1];
+      L[2 * i * n + 2 * j + 1] = sum[2];
+      L[(2 * i + 1) * n + 2 * j + 1] = sum[3];
+    }
+    for (int k = 0; k < 2; ++k) {
+      double *row = B + (2 * i + k) * columns;
+      for (int a = 0; a < 3; ++a) row[a] = D[k][a];
+      row[3] = r[k];
+      for (int64_t l = 0; l < K; ++l) row[4 + l] = 0;
+      for (int node = 0; node < 64 && K; ++node) {
+        const float *at = map->through + ((nodes[node] * C + c) * 2 + k) * K;
+        for (int64_t l = 0; l < K; ++l) row[4 + l] += (double)w[node] * (double)at[l];
+      }
+    }
+  }
+  for (int64_t i = 0; i < n; ++i) { /* Cholesky, and L^-1 B at once */
+    double *own = L + i * n, *row = B + i * columns;
+    for (int64_t j = 0; j <= i; ++j) {
+      double sum = own[j];
+      for (int64_t k = 0; k < j; ++k) sum -= own[k] * L[j * n + k];
+      if (j < i) {
+        own[j] = sum * L[j * n + j]; /* of the diagonal, the inverse is kept */
+        continue;
+      }
+      if (!(sum > 0)) return 0;
+      own[i] = 1 / sqrt(sum);
+    }
+    for (int64_t k = 0; k < i; ++k)
+      for (int64_t l = 0; l < columns; ++l) row[l] -= own[k] * B[k * columns + l];
+    for (int64_t l = 0; l < columns; ++l) row[l] *= own[i];
+  }
+  for (int k = 0; k < 6; ++k) H[k] = 0;
+  g[0] = g[1] = g[2] = *squares = 0;
+  for (int64_t l = 0; l < 3 * K; ++l) tied[l] = 0;
+  for (int64_t i = 0; i < n; ++i) {
+    const double *row = B + i * columns;
+    H[0] += row[0] * row[0]; H[1] += row[0] * row[1]; H[2] += row[0] * row[2];
+    H[3] += row[1] * row[1]; H[4] += row[1] * row[2]; H[5] += row[2] * row[2];
+    for (int a = 0; a < 3; ++a) {
+      g[a] += row[a] * row[3];
+      for (int64_t l = 0; l < K; ++l) tied[a * K + l] += row[a] * row[4 + l];
+    }
+    *squares += row[3] * row[3];
+  }
+  return isfinite(*squares);
 }
 
 static int NAME(normal_of_views)(const Map *map, const Seen *seen, View *views, int64_t m, const double x[3], int all,
@@ -523,8 +630,8 @@ INLINE void NAME(put)(const NAME(Place) *found, double *xyz, double *cov, double
 
 /* A block of up to BLOCK points. */
 static void NAME(block)(const Map *map, int64_t n, const double *uv, const double *noise, int64_t noise_stride,
-                        double *xyz, double *cov, double *p, double *share, int8_t *code, uint8_t *left_out, Seen *seen,
-                        View *views) {
+                        double *xyz, double *cov, double *p, double *share, int8_t *code, uint8_t *left_out,
+                        double *tied, Seen *seen, View *views, double *room) {
   const int64_t C = map->cameras;
   double H[6][BLOCK], N[6][BLOCK], inverse[6][BLOCK], by_noise[6][BLOCK], g[3][BLOCK], x[3][BLOCK], step[3][BLOCK];
   double squares[BLOCK], good[BLOCK], fine[BLOCK], place[3], h[6], e[6], f[3];
@@ -564,7 +671,11 @@ static void NAME(block)(const Map *map, int64_t n, const double *uv, const doubl
     for (int64_t j = 0; j < number; ++j) {
       const int64_t k = going[j];
       for (int a = 0; a < 3; ++a) place[a] = x[a][k];
-      if (!NAME(normal)(map, seen + C * k, NULL, views_of[k], place, 0, h, f, e, squares + k)) continue;
+      const int fine_here =
+          map->ties ? NAME(normal_tied)(map, seen + C * k, views_of[k], place, h, f, e, squares + k,
+                                        tied + 3 * map->unknowns * k, room)
+                    : NAME(normal)(map, seen + C * k, NULL, views_of[k], place, 0, h, f, e, squares + k);
+      if (!fine_here) continue;
       for (int a = 0; a < 6; ++a) {
         H[a][k] = h[a];
         N[a][k] = e[a];
@@ -603,7 +714,7 @@ static void NAME(block)(const Map *map, int64_t n, const double *uv, const doubl
     const int solved = code[k] == DISAGREES;
     NAME(Place) found = {{0}, {0}, 0, 0};
     int mended = m > 2 ? UNSURE : NOT_CLEAR;
-    if (m > 2 && !(solved && NAME(near)(p[k], map->disagree_p)))
+    if (m > 2 && !map->ties && !(solved && NAME(near)(p[k], map->disagree_p)))
       mended = NAME(mend)(map, seen + C * k, views, m, &found);
     if (mended == MENDED) {
       NAME(put)(&found, xyz + 3 * k, cov + 9 * k, p + k, share + k);
@@ -623,13 +734,14 @@ static void NAME(block)(const Map *map, int64_t n, const double *uv, const doubl
 
 static void NAME(measure)(const Map *map, int64_t n, const double *uv, const double *noise, int64_t noise_stride,
                           double *xyz, double *cov, double *p, double *share, int8_t *code, uint8_t *left_out,
-                          void *workspace) {
+                          double *tied, void *workspace) {
   const int64_t C = map->cameras;
   View *views = workspace;
   Seen *seen = (Seen *)(views + C);
+  double *room = (double *)(seen + C * BLOCK);
   for (int64_t k = 0; k < n; k += BLOCK)
     NAME(block)(map, n - k < BLOCK ? n - k : BLOCK, uv + 2 * C * k, noise + noise_stride * k, noise_stride, xyz + 3 * k,
-                cov + 9 * k, p + k, share + k, code + k, left_out + C * k, seen, views);
+                cov + 9 * k, p + k, share + k, code + k, left_out + C * k, tied + 3 * map->unknowns * k, seen, views, room);
 }
 
 #undef Eight

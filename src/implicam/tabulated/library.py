@@ -37,6 +37,9 @@ class Map(ctypes.Structure):
         ("clearly_better", ctypes.c_double),
         ("step_sds", ctypes.c_double),
         ("suspects_of_two", ctypes.c_int64),
+        ("ties", ctypes.c_void_p),
+        ("through", ctypes.c_void_p),
+        ("unknowns", ctypes.c_int64),
     )
 
 
@@ -57,7 +60,7 @@ class Kernel:
             version = self._function(library.implicam_kernel_version)()
             size = self._function(library.implicam_map_bytes)()
             self.avx2 = bool(self._function(library.implicam_has_avx2)())
-            self.workspace_bytes = self._function(library.implicam_workspace_bytes, ctypes.c_int64)
+            self.workspace_bytes = self._function(library.implicam_workspace_bytes, ctypes.c_int64, ctypes.c_int64)
             self.measure = library.implicam_measure
         except AttributeError as error:
             raise OSError(f"{path} is no kernel of implicam") from error
@@ -65,7 +68,7 @@ class Kernel:
             raise OSError(f"{path} is of another version of implicam")
         self.measure.restype = None
         numbers, arrays = [ctypes.c_int64], [ctypes.c_void_p]
-        self.measure.argtypes = [ctypes.POINTER(Map), *numbers, *arrays * 2, *numbers, *arrays * 7, *numbers]
+        self.measure.argtypes = [ctypes.POINTER(Map), *numbers, *arrays * 2, *numbers, *arrays * 8, *numbers]
         self.path = path
 
     @staticmethod

@@ -48,9 +48,9 @@ class Live:
         if tables is None or tables.compiled is None:
             return
         self._kernel = tables.compiled
-        self._workspace = ctypes.create_string_buffer(self._kernel.workspace_bytes(C))
+        self._workspace = ctypes.create_string_buffer(self._kernel.workspace_bytes(C, 0))
         out = (self._xyz, self._cov, self._p, self._share, self._code, self._left_out)
-        self._out = [array.ctypes.data for array in out]
+        self._out = [*(array.ctypes.data for array in out), None]  # no labels
         self._map, self._at, self._usual = ctypes.byref(tables.map), self._uv.ctypes.data, self._noise.ctypes.data
 
     def measure(self, uv: ArrayLike, noise: ArrayLike | None = None) -> MeasuredPixels:

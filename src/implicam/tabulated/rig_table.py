@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from implicam.geometry import Floats
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig
-from implicam.rig_model.triangulate import Located
+from implicam.rig_model.triangulate import Located, as_labelled
 from implicam.tabulated.array_solver import ArraySolver, Found
 from implicam.tabulated.library import LEFT_TO_EXACT, Kernel, Map, kernel
 from implicam.tabulated.sight_lines import SightLines, tabulate_sight_lines
 from implicam.tabulated.spline_table import SplineTable, box_of, tabulate
 from implicam.threads import cores, side_by_side
 
-STEP_SDS = 0.3
-"""The last step of Gauss-Newton, in standard deviations of the position: the error falls with its square."""
+STEP_SDS = 0.1
+"""The last step of Gauss-Newton, in standard deviations of the position: its square is what remains of this, the step
+itself of the covariance, both times some hundredths."""
 
 POINTS_PER_TASK = 8192
 """Points at a time of one thread of the kernel."""
@@ -30,6 +31,10 @@ ROWS_AT_A_TIME = 4096
 
 MAX_BYTES = 1 << 30
 """Of a table."""
+
+
+MAX_TIED_CAMERAS = 16
+"""Cameras of a rig that errors of known positions tie together: the table of their pairs grows with the square."""
 
 
 def why_not_tabulated(rig: FittedRig, known_points: int) -> str:
@@ -44,10 +49,14 @@ def why_not_tabulated(rig: FittedRig, known_points: int) -> str:
     """
     if rig.degrees is not None:
         return "the noise of its views has heavy tails"
-    if rig.posterior.tied or (rig.labels is not None and rig.labels.unknowns is not None):
-        return "errors of known positions tie its cameras together"
     if not known_points:
         return "no known points say where its workspace is"
+    if not rig.posterior.tied:
+        return ""
+    if len(rig.cameras) > MAX_TIED_CAMERAS:
+        return f"errors of known positions tie its cameras together, which are more than {MAX_TIED_CAMERAS}"
+    if kernel() is None:
+        return "errors of known positions tie its cameras together, and the kernel is not compiled here"
     return ""
 
 
@@ -91,28 +100,35 @@ class RigTable:
             In the working frame, within 1 % of a standard deviation of the exact path.
         """
         uv = np.ascontiguousarray(uv, dtype=np.float64)
+        if self.compiled is None and self.rig.posterior.tied:
+            return self.rig.locate(uv, noise)
         found = self._by_arrays(uv, noise) if self.compiled is None else self._by_kernel(self.compiled, uv, noise)
         exact = np.flatnonzero(found.code == LEFT_TO_EXACT)
-        found = self._as_labelled(found)
         if len(exact):
             slow = self.rig.locate(uv[exact], noise[exact])
             found.xyz[exact], found.cov[exact], found.p[exact] = slow.xyz, slow.cov, slow.p
             found.left_out[exact], found.share[exact] = slow.left_out, slow.share
         return Located(found.xyz, found.cov, found.p, found.left_out, found.share)
 
-    def _as_labelled(self, found: Found) -> Found:
-        """With what is not known of the world where its labels are, eq. (28)."""
-        if self.rig.labels is None:
+    def _as_labelled(self, found: Found, tied: Floats) -> Found:
+        """In the world as labelled, eqs. (22) and (28)."""
+        labels = self.rig.labels
+        if labels is None:
             return found
-        parts = np.trace(found.cov, axis1=1, axis2=2)
-        cov = found.cov + self.rig.labels.world(found.xyz)
-        share = 1 - (1 - found.share) * parts / np.trace(cov, axis1=1, axis2=2)
-        return found._replace(cov=cov, share=share)
+
+        def some(part: slice) -> tuple[Floats, Floats]:
+            return as_labelled(labels, found.xyz[part], found.cov[part], found.cov[part] @ tied[part])
+
+        parts = side_by_side(some, [slice(i, i + ROWS_AT_A_TIME) for i in range(0, len(tied), ROWS_AT_A_TIME)])
+        xyz, cov = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        left = np.trace(found.cov, axis1=1, axis2=2) / np.trace(cov, axis1=1, axis2=2)
+        return found._replace(xyz=xyz, cov=cov, share=np.clip(1 - (1 - found.share) * left, 0.0, 1.0))
 
     def _by_arrays(self, uv: Floats, noise: Floats) -> Found:
         tasks = [slice(i, i + ROWS_AT_A_TIME) for i in range(0, len(uv), ROWS_AT_A_TIME)] or [slice(0, 0)]
         found = side_by_side(lambda part: self.arrays.measure(uv[part], noise[part]), tasks, calls_blas=False)
-        return Found(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+        every = Found(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+        return self._as_labelled(every, np.zeros((len(uv), 3, 0)))
 
     @cached_property
     def arrays(self) -> ArraySolver:
@@ -128,10 +144,11 @@ class RigTable:
             np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n), np.empty(n), np.empty(n, dtype=np.int8),
             np.empty((n, C), dtype=np.bool_),
         )  # fmt: skip
+        tied = np.zeros((n, 3, self.table.through.shape[5]))
 
         def some(part: slice) -> None:
-            out = [column[part].ctypes.data for column in found]
-            workspace = ctypes.create_string_buffer(compiled.workspace_bytes(C))
+            out = [column[part].ctypes.data for column in (*found, tied)]
+            workspace = ctypes.create_string_buffer(compiled.workspace_bytes(C, tied.shape[2]))
             sd = noise[part].ctypes.data if per_point else noise.ctypes.data
             compiled.measure(
                 self.map, len(uv[part]), uv[part].ctypes.data, sd, per_point, *out, workspace, compiled.avx2
@@ -142,7 +159,7 @@ class RigTable:
         else:
             tasks = [slice(i, i + POINTS_PER_TASK) for i in range(0, n, POINTS_PER_TASK)]
             side_by_side(some, tasks, calls_blas=False)
-        return found
+        return self._as_labelled(found, tied)
 
     @cached_property
     def map(self) -> Map:
@@ -152,7 +169,7 @@ class RigTable:
             cameras=len(table.projections), sight_cells=self.lines.points.shape[1] - 3,
             min_p=settings.min_p_value, disagree_p=settings.disagree_p_value, agree_p=settings.agree_p_value,
             clearly_better=settings.clearly_better_ratio, step_sds=STEP_SDS,
-            suspects_of_two=settings.max_suspects_of_two,
+            suspects_of_two=settings.max_suspects_of_two, unknowns=table.through.shape[5],
         )  # fmt: skip
         made.cells[:], made.low[:], made.per_length[:] = (
             table.cells.tolist(),
@@ -171,6 +188,8 @@ class RigTable:
             "sight_frames": np.ascontiguousarray(self.lines.frames, dtype=np.float64),
             "sight": _aligned(self.lines.points),
         }
+        if self.table.ties.shape[3]:
+            arrays["ties"], arrays["through"] = _aligned(self.table.ties), _aligned(self.table.through)
         if self.table.marked.any():
             arrays["marked"] = np.ascontiguousarray(self.table.marked, dtype=np.uint8)
         return arrays
