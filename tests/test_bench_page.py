@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from implicam.dataset import read_dataset
 from implicam.errors import UsageError
-from implicam.hardware import SimulatedRobot
+from implicam.hardware import Person, SimulatedRobot
 from implicam.session.controller import SessionController
 from implicam.session.setup import Setup, open_session
 from test_view import Client
@@ -208,3 +209,105 @@ def post(client: Client, path: str, body: Any) -> Any:
 def test_nonsense_is_refused(page: BenchPage, given: Any) -> None:
     with pytest.raises(UsageError):
         page.do(given)
+
+
+# ------------------------------------------------------------------------------------------------------ in a browser
+
+
+@pytest.fixture
+def by_hand(tmp_path: Path) -> Iterator[SessionController]:
+    """A person moves the ball, as they say; the cameras see it where it always is."""
+    with open_session(tmp_path / "session", SETUP) as made:
+        person = Person(lambda wish: None)
+        yield SessionController(made.session, replace(made.equipment, robot=person), made.loop)
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
+    by_hand: SessionController, chromium: dict[str, Any]
+) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    typed = [("-0.38296", "-382.5667340745084", "0,25"), ("1e-3", "−12,5 cm", "0.1m")]
+    with open_page(by_hand) as (url, _), sync_api.sync_playwright() as play:
+        browser = play.chromium.launch(**chromium)
+        page = browser.new_page()
+        page.set_default_timeout(60_000)
+        page.goto(url)
+        for k, texts in enumerate(typed):
+            page.wait_for_selector("#go:enabled")
+            for axis, text in zip("xyz", texts, strict=True):
+                assert page.input_value(f"#{axis}") == ""  # what nobody typed is not known
+                page.fill(f"#{axis}", text)
+            page.keyboard.press("Enter")
+            page.get_by_role("button", name="It is", exact=True).click()  # outside of the workspace: asked about
+            page.wait_for_selector("#accept:enabled")
+            page.click("#accept")
+            until(lambda k=k: by_hand.session.data is not None and len(by_hand.session.data) == k + 1)
+            kept = read_dataset(by_hand.session.folder).xyz
+        assert kept.tolist() == [[-0.38296, -382.5667340745084, 0.25], [1e-3, -125.0, 100.0]]  # to the last bit
+        page.wait_for_selector("#go:enabled")
+        page.fill("#x", "1,234")
+        page.fill("#y", "1")
+        page.fill("#z", "1")
+        page.click("#go")
+        page.get_by_text("may mean 1.234 or 1234").wait_for()
+        # the list: one is looked at, one is deleted
+        page.click("#list summary")
+        row = page.locator("#points tr", has_text="p001")
+        row.get_by_role("button", name="look").click()
+        page.wait_for_function(
+            "[...document.querySelectorAll('#ask-pictures img')].filter((i) => i.naturalWidth).length == 2"
+        )
+        page.get_by_role("button", name="close", exact=True).click()
+        row.get_by_role("button", name="delete").click()
+        page.get_by_role("button", name="Delete", exact=True).click()
+        until(lambda: by_hand.session.data is not None and by_hand.session.data.points.tolist() == ["p002"])
+        page.locator("#points tr", has_text="p001").wait_for(state="detached")
+        page.locator("#points tr", has_text="p002").get_by_role("button", name="again").click()
+        page.get_by_role("button", name="Measure it again").click()
+        until(lambda: by_hand.session.data is None or not len(by_hand.session.data))
+        there = [1e-3, -125.0, 100.0]
+        until(lambda: by_hand.state.target is not None and by_hand.state.target.xyz.tolist() == there)
+        browser.close()
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_a_phone_and_two_desktops_each_have_their_layout_and_show_the_same(
+    controller: SessionController, chromium: dict[str, Any]
+) -> None:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with open_page(controller) as (url, _), sync_api.sync_playwright() as play:
+        browser = play.chromium.launch(**chromium)
+        wrong: list[str] = []
+        pages = []
+        for wide, high, scheme in ((1440, 900, "light"), (820, 1180, "dark"), (390, 844, "dark")):
+            page = browser.new_context(viewport={"width": wide, "height": high}, color_scheme=scheme).new_page()
+            page.set_default_timeout(60_000)
+            page.on("pageerror", lambda error: wrong.append(str(error)))
+            page.goto(url)
+            page.wait_for_selector("body[data-phase=aim]")
+            pages.append(page)
+        desktop, tablet, phone = pages
+        for page in pages:
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        assert [page.locator(".tile:visible").count() for page in pages] == [2, 2, 1]
+        paper = [page.evaluate("getComputedStyle(document.body).backgroundColor") for page in pages]
+        assert paper[0] != paper[1] == paper[2]
+        phone.click("#go")  # the only button in green
+        for page in pages:
+            page.wait_for_selector("#accept:enabled")
+            page.get_by_text("Found in 2 of 2 cameras").wait_for()
+        seen = phone.locator("#stop").bounding_box()
+        assert seen is not None
+        assert seen["y"] + seen["height"] <= 844  # STOP is on the first screen
+        phone.locator("#which button").nth(1).click()
+        assert phone.locator(".tile:visible b").inner_text() == "cam2"
+        desktop.keyboard.press("a")
+        for page in pages:
+            page.get_by_text("1 point").first.wait_for()
+        tablet.keyboard.press("Escape")
+        until(lambda: "robot stopped by hand" in [event.what for event in controller.session.events])
+        assert not wrong
+        browser.close()

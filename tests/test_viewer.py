@@ -198,9 +198,19 @@ def test_only_buttons_that_make_sense(stereo: Any) -> None:
     def on(state: State, moves: bool = True) -> set[str]:
         return {word for word, may in words.allowed(state, moves).items() if may}
 
-    assert on(aim) == {"go", "skip", "undo", "finish", "auto", "stop"}
+    assert on(aim) == {"go", "skip", "undo", "delete", "again", "finish", "auto", "stop"}
     assert on(replace(aim, data=None, calibration=None)) == {"go", "skip", "auto", "stop"}
-    assert on(replace(aim, phase="shown")) == {"accept", "redo", "skip", "undo", "finish", "auto", "stop"}
+    assert on(replace(aim, phase="shown")) == {
+        "accept",
+        "redo",
+        "skip",
+        "undo",
+        "delete",
+        "again",
+        "finish",
+        "auto",
+        "stop",
+    }
     assert "accept" not in on(replace(aim, phase="shown", looks=(look("left"),)))
     for busy in ("starting", "moving", "fitting"):
         assert on(replace(aim, phase=busy)) == {"auto", "stop"}

@@ -23,8 +23,9 @@ from implicam.dataset import Floats
 from implicam.errors import ImplicamError, UsageError
 from implicam.hardware import GuardedRobot
 from implicam.hardware.protocol import format_position
-from implicam.images import Grey
+from implicam.images import Grey, read_picture
 from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, SessionController, State
+from implicam.session.typed import PositionQuestion, TypedPosition, parse_position
 from implicam.viewer import words
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, list_cameras, up_of
 from implicam.viewer.snapshot import curve, snapshot
@@ -87,6 +88,8 @@ class BenchPage:
         self._curved: Any = None
         self._watching, self._last_watched = 0, time.monotonic()
         self._yes: dict[str, tuple[Any, float]] = {}  # number -> what a yes with it allows, and until when
+        self._position: TypedPosition | None = None  # that was typed last
+        self._questioned: dict[str, Any] | None = None  # what is asked about it
         self._allowed: Floats | None = None  # the one target to which a person has let the robot go
         self._threads = [
             threading.Thread(target=work, name=f"implicam-{work.__name__}", daemon=True)
@@ -146,23 +149,30 @@ class BenchPage:
             return self._report_position(given)
         if word == "go" and self._asks:
             return self._ask_for_move(given)
+        if word in ("delete", "again"):
+            return functools.partial(controller.remove, str(given.get("point")), again=word == "again")
         if word == "skip":
             reason = given.get("reason")
             return functools.partial(
                 controller.skip, reason if isinstance(reason, str) and reason else "skipped by hand"
             )
-        return {
+        actions: dict[str, Callable[[], Any]] = {
             "go": controller.go, "accept": controller.accept, "redo": controller.redo, "undo": controller.undo,
             "finish": controller.finish,
-        }[word]  # fmt: skip
+        }  # fmt: skip
+        return actions[word]
 
     def _report_position(self, given: Mapping[str, Any]) -> Callable[[], Any] | dict[str, Any]:
         """Where a person says that the ball is."""
-        typed = given.get("xyz")
-        if not (isinstance(typed, list) and len(typed) == 3 and all(isinstance(text, str) for text in typed)):
+        answered = self._questioned
+        self._questioned = None
+        if answered is not None and given.get("yes") == answered["number"]:
+            return functools.partial(self._controller.report_position, answered["position"], confirmed=True)
+        texts = given.get("xyz")
+        if not (isinstance(texts, list) and len(texts) == 3 and all(isinstance(text, str) for text in texts)):
             raise UsageError("a position needs x, y and z.", fix="fill in the three fields")
-        xyz = np.array([float(text.replace(",", ".").replace("−", "-")) for text in typed])
-        return functools.partial(self._controller.report_position, xyz)
+        self._position = parse_position(texts, self._unit)
+        return functools.partial(self._controller.report_position, self._position)
 
     def _ask_for_move(self, given: Mapping[str, Any]) -> Callable[[], Any] | dict[str, Any]:
         """A real robot: each move is asked for, with what it will do."""
@@ -218,6 +228,19 @@ class BenchPage:
         return allowed is not None and bool(np.array_equal(allowed, there))
 
     def _complain(self, error: ImplicamError) -> None:
+        if isinstance(error, PositionQuestion):
+            text = "\n".join((*error.questions, "", error.fix))
+            asked = {
+                "number": secrets.token_urlsafe(8),
+                "title": error.what,
+                "text": text,
+                "yes": "It is",
+                "no": "Correct",
+            }
+            self._questioned = {**asked, "position": self._position}
+            with self._lock:
+                self._sent = {**self._sent, "number": self._sent["number"] + 1, "question": asked}
+            return
         with self._lock:
             self._complaints = [
                 *self._complaints[-4:],
@@ -274,6 +297,7 @@ class BenchPage:
             self._curve += 1
         found |= {
             "scene": self._scene, "curve": self._curve, "measured": _or_none(measured), "complaints": self._complaints,
+            "question": _without_position(self._questioned),
         }  # fmt: skip
         with self._lock:
             self._sent = {**found, "number": self._sent["number"] + 1}
@@ -322,6 +346,41 @@ class BenchPage:
         """The uncertainty against the number of points."""
         return curve(self._controller.state.history, self._controller.loop.rule)
 
+    def points(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """The known points so far, and how far each is from where the calibration measures it."""
+        controller, state = self._controller, self._controller.state
+        data, calibration = controller.session.data, state.calibration
+        if data is None:
+            return {"points": []}
+        off, sd = np.full(len(data), np.nan), np.full(len(data), np.nan)
+        if calibration is not None and state.data is not None and len(state.data) == len(data):
+            measured = calibration.measure(state.data.observations)
+            off = np.linalg.norm(measured.xyz - data.xyz, axis=1)
+            sd = np.sqrt(np.trace(measured.cov, axis1=1, axis2=2))
+        return {
+            "points": [
+                {
+                    "name": str(name),
+                    "xyz": data.xyz[i].tolist(),
+                    "cameras": int(data.observations.seen[i].sum()),
+                    "off": float(off[i]) if np.isfinite(off[i]) else None,
+                    "sd": float(sd[i]) if np.isfinite(sd[i]) else None,
+                }
+                for i, name in enumerate(data.points)
+            ]
+        }
+
+    def kept(self, given: Mapping[str, Any]) -> Response:
+        """The picture that was kept of a known point by a camera."""
+        from starlette.responses import Response
+
+        data, point = self._controller.session.data, given.get("point")
+        known = data is not None and point in data.points.tolist()
+        file = self._controller.session.pictures_of(str(point)).get(str(given.get("camera"))) if known else None
+        if file is None:
+            raise ImplicamError("there is no such picture.", fix="reload the page")
+        return Response(jpeg(read_picture(file), bright=False, width=WIDTHS_PX[1]), media_type="image/jpeg")
+
     def picture(self, given: Mapping[str, Any]) -> Response:
         """The last picture of a camera, as wide as it is shown."""
         from starlette.responses import Response
@@ -369,7 +428,7 @@ class BenchPage:
                 return Response("Come by the front door.", 403)
             return StreamingResponse(self._stream(), media_type="text/event-stream")
 
-        reads = (self.about, self.scene, self.curve)
+        reads = (self.about, self.scene, self.curve, self.points)
         return Starlette(
             routes=[
                 *(Route(f"/api/{work.__name__}", answer(origin, work)) for work in reads),
@@ -377,8 +436,13 @@ class BenchPage:
                 Route("/api/stop", answer(origin, self.stop), methods=["POST"]),
                 Route("/api/state", stream),
                 Route("/picture.jpg", answer(origin, self.picture)),
+                Route("/kept.jpg", answer(origin, self.kept)),
             ]
         )
+
+
+def _without_position(question: dict[str, Any] | None) -> dict[str, Any] | None:
+    return None if question is None else {key: value for key, value in question.items() if key != "position"}
 
 
 def _or_none(values: Floats) -> list[float] | None:

@@ -94,7 +94,8 @@ def to_go(state: State, measured: Floats, unit: str) -> dict[str, Any] | None:
 
 
 def allowed(state: State, moves: bool) -> dict[str, bool]:
-    """Which buttons make sense now: go, accept, redo, skip, undo, finish, auto, stop."""
+    """Which buttons make sense now: go, accept, redo, skip, undo, finish, auto, stop; delete and again, of a
+    point in the list."""
     ready = state.phase in ("aim", "shown") and not state.auto
     return {
         "go": state.phase in ("trouble", "done")
@@ -102,7 +103,7 @@ def allowed(state: State, moves: bool) -> dict[str, bool]:
         "accept": state.phase == "shown" and bool(state.cameras_with_ball) and not state.auto,
         "redo": state.phase == "shown" and not state.auto,
         "skip": ready and state.target is not None,
-        "undo": ready and state.data is not None and len(state.data) > 0,
+        **dict.fromkeys(("undo", "delete", "again"), ready and state.data is not None and len(state.data) > 0),
         "finish": state.phase == "done" or (ready and state.calibration is not None),
         "auto": moves and state.phase not in ("trouble", "done"),
         "stop": moves,

@@ -9,7 +9,7 @@ const LABELS = {go: "Go", accept: "Accept", redo: "Redo", skip: "Skip", undo: "U
 const LOST_MS = 6000, LOUPE_RADII = 4, ON_TARGET_PX = 12, GAP_PX = 8;
 
 let about = null, state = null, scene = null, world = null, heard = Date.now(), dismissed = new Set();
-let sceneNumber = -1, curveNumber = -1, chosen = 0, typed = null, closed = false, fetching = false;
+let sceneNumber = -1, curveNumber = -1, chosen = 0, typed = null, questioned = null, listed = null, closed = false, fetching = false;
 window.implicam = {get state() { return state; }, get scene() { return scene; }, get world() { return world; }};
 
 const number = (value, digits = 3) => Number.isFinite(value) ? String(Number(value.toPrecision(digits))) : "–";
@@ -55,7 +55,14 @@ async function press(word, more = {}) {
   drawButtons();
 }
 
-function dialog(title, text, buttons) {
+function dialog(title, text, buttons, pictures = []) {
+  by("ask-pictures").replaceChildren(...pictures.map(([name, url]) => {
+    const figure = document.createElement("figure"), image = document.createElement("img");
+    Object.assign(image, {src: url, alt: `picture of ${name}`});
+    image.addEventListener("error", () => { image.remove(); figure.append(" (no picture)"); });
+    figure.append(name, image);
+    return figure;
+  }));
   by("ask-title").textContent = title;
   by("ask-text").textContent = text;
   by("ask-buttons").replaceChildren(...buttons.map(([label, action, kind]) => {
@@ -109,8 +116,13 @@ function draw() {
   drawNumbers();
   drawComplaints();
   drawMoving();
+  refreshPoints();
   if (state.scene !== sceneNumber) refreshScene();
   if (state.curve !== curveNumber) refreshCurve();
+  if (state.question && state.question.number !== questioned && !by("ask").open) {
+    questioned = state.question.number;
+    question(state.question, (yes) => press("go", yes));
+  }
 }
 
 const place = (xyz) => `${["x", "y", "z"].map((axis, i) => `${axis} ${number(xyz[i], 4)}`).join(", ")} ${about.unit}`;
@@ -136,11 +148,14 @@ function drawButtons() {
   by("files").hidden = !done;
 }
 
-function drawPlace() {  // where the next target is, to be corrected to where the ball really is
+function drawPlace() {  // beside where the target is, to be typed: where the ball really is
   by("place").hidden = about.moves || state.phase === "done";
   if (about.moves || !state.target || state.target.name === typed) return;
   typed = state.target.name;
-  ["x", "y", "z"].forEach((axis, i) => { by(axis).value = String(Number(state.target.xyz[i].toPrecision(6))); });
+  ["x", "y", "z"].forEach((axis, i) => {  // empty: what nobody typed is not known
+    by(axis).value = "";
+    by(axis).placeholder = number(state.target.xyz[i], 6);
+  });
 }
 
 function drawComplaints() {
@@ -316,6 +331,37 @@ function drawNumbers() {
     `everything is in ${about.folder}`);
 }
 
+async function refreshPoints() {
+  if (!by("list").open || !state) return;
+  const key = `${state.numbers.points} ${state.scene} ${state.buttons.delete.enabled}`;
+  if (key === listed) return;
+  listed = key;
+  let rows;
+  try { rows = (await ask("api/points")).points; } catch { listed = null; return; }
+  const table = document.createElement("table"), cell = (kind, text) => Object.assign(document.createElement(kind), {textContent: text});
+  table.insertRow().append(...["", "x", "y", "z", "cameras", `off, ${about.unit}`, ""].map((text) => cell("th", text)));
+  for (const row of rows.reverse()) {
+    const line = table.insertRow(), acts = cell("td", "");
+    const off = cell("td", row.off === null ? "–" : number(row.off, 2));
+    if (row.off > 4 * row.sd) off.className = "far";
+    line.append(cell("td", row.name), ...row.xyz.map((v) => cell("td", number(v, 5))), cell("td", row.cameras), off, acts);
+    for (const [label, act] of [["look", () => lookAt(row)], ["again", () => again(row)], ["delete", () => remove(row)]]) {
+      const button = cell("button", label);
+      button.disabled = label !== "look" && !state.buttons.delete.enabled;
+      button.addEventListener("click", act);
+      acts.append(button);
+    }
+  }
+  by("points").replaceChildren(table);
+}
+
+const lookAt = (row) => dialog(row.name, place(row.xyz), [["close", null, "next"]], about.cameras.map(({name}) =>
+  [name, `kept.jpg?camera=${encodeURIComponent(name)}&point=${encodeURIComponent(row.name)}`]));
+const remove = (row) => dialog(`Delete ${row.name}?`, "It is kept in the session as undone, and its pictures in undone/.",
+  [["Delete", () => press("delete", {point: row.name})], ["keep it", null, "next"]]);
+const again = (row) => dialog(`Measure ${row.name} again?`, "It is taken back, and its place is the next target.",
+  [["Measure it again", () => press("again", {point: row.name})], ["keep it", null, "next"]]);
+
 async function refreshCurve() {
   curveNumber = state.curve;
   let data;
@@ -455,7 +501,12 @@ async function begin() {
     by("auto").checked = state.auto;  // until the session says so
     press("auto", {on});
   });
-  by("place").addEventListener("submit", (event) => { event.preventDefault(); if (!by("go").disabled) by("go").click(); });
+  by("place").addEventListener("submit", (event) => event.preventDefault());
+  by("place").addEventListener("keydown", (event) => {
+    if (event.key === "Enter" && event.target.tagName === "INPUT" && !by("go").disabled) by("go").click();
+  });
+  by("there").addEventListener("click", () => { for (const axis of ["x", "y", "z"]) by(axis).value = by(axis).placeholder; });
+  by("list").addEventListener("toggle", refreshPoints);
   by("whole").addEventListener("click", () => scene?.aim());
   by("colour").addEventListener("change", colourCloud);
   by("threshold").addEventListener("input", colourCloud);
