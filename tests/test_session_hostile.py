@@ -105,6 +105,29 @@ def test_what_is_named_again_needs_no_other_word_and_the_rest_does(tmp_path: Pat
     assert opened.count("ur") == 4
 
 
+def test_what_was_not_shown_is_not_confirmed(tmp_path: Path, opened: list[str]) -> None:
+    """A box lies in wait until there is a robot."""
+    hand = Setup(cameras=(("left", "0"),), workspace="0:9000,0:9000,0:9000")
+    folder = from_elsewhere(tmp_path / "s", hand)
+    open_session(folder, None, trust=True).close()
+    with pytest.raises(UsageError, match=r"nobody has confirmed[\s\S]*--workspace=0:9000,0:9000,0:9000"):
+        open_session(folder, replace(hand, robot="ur:192.0.2.7"), named=["robot"])
+    careful = replace(UR, dry_run=True)
+    open_session(tmp_path / "t", careful).close()
+    with Session.open(tmp_path / "t") as session:
+        session.set("dry_run", False)  # the value of one that was never said
+    with pytest.raises(UsageError, match="nobody has confirmed"):
+        open_session(tmp_path / "t", None)
+    assert opened.count("ur") == 1  # when the second was begun
+
+
+def test_what_is_shown_cannot_hide_itself(tmp_path: Path) -> None:
+    sly = Setup(cameras=(("left", "rtsp://h/x\x1b[2K\r\u202e0=left"),), workspace=WORKSPACE)
+    with pytest.raises(UsageError) as told:
+        open_session(from_elsewhere(tmp_path / "s", sly), None)
+    assert "--camera left=rtsp://h/x\\x1b[2K\\r\\u202e0=left" in told.value.why
+
+
 def test_a_session_that_was_begun_here_goes_on_without_a_word(tmp_path: Path, machine: Path) -> None:
     places = tmp_path / "places.csv"
     places.write_text("x,y,z\n0,0,0\n100,0,0\n0,100,0\n0,0,100\n")

@@ -42,6 +42,8 @@ DATA_ENDINGS = (*ENDINGS, *FILM_ENDINGS, ".csv", ".toml")
 _FILES = {"rig": (".toml",), "workspace": (".csv",)}
 """Settings that may name a file to be read, by its endings."""
 
+_ALL = (*DEVICES, *LIMITS, *(key for key in _FILES if key not in LIMITS))
+
 
 def equipment_of(settings: Mapping[str, Any]) -> dict[str, Any]:
     """What a person has to confirm of a session from elsewhere, without passwords.
@@ -61,7 +63,7 @@ def equipment_of(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def in_words(equipment: Mapping[str, Any]) -> str:
-    """Equipment as the options of the command line that name it.
+    """Equipment as the options of the command line that name it; letters that would hide others are shown.
 
     Args:
         equipment: As `equipment_of` gives it.
@@ -76,7 +78,7 @@ def in_words(equipment: Mapping[str, Any]) -> str:
             words += ["--dry-run"] if value else []
         elif key not in DEVICES and value not in (None, ""):
             words.append(f"--{key}={value}")
-    return " ".join(words)
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in " ".join(words))
 
 
 def check_trusted(
@@ -96,10 +98,10 @@ def check_trusted(
     equipment, before = equipment_of(settings), _read_confirmed(folder)
     left = [
         key for key, value in equipment.items()
-        if key not in named and value not in _AS_IF_NOT_SAID and before.get(key) != value
+        if key not in named and (value != before[key] if key in before else value not in _AS_IF_NOT_SAID)
     ]  # fmt: skip
     if trust or not left:
-        remember(folder, settings)
+        _remember(folder, before | {key: settings.get(key) for key in _ALL if key in equipment or key in named})
         return
     raise UsageError(
         f"the session in {folder} names equipment that nobody has confirmed on this machine.",
@@ -109,19 +111,24 @@ def check_trusted(
 
 
 def remember(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Keep that a person has confirmed the equipment of a session here; where that cannot be kept, it is asked again.
+    """Keep that a person has named all that a session uses, by beginning it here.
 
     Args:
         folder: Of the session.
         settings: All that it uses.
     """
-    kept = {key: settings.get(key) for key in (*DEVICES, *LIMITS, *_FILES)}
-    if not equipment_of(settings) or _read_confirmed(folder) == kept:
+    if equipment_of(settings):
+        _remember(folder, {key: settings.get(key) for key in _ALL})
+
+
+def _remember(folder: Path, confirmed: Mapping[str, Any]) -> None:
+    """Where it cannot be kept, it is asked again the next time."""
+    if not confirmed or _read_confirmed(folder) == confirmed:
         return
     file = _file(folder)
     with suppress(ImplicamError, OSError):
         file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        write_text(file, json.dumps({"folder": str(folder.resolve()), "equipment": kept}, indent=1) + "\n")
+        write_text(file, json.dumps({"folder": str(folder.resolve()), "equipment": confirmed}, indent=1) + "\n")
 
 
 def _read_confirmed(folder: Path) -> dict[str, Any]:
