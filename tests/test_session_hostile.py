@@ -396,6 +396,26 @@ def test_names_that_lead_out_of_the_folder_are_refused(tmp_path: Path, sql: str)
         Session.open(db.parent)
 
 
+@pytest.mark.parametrize("place", ["images", "images/cam1", "undone", "undone/cam2"])
+def test_pictures_elsewhere_are_not_moved(tmp_path: Path, place: str) -> None:
+    """A shot that was only begun has its pictures moved to undone/: those of yours, where images/cam1 is a link."""
+    db = _ours(tmp_path / "s")
+    mine = tmp_path / "mine"
+    (mine / "cam1").mkdir(parents=True)
+    for name in ("IMG_1.png", "cam1/IMG_1.png", ".x.partial-1"):
+        (mine / name).write_text("mine")
+    with sqlite3.connect(db) as connection:
+        connection.execute("INSERT INTO shots (name, state, time) VALUES ('IMG_1', 'begun', '')")
+    connection.close()
+    (db.parent / place).parent.mkdir(exist_ok=True)
+    (db.parent / place).symlink_to(mine, target_is_directory=True)
+    with pytest.raises(DatasetError, match="is a link to another folder"):
+        Session.open(db.parent)
+    assert sorted(path.name for path in mine.rglob("*")) == [".x.partial-1", "IMG_1.png", "IMG_1.png", "cam1"]
+    (tmp_path / "link").symlink_to(_ours(tmp_path / "whole").parent, target_is_directory=True)
+    Session.open(tmp_path / "link").close()
+
+
 @pytest.mark.parametrize(
     ("sql", "why"),
     [

@@ -128,6 +128,26 @@ class Tables:
                 )  # else only the last points are missing, after a kill
 
 
+def check_no_links(folder: Path, cameras: Sequence[Camera]) -> None:
+    """Refuse folders of pictures that are links: files are moved out of these and deleted there, wherever that is.
+
+    Args:
+        folder: Of the session; it may be a link itself.
+        cameras: All of the session.
+
+    Raises:
+        DatasetError: One of them is a link.
+    """
+    for top in (folder / IMAGES, folder / UNDONE):
+        for place in (top, *(top / camera.name for camera in cameras)):
+            if place.is_symlink():
+                raise DatasetError(
+                    f"{place} is a link to another folder.",
+                    why="a session moves and deletes pictures in it, and a folder from elsewhere may link to yours",
+                    fix="put the pictures there in its place; a link to the whole session is no trouble",
+                )
+
+
 def remove_partial(folder: Path, cameras: Sequence[Camera]) -> None:
     """Delete half-written files that a killed process left.
 

@@ -133,6 +133,7 @@ class Session:
     def _start(cls, folder: Path, database: Database) -> Session:
         try:
             session = cls(folder, database)
+            files.check_no_links(folder, session.cameras)
             session._repair()
         except BaseException:
             database.close()
