@@ -19,6 +19,8 @@ from implicam import images
 from implicam.detect.folder import note_turned
 from implicam.detect.model import View
 from implicam.errors import ImageError, UsageError
+from implicam.films import Film
+from implicam.hardware import OpenCVCamera
 from implicam.images import blank, eight_bit, one_thread_each, read_picture, stored_jpeg, write_picture
 from implicam.picture_heads import read_head
 from implicam.picture_names import find_pictures, in_order
@@ -455,3 +457,17 @@ def test_pictures_side_by_side_wait_for_room(tmp_path, monkeypatch):
     assert room._free == room.size
     monkeypatch.setattr(images, "_ROOM", images._Room(10))  # one that never fits is read alone
     assert read_picture(path).shape == (48, 64)
+
+
+def test_films_are_measured_before_a_picture_is_unpacked(tmp_path, monkeypatch):
+    path = tmp_path / "a.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (64, 48))
+    for i in range(3):
+        writer.write(scene(channels=3, seed=i))
+    writer.release()
+    assert (Film.of(path).width, OpenCVCamera("left", path).frame().picture.shape) == (64, (48, 64))
+    monkeypatch.setattr(images, "MAX_PIXELS", 64 * 48 - 1)
+    with pytest.raises(ImageError, match="has 64 x 48 pixels"):
+        Film.of(path)
+    with pytest.raises(ImageError, match=r"camera left: .*a.avi has 64 x 48 pixels"):
+        OpenCVCamera("left", path).open()
