@@ -275,6 +275,8 @@ def test_the_log_has_no_password_and_no_token(cli: Cli, tmp_path: Path, monkeypa
         ("vendor:u:p@h", "vendor:***@h"),
         *((same, same) for same in ("0", "/dev/video2", "http://h:80/a@b", "rtsp://[::1]:554/a", "person")),
         *((same, same) for same in ("genicam:00:11:1C@/opt/x.cti", "csv:places.csv", "udp://10.0.0.1:4000", "ur:h")),
+        *((same, same) for same in ("/dev/video0,1280x800,MJPG,exposure=200,keyframe=1", "side=left/*.png")),
+        ("http://h/x?api_key=a1&design=2&sid=9", "http://h/x?api_key=***&design=2&sid=***"),
     ],
 )  # fmt: skip
 def test_what_is_left_of_an_address(spec: str, kept: str) -> None:

@@ -14,8 +14,9 @@ _SCHEME = r"[A-Za-z][A-Za-z0-9+.-]{0,20}://"
 _ADDRESS = re.compile(rf"({_SCHEME})([^\s\"'<>\\]*)")
 _DRIVER = re.compile(r"^([A-Za-z]\w*:)([^/@:]+:[^@]*)@(?!.*\.cti$)")  # a driver's user:password@; serial numbers stay
 _SECRET_VALUE = re.compile(
-    r"((?:^|[?&;/_#,\s-])[\w.-]{0,40}(?:pass|pwd|psw|token|secret|auth|key|sig|user|usr|login|account|credential|sid)"
-    r"[\w.-]{0,40}[=:])[^&;/#\s\"']+",
+    r"((?:^|[?&;/_#,\s-])"
+    r"(?:[\w.-]{0,40}(?:pass|pwd|psw|token|secret|auth|user|usr|login|account|credential|apikey|signature)[\w.-]{0,40}"
+    r"|(?:[\w.-]{0,40}[._-])?(?:key|sig|sid|pin|pw))[=:])[^&;/#\s\"']+",
     re.IGNORECASE,
 )  # some cameras want user=..._password=... in the path
 
