@@ -59,6 +59,17 @@ MIN_USUAL_STEP_RATIO, MIN_BALLS_PER_CAMERA = 0.6, 5
 """A ball whose step is less than this part of the usual one in the camera's pictures, or, where they show fewer than so
 many balls, in those of all cameras, is another thing."""
 
+NEAR_RADII, NEAR_PX, ALIGNED_PX = 3.0, 64, 32
+"""How far around its last place a ball that is followed is looked for: so many radii, and at least so many pixels; the
+part of the picture begins at multiples of the third, so that it is halved as the whole picture is."""
+
+ALIKE_CORRELATION, ALIKE_RADII = 0.6, 1.5
+"""Two pictures that correlate so much around a ball, so many radii to each side, show the same thing there."""
+
+FOLLOWED_RADIUS_RATIO, FOLLOWED_STEP_RATIO = 1.25, 1.35
+"""A ball that is followed has about the radius, and the step at its edge, that it had: at most so many times as much,
+or as little, from one picture to the next."""
+
 MIN_RIVAL_SCORE_RATIO = 0.75
 """A second ball whose score is this part of the first's is one too many."""
 
@@ -228,11 +239,57 @@ class Ball(DetectorBase):
             One point or none, with the ball's edge as an outline.
         """
         looked = 1 - picture if self.bright else picture
-        found = self._find_balls(looked)
+        found = self._find_balls(looked, _brightest(looked))
         if not found:
             return nothing("no ball: nowhere is there a dark disc with a whole edge before something light")
         made = [_detection_of(edge, view) for edge in found]
         return _choose(made)
+
+    def detect_near(self, picture: Grey, view: View, last: Detected) -> Detected | None:
+        """Look for a ball only around where it was in the picture before, by the same tests as in the whole picture.
+
+        Args:
+            picture: (height, width) grey from 0 to 1: all of it, because the plate is judged by its brightest parts.
+            view: Which picture it is.
+            last: What was found in the picture before.
+
+        Returns:
+            The ball; None where it is not there, not alone, or not like it was: then the whole picture tells.
+        """
+        looked = 1 - picture if self.bright else picture
+        radius = float(last.notes["radius_px"])
+        reach = max(NEAR_RADII * radius, NEAR_PX) + 2.5 * radius
+        sides = np.array([looked.shape[1], looked.shape[0]])
+        low = np.clip(np.floor((last.uv[0] - reach) / ALIGNED_PX) * ALIGNED_PX, 0, sides).astype(int)
+        high = np.clip(np.ceil(last.uv[0] + reach), 0, sides).astype(int)
+        part = np.ascontiguousarray(looked[low[1] : high[1], low[0] : high[0]])
+        if min(part.shape) < 4 * MIN_RADIUS_PX:
+            return None
+        sized = replace(
+            self,
+            smallest=max(self.smallest, radius / FOLLOWED_RADIUS_RATIO),
+            largest=min(self.largest, radius * FOLLOWED_RADIUS_RATIO),
+        )
+        found = sized._find_balls(part, _brightest(looked), float(last.notes["blur_px"]))
+        if len(found) != 1 or not _is_like(found[0], last):
+            return None
+        edge = found[0]
+        return _detection_of(edge._replace(ellipse=edge.ellipse._replace(centre=edge.ellipse.centre + low)), view)
+
+    def was_there(self, earlier: NDArray[Any], picture: Grey, found: Detected) -> bool:
+        """Whether an earlier picture shows the same thing at the place where a ball was found, brighter or darker.
+
+        Args:
+            earlier: (height, width) grey of any unit, in which the ball was found elsewhere.
+            picture: (height, width) grey, in which it was found now.
+            found: The ball in `picture`.
+        """
+        reach = int(np.ceil(ALIKE_RADII * float(found.notes["radius_px"])))
+        u, v = np.rint(found.uv[0]).astype(int)
+        rows, columns = slice(max(v - reach, 0), v + reach + 1), slice(max(u - reach, 0), u + reach + 1)
+        before, now = (one[rows, columns] - one[rows, columns].mean() for one in (earlier, picture))
+        size = float(np.sqrt(np.mean(before**2) * np.mean(now**2)))
+        return float(np.mean(before * now)) > ALIKE_CORRELATION * size
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
         """Drop what is at the same place in shot after shot of a camera, or far fainter than usual, and choose again.
@@ -271,14 +328,18 @@ class Ball(DetectorBase):
             f"give its radius with --radius, in {data.length_unit}, and it is corrected"
         ]
 
-    def _find_balls(self, picture: Grey) -> list[Edge]:
-        """Different balls, the likeliest first; only where there is none, those that their shadow has displaced."""
-        bright = float(np.quantile(picture[::4, ::4], 0.999))
+    def _find_balls(self, picture: Grey, bright: float, blur: float = 1.0) -> list[Edge]:
+        """Different balls, the likeliest first; only where there is none, those that their shadow has displaced. blur:
+        of their edges, pixels, where it is known: the fit begins there."""
         places = self._find_places(picture)
-        return self._fit_balls(picture, places, bright) or self._fit_balls(picture, places, bright, steep_first=True)
+        for steep_first in (False, True):
+            found = self._fit_balls(picture, places, bright, blur, steep_first=steep_first)
+            if found:
+                break
+        return found
 
     def _fit_balls(
-        self, picture: Grey, places: list[tuple[Floats, float]], bright: float, *, steep_first: bool = False
+        self, picture: Grey, places: list[tuple[Floats, float]], bright: float, blur: float, *, steep_first: bool
     ) -> list[Edge]:
         rough: list[Rough] = []
         for centre, radius in places:
@@ -292,7 +353,7 @@ class Ball(DetectorBase):
         for one in rough[:MAX_EDGES_FITTED]:
             if good and one.quality < MIN_RIVAL_QUALITY_RATIO * rough[0].quality:
                 break
-            edge = _fit_ball(picture, one)
+            edge = _fit_ball(picture, one, blur)
             if edge is not None and self._is_plausible(edge, bright):
                 good.append(edge)
         return sorted(good, key=_score, reverse=True)
@@ -322,13 +383,24 @@ class Ball(DetectorBase):
         return [(centre, radius) for _, centre, radius in _keep_apart(places)]
 
 
+def _brightest(picture: Grey) -> float:
+    """What counts as white in a picture."""
+    return float(np.quantile(picture[::4, ::4], 0.999))
+
+
+def _is_like(edge: Edge, last: Detected) -> bool:
+    """Whether a ball has about the step at its edge that it had; its radius was asked for."""
+    ratio = (edge.outer - edge.inner) / float(last.notes["step"])
+    return 1 / FOLLOWED_STEP_RATIO < ratio < FOLLOWED_STEP_RATIO
+
+
 def _overlaps(centre: Floats, other: Rough) -> bool:
     return float(np.linalg.norm(centre - other.ellipse.centre)) < other.ellipse.radius
 
 
-def _fit_ball(picture: Grey, rough: Rough) -> Edge | None:
+def _fit_ball(picture: Grey, rough: Rough, blur: float = 1.0) -> Edge | None:
     """The edge of a ball, or None where it is not whole, round and clear."""
-    edge = fit_edge(picture, rough.ellipse)
+    edge = fit_edge(picture, rough.ellipse, blur)
     if edge is None:
         return None
     long, short = edge.ellipse.axes

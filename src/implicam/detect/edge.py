@@ -296,42 +296,47 @@ def _cut_band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:
 def _signed_distance(uv: Floats, ellipse: Ellipse) -> tuple[Floats, Floats]:
     """Signed distance (n,) from the ellipse, right to first order near it; its derivative (n, 5) by the centre and by
     the shape's numbers (0, 0), (0, 1), (1, 1)."""
-    p = uv - ellipse.centre
-    q = p @ ellipse.shape
-    size = np.maximum(np.linalg.norm(q, axis=1), 1e-9)
-    slope = (q / size[:, None]) @ ellipse.shape
-    steep = np.maximum(np.linalg.norm(slope, axis=1), 1e-9)
-    unit = q / size[:, None]
-    by_shape = np.column_stack(
-        [unit[:, 0] * p[:, 0], unit[:, 0] * p[:, 1] + unit[:, 1] * p[:, 0], unit[:, 1] * p[:, 1]]
-    )
-    return (size - 1) / steep, np.column_stack([-slope, by_shape]) / steep[:, None]
+    p = (uv - ellipse.centre).T
+    q = ellipse.shape @ p
+    size = np.maximum(np.hypot(*q), 1e-9)
+    unit = q / size
+    slope = ellipse.shape @ unit
+    steep = np.maximum(np.hypot(*slope), 1e-9)
+    by_shape = unit[0] * p[0], unit[0] * p[1] + unit[1] * p[0], unit[1] * p[1]
+    return (size - 1) / steep, (np.stack([-slope[0], -slope[1], *by_shape]) / steep).T
 
 
 def _evaluate_model(uv: Floats, fit: _Fit) -> tuple[Floats, Floats, Floats]:
     """Grey values (n,), their derivative (n, GEOMETRY_NUMBERS + 2 LIGHT_NUMBERS), and how far outside each pixel is,
-    0 to 1."""
+    0 to 1. Live pictures spend most of their time here: rows are pixels' neighbours in memory, and nothing is built
+    twice."""
     d, by_ellipse = _signed_distance(uv, fit.ellipse)
     around = _wave_basis(uv, fit.ellipse)
     z = d / fit.blur
     step, density = ndtr(z), np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)
-    inner = np.column_stack([around, around[:, :LIGHT_SLOPES] * np.minimum(d, 0)[:, None]])
-    outer = np.column_stack([around, around[:, :LIGHT_SLOPES] * np.maximum(d, 0)[:, None]])
-    jump = outer @ fit.light[LIGHT_NUMBERS:] - inner @ fit.light[:LIGHT_NUMBERS]
-    J = np.empty((len(uv), GEOMETRY_NUMBERS + 2 * LIGHT_NUMBERS))
-    J[:, :5] = (jump * density / fit.blur)[:, None] * by_ellipse
-    J[:, 5] = -jump * density * z / fit.blur
-    J[:, GEOMETRY_NUMBERS : GEOMETRY_NUMBERS + LIGHT_NUMBERS] = inner * (1 - step)[:, None]
-    J[:, GEOMETRY_NUMBERS + LIGHT_NUMBERS :] = outer * step[:, None]
-    return J[:, GEOMETRY_NUMBERS:] @ fit.light, J, step
+    rows = np.empty((GEOMETRY_NUMBERS + 2 * LIGHT_NUMBERS, len(uv)))
+    light, jump = rows[GEOMETRY_NUMBERS:], np.zeros(len(uv))
+    for side, sign, share, depth in ((0, -1, 1 - step, np.minimum(d, 0)), (1, 1, step, np.maximum(d, 0))):
+        numbers = fit.light[side * LIGHT_NUMBERS :][:LIGHT_NUMBERS]
+        own, waves = light[side * LIGHT_NUMBERS :], len(around)
+        np.multiply(around, share, out=own[:waves])
+        np.multiply(around[:LIGHT_SLOPES], depth * share, out=own[waves:LIGHT_NUMBERS])
+        jump += sign * (numbers[:waves] @ around + (numbers[waves:] @ around[:LIGHT_SLOPES]) * depth)
+    steepness = jump * density / fit.blur
+    np.multiply(by_ellipse.T, steepness, out=rows[:5])
+    rows[5] = -steepness * z
+    return fit.light @ light, rows.T, step
 
 
 def _wave_basis(uv: Floats, ellipse: Ellipse) -> Floats:
-    """(n, 1 + 2 LIGHT_WAVES) 1 and cos, sin of 1, 2, ... times the angle around the centre."""
-    q = (uv - ellipse.centre) @ ellipse.shape
-    turn = (q[:, 0] + 1j * q[:, 1]) / np.maximum(np.hypot(*q.T), 1e-9)
-    powers = np.multiply.accumulate(np.broadcast_to(turn[:, None], (len(q), LIGHT_WAVES)), axis=1)
-    return np.column_stack([np.ones(len(q)), np.stack([powers.real, powers.imag], axis=2).reshape(len(q), -1)])
+    """(1 + 2 LIGHT_WAVES, n) 1 and cos, sin of 1, 2, ... times the angle around the centre."""
+    q = ellipse.shape @ (uv - ellipse.centre).T
+    turn = (q[0] + 1j * q[1]) / np.maximum(np.hypot(*q), 1e-9)
+    basis, power = np.ones((1 + 2 * LIGHT_WAVES, len(uv))), turn
+    for k in range(1, 2 * LIGHT_WAVES, 2):
+        basis[k], basis[k + 1] = power.real, power.imag
+        power = power * turn
+    return basis
 
 
 def _prior_precision(fit: _Fit) -> Floats:

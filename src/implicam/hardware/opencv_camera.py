@@ -277,59 +277,78 @@ class OpenCVCamera:
 
 
 class _Grabber:
-    """Reads a capture until it is told to end or nothing comes any more; keeps the newest picture.
+    """Takes every picture out of a capture until it is told to end or nothing comes any more; decodes those that are
+    asked for: a camera may send sixty a second, and to decode one costs some milliseconds.
 
-    patient: a read that took long and brought nothing is no sign of anything, because a trigger may not have fired.
+    patient: a wait that was long and brought nothing is no sign of anything, because a trigger may not have fired.
     """
 
     def __init__(self, capture: Any, name: str, *, patient: bool = False) -> None:
         self.running, self._patient = True, patient
-        self._stamp = 0.0
-        self._newest: tuple[NDArray[np.uint8], float] | None = None
+        self._stamp, self._last = 0.0, np.zeros((0, 0), np.uint8)  # of the last picture; the last that was decoded
         self._arrived = 0
+        self._wanted: int | None = None  # the first arrival that is to be decoded; None for none
+        self._found: tuple[NDArray[np.uint8], float] | None = None
         self._arrival = threading.Condition()
         self._thread = threading.Thread(target=self._grab, args=(capture,), name=name, daemon=True)
         self._thread.start()
 
     def after(self, skip: int, timeout: float) -> tuple[NDArray[np.uint8], float] | None:
-        """The newest picture once more than `skip` have arrived since the call, and when; None where they do not."""
+        """The first picture after `skip` that arrive after the call, and when it did; None where it does not."""
         with self._arrival:
-            wanted = self._arrived + 1 + skip
-            self._arrival.wait_for(lambda: self._arrived >= wanted or not self.running, timeout)
-            return self._newest if self._arrived >= wanted else None
+            self._wanted, self._found = self._arrived + 1 + skip, None
+            self._arrival.wait_for(lambda: self._found is not None or not self.running, timeout)
+            found, self._wanted, self._found = self._found, None, None
+            return found
 
     def end(self) -> None:
         """Stop reading; a read that hangs ends by its own time limit."""
         self.running = False
         self._thread.join(SILENCE_MS / 1000 + 1)
 
-    def _in_vain(self, capture: Any, read: _Read) -> bool:
-        """Whether a read ended by its time limit: then there is no picture, or, by some versions of OpenCV, the last
+    def _in_vain(self, capture: Any, good: bool, waited: float) -> bool:
+        """Whether a wait ended by its time limit: then there is no picture, or, by some versions of OpenCV, the last
         one again."""
         before, self._stamp = self._stamp, float(capture.get(opencv().CAP_PROP_POS_MSEC))
-        if read.waited < 0.9 * WAIT_SECONDS:
+        if waited < 0.9 * WAIT_SECONDS:
             return False
-        if read.image is None:
+        if not good:
             return True
         if self._stamp > 0:
             return self._stamp == before
-        return self._newest is not None and np.array_equal(read.image, self._newest[0])
+        image = _decode(capture)
+        return image is None or np.array_equal(image, self._last)
 
     def _grab(self, capture: Any) -> None:
         try:
             while self.running:
-                read = _read(capture)
-                if read.broken or (self._patient and self._in_vain(capture, read)):
+                begun = time.monotonic()
+                good, taken = capture.grab(), time.time()
+                if self._patient and self._in_vain(capture, good, time.monotonic() - begun):
                     continue
-                if read.image is None:
+                if not good:
                     return
-                with self._arrival:
-                    self._newest, self._arrived = (read.image, time.time()), self._arrived + 1
-                    self._arrival.notify_all()
+                self._hand_out(capture, taken)
         finally:
             capture.release()
             with self._arrival:
                 self.running = False
+                self._arrival.notify_all()
+
+    def _hand_out(self, capture: Any, taken: float) -> None:
+        """Count what was grabbed, and decode it where somebody waits for it; one that cannot be is as if lost."""
+        with self._arrival:
+            self._arrived += 1
+            wanted = self._wanted
+        if wanted is None or self._arrived < wanted:
+            return
+        image = _decode(capture)
+        if image is None:
+            return
+        self._last = image
+        with self._arrival:
+            if self._wanted == wanted:  # else it was for a call that is over
+                self._found, self._wanted = (image, taken), None
                 self._arrival.notify_all()
 
 
@@ -346,7 +365,7 @@ def _silence_opencv(cv2: Any) -> Iterator[None]:
 
 class _Read(NamedTuple):
     """What a read brought: a picture or None; whether one was lost on its way and cannot be decoded; and how long it
-    took, seconds."""
+    took to come, seconds."""
 
     image: NDArray[np.uint8] | None
     broken: bool
@@ -354,12 +373,20 @@ class _Read(NamedTuple):
 
 
 def _read(capture: Any) -> _Read:
-    begun, broken = time.monotonic(), False
+    begun = time.monotonic()
+    good = capture.grab()
+    waited = time.monotonic() - begun
+    image = _decode(capture) if good else None
+    return _Read(image, good and image is None, waited)
+
+
+def _decode(capture: Any) -> NDArray[np.uint8] | None:
+    """The picture that was grabbed; None where it cannot be decoded."""
     try:
-        good, image = capture.read()
+        good, image = capture.retrieve()
     except opencv().error:
-        good, image, broken = False, None, True
-    return _Read(image if good else None, broken, time.monotonic() - begun)
+        return None
+    return image if good else None
 
 
 def _size_of(image: NDArray[np.uint8]) -> str:

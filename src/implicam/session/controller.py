@@ -30,6 +30,7 @@ from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observatio
 from implicam.dataset.image_bounds import are_on_image
 from implicam.dataset.units import METRES_PER_UNIT
 from implicam.detect import Detected, Detector, View, correct_outlines
+from implicam.detect.follow import Follower
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.formatting import json_safe
 from implicam.hardware import (
@@ -163,6 +164,7 @@ class SessionController:
         self._targets_without_ball = 0
         pulsed = equipment.trigger is not None and equipment.pulse_every > 0
         self._live = pulsed or (equipment.trigger is None and all(source.live for source in equipment.cameras))
+        self._followers = {name: Follower(equipment.detector, k) for k, name in enumerate(names)}
         self._next_pulse = 0.0  # time.monotonic() before which none is fired for live pictures
         loop.history = _read_history(session)
         for skipped in session.skipped:
@@ -454,7 +456,7 @@ class SessionController:
             frames = self._take_frames(self.equipment.trigger)
             if self.equipment.trigger is not None:
                 self._next_pulse = time.monotonic() + self.equipment.pulse_every
-            looks = self._detect_all(frames)
+            looks = self._detect_all(frames, live=True)
             if self.state.phase == phase:
                 self._show(looks=looks)
         except Exception as error:
@@ -647,11 +649,17 @@ class SessionController:
     def _take_frames(self, trigger: Trigger | None) -> list[Frame]:
         return take_frames(self.equipment.cameras, trigger, self.equipment.timeout, self._pool)
 
-    def _detect_all(self, frames: Sequence[Frame]) -> tuple[Look, ...]:
+    def _detect_all(self, frames: Sequence[Frame], *, live: bool = False) -> tuple[Look, ...]:
         expected = self.state.target.uv if self.state.target is not None else np.full((len(frames), 2), np.nan)
         names = [source.name for source in self.equipment.cameras]
-        found = list(self._pool.map(self._detect, names, frames))
+        found = list(self._pool.map(self._follow if live else self._detect, names, frames))
         return tuple(Look(n, f, d, e) for n, f, d, e in zip(names, frames, found, expected, strict=True))
+
+    def _follow(self, camera: str, frame: Frame) -> Detected:
+        """As `_detect`, of a live picture: near the last place first."""
+        follower = self._followers[camera]
+        near = follower.near(frame.picture, View(camera, "live"))
+        return follower.found(frame.picture, self._detect(camera, frame)) if near is None else near
 
     def _detect(self, camera: str, frame: Frame) -> Detected:
         why = blank(frame.picture)
