@@ -3,6 +3,8 @@
 The cameras here are stand-ins with a driver's buffer: a pulse puts a picture of its number into it, after a while.
 """
 
+import shutil
+import subprocess
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +18,7 @@ from drivers import nothing_left, says_all  # noqa: F401
 from implicam.errors import HardwareError, UsageError
 from implicam.hardware import TriggerBoxes, TriggerSimulator, take_frames, triggers_from
 from implicam.hardware.protocol import Frame
-from implicam.hardware.trigger import NetworkTrigger
+from implicam.hardware.trigger import GREETING_PREFIX, NetworkTrigger
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.setup import Setup, open_session
 
@@ -228,3 +230,54 @@ def test_live_pictures_are_pulsed_now_and_then_and_never_in_a_shot(tmp_path: Pat
         fired = line.fired
         quiet.live()
         assert line.fired == fired
+
+
+# ---- the box itself ------------------------------------------------------------------------------------------------
+
+ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")
+AVR = ("-mmcu=atmega328p", "-DF_CPU=16000000L", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR", "-Os", "-ffunction-sections")
+
+
+@pytest.mark.slow
+def test_the_sketch_of_the_docs_does_what_the_protocol_says(tmp_path: Path) -> None:
+    """Compiled with the real Arduino core, and run by a simulated ATmega328P, with a serial line in place of the
+    shield."""
+    if shutil.which("avr-g++") is None or not ARDUINO.is_dir() or not Path("/usr/include/simavr").is_dir():
+        pytest.skip("apt-get install gcc-avr avr-libc arduino-core-avr libsimavr-dev libelf-dev")
+    here = Path(__file__).parent
+    text = (here.parent / "docs" / "hardware.md").read_text(encoding="utf-8")
+    sketch = text.partition("```cpp\n")[2].partition("```")[0]
+    (tmp_path / "sketch.cpp").write_text("#include <Arduino.h>\n" + sketch)  # as the Arduino IDE does
+    core, box = ARDUINO / "cores" / "arduino", here / "trigger_box"
+    include = [f"-I{place}" for place in (core, ARDUINO / "variants" / "standard", box)]
+    own = ["-std=gnu++11", "-fpermissive", "-fno-exceptions", "-fno-threadsafe-statics"]
+
+    def build(*words: str | Path) -> None:
+        subprocess.run(list(map(str, words)), check=True, cwd=tmp_path, capture_output=True)
+
+    build("avr-g++", *AVR, *own, "-Wall", "-Wextra", "-Werror", *include, "-c", "sketch.cpp", "-o", "sketch.o")
+    build("avr-g++", *AVR, *own, *include, "-c", box / "ethernet_over_serial.cpp", "-o", "ethernet.o")
+    needed = ["wiring.c", "wiring_digital.c", "hooks.c", "main.cpp", "Print.cpp", "HardwareSerial.cpp"]
+    needed += ["HardwareSerial0.cpp", "IPAddress.cpp", "Stream.cpp", "new.cpp", "abi.cpp"]
+    for name in needed:
+        compiler = ["avr-g++", *own] if name.endswith("pp") else ["avr-gcc"]
+        build(*compiler, *AVR, "-w", *include, "-c", core / name, "-o", f"{name}.o")
+    objects = [f"{name}.o" for name in needed]
+    build("avr-gcc", AVR[0], "-Wl,--gc-sections", "-o", "box.elf", "sketch.o", "ethernet.o", *objects, "-lm")
+    build("cc", "-w", box / "simulated_board.c", "-o", "board", "-lsimavr", "-lelf", "-lm")
+    asked = ["HELLO", "TRIG 7", "TRIG 7", "TRIG 8", "TRIG 2147483647", "TRIG -1", "TRIG x", "BANG"]
+    ran = subprocess.run(
+        [tmp_path / "board", "box.elf"], input="".join(f"{line}\n" for line in asked), cwd=tmp_path, text=True,
+        capture_output=True, check=True, timeout=100,
+    )  # fmt: skip
+    answers = [line.split("|") for line in ran.stdout.splitlines() if "|" in line]
+    once, never = "1 1 1 1 1 1", "0 0 0 0 0 0"
+    assert [pins for _, pins, _, _ in answers] == [never, once, never, once, once, never, never, never]
+    texts = [text for text, _, _, _ in answers]
+    assert texts[0] == f"{GREETING_PREFIX}6"
+    assert [text.rpartition(" ")[0] for text in texts[1:5]] == ["OK 7", "OK 7", "OK 8", "OK 2147483647"]
+    assert texts[1] == texts[2]  # the clock of the pulse, not of the answer
+    assert all(text.startswith("ERR ") for text in texts[5:])
+    for k in (1, 3, 4):
+        assert 1000 <= float(answers[k][2]) < 1100  # microseconds
+        assert float(answers[k][3]) < 40  # from the first pin to the last

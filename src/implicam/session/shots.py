@@ -97,14 +97,14 @@ class Shutter:
         Raises:
             HardwareError: A camera or the trigger failed, or the pictures are not of one pulse.
         """
+        turn = _Turn(math.inf, MAX_SET_SECONDS) if self.waits else _Turn(PICTURE_TIMEOUT_SECONDS, math.inf)
         with ThreadPoolExecutor(len(self.cameras)) as pool:
             if self.trigger is not None:
                 return take_frames(self.cameras, self.trigger, LIVE_TIMEOUT_SECONDS, pool)
-            turn = _Turn(math.inf, MAX_SET_SECONDS) if self.waits else _Turn(PICTURE_TIMEOUT_SECONDS, math.inf)
-            asked = [pool.submit(turn.ask, camera) for camera in self.cameras]
             try:
+                asked = [pool.submit(turn.ask, camera) for camera in self.cameras]
                 wait(asked)
-            finally:  # Ctrl-C: those that wait for long end after a slice
+            finally:  # Ctrl-C, at any moment: those that wait for long end after a slice
                 turn.ending.set()
             frames = [one.result() for one in asked]
         spread = spread_of(frames)
