@@ -138,7 +138,9 @@ def test_a_session_comes_back_as_it_was(tmp_path):
         assert_same(session.data, expected([shot("p001", 1), shot("p002", 2, extra="colour, of lamp"),
                                             shot("board 1, tilted", 3, n=7, sd=False)]))  # fmt: skip
         before = session.data
+    assert Session.read_settings(folder) == {"target": "ball", "limits": [1, 2.5], "threshold": 0.25}
     with Session.open(folder) as session:
+        refused(UsageError, lambda: Session.read_settings(folder), "open elsewhere")
         assert (session.name, session.length_unit, session.cameras) == ("my rig, 2", "mm", CAMERAS)
         assert session.settings == {"target": "ball", "limits": [1, 2.5], "threshold": 0.25}
         assert_same(session.data, before)

@@ -229,10 +229,7 @@ def _stored(folder: Path) -> Any:
     from implicam.session import Session, is_session
     from implicam.session.setup import Setup
 
-    if not is_session(folder):
-        return None
-    with Session.open(folder) as session:
-        return Setup.from_settings(session.settings)
+    return Setup.from_settings(Session.read_settings(folder)) if is_session(folder) else None
 
 
 def _run(controller: SessionController, json: bool) -> None:

@@ -72,7 +72,7 @@ class Session:
         self._lock = threading.RLock()
         self._database = database
         self.folder = folder
-        with self._reporting_damage():
+        with _reporting_damage(self.folder):
             ((self.name, self.length_unit),) = database.rows("SELECT name, length_unit FROM session")
             self.cameras = read_cameras(database)
             for camera in self.cameras:
@@ -82,7 +82,7 @@ class Session:
             self._empty = _make_empty_dataset(self.name, self.length_unit, self.cameras)
             self._data = read_accepted(database, self._empty)
             self._tables = files.Tables.of(self._data, self._empty)
-            self._settings = {key: json.loads(text) for key, text in database.rows("SELECT key, value FROM settings")}
+            self._settings = _read_settings(database)
         database.end_of_reading()
 
     @classmethod
@@ -128,6 +128,21 @@ class Session:
         """
         folder = Path(folder).absolute()
         return cls._start(folder, Database.open(folder / DATABASE))
+
+    @staticmethod
+    def read_settings(folder: Path) -> dict[str, Any]:
+        """The settings of a session, without its points and without a change to its files; it fails as `open` does.
+
+        Args:
+            folder: Of the session.
+        """
+        folder = Path(folder).absolute()
+        database = Database.open(folder / DATABASE)
+        try:
+            with _reporting_damage(folder):
+                return _read_settings(database)
+        finally:
+            database.close()
 
     @classmethod
     def _start(cls, folder: Path, database: Database) -> Session:
@@ -287,7 +302,7 @@ class Session:
         """The targets that were not measured, in order."""
         with self._lock:
             rows = self._database.rows("SELECT x, y, z, reason, time FROM skipped ORDER BY number")
-        with self._reporting_damage():
+        with _reporting_damage(self.folder):
             return [Skipped(np.array(xyz, dtype=float), why, datetime.fromisoformat(time)) for *xyz, why, time in rows]
 
     @property
@@ -295,7 +310,7 @@ class Session:
         """What happened, in order."""
         with self._lock:
             rows = self._database.rows("SELECT what, more, time FROM events ORDER BY number")
-        with self._reporting_damage():
+        with _reporting_damage(self.folder):
             return [Event(what, json.loads(more), datetime.fromisoformat(time)) for what, more, time in rows]
 
     def next_name(self) -> str:
@@ -331,14 +346,6 @@ class Session:
             )
         observations = Observations(seen.points, self.cameras, seen.uv, seen.sd, seen.extra)
         return Dataset(self.name, self.length_unit, observations, point.positions)
-
-    @contextmanager
-    def _reporting_damage(self) -> Iterator[None]:
-        """Values that cannot be read are a damaged database."""
-        try:
-            yield
-        except (DatasetError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-            raise damaged_error(self.folder / DATABASE, str(error)) from error
 
     def _commit_begun(self, shot: str) -> None:
         """Commit that files of this name are about to appear, so that a kill leaves none unknown."""
@@ -382,6 +389,19 @@ class Session:
             self._set_pictures_aside()
             self._tables.keep_edited(self.folder)
             self._tables.rewrite(self.folder)
+
+
+@contextmanager
+def _reporting_damage(folder: Path) -> Iterator[None]:
+    """Values that cannot be read are a damaged database."""
+    try:
+        yield
+    except (DatasetError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise damaged_error(folder / DATABASE, str(error)) from error
+
+
+def _read_settings(database: Database) -> dict[str, Any]:
+    return {key: json.loads(text) for key, text in database.rows("SELECT key, value FROM settings")}
 
 
 def _make_empty_dataset(name: str, length_unit: str, cameras: Sequence[Camera]) -> Dataset:
