@@ -26,6 +26,7 @@ from implicam.dataset.image_bounds import image_bounds
 from implicam.errors import ImageError, UsageError
 from implicam.files import write_text
 from implicam.images import write_picture
+from implicam.measurement import notes_outside
 from implicam.report.instrument import Instrument
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, measured_points, scene, uncertainty_map
 
@@ -105,7 +106,7 @@ def test_measured_points_are_those_of_the_measurement_in_the_unit_of_the_page(ri
         }
     )
     some = measured_points(lone, stereo.data.length_unit)
-    assert (len(some["names"]), some["missing"]) == (1, 1)
+    assert (len(some["names"]), some["missing"]) == (1, [[str(measured.points[1]), "no reason given"]])
     json.dumps(some, allow_nan=False)
 
 
@@ -221,6 +222,33 @@ def test_pictures_of_other_cameras_are_refused(stereo: Any, tmp_path: Path) -> N
         ic.LiveView(stereo, pictures=tmp_path / "images", browser=False)
 
 
+def test_pictures_of_another_size_are_not_drawn(stereo: Any, tmp_path: Path) -> None:
+    for camera in stereo.camera_names:
+        write_picture(tmp_path / "images" / camera / "a.png", np.zeros((800, 1280), np.uint8))
+    with ic.LiveView(stereo, pictures=tmp_path / "images", browser=False) as view:
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            Client(view.url).get("picture.jpg?camera=cam1&shot=a")
+        said = json.loads(refused.value.read())
+    assert "1280 x 800 pixels" in said["error"]
+    assert "1280 x 1024" in said["why"]
+
+
+def test_points_where_nothing_was_known_are_told(rig: Any, stereo: Any) -> None:
+    """Behind a window error bars there were several times too small, and nothing said so."""
+    order = np.argsort(rig.xyz[:, 0])
+    slab = ic.ForwardGP().fit(rig.select(order[10:30]))
+    measured = slab.measure(rig)
+    with ic.LiveView(slab, browser=False) as view:
+        view.add(measured)
+        chunks = Client(view.url).chunks(2)
+    low, high = slab.data.xyz.min(axis=0), slab.data.xyz.max(axis=0)
+    beyond = np.linalg.norm(np.maximum(np.maximum(low - measured.xyz, measured.xyz - high), 0), axis=1)
+    count = int((beyond > 0.05 * np.linalg.norm(high - low)).sum())
+    assert count > 5
+    assert chunks[1]["note"].startswith(f"{count} of 40 points are outside of the box of the known points")
+    assert notes_outside(stereo.measure(rig), stereo.data) == []
+
+
 # ------------------------------------------------------------------------------------------------ the command, for real
 
 COMMAND = """
@@ -275,27 +303,43 @@ def test_points_of_a_growing_file_are_shown_as_they_come_and_only_when_complete(
     rig: Any, stereo: Any, tmp_path: Path
 ) -> None:
     stereo.save(tmp_path / "rig.implicam")
-    seen = tmp_path / "seen.csv"
-    write_text(seen, "point,camera,u,v\n" + rows(rig, range(2)))
+    seen = tmp_path / "seen.csv"  # it is not there yet: a recording begins so
     running = Running(str(tmp_path / "rig.implicam"), str(seen), "--follow")
-    page = Client(running.url)
+    page, begin = Client(running.url), 0
+
+    def told(what: str, count: int) -> list[Any]:
+        """So many names, or the next note."""
+        nonlocal begin
+        found: list[Any] = []
+        while len(found) < count:
+            chunk = page.chunks(1, begin)[0]
+            begin += 1
+            if what in chunk:
+                found += chunk[what] if what == "names" else [chunk[what]]
+            if what == "names" and what in chunk:
+                at = [expected.points.tolist().index(name) for name in chunk["names"]]
+                np.testing.assert_allclose(chunk["xyz"], expected.xyz[at], rtol=1e-9)  # with both of its views
+        return found
+
     expected = stereo.measure(rig)
-    assert page.chunks(1)[0]["names"] == expected.points[:2].tolist()
+    assert told("note", 1)[0] == f"waiting for {seen}"
+    write_text(seen, "point,camera,u,v\n" + rows(rig, range(2)))
+    assert told("names", 2) == expected.points[:2].tolist()
     more = rows(rig, range(2, 5)).encode()
     with seen.open("ab", buffering=0) as file:  # half a line, then the rest of it, then the last view of a point
         last = more[:-1].rindex(b"\n") + 1
         for piece in (more[:37], more[37:last], more[last:]):
             file.write(piece)
             time.sleep(0.4)
-    names: list[str] = []
-    begin = 1
-    while len(names) < 3:
-        chunk = page.chunks(1, begin)[0]
-        names += chunk["names"]
-        begin += 1
-        at = [expected.points.tolist().index(name) for name in chunk["names"]]
-        np.testing.assert_allclose(chunk["xyz"], expected.xyz[at], rtol=1e-9)  # with both of its views
-    assert names == expected.points[2:5].tolist()
+    assert told("names", 3) == expected.points[2:5].tolist()
+    write_text(seen, seen.read_text() + "rubbish\n")
+    assert "Nothing new is shown until that is mended." in told("note", 1)[0]
+    first, second = (str(name) for name in rig.points[:2])
+    moved = rows(rig, range(1, 2)).replace(second, first)  # the first point is where the second is
+    write_text(seen, "point,camera,u,v\n" + moved + rows(rig, range(1, 5)))
+    chunk = page.chunks(2, begin)
+    names = [name for one in chunk for name in one.get("names", ())]
+    assert names == [first]  # measured again, since its views are others
     running.process.send_signal(signal.SIGINT)
     assert running.end()["points"] == 5
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from implicam.dataset import Floats, Names
+from implicam.dataset import Dataset, Floats, Names
 from implicam.dataset.folder import csv_text, format_cells
 from implicam.dataset.frames import keep_others, rigid_parts
 from implicam.dataset.units import metres_per
@@ -380,3 +380,35 @@ class Measurement(Plotted):
 
 def _shortened(text: str) -> str:
     return text if len(text) <= MAX_CHARACTERS_SHOWN else f"{text[: MAX_CHARACTERS_SHOWN - 3]}..."
+
+
+FAR_OUTSIDE = 0.05
+"""Of the diagonal of the box of the known points: a position that is farther outside is told."""
+
+
+def notes_outside(measurement: Measurement, known: Dataset) -> list[str]:
+    """What the user should know of positions where nothing was known.
+
+    Args:
+        measurement: Of any points.
+        known: What was calibrated from, in the same frame and unit.
+
+    Returns:
+        A sentence where some are outside of the box of the known points by more than a twentieth of its size.
+    """
+    places = known.xyz[np.isfinite(known.xyz).all(axis=1)]
+    xyz = measurement.xyz[measurement.measured]
+    if len(places) < 2 or not len(xyz) or measurement.length_unit != known.length_unit:
+        return []
+    low, high = places.min(axis=0), places.max(axis=0)
+    size = float(np.linalg.norm(high - low))
+    beyond = np.linalg.norm(np.maximum(np.maximum(low - xyz, xyz - high), 0), axis=1)
+    count = int((beyond > FAR_OUTSIDE * size).sum())
+    if not count:
+        return []
+    return [
+        f"{count} of {len(xyz)} points are outside of the box of the known points, the farthest by "
+        f"{decimal_number(float(beyond.max()))} {measurement.length_unit} (the box is {decimal_number(size)} across): "
+        "no known point says how the cameras see there, and the error bars rest on the lens models alone. Behind glass "
+        "or water they can be several times too small; put known points there."
+    ]

@@ -75,6 +75,7 @@ from implicam.errors import UsageError
 from implicam.evaluation import Evaluation, cross_validate, evaluate, leave_out_shots
 from implicam.files import refuse_folder, toml_text, write_text
 from implicam.formatting import decimal_number, percent
+from implicam.measurement import notes_outside
 from implicam.verdict import DOUBTFUL, NOT_USABLE, Verdict, judge
 
 __all__ = ["EXAMPLES", "app"]
@@ -260,6 +261,7 @@ def measure_command(
     with show.progress(json) as progress:
         progress("measuring", 0, 1)
         measured = fitted.measure(data.observations).with_columns(data.further_columns())
+        outside = notes_outside(measured, fitted.data)
         progress("measuring", 1, 1)
     if unit != measured.length_unit:
         measured = measured.in_unit(unit)
@@ -275,7 +277,7 @@ def measure_command(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
              "median_share_calibration": share,
              "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
-             "views_left_out": show.left_out(measured), "notes": list(data.notes), "alarm": measured.alarm,
+             "views_left_out": show.left_out(measured), "notes": [*data.notes, *outside], "alarm": measured.alarm,
              **({"distances": str(beside)} if wanted else {})}
         )  # fmt: skip
         raise typer.Exit(int(bool(measured.alarm)))
@@ -292,7 +294,7 @@ def measure_command(
             show.line(f"  {row}")
     if judged in (DOUBTFUL, NOT_USABLE):
         show.note(f"this calibration was found {judged} when it was made: implicam info {calibration} says why")
-    show.notes(data.notes)
+    show.notes([*data.notes, *outside])
     show.notes(show.reasons(measured))
     show.notes(show.left_out(measured))
     if measured.alarm:

@@ -21,7 +21,7 @@ from implicam.detect.folder import pictures_of
 from implicam.errors import ImageError, ImplicamError, UsageError
 from implicam.formatting import list_some
 from implicam.images import read_picture
-from implicam.measurement import Measurement
+from implicam.measurement import Measurement, notes_outside
 from implicam.report.instrument import Instrument
 from implicam.viewer.calibration_scene import measured_points, scene, uncertainty_map
 from implicam.viewer.web import answer, behind_door, jpeg
@@ -63,6 +63,7 @@ class CalibrationPage:
         self._pictures = {} if pictures is None else pictures
         self._chunks: list[dict[str, Any]] = []
         self._count = 0
+        self._told: list[str] = []
         self._mapping = threading.Lock()
         self._map: dict[str, Any] | None = None
         self.closed = threading.Event()
@@ -80,6 +81,22 @@ class CalibrationPage:
             chunk["not_shown"] = max(len(rows) - max(left, 0), 0)
             self._count += len(chunk["names"])
             self._chunks.append(chunk)
+        notes = notes_outside(measurement, self._calibration.data)
+        if notes and notes != self._told:
+            self._told = notes
+            self.tell(notes[0])
+
+    def tell(self, note: str) -> None:
+        """Show a sentence on the pages; an empty one takes the last one away."""
+        self._chunks.append({"note": note})
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """How many points are shown, and how many could not be measured."""
+        chunks = [chunk for chunk in self._chunks if "names" in chunk]
+        measured = {name for chunk in chunks for name in chunk["names"]}
+        missing = {name for chunk in chunks for name, _ in chunk["missing"]}
+        return len(measured), len(missing - measured)
 
     def scene(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """What stands still, and of which cameras and shots there are pictures."""
@@ -103,7 +120,15 @@ class CalibrationPage:
         file = self._pictures.get(str(given.get("camera")), {}).get(str(given.get("shot")))
         if file is None:
             raise ImplicamError("there is no such picture.", fix="reload the page")
-        return Response(jpeg(read_picture(file), width=PICTURE_PX), media_type="image/jpeg")
+        picture = read_picture(file)
+        ours = next(one for one in self._calibration.data.cameras if one.name == given.get("camera"))
+        if None not in (ours.width, ours.height) and picture.shape[::-1] != (ours.width, ours.height):
+            raise ImageError(
+                f"{file} has {picture.shape[1]} x {picture.shape[0]} pixels.",
+                why=f"{ours.name} was calibrated with {ours.width} x {ours.height}: it is of another camera, or scaled",
+                fix="give the pictures that its camera took",
+            )
+        return Response(jpeg(picture, width=PICTURE_PX), media_type="image/jpeg")
 
     def stop(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The end: the server stops when this is answered."""

@@ -107,7 +107,10 @@ def measured_points(measurement: Measurement, unit: str) -> dict[str, Any]:
         "views": some.views.tolist(),
         "consistency": _or_none(some.consistency),
         "reason": [str(reason) for reason in some.reason],
-        "missing": int(len(measurement) - len(some)),
+        "missing": [
+            [str(measurement.points[i]), str(measurement.reason[i]) or "no reason given"]
+            for i in np.flatnonzero(~measurement.measured)
+        ],
         "alarm": measurement.alarm,
     }
 

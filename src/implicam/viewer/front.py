@@ -538,6 +538,6 @@ def _listen(host: str, port: int) -> socket.socket:
         raise ImplicamError(
             f"The page cannot be opened on {host or 'all addresses'}, port {port}.",
             why=str(error),
-            fix="Close what uses the port (perhaps another session), or choose another with --port; "
-            "--host must be an address or a name of this machine.",
+            fix="Close what uses the port (perhaps another session), or choose another with --port"
+            + ("." if _is_this_machine(host) else "; the host must be an address or a name of this machine."),
         ) from error

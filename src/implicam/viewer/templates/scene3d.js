@@ -562,16 +562,12 @@ export class Scene3D {
 
   // --------------------------------------------------------------------------------------------------- measured points
 
-  // xyz: positions; cov: xx, xy, xz, yy, yz, zz of each.
-  addMeasured(xyz, cov) {
-    const own = this.measured;
-    xyz.forEach((place, i) => {
-      own.xyz.push(this.place(place));
-      own.cov.push(cov[i]);
-    });
+  // All of them. xyz: positions; cov: xx, xy, xz, yy, yz, zz of each.
+  setMeasured(xyz, cov) {
+    this.measured = {xyz: xyz.map((place) => this.place(place)), cov: [...cov]};
     const group = this.groups.measured;
     this.empty(group);
-    this.points(own.xyz, "measured", group);
+    this.points(this.measured.xyz, "measured", group);
     this.setMagnified(this.magnified);
   }
 

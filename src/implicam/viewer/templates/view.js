@@ -7,13 +7,14 @@ const SHOWN = [["cameras", "cameras", "camera"], ["pictures", "pictures", "camer
   ["known", "known points", "known"], ["volume", "uncertainty", ""], ["measured", "measured points", "measured"],
   ["ellipsoids", "95 % ellipsoids", "measured"], ["box", "box", "soft"]];
 const TIMES = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000];
-const LAST = 8, HOVER_PX = 10, TOUCH_PX = 24, USUAL_ELLIPSOID = 0.03;
+const LAST = 8, MOST_REASONS = 100, HOVER_PX = 10, TOUCH_PX = 24, USUAL_ELLIPSOID = 0.03;
 
 const OUTSIDE = by("hint").textContent;
 
 let world = null, scene = null, maps = null;
 const points = {names: [], xyz: [], cov: [], views: [], consistency: [], reason: []};
-let missing = 0, notShown = 0, chosen = false;
+const rows = new Map(), unmeasured = new Map();  // name -> where it is in points; name -> why not
+let notShown = 0, chosen = false, ended = false;
 window.implicam = {points, get scene() { return scene; }, get world() { return world; }};  // for a browser's console
 
 const number = (value, digits = 4) => {
@@ -95,16 +96,23 @@ function setUp() {
   by("threshold").addEventListener("input", threshold);
   by("magnified").addEventListener("input", () => { chosen = true; magnify(); });
   by("end").addEventListener("click", async () => {
-    try { await ask("api/stop", {}); say({error: "Ended. This page can be closed."}); } catch (problem) { say(problem); }
+    ended = true;
+    try { await ask("api/stop", {}); } catch (problem) { say(problem); return; }
+    by("note").hidden = false;
+    by("note").textContent = "Ended. This page can be closed.";
+    by("end").disabled = true;
   });
 }
 
 async function showPictures() {
+  say(null);
   const shot = by("shot").value;
   const query = (camera) => `picture.jpg?camera=${encodeURIComponent(camera)}&shot=${encodeURIComponent(shot)}`;
   const shown = await Promise.all(world.cameras.map(({name}) =>
     scene.setPicture(name, world.pictures[name]?.includes(shot) ? query(name) : null)));
   document.body.dataset.pictures = shown.filter(Boolean).length;
+  const wrong = world.cameras.find(({name}, i) => shown[i] === false && world.pictures[name]?.includes(shot));
+  if (wrong) try { await ask(query(wrong.name)); } catch (problem) { say(problem); }
 }
 
 function chooseMap() {
@@ -134,28 +142,42 @@ function magnify() {
 // --------------------------------------------------------------------------------------------------- measured points
 
 function take(chunk) {
-  for (const name of Object.keys(points)) points[name].push(...chunk[name]);
-  missing += chunk.missing;
+  if (chunk.note !== undefined) {
+    by("note").textContent = chunk.note;
+    by("note").hidden = !chunk.note;
+    return;
+  }
+  for (const [name, reason] of chunk.missing) unmeasured.set(name, reason);
+  chunk.names.forEach((name, i) => {  // one that was measured before is where it is now
+    unmeasured.delete(name);
+    const at = rows.get(name) ?? points.names.length;
+    rows.set(name, at);
+    for (const key of Object.keys(points)) points[key][at] = chunk[key][i];
+  });
   notShown += chunk.not_shown;
-  scene.addMeasured(chunk.xyz, chunk.cov);
+  scene.setMeasured(points.xyz, points.cov);
   if (!chosen && points.names.length) {
     const ideal = USUAL_ELLIPSOID / Math.max(scene.usualEllipsoid(), 1e-12);
     by("magnified").value = Math.max(TIMES.filter((times) => times <= ideal).length - 1, 0);
     magnify();
   }
   by("measured").hidden = false;
-  by("count").textContent = [`${points.names.length} points`, missing && `${missing} could not be measured`,
+  const count = points.names.length;
+  by("count").textContent = [`${count} point${count === 1 ? "" : "s"}`, unmeasured.size && `${unmeasured.size} could not be measured`,
     notShown && `${notShown} more are not shown`].filter(Boolean).join(", ");
   if (chunk.alarm) say({error: chunk.alarm});
-  const rows = points.names.slice(-LAST).map((name, i, last) => {
+  by("why").hidden = !unmeasured.size;
+  by("reasons").replaceChildren(...[...unmeasured].slice(-MOST_REASONS).reverse().map(([name, reason]) =>
+    Object.assign(document.createElement("li"), {textContent: `${name}: ${reason}`})));
+  const lines = points.names.slice(-LAST).map((name, i, last) => {
     const k = points.names.length - last.length + i, sd = usual(points.cov[k]);
     return [name, ...place(points.xyz[k], sd), number(sd, 2)];
   });
   const table = document.createElement("table");  // the newest first
-  for (const [cells, kind] of [[["", "x", "y", "z", `sd, ${world.unit}`], "th"],
-    ...rows.reverse().map((row) => [row, "td"])]) {
+  for (const [cells, kind] of [[["", "x", "y", "z", `sd per axis, ${world.unit}`], "th"],
+    ...lines.reverse().map((row) => [row, "td"])]) {
     const line = table.insertRow();
-    for (const text of cells) line.append(Object.assign(document.createElement(kind), {textContent: text}));
+    for (const text of cells) line.append(Object.assign(document.createElement(kind), {textContent: text, title: text}));
   }
   by("last").replaceChildren(table);
 }
@@ -165,6 +187,7 @@ function listen() {
   source.onmessage = (event) => take(JSON.parse(event.data));
   source.onopen = () => { if (document.body.dataset.lost) { delete document.body.dataset.lost; say(null); } };
   source.onerror = () => {
+    if (ended) { source.close(); return; }
     document.body.dataset.lost = "yes";
     say({error: "implicam view does not answer.", fix: "Start it again in the terminal, or close this page."});
   };
