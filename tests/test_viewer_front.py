@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Iterator
 from itertools import takewhile
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 import pytest
 
@@ -567,10 +567,31 @@ def test_a_body_that_does_not_come_ends_in_time(front, monkeypatch):
     assert send(front, b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10\r\n\r\nabc")[0] == 502
 
 
-def test_too_many_at_once_are_told_so(front, monkeypatch):
+@pytest.mark.parametrize("begun", [b"", b"GET / HTTP/1.1\r\nHost: loc"])
+def test_a_flood_of_connections_that_say_nothing_keeps_nobody_out(locked, begun):
+    """130 of them locked everybody out."""
+    _, answer = get(locked, f"/?token={quote(TOKEN)}")
+    cookie = f"Cookie: {cookie_of(locked, answer)}\r\n"
+    with contextlib.ExitStack() as stack:
+        for _ in range(300):
+            line = stack.enter_context(connect(locked))
+            with contextlib.suppress(OSError):
+                line.sendall(begun)
+        for _ in range(5):
+            before = time.monotonic()
+            assert get(locked, "/", cookie)[0] == 200
+            assert time.monotonic() - before < 5
+
+
+def test_too_many_at_once_are_told_so(front, behind, monkeypatch):
     monkeypatch.setattr(door, "MAX_CLIENTS", 3)
-    with connect(front), connect(front), connect(front):
-        assert get(front)[0] == 503
+    begun = b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
+    with contextlib.ExitStack() as stack:
+        for _ in range(3):
+            stack.enter_context(connect(front)).sendall(begun)
+        deadline = time.monotonic() + 60
+        while get(front)[0] != 503:
+            assert time.monotonic() < deadline
     deadline = time.monotonic() + 60
     while get(front)[0] == 503:
         assert time.monotonic() < deadline

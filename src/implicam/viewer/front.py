@@ -44,6 +44,9 @@ ANSWER_SECONDS = 30.0  # seconds that the page behind has until its first line
 STALL_SECONDS = 60.0  # seconds without reading, after which the other side counts as gone
 WRONG_TOKEN_SECONDS = 0.5  # seconds that a wrong token costs
 MAX_CLIENTS = 128  # more would take file descriptors from the cameras and the journal
+MAX_STRANGERS = (
+    64  # connections that have not shown the token yet; of more, the oldest of the busiest address is hung up on
+)
 WILDCARDS = ("", "0.0.0.0", "::")
 
 REQUEST_LINE = re.compile(
@@ -240,6 +243,9 @@ class Front:
         self._origin, self._command, self._stake = origin, command, stake
         self._token = secrets.token_urlsafe(16) if token is None and needs_token(host) else token
         self._clients: set[asyncio.Task[None]] = set()
+        self._strangers: dict[
+            asyncio.Task[None], str
+        ] = {}  # those that may not pass yet: task -> address, oldest first
         self._thread: threading.Thread | None = None
         self._hang_up: Callable[[], None] | None = None
 
@@ -303,7 +309,7 @@ class Front:
 
     def _accept(self, loop: asyncio.AbstractEventLoop, listening: socket.socket) -> None:
         try:
-            line, _ = listening.accept()
+            line, (address, *_) = listening.accept()
         except BlockingIOError:
             return  # who knocked is gone
         except OSError:
@@ -312,8 +318,20 @@ class Front:
         line.setblocking(False)
         client = loop.create_task(self._client(line))
         self._clients.add(client)
+        self._strangers[client] = address
         client.add_done_callback(self._clients.discard)
+        client.add_done_callback(lambda done: self._strangers.pop(done, None))
+        self._make_room()
         client.add_done_callback(lambda _: line.close())  # nobody else does where it is cancelled before it begins
+
+    def _make_room(self) -> None:
+        """Connections that say nothing must not keep out who has the token."""
+        addresses = list(self._strangers.values())
+        if len(addresses) > MAX_STRANGERS:
+            busiest = max(addresses, key=addresses.count)
+            oldest = next(task for task, address in self._strangers.items() if address == busiest)
+            del self._strangers[oldest]
+            oldest.cancel()
 
     async def _client(self, line: socket.socket) -> None:
         """One connection from its first byte to its last."""
@@ -332,7 +350,10 @@ class Front:
             if head is None:
                 return
             self._check_source(head)
-            reply = await self._check_token(head) or await self._file(head) or await self._relay(head, reader, writer)
+            reply = await self._check_token(head)
+            if reply is None:
+                self._let_pass()
+                reply = await self._file(head) or await self._relay(head, reader, writer)
         except _RefusedError as refused:
             reply = refused.reply
         if reply is not None:
@@ -342,8 +363,6 @@ class Front:
 
     async def _read_head(self, reader: StreamReader) -> _Head | None:
         """The next head; None where the client hung up before it was complete."""
-        if len(self._clients) > MAX_CLIENTS:
-            raise _RefusedError(503, f"More than {MAX_CLIENTS} connections are open. Close other pages and reload.")
         try:
             async with asyncio.timeout(PATIENCE_SECONDS):
                 return _Head.parse(await reader.readuntil(b"\r\n\r\n"))
@@ -353,6 +372,14 @@ class Front:
             raise _RefusedError(431, f"The head of the request is longer than {HEAD_BYTES} bytes.") from None
         except TimeoutError:
             raise _RefusedError(408, f"No complete request within {PATIENCE_SECONDS:.0f} seconds.") from None
+
+    def _let_pass(self) -> None:
+        """Of the connection that is answered now: it has the token, where one is asked. Not any number may."""
+        task = asyncio.current_task()
+        if task is not None:
+            self._strangers.pop(task, None)
+        if len(self._clients) - len(self._strangers) > MAX_CLIENTS:
+            raise _RefusedError(503, f"More than {MAX_CLIENTS} connections are open. Close other pages and reload.")
 
     def _check_source(self, head: _Head) -> None:
         """Refuse a Host that is not ours, and what a page from elsewhere asks for."""
