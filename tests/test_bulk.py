@@ -164,6 +164,15 @@ def test_parts_of_another_measurement_are_not_gone_on_with(tmp_path: Path, monke
         measure_file(made(), source, tmp_path / "m.csv", points_at_once=50)
 
 
+def test_a_folder_of_a_person_is_not_taken_for_parts(tmp_path: Path) -> None:
+    notes = tmp_path / "m.csv.parts" / "notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    with pytest.raises(DatasetError, match=r"'notes\.txt', which is no part of a measurement in parts"):
+        measure_file(made(), table(tmp_path / "new.csv"), tmp_path / "m.csv", points_at_once=50)
+    assert notes.read_text() == "mine"
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

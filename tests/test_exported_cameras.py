@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 import implicam as ic
+from command_line import Cli, cli, files, made  # noqa: F401  fixtures
 from deployed_rigs import fisheyes
 from implicam.calibrators.explicit import rig_of
 from implicam.calibrators.protocol import RigCalibration
+from implicam.cli.cameras import WRITE_FOLDERS
 from implicam.exchange import export_cameras
 from implicam.simulate import build_rig, random_positions, simulate
 
@@ -101,3 +103,14 @@ def test_other_programs_see_what_the_calibration_sees(program: str, kind: str, t
         assert inside.sum() > 100
         assert np.sqrt(np.mean(off**2)) < OTHER_PLACES * rms
         assert off.max() < OTHER_PLACES * largest
+
+
+@pytest.mark.parametrize("to", WRITE_FOLDERS)
+def test_a_folder_that_holds_something_else_is_never_replaced(to: str, made: Path, cli: Cli) -> None:
+    kept = Path("victim", "deep", "notes.txt")
+    kept.parent.mkdir(parents=True)
+    kept.write_text("mine")
+    ran = cli("export", made / "rig.implicam", "--to", to, "-o", "victim")
+    assert ran.code == 1
+    assert "notes.txt', which is no part of " in ran.err or "cannot be written" in ran.err, ran.err
+    assert files(Path("victim")) == {"deep/notes.txt": b"mine"}

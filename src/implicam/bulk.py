@@ -29,7 +29,7 @@ from implicam.dataset.cells import guard_cell
 from implicam.dataset.folder import format_cells
 from implicam.dataset.model import check_views
 from implicam.errors import DatasetError, UsageError, import_extra
-from implicam.files import convert_write_errors, replacing, write_text
+from implicam.files import convert_write_errors, refuse_other_files, replacing, write_text
 from implicam.measurement import DOUBTFUL, MEASURED_COLUMNS
 from implicam.progress import Progress, silent
 from implicam.rig_model import MeasuredPixels
@@ -164,6 +164,11 @@ def _plan(calibration: RigCalibration, source: Path, points_at_once: int) -> dic
     }
 
 
+def _is_part(name: str) -> bool:
+    """Whether `_Parts` writes a file of this name; a kill leaves a hidden one."""
+    return name.lstrip(".").startswith(("part-", PLAN))
+
+
 class _Parts:
     """The parts on disk. Each is a file as the whole will be, and a summary that is written after it."""
 
@@ -175,6 +180,7 @@ class _Parts:
         self.done: list[dict[str, Any]] = []
         path = self.folder / PLAN
         if not self._file(0, ".json").exists():  # nothing is done
+            refuse_other_files(self.folder, _is_part, "a measurement in parts")
             with convert_write_errors(str(self.folder)):
                 shutil.rmtree(self.folder, ignore_errors=True)
                 self.folder.mkdir(parents=True)

@@ -12,6 +12,7 @@ import io
 import math
 import os
 import re
+import reprlib
 import secrets
 import shutil
 import struct
@@ -26,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.errors import ImplicamError
+from implicam.errors import DatasetError, ImplicamError
 
 # A calibration or dataset is stored uncompressed by us, so a member is never larger than its file. Others may
 # deflate: text shrinks perhaps tenfold, zip bombs a thousandfold. Bzip2 and LZMA may ask for
@@ -105,6 +106,33 @@ def refuse_folder(path: Path) -> None:
     if path.is_dir():
         raise ImplicamError(
             f"{path} is a folder, and a file is to be written.", fix=f"name a file, {path / 'NAME'} say"
+        )
+
+
+def refuse_other_files(folder: Path, ours: Callable[[str], bool], what: str) -> None:
+    """Check that writing a folder anew would delete nothing but what was written there before.
+
+    Args:
+        folder: The folder to be written; it need not exist.
+        ours: Whether a file is one of those that are written; its path in the folder, with slashes.
+        what: What is written, for the error.
+
+    Raises:
+        DatasetError: It is a file, or holds something else.
+    """
+    if not folder.is_dir():
+        if folder.exists():
+            raise DatasetError(
+                f"{folder} is a file, and a folder is to be written.", fix="choose another name, or remove the file"
+            )
+        return
+    entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
+    others = sorted(name for entry in entries if not ours(name := entry.relative_to(folder).as_posix()))
+    if others:
+        raise DatasetError(
+            f"{folder} holds {reprlib.repr(others[0])}, which is no part of {what}.",
+            why="the folder would be replaced, and this be lost",
+            fix="choose a new folder",
         )
 
 

@@ -19,7 +19,7 @@ from implicam.deploy import write_cpp, write_onnx
 from implicam.deploy.cpp_table import EXAMPLE_FILE, HEADER_FILE, TABLE_FILE
 from implicam.errors import UsageError, did_you_mean
 from implicam.exchange import FOLDERS, FORMATS, UNKNOWN_UNIT, export_cameras, import_cameras
-from implicam.exchange.pixel_maps import MAPS_FORMAT, write_maps
+from implicam.exchange.pixel_maps import MAPS_FORMAT, check_maps_folder, write_maps
 from implicam.files import is_file_name
 
 ONNX_FORMAT, CPP_FORMAT = "onnx", "cpp"
@@ -104,6 +104,7 @@ def _with_size(given: dict[str, Any]) -> dict[str, Any]:
 
 def _export_maps(calibration: Calibration, view: PinholeView, output: Path, json: bool) -> None:
     must_be_folder(output)
+    check_maps_folder(output, calibration.data.camera_names)
     with show.progress(json) as progress:
         maps, notes = pinhole_maps(calibration, view, progress)
     write_maps(maps, calibration.data.length_unit, output)

@@ -23,7 +23,7 @@ from implicam import calibration_file
 from implicam.calibrators import Calibration
 from implicam.calibrators.protocol import RigCalibration
 from implicam.errors import FitError, UsageError
-from implicam.files import replacing_folder
+from implicam.files import refuse_other_files, replacing_folder
 from implicam.formatting import percent
 from implicam.progress import Progress, silent
 from implicam.rig_model import FittedRig
@@ -49,7 +49,7 @@ def write_cpp(
 
     Args:
         calibration: By `forward-gp` or `explicit`.
-        folder: The folder to write; one that is there is replaced.
+        folder: The folder to write; an earlier one is replaced.
         checksum: The SHA-256 of the calibration file; of a calibration that is not a file it is found out.
         progress: Is told how far it is.
 
@@ -59,6 +59,7 @@ def write_cpp(
     Raises:
         UsageError: The method has no cameras, or the noise has heavy tails.
         FitError: A camera sees too little of the box, or cannot be tabulated.
+        DatasetError: The folder holds something else.
         ImplicamError: The folder cannot be written.
 
     >>> import implicam as ic
@@ -68,12 +69,14 @@ def write_cpp(
     ...     print(note.partition(":")[0])
     The table is exact to 0.3 % of a view's sd and 0.5 % of its variance
     """
+    folder = Path(folder)
+    refuse_other_files(folder, {TABLE_FILE, HEADER_FILE, EXAMPLE_FILE}.__contains__, "a calibration for C++")
     rig = _rig(calibration)
     low, high = box_of(rig, calibration.data.xyz)
     table = tabulate(rig, low, high, progress)
     notes = _notes(rig, table)
     content = table_bytes(rig, table, checksum or calibration_file.checksum(calibration))
-    with replacing_folder(Path(folder), overwrite=True) as temporary:
+    with replacing_folder(folder, overwrite=True) as temporary:
         (temporary / TABLE_FILE).write_bytes(content)
         for name in (HEADER_FILE, EXAMPLE_FILE):
             text = files(__package__).joinpath("templates", name).read_text(encoding="utf-8")

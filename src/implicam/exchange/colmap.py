@@ -30,7 +30,7 @@ from implicam.exchange.other_lenses import (
 )
 from implicam.exchange.refits import make_camera
 from implicam.exchange.source import Source
-from implicam.files import replacing_folder
+from implicam.files import refuse_other_files, replacing_folder
 from implicam.geometry import Pose
 from implicam.images import ENDINGS
 from implicam.lenses import KannalaBrandt, Lens
@@ -90,13 +90,7 @@ def write(rig: Rig, path: Path) -> list[str]:
         DatasetError: The folder holds something else, two names become the same, or an image size is not known.
         ImplicamError: The folder cannot be written.
     """
-    there = {entry.name for entry in path.iterdir()} if path.is_dir() else set()
-    others = there - {CAMERAS_FILE, IMAGES_FILE, POINTS_FILE}
-    if others:
-        raise DatasetError(
-            f"{path} holds {shorten(min(others))}, which is no part of a COLMAP text model.",
-            fix="choose a new folder for the model",
-        )
+    refuse_other_files(path, {CAMERAS_FILE, IMAGES_FILE, POINTS_FILE}.__contains__, "a COLMAP text model")
     names, notes = _image_names(rig)
     cameras = [f"{_UNIT_COMMENT}{rig.length_unit}", "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS"]
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line for its points (none)"]

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from implicam.errors import DatasetError
-from implicam.exchange.checks import shorten
-from implicam.files import replacing_folder
+from implicam.files import refuse_other_files, replacing_folder
 
 
 def write_folder(path: Path, texts: Mapping[str, str], what: str) -> None:
@@ -22,14 +20,7 @@ def write_folder(path: Path, texts: Mapping[str, str], what: str) -> None:
         DatasetError: The folder holds something else.
         ImplicamError: It cannot be written.
     """
-    there = (
-        {file.relative_to(path).as_posix() for file in path.rglob("*") if file.is_file()} if path.is_dir() else set()
-    )
-    others = there - set(texts)
-    if others:
-        raise DatasetError(
-            f"{path} holds {shorten(min(others))}, which is no part of {what}.", fix="choose a new folder for it"
-        )
+    refuse_other_files(path, texts.__contains__, what)
     with replacing_folder(path, overwrite=True) as folder:
         for name, text in texts.items():
             file = folder / name

@@ -14,6 +14,7 @@ use it; and for each camera NAME.npz and NAME.yml.gz, the same for NumPy and for
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +28,7 @@ from scipy.spatial import KDTree
 from implicam.errors import DatasetError
 from implicam.exchange.anipose import write_aniposelib
 from implicam.exchange.model import ExplicitCamera, Rig
-from implicam.files import npz_bytes, read_npz, replacing_folder
+from implicam.files import npz_bytes, read_npz, refuse_other_files, replacing_folder
 from implicam.geometry import Pose
 from implicam.images import opencv
 from implicam.lenses import Bools, BrownConrady, Floats
@@ -194,6 +195,20 @@ def _median(sd: NDArray[np.float32]) -> float | None:
     return float(np.median(sd)) if sd.size and np.isfinite(sd).all() else None
 
 
+def check_maps_folder(path: Path, names: Sequence[str]) -> None:
+    """Say that the maps cannot be written before they are made, not after.
+
+    Args:
+        path: The folder that they are to be written to.
+        names: Of the cameras.
+
+    Raises:
+        DatasetError: It is a file, or holds something else.
+    """
+    ours = {PINHOLES_FILE, README_FILE} | {name + ending for name in names for ending in (".npz", ".yml.gz")}
+    refuse_other_files(path, ours.__contains__, "these maps")
+
+
 def write_maps(maps: list[PinholeMaps], length_unit: str, path: Path) -> None:
     """Write the folder, whole or not at all; earlier maps in it are replaced.
 
@@ -209,10 +224,7 @@ def write_maps(maps: list[PinholeMaps], length_unit: str, path: Path) -> None:
     """
     cv2 = opencv()
     names = [each.pinhole.name for each in maps]
-    ours = {PINHOLES_FILE, README_FILE} | {name + ending for name in names for ending in (".npz", ".yml.gz")}
-    others = {entry.name for entry in path.iterdir()} - ours if path.is_dir() else set()
-    if others:
-        raise DatasetError(f"{path} holds {min(others)!r}, which is none of these maps.", fix="choose a new folder")
+    check_maps_folder(path, names)
     with replacing_folder(path, overwrite=True) as folder:
         write_aniposelib(Rig(tuple(each.pinhole for each in maps), length_unit), folder / PINHOLES_FILE)
         (folder / README_FILE).write_text(README.replace("UNIT", length_unit), encoding="utf-8", newline="")
