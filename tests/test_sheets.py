@@ -18,6 +18,7 @@ from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read
 from implicam.dataset.headings import is_camera_name, read_headings, take_apart
 from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.measurement import Measurement
+from implicam.simulate import build_rig, random_positions, record
 
 SPREADSHEETS = 30
 
@@ -242,6 +243,19 @@ def test_one_line_says_how_the_headings_were_read(tmp_path: Path) -> None:
     )
     assert read.observations.uv.tolist() == [[[10.25, 20.0]]]
     assert sheet(tmp_path, "point,x,y,z,u_a,v_a\np,1,2,3,4,5\n").notes == ()
+
+
+def test_a_table_of_views_that_this_program_wrote_can_be_read_alone(tmp_path: Path) -> None:
+    """With the columns true_u and true_v, which are a pair as well."""
+    rig = build_rig("bar4", seed=1)
+    data = record(rig, random_positions(rig, 5, np.random.default_rng(1)), seed=1).data
+    write_dataset(data, tmp_path / "rig")
+    table = tmp_path / "rig" / "observations.csv"
+    assert "true_u" in table.read_text()
+    for cameras in ((), data.observations.camera_names):
+        read = read_dataset(table, unit="mm", cameras=cameras)
+        np.testing.assert_array_equal(read.observations.uv, data.observations.uv)
+        assert "true_u" in read.observations.extra
 
 
 BODY = "a{s}1{s}2{s}3{s}4.5{s}6.5\nb{s}4{s}5{s}6{s}7.5{s}8.5\n"

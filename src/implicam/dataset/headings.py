@@ -144,7 +144,7 @@ def read_headings(header: Sequence[str], place: str, cameras: Sequence[str] = ()
     positions = _find_positions(parsed, bool(camera), place)
     unit = _one_unit([heading for heading in parsed if heading.text in positions], place)
     rest = [heading for heading in parsed if heading.text not in (*positions, camera)]
-    pixels = _find_view_pixels(rest) if camera else {}
+    pixels = _find_view_pixels(rest, cameras) if camera else {}
     if not pixels:
         camera, pixels = "", _find_pixels(rest, bool(positions), place, cameras)
     taken = {*positions, camera, *(column for pair in pixels.values() for column in pair)}
@@ -301,11 +301,13 @@ def _camera_column(parsed: list[Heading]) -> str:
     return found[0] if len(found) == 1 else ""
 
 
-def _find_view_pixels(rest: list[Heading]) -> dict[str, tuple[str, str]]:
-    """The two columns of pixels of a long table; empty where they are not the only ones."""
+def _find_view_pixels(rest: list[Heading], cameras: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """The two columns of pixels of a long table; empty where a camera has columns of its own. Others may have an axis:
+    simulate writes true_u and true_v beside u and v."""
     bare = {heading.axis: heading.text for heading in rest if heading.axis and not heading.label}
     pairs = [(bare[u], bare[v]) for u, v in _FAMILIES if u in bare and v in bare]
-    labelled = any(heading.label for heading in rest if heading.axis in ("u", "v"))
+    labels = {heading.label for heading in rest if heading.axis in ("u", "v")} - {""}
+    labelled = any(label in cameras or is_camera_name(label, True) for label in labels)
     return {"": pairs[0]} if len(pairs) == 1 and "z" not in bare and not labelled else {}
 
 
