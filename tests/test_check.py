@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import json
 from dataclasses import replace
 from functools import cache
@@ -14,8 +15,11 @@ from scipy.spatial.transform import Rotation
 
 import implicam as ic
 from command_line import Cli, cli  # noqa: F401  a fixture
+from implicam.calibrators.explicit import calibration_of
 from implicam.dataset import Dataset, Floats
 from implicam.errors import DatasetError, UsageError
+from implicam.exchange import ExplicitCamera
+from implicam.exchange import Rig as ExplicitRig
 from implicam.geometry import Pose
 from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.general_camera import GeneralCamera
@@ -183,6 +187,63 @@ def test_what_cannot_be_checked_is_refused() -> None:
     uv[:, 1:] = np.nan
     with pytest.raises(DatasetError, match="no two cameras saw enough"):
         ic.check_calibration(calibration, replace(data, observations=replace(data.observations, uv=uv)))
+
+
+def imported(rig: Rig, off: float = 0.0) -> ic.Calibration:
+    """The true cameras as another program's file has them, the first turned by `off` degrees: nothing is known of how
+    well they were calibrated."""
+    told = moved(rig, 0, step_of(pan=off))
+    cameras = [ExplicitCamera(c.name, c.width, c.height, c.lens, c.camera_from_world) for c in told.cameras]
+    return calibration_of(ExplicitRig(tuple(cameras), "mm"), "cameras", 0.3)
+
+
+def test_of_cameras_that_were_never_exact_none_is_said_to_have_moved(cli: Cli, tmp_path: Path) -> None:
+    rig = build_rig("bar4", seed=1, lens_error=0.0)
+    assert ic.check_calibration(imported(rig), views(rig, 15)).verdict == "stands"
+    calibration = imported(rig, off=0.05)
+    found = ic.check_calibration(calibration, views(rig, 15))
+    assert found.found.named is not None  # what would be named, were these cameras known to be exact
+    assert (found.verdict, found.holds, found.cameras, found.candidates, found.noticed) == (
+        "disagree",
+        False,
+        (),
+        (),
+        {},
+    )
+    said = " ".join(found.sentences())
+    assert "disagree by more than their noise" in said
+    assert "moved since or were never more exact" in said
+    assert not any(name in said for name in calibration.camera_names)
+    with pytest.raises(UsageError, match="'disagree'"):
+        found.repair()
+    calibration.save("imported.implicam")
+    ic.write_dataset(views(rig, 15), "new.csv")
+    ran = cli("check", "imported.implicam", "new.csv", "--repair", "after.implicam", "--log", "checks.csv")
+    assert ran.code == 1
+    assert "after.implicam is not written: of these cameras it cannot be told" in ran.out
+    assert "if it alone moved" not in ran.out
+
+
+def test_what_an_imported_calibration_does_not_know_is_not_said(cli: Cli) -> None:
+    rig = build_rig("bar4", seed=1)
+    calibration = imported(rig)
+    assert np.isnan(calibration.measure(views(rig, 15)).share_calibration).all()
+    calibration.save("imported.implicam")
+    ic.write_dataset(views(rig, 15), "new.csv")
+    ran = cli("measure", "imported.implicam", "new.csv")
+    assert "more known points" not in ran.out
+    assert "of the noise of the pixels alone" in ran.err
+    told = cli("measure", "imported.implicam", "new.csv", "--json").json
+    assert told["median_share_calibration"] is None
+    assert any("nothing is known of how well" in note for note in told["notes"])
+    for words in (("evaluate", "imported.implicam", "--cv", "5"), ("report", "imported.implicam")):
+        said = cli(*words).err
+        assert "has no known points, so none can be held out" in said
+        assert "evaluate FILE DATASET" in said
+    if importlib.util.find_spec("onnx"):
+        said = cli("export", "imported.implicam", "--to", "onnx", "-o", "rig.onnx").err
+        assert "Nothing is known of the errors of these cameras" in said
+        assert "known positions" not in said
 
 
 def knocked(rig: Rig, camera: int) -> Rig:

@@ -105,7 +105,12 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
         raise DatasetError(
             f"{data.name!r} is in {data.length_unit}, and the calibration is in {calibration.data.length_unit}.",
             why="errors are differences of positions, so both must be in one length unit",
-            fix="convert the known positions, or calibrate in the unit of this dataset",
+            fix=f"in Python evaluate(calibration, data.in_unit({calibration.data.length_unit!r})); or "
+            + (
+                "calibrate with known points in the unit of this dataset"
+                if len(calibration.data)
+                else f"import the cameras with --unit {data.length_unit}"
+            ),
         )
     names = calibration.data.observations.camera_names
     if set(names) <= set(data.observations.camera_names):
@@ -179,7 +184,14 @@ def leave_out_shots(fit: Fits, data: Dataset, *, progress: Progress = silent) ->
 
 
 def _each_once(data: Dataset, how: str) -> tuple[Dataset, str]:
-    """Without copied points: a copy in another fold is a point that the fit knows, and no second piece of evidence."""
+    """Without copied points: a copy in another fold is a point that the fit knows, and no second piece of evidence.
+    DatasetError where there is no point at all."""
+    if not len(data):
+        raise DatasetError(
+            f"{data.name!r} has no known points, so none can be held out.",
+            why="of cameras that another program calibrated a file holds none",
+            fix="judge it by others: implicam evaluate FILE DATASET, or implicam report FILE DATASET",
+        )
     copied = find_copies(data).points
     if not copied.any():
         return data, how

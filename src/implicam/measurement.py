@@ -88,7 +88,8 @@ class MeasuredPoint:
         consistency: p-value of the test that the views agree.
         reason: Why it was not measured, or which views were left out.
         length_unit: Of the position.
-        share_calibration: Share of the variance that more known points could remove.
+        share_calibration: Share of the variance that more known points could remove; NaN where the errors of the
+            cameras are not known.
 
     >>> import implicam as ic
     >>> rig = ic.simulated("stereo", points=30, seed=1)

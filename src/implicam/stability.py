@@ -28,7 +28,13 @@ from implicam.geometry import cross_matrices
 from implicam.rig_model import NUMBERS, Check, Evidence, errors_with_and_without, find_repair
 
 STANDS, MOVED, ONE_MOVED, SEVERAL, BIASED = "stands", "moved", "one moved", "several moved", "biased"
+DISAGREE = "disagree"
+"""Of cameras of whose errors nothing is known: these may always have been so large."""
 UNSEEN = "A rig whose cameras all moved together looks the same to itself: only known points could show it."
+NEVER_EXACT = (
+    "Nothing is known of how exact these cameras were when they were calibrated, so it cannot be told whether they "
+    "have moved since or were never more exact."
+)
 NUMBER_NAMES = ("tilt", "pan", "roll", "right", "down", "forward", "zoom")
 """Of a movement: turns about the camera's axes that point right, down and forward in its picture (degrees), shifts
 along these (length unit), and the zoom (per cent)."""
@@ -137,9 +143,11 @@ class CalibrationCheck:
     ('stands', True)
 
     Attributes:
-        verdict: `stands`, `moved` (the first of `cameras`), `one moved` (of `candidates`), `several moved` or `biased`.
+        verdict: `stands`, `moved` (the first of `cameras`), `one moved` (of `candidates`), `several moved`, `biased` or
+            `disagree`: nothing is known of the errors of the cameras, and whether one has moved cannot be told.
         p_value: That chance alone makes the views disagree as a movement would.
-        cameras: Of each camera how it moved if it alone did, the likeliest first; none where hardly two views agree.
+        cameras: Of each camera how it moved if it alone did, the likeliest first; none where hardly two views agree, or
+            nothing is known of the errors of the cameras.
         candidates: Names of the cameras of which one moved.
         known: The comparison with known points; None where there are none.
         points: How many points were used.
@@ -170,8 +178,8 @@ class CalibrationCheck:
     def noticed(self) -> dict[str, Floats]:
         """Camera -> (7,) what each number of `NUMBER_NAMES` alone would have to be for the camera to be named half the
         time; infinite where none would do."""
-        pairs = zip(self.cameras, self.found.evidence, strict=True)
-        return {one.camera: self.found.noticed[seen.camera] * self.units for one, seen in pairs}
+        numbers = {name: c for c, name in enumerate(self.calibration.camera_names)}
+        return {one.camera: self.found.noticed[numbers[one.camera]] * self.units for one in self.cameras}
 
     @property
     def holds(self) -> bool:
@@ -188,7 +196,7 @@ class CalibrationCheck:
             UsageError: No single camera is known to have moved, or the calibration cannot be repaired.
         """
         one = self.found.named
-        if one is None:
+        if one is None or self.verdict != MOVED:
             raise UsageError(
                 f"there is no camera to put right: the verdict is {self.verdict!r}.",
                 why="only of a single camera that moved can the others say where it stands now",
@@ -222,8 +230,12 @@ class CalibrationCheck:
             + (f", or many views of {doubtful} are wrong detections." if doubtful else "."),
             BIASED: "The views agree with each other, but not with the known points: all cameras moved together, or "
             "the known points did.",
+            DISAGREE: f"The views disagree by more than their noise (p = {decimal_number(self.p_value, 2)}). "
+            + NEVER_EXACT,
         }[self.verdict]
         found = [said]
+        if self.verdict == BIASED and not self.calibration.map.posterior.errors_known:
+            found.append(NEVER_EXACT)
         if self.known is not None:
             pairs = zip("xyz", self.known.bias, self.known.bias_sd, strict=True)
             bias = ", ".join(f"{axis} {number_with_sd(value, sd)}" for axis, value, sd in pairs)
@@ -372,11 +384,12 @@ def _conclude(
     assert len(units) == NUMBERS
     cameras = tuple(_in_units(one, names, units, found.noise_ratio) for one in found.evidence)
     judged = {one.camera for one in cameras}
+    verdict, errors_known = _verdict(found, known, level), calibration.map.posterior.errors_known
     return CalibrationCheck(
-        _verdict(found, known, level),
+        verdict if errors_known or verdict in (STANDS, BIASED) else DISAGREE,
         found.p_value,
-        cameras,
-        tuple(names[c] for c in found.candidates),
+        cameras if errors_known else (),
+        tuple(names[c] for c in found.candidates) if errors_known else (),
         known,
         found.points,
         found.noise_ratio,

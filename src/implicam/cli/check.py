@@ -19,6 +19,7 @@ from implicam.errors import UsageError
 from implicam.formatting import decimal_number, number_with_sd
 from implicam.stability import (
     BIASED,
+    DISAGREE,
     MOVED,
     NUMBER_NAMES,
     ONE_MOVED,
@@ -125,6 +126,7 @@ _NO_REPAIR = {
     ONE_MOVED: "show the cameras points that three of them see, or calibrate again with known points",
     SEVERAL: "one camera that moved can be put right by the others; calibrate again with known points",
     BIASED: "no camera's movement explains it; calibrate again with known points",
+    DISAGREE: "of these cameras it cannot be told that one has moved; calibrate with known points",
 }
 """Verdict of a check -> why no calibration is written."""
 

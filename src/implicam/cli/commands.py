@@ -272,12 +272,13 @@ def measure_command(
     count, typical = int(measured.measured.sum()), _typical(measured.sd)
     known = measured.share_calibration[np.isfinite(measured.share_calibration)]
     share = float(np.median(known)) if len(known) else math.nan
+    notes = [*data.notes, *outside, *_unknown_errors(fitted)]
     if json:
         show.emit_json(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
              "median_share_calibration": share,
              "length_unit": measured.length_unit, "not_measured": show.reasons(measured),
-             "views_left_out": show.left_out(measured), "notes": [*data.notes, *outside], "alarm": measured.alarm,
+             "views_left_out": show.left_out(measured), "notes": notes, "alarm": measured.alarm,
              **({"distances": str(beside)} if wanted else {})}
         )  # fmt: skip
         raise typer.Exit(int(bool(measured.alarm)))
@@ -294,12 +295,22 @@ def measure_command(
             show.line(f"  {row}")
     if judged in (DOUBTFUL, NOT_USABLE):
         show.note(f"this calibration was found {judged} when it was made: implicam info {calibration} says why")
-    show.notes([*data.notes, *outside])
+    show.notes(notes)
     show.notes(show.reasons(measured))
     show.notes(show.left_out(measured))
     if measured.alarm:
         show.alarm(f"{measured.alarm}{'' if measured.alarm.endswith('?') else '.'} Every row says that it is doubtful.")
     raise typer.Exit(int(bool(measured.alarm)))
+
+
+def _unknown_errors(fitted: Calibration) -> list[str]:
+    """What an imported calibration says of its error bars."""
+    if len(fitted.data) or not isinstance(fitted, RigCalibration) or fitted.map.posterior.errors_known:
+        return []
+    return [
+        "Another program calibrated these cameras, and nothing is known of how well: the standard uncertainties are "
+        "of the noise of the pixels alone, and the errors may be larger."
+    ]
 
 
 def _typical(sd: Any) -> list[float]:

@@ -49,10 +49,10 @@ def write_onnx(calibration: Calibration, path: str | Path, checksum: str = "") -
         graph, what = forward_graph(rig), FORWARD
         cameras = tuple(rig.trained.cameras[c] for c in rig.cameras)
         noise = {name: model.noise for name, model in zip(rig.camera_names, rig.posterior.models, strict=True)}
-        if rig.posterior.tied:
-            notes.append(
-                "Errors of the known positions tie the cameras together: each covariance is that of one camera alone."
-            )
+        if not rig.posterior.errors_known:
+            notes.append("Nothing is known of the errors of these cameras: each covariance is zero.")
+        elif rig.posterior.tied:
+            notes.append("The errors of the cameras depend on each other: each covariance is that of one camera alone.")
     else:
         raise UsageError(
             f"{calibration.method} cannot be written as an ONNX graph.",

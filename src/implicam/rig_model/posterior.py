@@ -9,6 +9,7 @@ cameras together. Work and memory grow linearly with the number of points.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -48,9 +49,15 @@ class Posterior:
     displacement: Floats | None = None
     ties: Floats | None = None
 
+    @cached_property
+    def errors_known(self) -> bool:
+        """Whether anything is known of the errors of the cameras; not where another program calibrated them, and they
+        are taken as they are."""
+        return any(self.root(c).any() for c in range(len(self.models)))
+
     @property
     def tied(self) -> bool:
-        """Whether errors of known positions tie the cameras."""
+        """Whether errors of known positions, or boards, tie the cameras."""
         return self.joint is not None or self.ties is not None
 
     def root(self, c: int) -> Floats:

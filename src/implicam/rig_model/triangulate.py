@@ -223,8 +223,11 @@ class _Seen:
         return xyz, cov, p
 
     def calibration_share(self, x: Floats, cov: Floats, seen: Bools) -> Floats:
-        """(n,) share of the variance of positions x (n, 3) that perfectly known cameras would not have, eq. (22a)."""
+        """(n,) share of the variance of positions x (n, 3) that perfectly known cameras would not have, eq. (22a);
+        NaN where nothing is known of their errors."""
         share = np.full(len(x), np.nan)
+        if not self.posterior.errors_known:
+            return share
         rows = np.flatnonzero(np.isfinite(x).all(axis=1))
         x, cov, seen, noise = x[rows], cov[rows], seen[rows], self.noise[rows]
         if self.degrees is None:
