@@ -17,7 +17,8 @@ import implicam as ic
 from command_line import Cli, cli  # noqa: F401  a fixture
 from implicam.dataset import Floats
 from implicam.derived import angle, distance, distances, fit_cylinder, fit_motion, fit_plane, fit_sphere, joint
-from implicam.errors import NumericalError, UsageError
+from implicam.derived.table import read_pairs
+from implicam.errors import DatasetError, NumericalError, UsageError
 from implicam.files import write_text
 from implicam.measurement import Measurement, SharedErrors
 from implicam.simulate import build_rig, random_positions, simulate
@@ -271,4 +272,20 @@ def test_distances_on_the_command_line(cli: Cli) -> None:
     assert ran.code != 0
     assert "no point 'nobody'" in ran.err
     write_text(Path("pairs.csv"), "p,q\n1,2\n")
-    assert "begin it with a line a,b" in cli("measure", "rig.implicam", "new.csv", "--distances", "pairs.csv").err
+    assert (
+        "the first line must name at least the columns a,b"
+        in cli("measure", "rig.implicam", "new.csv", "--distances", "pairs.csv").err
+    )
+
+
+@pytest.mark.parametrize("text", ["a,b\np1,p2\n", "a;b\np1;p2\n", "a\tb\np1\tp2\n", "note,b,a\nx,p2,p1\n"])
+def test_pairs_are_read_however_they_are_separated(text: str, tmp_path: Path) -> None:
+    (tmp_path / "pairs.csv").write_text(text)
+    assert read_pairs(tmp_path / "pairs.csv") == [("p1", "p2")]
+
+
+@pytest.mark.parametrize("text", ["", "from,to\np1,p2\n", "a;b\np1;p2;p3\n"])
+def test_what_is_no_table_of_pairs_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "pairs.csv").write_text(text)
+    with pytest.raises(DatasetError, match=r"pairs\.csv"):
+        read_pairs(tmp_path / "pairs.csv")

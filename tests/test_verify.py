@@ -145,6 +145,15 @@ def test_mistakes_in_a_table_of_lengths_are_named(text: str, says: str, tmp_path
     assert says in str(error.value)
 
 
+@pytest.mark.parametrize("written", ["line;a;b;length;U", "sep=;\nline;a;b;length;U", "line\ta\tb\tlength\tU"])
+def test_a_table_of_lengths_as_german_excel_writes_it(written: str, tmp_path: Path) -> None:
+    mark = "\t" if "\t" in written else ";"
+    path = tmp_path / "lengths.csv"
+    path.write_text(f"{written}\n" + mark.join(["L1", "p1", "p2", "500,0125", "0,002"]) + "\n")
+    (one,) = read_lengths(path)
+    assert (one.a, one.b, one.length, one.sd) == ("p1", "p2", 500.0125, 0.001)
+
+
 def test_ends_are_found_by_their_names() -> None:
     found = lengths_by_names(["bar01_a", "bar02-A", "bar01_b", "bar02-B", "bar03_a", "x"], 500.0, sd=0.1)
     assert [(one.a, one.b, one.line) for one in found] == [
@@ -427,3 +436,21 @@ def test_the_command_writes_protocol_and_table_and_ends_with_the_decision(made: 
     plain = cli("verify", file, lengths, "--json").json
     ratio = warm["lengths"][0]["calibrated"] / plain["lengths"][0]["calibrated"]
     assert ratio == pytest.approx(1 + 5 * 11.5e-6, rel=1e-9)
+
+
+def test_lengths_are_in_the_unit_that_is_said_whatever_the_data_are_in(made: Path, cli: Cli) -> None:
+    lengths = made / "rig" / "lengths"
+    assert cli("import", made / "cameras.toml", "-o", "in-m.implicam", "--unit", "m").code == 0
+    ran = cli("verify", "in-m.implicam", lengths)
+    assert ran.code == 2
+    assert "say it: --unit mm or --unit m" in ran.err
+    in_mm = cli("verify", "in-m.implicam", lengths, "--unit", "mm", "--json").json
+    with (lengths / "lengths.csv").open() as file:
+        rows = [(row["a"], row["b"], float(row["length"]) / 1000) for row in csv.DictReader(file)]
+    Path("len_m.csv").write_text("a;b;length\n" + "".join(f"{a};{b};{x!r}\n" for a, b, x in rows))
+    in_m = cli("verify", "in-m.implicam", lengths, "--lengths", "len_m.csv", "--unit", "m", "--json").json
+    errors = [[1000 * one["error"] for one in in_m["lengths"]], [one["error"] for one in in_mm["lengths"]]]
+    np.testing.assert_allclose(*errors, atol=1e-6)
+    assert "import the cameras with --unit mm" in cli("evaluate", "in-m.implicam", made / "rig" / "check").err
+    assert cli("import", made / "cameras.toml", "-o", "in-mm.implicam", "--unit", "mm").code == 0
+    assert cli("evaluate", "in-mm.implicam", made / "rig" / "check").code == 0

@@ -13,10 +13,11 @@ from implicam import calibration_file
 from implicam.active.workspace import workspace_from
 from implicam.calibrators import Calibration, load_calibration
 from implicam.cli import show
-from implicam.cli.app import Json, command, must_not_replace, read
+from implicam.cli.app import Json, command, must_not_replace, read_to_measure
 from implicam.cli.options import with_table_options
 from implicam.dataset import Dataset, Floats, TableOptions
 from implicam.dataset.table_options import DOCUMENTED
+from implicam.dataset.units import UNKNOWN_UNIT
 from implicam.errors import DatasetError, UsageError, import_extra
 from implicam.files import refuse_folder, write_text
 from implicam.formatting import decimal_number
@@ -99,7 +100,13 @@ def verify_command(
     import_extra("jinja2", "report", "the protocol")
     fitted = load_calibration(calibration)
     unit = table.unit or fitted.data.length_unit
-    data = read(dataset, replace(table, unit=unit), calibration=fitted)
+    data = read_to_measure(dataset, replace(table, unit=None), fitted)
+    if not table.unit and data.length_unit not in (unit, UNKNOWN_UNIT):
+        raise UsageError(
+            f"{dataset} is in {data.length_unit!r}, and the calibration in {unit!r}.",
+            why="it cannot be told in which of the two the calibrated lengths are",
+            fix=f"say it: --unit {data.length_unit} or --unit {unit}",
+        )
     known = _lengths(lengths, length, length_sd, dataset, data)
     known = [_at_temperature(one, temperature, expansion) for one in known]
     volume = None if workspace is None else workspace_from(workspace, _known_xyz(fitted, unit))

@@ -14,7 +14,15 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from implicam.dataset.tables import NO_VALUE_WORDS, Row, read_lines, split_lines
+from implicam.dataset.tables import (
+    NO_VALUE_WORDS,
+    Row,
+    check_header,
+    check_width,
+    read_lines,
+    require_file,
+    split_lines,
+)
 from implicam.errors import DatasetError
 
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars"}
@@ -165,3 +173,45 @@ def look_at_numbers(
             fix="write them with decimal points, or with another number of decimals",
         )
     return Cells("," if "," in first else ".", words)
+
+
+class BroughtTable(NamedTuple):
+    """A table with the columns of docs/formats.md, however it separates them: header, rows, and the decimal mark."""
+
+    header: list[str]
+    rows: Iterator[Row]
+    decimal: str
+
+
+def read_brought_table(
+    path: Path, required: Sequence[str], numbers: Collection[str] = (), example: str = ""
+) -> BroughtTable:
+    """As `read_table`, of a table that a person wrote: with commas, semicolons, tabs or bars, and decimal commas.
+
+    Args:
+        path: The file.
+        required: Columns that must be there.
+        numbers: Columns that hold numbers, as far as they are there.
+        example: How a header looks, for the error; empty for `required`.
+
+    Returns:
+        The table; `rows` raises DatasetError for a row that is no row of it.
+
+    Raises:
+        DatasetError: There is no such file, its header has a mistake, or it can be read in two ways.
+    """
+    example = example or ",".join(required)
+    require_file(path, f"put a table with the columns {example} there")
+
+    def first_row(rows: list[list[str]]) -> int | None:
+        return 0 if rows and set(required) <= {cell.strip() for cell in rows[0]} else None
+
+    writing = find_separator(path, first_row)
+    rows = rows_of(path, writing)
+    header = [name.strip() for name in next(rows, (1, []))[1]]
+    if not header:
+        raise DatasetError(f"{path} is empty.", fix=f"its first line must be {example}, then one row per entry")
+    check_header(path, header, required)
+    at = [i for i, name in enumerate(header) if name in numbers]
+    decimal = look_at_numbers(islice(rows_of(path, writing), 1, None), at, (), str(path), "line").decimal
+    return BroughtTable(header, check_width(f"{path}, line", len(header), rows), decimal)

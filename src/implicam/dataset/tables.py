@@ -142,7 +142,7 @@ def read_table(path: Path, required: Sequence[str], example: str = "") -> tuple[
     if not header:
         raise DatasetError(f"{path} is empty.", fix=f"its first line must be {example}, then one row per entry")
     header = [name.strip() for name in header]
-    _check_header(path, header, required)
+    check_header(path, header, required)
     return header, check_width(f"{path}, line", len(header), rows)
 
 
@@ -258,7 +258,17 @@ def _refuse_other_text(path: Path, line: bytes) -> None:
         )
 
 
-def _check_header(path: Path, header: list[str], required: Sequence[str]) -> None:
+def check_header(path: Path, header: list[str], required: Sequence[str]) -> None:
+    """Check the headings of a table.
+
+    Args:
+        path: The file.
+        header: They, without spaces around them.
+        required: Columns that must be there.
+
+    Raises:
+        DatasetError: One is missing, or has a mistake.
+    """
     if len(header) == 1:
         for separator, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if separator in header[0]:

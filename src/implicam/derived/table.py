@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from implicam.dataset.dialect import read_brought_table
 from implicam.dataset.folder import csv_text, format_cells
-from implicam.dataset.tables import check_width, split_lines
 from implicam.derived.joint_positions import find_point
 from implicam.derived.quantities import Quantity, distances
-from implicam.errors import DatasetError
 from implicam.measurement import Measurement
 
 DISTANCE_COLUMNS = ("a", "b", "distance", "sd", "low_95", "high_95", "note")
@@ -21,7 +20,7 @@ Pair = tuple[str, str]
 
 
 def read_pairs(path: Path) -> list[Pair]:
-    """Read pairs of names: a table with a line `a,b`, then a row for each pair.
+    """Read pairs of names: a table with a line `a,b`, also with semicolons or tabs, then a row for each pair.
 
     Args:
         path: The file.
@@ -29,15 +28,9 @@ def read_pairs(path: Path) -> list[Pair]:
     Raises:
         DatasetError: It cannot be read, or is no such table.
     """
-    try:
-        lines = list(split_lines(path))
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read.", why=str(error), fix="check the name") from error
-    header = [cell.strip() for cell in lines[0][1]] if lines else []
-    if header[:2] != ["a", "b"]:
-        raise DatasetError(f"{path} is no table of pairs.", fix="begin it with a line a,b, then a row for each pair")
-    rows = check_width(f"{path}, line", len(header), lines[1:])
-    return [(row[0].strip(), row[1].strip()) for _, row in rows]
+    header, rows, _ = read_brought_table(path, ("a", "b"))
+    first, second = header.index("a"), header.index("b")
+    return [(row[first].strip(), row[second].strip()) for _, row in rows]
 
 
 class DistanceRow(NamedTuple):

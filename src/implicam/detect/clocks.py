@@ -12,7 +12,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from implicam.dataset import Floats
-from implicam.dataset.tables import NumberColumn, read_columns, read_table
+from implicam.dataset.dialect import read_brought_table
+from implicam.dataset.tables import NumberColumn, read_columns
 from implicam.detect.offsets import RICHER, Offset, OffsetError, find_offset
 from implicam.detect.tracks import Track
 from implicam.errors import DatasetError, UsageError, did_you_mean
@@ -187,8 +188,8 @@ def read_times(path: Path, counts: Mapping[str, tuple[int, int]]) -> tuple[dict[
     Raises:
         DatasetError: The table has a mistake, or another number of frames than a film; names the line.
     """
-    header, rows = read_table(path, TIME_COLUMNS)
-    number = NumberColumn("write the number, or remove the row")
+    header, rows, decimal = read_brought_table(path, TIME_COLUMNS, ("frame", "time_s"))
+    number = NumberColumn("write the number, or remove the row", decimal=decimal)
     table = read_columns(path, header, rows, ("camera",), {"frame": number, "time_s": number})
     if not table.n:
         raise DatasetError(f"{path} has a header and no rows.", fix="add a row for each picture: camera,frame,time_s")

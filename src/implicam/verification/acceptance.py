@@ -154,7 +154,8 @@ def _refuse_other_unit(ratio: Floats, unit: str) -> None:
         why=f"the table of lengths is in another unit than the calibration ({unit}), which differs by {near:g}"
         if named
         else "a length was stated for other points, or in another unit",
-        fix=f"write all lengths in {unit}" + ("" if named else ", and look at which points are their ends"),
+        fix=f"write all lengths in {unit}, or say their unit (--unit)"
+        + ("" if named else ", and look at which points are their ends"),
     )
 
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.dataset.tables import NumberColumn, read_columns, read_table
+from implicam.dataset.dialect import read_brought_table
+from implicam.dataset.tables import NumberColumn, read_columns
 from implicam.errors import DatasetError, UsageError, did_you_mean
 
 REFERENCE_TEMPERATURE_C = 20.0
@@ -132,13 +133,14 @@ def read_lengths(path: Path) -> list[CalibratedLength]:
     """Read a table of calibrated lengths.
 
     Args:
-        path: CSV with the columns a, b, length, and any of line, name, artefact, sd (or U and k), temperature,
-            sd_temperature, expansion, sd_expansion, sd_setup.
+        path: CSV, also with semicolons and decimal commas, with the columns a, b, length, and any of line, name,
+            artefact, sd (or U and k), temperature, sd_temperature, expansion, sd_expansion, sd_setup.
 
     Raises:
         DatasetError: It cannot be read; names the line.
     """
-    header, rows = read_table(path, REQUIRED_COLUMNS, "line,name,a,b,length,U")
+    wanted = ("length", *NUMBER_COLUMNS)
+    header, rows, decimal = read_brought_table(path, REQUIRED_COLUMNS, wanted, "line,name,a,b,length,U")
     known = (*REQUIRED_COLUMNS, *TEXT_COLUMNS, *NUMBER_COLUMNS)
     for column in header:
         if column not in known:
@@ -153,8 +155,9 @@ def read_lengths(path: Path) -> list[CalibratedLength]:
             why="both are the uncertainty of the certificate: sd is standard, U is expanded, k times as large",
             fix="take one out",
         )
-    must = NumberColumn("give the calibrated length")
-    numbers = {column: NumberColumn("leave the cell empty", missing=("",)) for column in NUMBER_COLUMNS}
+    must = NumberColumn("give the calibrated length", decimal=decimal)
+    may = NumberColumn("leave the cell empty", missing=("",), decimal=decimal)
+    numbers = dict.fromkeys(NUMBER_COLUMNS, may)
     table = read_columns(path, header, rows, ("a", "b", *TEXT_COLUMNS), {"length": must, **numbers})
     if not table.n:
         raise DatasetError(f"{path} has no lengths.", fix="add a row for each length")
