@@ -535,6 +535,37 @@ def test_debug_adds_the_traceback(words: list[str], cli: Cli) -> None:
     assert cli("evaluate", "nothing", "--debug").code == 2
 
 
+class CtrlC:
+    """Comes while a module is loaded: a finder of modules, or what is called instead of something."""
+
+    def __init__(self, module: str = "") -> None:
+        self.module = module
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == self.module:
+            raise KeyboardInterrupt
+
+    def __call__(self, *_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("module", ["implicam.cli.commands", "implicam.cli.options"])
+def test_ctrl_c_while_modules_load_is_one_line(module: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setattr(sys, "meta_path", [CtrlC(module), *sys.meta_path])
+    assert cli("info", "rig.implicam") == Ran(130, "", "interrupted\n")
+
+
+@pytest.mark.parametrize("moment", ["make_context", "invoke"])
+def test_ctrl_c_while_a_command_starts_or_runs_is_one_line(
+    moment: str, made: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"typer.core.TyperCommand.{moment}", CtrlC())
+    for words in (("info", made / "rig.implicam"), ("measure", made / "rig.implicam", made / "rig")):
+        assert cli(*words) == Ran(130, "", "interrupted\n")
+    assert "Traceback" in cli("info", made / "rig.implicam", "--debug").err
+
+
 def test_a_mistake_of_ours_is_told_as_one(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(path: Path) -> None:
         raise ZeroDivisionError("division by zero")

@@ -1,6 +1,6 @@
 """The command line: thin. Each command reads, calls the library, prints.
 
-Exit codes: 0 fine, 1 failed, 2 wrong usage. Errors are three lines (what, why, fix). Anywhere on the line, `--debug`
+Exit codes: 0 fine, 1 failed, 2 wrong usage, 130 interrupted. Errors are three lines (what, why, fix). Anywhere on the line, `--debug`
 adds the traceback, and `--verbose` or `-v` shows what a command does as it goes.
 """
 
@@ -13,19 +13,33 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import NoReturn
 
-from implicam.errors import ImplicamError, UsageError
-from implicam.logs import log_to_stream
+INTERRUPTED = 130
+"""As a shell has it: 128 and the number of SIGINT."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run `implicam ...` and exit."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
+    try:
+        _run(given, debug)
+    except KeyboardInterrupt:  # while modules load
+        _interrupted(debug)
+    except SystemExit as end:
+        if _by_ctrl_c(end):
+            _interrupted(debug)
+        raise
+
+
+def _run(given: list[str], debug: bool) -> None:
+    # all of it is imported late: `import implicam.cli` stays cheap, and Ctrl-C is heard while it is loaded
+    from implicam.cli.commands import app
+    from implicam.cli.options import load_options, only_command
+    from implicam.errors import ImplicamError, UsageError
+    from implicam.logs import log_to_stream
+
     verbose = not {"--verbose", "-v"}.isdisjoint(given)
     given = [word for word in given if word not in ("--debug", "--verbose", "-v")]
-    from implicam.cli.commands import app  # late: `import implicam.cli` stays cheap
-    from implicam.cli.options import load_options, only_command
-
     try:
         with log_to_stream(sys.stderr) if verbose else nullcontext():
             load_options(app, given or _words_to_complete())
@@ -34,6 +48,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(str(error), 2 if isinstance(error, UsageError) else 1, debug)
     except Exception as error:
         _fail(str(_unexpected(error)), 1, debug)
+
+
+def _by_ctrl_c(end: SystemExit) -> bool:
+    """Whether Typer made this of Ctrl-C, of which it says nothing; a command that has said something says so by `from
+    None`."""
+    return end.__context__ is not None and isinstance(end.__context__.__cause__, KeyboardInterrupt)
+
+
+def _interrupted(debug: bool) -> NoReturn:
+    """One line, for which nothing more is loaded."""
+    if debug:
+        traceback.print_exc()
+    print("interrupted", file=sys.stderr)
+    sys.exit(INTERRUPTED)
 
 
 def _words_to_complete() -> list[str]:
@@ -54,7 +82,9 @@ def _fail(text: str, code: int, debug: bool) -> NoReturn:
     sys.exit(code)
 
 
-def _unexpected(error: Exception) -> ImplicamError:
+def _unexpected(error: Exception) -> Exception:
+    from implicam.errors import ImplicamError
+
     if isinstance(error, OSError):
         return ImplicamError(f"{error.filename or 'a file'}: {error.strerror or error}.", fix="check the file")
     return ImplicamError(
