@@ -32,6 +32,7 @@ from implicam.hardware.protocol import (
     TellsSettings,
     Trigger,
     TriggerDriver,
+    open_all,
     take_frames,
 )
 from implicam.hardware.simulated import PhotographingCamera, SimulatedRobot, simulated_rig
@@ -67,6 +68,7 @@ __all__ = [
     "guard_robot",
     "keep_settings",
     "list_specs",
+    "open_all",
     "refuse_one_device_twice",
     "robot_from",
     "simulated_rig",

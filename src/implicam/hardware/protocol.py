@@ -40,6 +40,7 @@ __all__ = [
     "check_position",
     "format_position",
     "incomplete_spec_error",
+    "open_all",
     "take_frames",
     "wait_for",
 ]
@@ -374,6 +375,22 @@ class Box:
             )
 
 
+def open_all(devices: Sequence[FrameSource | Trigger], pool: Executor) -> None:
+    """Open devices side by side: a USB camera that waits for a trigger takes a second.
+
+    Args:
+        devices: Cameras and triggers.
+        pool: At least one thread.
+
+    Raises:
+        HardwareError: The first that failed, once all have answered.
+    """
+    opening = [pool.submit(device.open) for device in devices]
+    wait(opening)
+    for one in opening:
+        one.result()
+
+
 ARMING_SECONDS = 0.05
 """Seconds from asking the cameras for a picture until all of them wait for the trigger."""
 
@@ -396,7 +413,7 @@ def take_frames(cameras: Sequence[FrameSource], trigger: Trigger | None, timeout
             pulse is left for the next.
     """
     if trigger is not None:
-        list(pool.map(lambda camera: camera.open(), cameras))  # a camera that is being opened hears no pulse
+        open_all(cameras, pool)  # a camera that is being opened hears no pulse
     waiting = [pool.submit(camera.frame, timeout) for camera in cameras]
     if trigger is None:
         wait(waiting)

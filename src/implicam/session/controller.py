@@ -42,6 +42,7 @@ from implicam.hardware import (
     RobotOptions,
     Trigger,
     guard_robot,
+    open_all,
     take_frames,
 )
 from implicam.hardware.protocol import format_position
@@ -183,8 +184,7 @@ class SessionController:
         """Open cameras and robot, fit the points that the session has, and propose the first target."""
         self._ending.clear()
         with self._working("starting", "connecting to the cameras and the robot"):
-            for device in self._list_devices():
-                device.open()
+            self._open_devices()
             self._fit()
             self._aim()
 
@@ -317,8 +317,7 @@ class SessionController:
     def retry(self) -> None:
         """After trouble: connect again, and go on."""
         with self._working("starting", "connecting again"):
-            for device in self._list_devices():
-                device.open()
+            self._open_devices()
             self._fit()
             self._aim()
 
@@ -502,6 +501,12 @@ class SessionController:
         return calibration.measure(self._make_observations("live", looks))
 
     # private
+
+    def _open_devices(self) -> None:
+        open_all(self.equipment.cameras, self._pool)
+        self.equipment.robot.open()
+        if self.equipment.trigger is not None:
+            self.equipment.trigger.open()
 
     def _list_devices(self) -> Iterator[FrameSource | Robot | Trigger]:
         yield from self.equipment.cameras

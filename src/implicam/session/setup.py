@@ -45,6 +45,7 @@ from implicam.hardware import (
     compare_settings,
     keep_settings,
     list_specs,
+    open_all,
     refuse_one_device_twice,
     robot_from,
     simulated_rig,
@@ -505,7 +506,7 @@ def _sized(setup: Setup, cameras: list[FrameSource], say: Callable[[str], None])
         needed: list[FrameSource | Trigger] = [*cameras, *([] if trigger is None else [trigger])]
         for device in needed:
             devices.callback(device.close)
-            device.open()
+        open_all(needed, pool)
         timeout = PICTURE_TIMEOUT_SECONDS if trigger is None else LIVE_TIMEOUT_SECONDS
         frames = take_frames(cameras, trigger, timeout, pool)
         for text in tell_settings(cameras):

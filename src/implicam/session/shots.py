@@ -35,6 +35,7 @@ from implicam.hardware import (
     Trigger,
     compare_settings,
     keep_settings,
+    open_all,
     simulated_rig,
     take_frames,
     tell_settings,
@@ -85,7 +86,7 @@ class Shutter:
         devices: list[FrameSource | Trigger] = [*self.cameras, *([] if self.trigger is None else [self.trigger])]
         try:
             with ThreadPoolExecutor(len(devices)) as pool:
-                list(pool.map(lambda device: device.open(), devices))
+                open_all(devices, pool)
             yield self
         finally:
             for device in devices:
