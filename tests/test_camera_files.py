@@ -671,3 +671,14 @@ def test_cameras_that_were_imported_go_on_to_another_program(tmp_path):
     assert notes == []
     assert [c.lens for c in again.cameras] == [c.lens for c in rig.cameras]
     np.testing.assert_allclose(again.cameras[1].camera_from_world.centre, [60, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["caliscope", "aniposelib", "opencv", "kalibr"])
+def test_a_format_is_recognised_whatever_the_file_is_called(kind: str, tmp_path: Path) -> None:
+    rig = random_rig(0)
+    ending = ".toml" if kind in ("caliscope", "aniposelib") else ".yaml"
+    export_cameras(rig, kind, tmp_path / f"cameras{ending}")
+    (tmp_path / f"cameras{ending}").rename(tmp_path / "cameras.bak")
+    assert [c.lens for c in import_cameras(tmp_path / "cameras.bak").cameras] == pytest.approx(
+        [c.lens for c in import_cameras(tmp_path / "cameras.bak", kind).cameras]
+    )

@@ -182,6 +182,8 @@ def test_what_cannot_be_checked_is_refused() -> None:
         ic.check_calibration(ic.InverseGP().fit(rig_and_calibration("stereo", 60)[1].data), views(rig, 12))
     with pytest.raises(UsageError, match="no probability"):
         ic.check_calibration(calibration, views(rig, 12), level=5)
+    with pytest.raises(DatasetError, match=r"saw 19 points; a check takes 20"):
+        ic.check_calibration(calibration, views(rig, 12, points=19))
     data = views(rig, 12, points=3)
     uv = data.observations.uv.copy()
     uv[:, 1:] = np.nan
@@ -236,6 +238,9 @@ def test_what_an_imported_calibration_does_not_know_is_not_said(cli: Cli) -> Non
     told = cli("measure", "imported.implicam", "new.csv", "--json").json
     assert told["median_share_calibration"] is None
     assert any("nothing is known of how well" in note for note in told["notes"])
+    imported(replace(rig, cameras=rig.cameras[:3])).save("three.implicam")
+    assert "cameras that are not calibrated are not used: cam4 (50)" in cli("measure", "three.implicam", "new.csv").err
+    assert "not calibrated" not in ran.err
     for words in (("evaluate", "imported.implicam", "--cv", "5"), ("report", "imported.implicam")):
         said = cli(*words).err
         assert "has no known points, so none can be held out" in said

@@ -56,6 +56,15 @@ def test_arrays_of_another_shape_are_refused(uv: np.ndarray, noise: object) -> N
         fitted().measure_pixels(uv, noise)  # type: ignore[arg-type]
 
 
+def test_pixels_that_no_camera_has_are_no_position_and_no_warning() -> None:
+    made, uv = fitted(), pixels()
+    uv[4], uv[5, 0, 0], uv[6], uv[7] = 1e300, np.inf, -np.inf, -1e300
+    found = made.measure_pixels(uv)
+    assert not found.measured[[4, 6, 7]].any()
+    assert found.reason[6] == "no camera saw it"
+    assert not found.seen[5, 0]
+
+
 def test_explicit_has_it_too() -> None:
     data = ic.simulated("stereo", points=40, seed=1)
     made = ic.Explicit().fit(data)

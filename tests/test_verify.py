@@ -24,7 +24,12 @@ from implicam.verification import MaximumPermissibleError, Verification, decide,
 from implicam.verification.lengths import lengths_by_names, shared_covariance
 from implicam.verification.printing import find_browser, print_page
 from implicam.verification.protocol import Circumstances, page
-from implicam.verification.statistics import check_error_bars, fit_scale, unlike_the_others
+from implicam.verification.statistics import (
+    check_error_bars,
+    constant_rather_than_scale,
+    fit_scale,
+    unlike_the_others,
+)
 from implicam.verification.volume import bounding_box, cover, name_lines
 
 
@@ -207,6 +212,21 @@ def test_the_uncertainty_of_the_scale_grows_where_lengths_scatter() -> None:
     test = fit_scale(3 * rng.normal(size=35), length, np.eye(35))
     assert test.widened == pytest.approx(3, rel=0.3)
     assert fit_scale(rng.normal(size=35), length, np.eye(35)).widened == 1
+
+
+def test_a_constant_error_is_told_from_an_error_of_scale() -> None:
+    rng, found = np.random.default_rng(5), {"constant": 0, "scale": 0, "neither": 0}
+    length = np.tile(np.linspace(50.0, 500.0, 5), 7)
+    shared = 0.01 * np.ones((35, 1)) + 2e-5 * length[:, None]
+    cov = 0.02**2 * np.eye(35) + shared @ shared.T
+    for _ in range(200):
+        noise = rng.multivariate_normal(np.zeros(35), cov)
+        found["constant"] += constant_rather_than_scale(noise + 0.1, length, cov) is not None
+        found["scale"] += constant_rather_than_scale(noise + 5e-4 * length, length, cov) is not None
+        found["neither"] += constant_rather_than_scale(noise, length, cov) is not None
+    assert found["constant"] > 195
+    assert found["scale"] == 0
+    assert found["neither"] <= 4  # a likelihood ratio of 100 comes about by chance once in 100 times at most
 
 
 def test_one_wrong_length_is_named_and_a_scale_error_is_none() -> None:

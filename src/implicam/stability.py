@@ -38,8 +38,8 @@ NEVER_EXACT = (
 NUMBER_NAMES = ("tilt", "pan", "roll", "right", "down", "forward", "zoom")
 """Of a movement: turns about the camera's axes that point right, down and forward in its picture (degrees), shifts
 along these (length unit), and the zoom (per cent)."""
-MIN_POINTS_TO_WATCH = 20
-"""Before a check of a stream."""
+MIN_POINTS = 20
+"""That a check takes: with fewer a movement that matters would rarely show."""
 MAX_KNOWN_POINTS = 400
 """Known points that are compared; of more, evenly many."""
 MIN_KNOWN_POINTS = 4
@@ -288,6 +288,13 @@ def check_calibration(calibration: Calibration, data: Dataset, *, level: float =
     if not 0 < level < 1:
         raise UsageError(f"a level of {level!r} is no probability.", fix="give one above 0 and below 1")
     rig = _require_cameras(calibration)
+    seen = int(np.sum(np.isfinite(rig.map.matched_views(data)[0]).all(axis=2).sum(axis=1) >= 2))
+    if 0 < seen < MIN_POINTS:
+        raise DatasetError(
+            f"two cameras or more saw {seen} point{'s' * (seen != 1)}; a check takes {MIN_POINTS} or more.",
+            why="with so few it cannot be told whether the calibration still holds",
+            fix="show the cameras more points; none of them need be known",
+        )
     share = level / 2 if data.known is not None else level
     found = rig.map.movement(data, level=share)
     if found is None:
@@ -358,7 +365,7 @@ class CalibrationWatch:
             self._noise = np.concatenate([self._noise, noise[part]])[-self.window :]
             self.points += len(uv[part])
             self._since += len(uv[part])
-            if self._since >= self.every and len(self._uv) >= min(self.window, MIN_POINTS_TO_WATCH):
+            if self._since >= self.every and len(self._uv) >= min(self.window, MIN_POINTS):
                 self._since = 0
                 found = self.calibration.map.movement_in_views(self._uv, self._noise, level=self.level)
                 self.last = None if found is None else _conclude(self.calibration, found, None, self.level, "stream")

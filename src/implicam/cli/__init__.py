@@ -1,7 +1,7 @@
 """The command line: thin. Each command reads, calls the library, prints.
 
-Exit codes: 0 fine, 1 failed, 2 wrong usage, 130 interrupted. Errors are three lines (what, why, fix). Anywhere on the line, `--debug`
-adds the traceback, and `--verbose` or `-v` shows what a command does as it goes.
+Exit codes: 0 fine, 1 failed, 2 wrong usage, 130 interrupted. Errors are three lines (what, why, fix). Anywhere on the
+line, `--debug` adds the traceback, and `--verbose` or `-v` shows what a command does as it goes.
 """
 
 from __future__ import annotations

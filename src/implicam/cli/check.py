@@ -77,7 +77,7 @@ def check_command(
     if json:
         show.emit_json(_as_json(found) | {"repair": None if repaired is None else _repair_as_json(repaired)})
         raise typer.Exit(int(not found.holds))
-    _tell(found)
+    _tell(found, len(data))
     if log is not None:
         show.line(f"{log}: one more check{'' if figure is None else f', drawn in {figure}'}")
     if repaired is not None:
@@ -106,7 +106,7 @@ def _draw_history(log: Path, figure: Path) -> None:
     save_figure(check_history_figure(read_log(log)), figure)
 
 
-def _tell(found: CalibrationCheck) -> None:
+def _tell(found: CalibrationCheck, given: int) -> None:
     first, *others = found.sentences()
     if found.holds:
         show.line(first)
@@ -115,9 +115,9 @@ def _tell(found: CalibrationCheck) -> None:
     for sentence in others:
         show.line(sentence)
     if not found.holds and found.cameras:
-        show.table(_table(found, "if it alone moved", lambda one: map(number_with_sd, one.step, one.sd)))
+        show.table(_table(found, given, "if it alone moved", lambda one: map(number_with_sd, one.step, one.sd)))
     if found.cameras:
-        show.table(_table(found, "named half the time", lambda one: map(_smallest, found.noticed[one.camera])))
+        show.table(_table(found, given, "named half the time", lambda one: map(_smallest, found.noticed[one.camera])))
         show.line("named half the time: the smallest movement, of this kind alone, that this check would name so often")
 
 
@@ -131,11 +131,12 @@ _NO_REPAIR = {
 """Verdict of a check -> why no calibration is written."""
 
 
-def _table(found: CalibrationCheck, what: str, cells: Callable[[CameraMovement], Iterable[str]]) -> Any:
+def _table(found: CalibrationCheck, given: int, what: str, cells: Callable[[CameraMovement], Iterable[str]]) -> Any:
     """A row for each camera, the likeliest to have moved first."""
     units = ["deg"] * 3 + [found.length_unit] * 3 + ["%"]
     headings = [what, *(f"{name}, {unit}" for name, unit in zip(NUMBER_NAMES, units, strict=True))]
-    return show.text_table(f"{found.points} points", headings, [[one.camera, *cells(one)] for one in found.cameras])
+    used = f"{found.points} points" if found.points == given else f"{found.points} of {given} points used"
+    return show.text_table(used, headings, [[one.camera, *cells(one)] for one in found.cameras])
 
 
 def _smallest(noticed: float) -> str:

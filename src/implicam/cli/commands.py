@@ -272,7 +272,7 @@ def measure_command(
     count, typical = int(measured.measured.sum()), _typical(measured.sd)
     known = measured.share_calibration[np.isfinite(measured.share_calibration)]
     share = float(np.median(known)) if len(known) else math.nan
-    notes = [*data.notes, *outside, *_unknown_errors(fitted)]
+    notes = [*data.notes, *outside, *_views_not_used(fitted, data), *_unknown_errors(fitted)]
     if json:
         show.emit_json(
             {"measured": str(output), "rows": len(measured), "points_measured": count, "median_sd": typical,
@@ -301,6 +301,14 @@ def measure_command(
     if measured.alarm:
         show.alarm(f"{measured.alarm}{'' if measured.alarm.endswith('?') else '.'} Every row says that it is doubtful.")
     raise typer.Exit(int(bool(measured.alarm)))
+
+
+def _views_not_used(fitted: Calibration, data: Dataset) -> list[str]:
+    """Which cameras of the data measure nothing, because they are not calibrated."""
+    names = fitted.camera_names if isinstance(fitted, RigCalibration) else fitted.data.observations.camera_names
+    views = zip(data.observations.camera_names, data.observations.seen.sum(axis=0).tolist(), strict=True)
+    lost = [f"{name} ({count})" for name, count in views if count and name not in names]
+    return [f"views of cameras that are not calibrated are not used: {', '.join(lost)}"] if lost else []
 
 
 def _unknown_errors(fitted: Calibration) -> list[str]:

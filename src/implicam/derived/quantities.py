@@ -118,9 +118,9 @@ def _numbers_of_pairs(measurement: Measurement, pairs: Sequence[tuple[str | int,
     """(n, 2) numbers of points that were measured, the two of a pair different."""
     rows = np.array([[find_measured_point(measurement, point) for point in pair] for pair in pairs], dtype=np.int64)
     rows = rows.reshape(len(pairs), 2)
-    for a, b in rows[rows[:, 0] == rows[:, 1]]:
+    for a in rows[rows[:, 0] == rows[:, 1], 0]:
         name = str(measurement.points[a])
-        raise UsageError(f"a distance is between two points, and {name!r} is one.", fix=f"give another beside {b}")
+        raise UsageError(f"a distance is between two points, and {name!r} is one.", fix="give two different points")
     return rows
 
 

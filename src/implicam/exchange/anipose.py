@@ -14,7 +14,6 @@ Rotation and translation are camera_from_world; pixels are OpenCV's. Pose2Sim re
 
 from __future__ import annotations
 
-import re
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
@@ -156,9 +155,7 @@ def knows_aniposelib(source: Source) -> bool:
 
 def _cameras_of(source: Source) -> list[dict[str, Any]]:
     """The tables of a TOML file that look like a camera."""
-    if not re.search(r"^\s*\[[^\]\n]+\]\s*$", source.text, re.MULTILINE):
-        return []
-    cameras = camera_tables(read_toml(source.path)).values()
+    cameras = camera_tables(source.toml).values()
     return [camera for camera in cameras if {"matrix", "distortions", "rotation", "translation"} & set(camera)]
 
 

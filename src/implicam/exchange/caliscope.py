@@ -74,9 +74,7 @@ def knows(source: Source) -> bool:
     Args:
         source: What is given.
     """
-    if source.path.suffix.lower() != ".toml":
-        return False
-    table = read_toml(source.path)
+    table = source.toml
     if "cameras" in table:
         return isinstance(table["cameras"], dict) and any(isinstance(v, dict) for v in table["cameras"].values())
     rotations = [camera.get("rotation") for camera in _tables(table).values()]

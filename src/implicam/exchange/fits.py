@@ -48,6 +48,12 @@ class Cost:
         distance = np.hypot(*(a - b).T)
         return cls(float(np.sqrt(np.mean(distance**2))), float(distance.max()))
 
+    def in_words(self) -> str:
+        """The largest, or that there is none, as the end of a sentence on the nearest lens."""
+        if np.isfinite(self.largest):
+            return f"is off by {self.largest:.3g} px somewhere in the image"
+        return "shows a part of the image nowhere"
+
     def __str__(self) -> str:
         return f"rms {self.rms:.2g} px, at most {self.largest:.2g} px"
 
@@ -143,7 +149,7 @@ def fit_four_coefficients(camera: ExplicitCamera) -> tuple[BrownConrady, Cost | 
     if not cost.largest <= MAX_LENS_DIFFERENCE_PX:
         raise DatasetError(
             f"camera {camera.name!r} cannot be written as {form}.",
-            why=f"the nearest such lens is off by {cost.largest:.3g} px somewhere in the image",
+            why=f"the nearest such lens {cost.in_words()}",
             fix="use a format that holds its lens: opencv, aniposelib or colmap"
             if _known(lens)
             else "calibrate with brown-conrady or kannala-brandt, which opencv, aniposelib and colmap hold",

@@ -87,7 +87,7 @@ def _fit_correction(camera: ExplicitCamera) -> tuple[Floats, Floats, Cost | None
     if not cost.largest <= MAX_LENS_DIFFERENCE_PX:
         raise DatasetError(
             f"camera {camera.name!r} cannot be written for MyPTV.",
-            why=f"its correction is quadratic, and is off by {cost.largest:.3g} px somewhere in the image",
+            why=f"its correction is quadratic, and {cost.in_words()}",
             fix="export to openptv or opencv; or undistort the pictures first, and export the pinhole",
         )
     return e, moved, cost

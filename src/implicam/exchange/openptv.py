@@ -130,7 +130,7 @@ def _fit_numbers(camera: ExplicitCamera) -> tuple[list[float], Cost]:
     if not cost.largest <= MAX_LENS_DIFFERENCE_PX:
         raise DatasetError(
             f"camera {camera.name!r} cannot be written for OpenPTV.",
-            why=f"the nearest camera with its terms is off by {cost.largest:.3g} px somewhere in the image",
+            why=f"the nearest camera with its terms {cost.in_words()}",
             fix="export to opencv, or calibrate with brown-conrady",
         )
     return (start + scale * x).tolist(), cost

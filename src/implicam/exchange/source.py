@@ -41,6 +41,15 @@ class Source:
         return "" if self.path.is_dir() else read_text(self.path)
 
     @cached_property
+    def toml(self) -> dict[str, Any]:
+        """The first file as TOML, whatever its name; empty where it is none. DatasetError if its name promises it."""
+        if self.path.suffix.lower() == ".toml" and not self.path.is_dir():
+            return read_toml(self.path)
+        with suppress(ValueError, RecursionError):
+            return parse_toml(self.text)
+        return {}
+
+    @cached_property
     def keys(self) -> tuple[str, ...]:
         """The names at the top of all files, in their order; none of folders, and where a file has none."""
         found: dict[str, None] = {}

@@ -25,7 +25,7 @@ class MeasuredPixels:
         code: (n,) what became of each point, of `rig_model.reasons.Reason`; 0 where it was measured.
         left_out: (n, C) views that contradict the others, and were not used.
         share_calibration: (n,) share of the variance that more known points could remove.
-        uv: (n, C, 2) the pixels, as they were given.
+        uv: (n, C, 2) the pixels, as they were given; NaN where infinite.
         camera_names: Of the C cameras.
         length_unit: Of the positions.
         find_alarm: Looks at the whole table.

@@ -32,6 +32,8 @@ Locator = Callable[[Floats, Floats], Located]
 """Finds where points are from pixels (n, C, 2) and noise (n, C), in the working frame."""
 
 LENS_KINDS = ("ordinary", "aspect")
+MAX_PIXEL = 1e9
+"""Of pixels given as arrays: what is farther out is as far, so that no square of it is too large for a number."""
 """Kinds of cameras that cannot follow anything that lenses do not do."""
 
 
@@ -143,6 +145,8 @@ class FittedRig:
                 why=f"the calibrated cameras are {', '.join(self.camera_names)}",
                 fix="give u and v of each camera in this order, NaN where it did not see the point",
             )
+        if (np.abs(pixels) > MAX_PIXEL).any():
+            pixels = np.where(np.isinf(pixels), np.nan, np.clip(pixels, -MAX_PIXEL, MAX_PIXEL))
         sd = self.noise_of_pixels(noise, len(pixels))
         found = (locator or self.locate)(pixels, sd)
         measured = np.isfinite(found.xyz[:, 0])

@@ -18,7 +18,7 @@ from implicam.dataset.units import METRES_PER_UNIT
 from implicam.derived import joint_distances
 from implicam.derived.joint_positions import find_point
 from implicam.errors import DatasetError, UsageError
-from implicam.formatting import decimal_number, list_some
+from implicam.formatting import decimal_number, list_some, number_with_sd
 from implicam.measurement import Measurement
 from implicam.verification.lengths import (
     CalibratedLength,
@@ -29,7 +29,13 @@ from implicam.verification.lengths import (
 )
 from implicam.verification.limit import MaximumPermissibleError
 from implicam.verification.result import NO_LIMIT, UNDECIDED, LengthResult, Verification, decide
-from implicam.verification.statistics import ScaleTest, check_error_bars, fit_scale, unlike_the_others
+from implicam.verification.statistics import (
+    ScaleTest,
+    check_error_bars,
+    constant_rather_than_scale,
+    fit_scale,
+    unlike_the_others,
+)
 from implicam.verification.volume import VolumeCoverage, cover
 
 COVERAGE_FACTOR = 2.0
@@ -100,13 +106,14 @@ def verify(
     _refuse_other_unit(measured[seen] / calibrated[seen], measurement.length_unit)
     cov = _predicted_covariance(measurement, rows[seen])
     used = [one for one, there in zip(known, seen, strict=True) if there]
-    error, bars, scale, odd = (measured - calibrated)[seen], None, None, list[int]()
+    error, bars, scale, constant, odd = (measured - calibrated)[seen], None, None, None, list[int]()
     if cov is not None:
         total = cov + shared_covariance(used)
         odd = unlike_the_others(error, calibrated[seen], total)
         rest = np.setdiff1d(np.arange(len(error)), odd)
         bars = check_error_bars(error[rest], total[np.ix_(rest, rest)])
-        scale = fit_scale(error[rest], calibrated[seen][rest], total[np.ix_(rest, rest)])
+        of_rest = error[rest], calibrated[seen][rest], total[np.ix_(rest, rest)]
+        scale, constant = fit_scale(*of_rest), constant_rather_than_scale(*of_rest)
     volume = _volume(calibration, measurement, workspace, ends, used, next_lengths)
     lines = iter(volume.lines if volume else [one.line for one in used])
     sds = iter(np.sqrt(np.diagonal(cov)) if cov is not None else np.full(len(used), np.nan))
@@ -116,6 +123,12 @@ def verify(
         for one, value, there, pair in zip(known, measured.tolist(), seen, rows, strict=True)
     )  # fmt: skip
     notes = _notes(measurement, known, used, [used[i] for i in odd], scale, cov is None)
+    if constant is not None:
+        notes.append(
+            f"All lengths are off by {number_with_sd(constant.value, constant.sd)} {measurement.length_unit} alike, "
+            "whatever their size, which explains their errors better than an error of scale: look for marks that are "
+            "not found where they were calibrated, or a constant in the table of lengths."
+        )
     return Verification(
         results, limit, k, bars, scale, volume, calibration.method, measurement.length_unit, tuple(notes)
     )

@@ -27,6 +27,8 @@ NUMBER_COLUMNS = (
 USUAL_COVERAGE_FACTOR = 2.0
 MAX_EXPANSION_PER_K = 1e-3
 """Ten times that of plastics: a larger one is in another unit."""
+MIN_TEMPERATURE_C, MAX_TEMPERATURE_C = -100.0, 300.0
+"""Of an artefact: no lengths are calibrated for others, and what is beyond is a slip, or in another unit."""
 _END = re.compile(r"(.+)([-_.])([abAB])")
 
 
@@ -84,6 +86,11 @@ class CalibratedLength:
             raise UsageError(
                 f"{self.title}: a coefficient of expansion of {self.expansion!r} per K is not possible.",
                 fix="steel has 11.5e-6, aluminium 23e-6: write it per K, not in 1e-6 per K",
+            )
+        if self.temperature is not None and not MIN_TEMPERATURE_C <= self.temperature <= MAX_TEMPERATURE_C:
+            raise UsageError(
+                f"{self.title}: no artefact is measured at {self.temperature:g} degrees C.",
+                fix="give its temperature in degrees C, mostly near 20",
             )
         if self.temperature is None:
             if self.expansion is not None:

@@ -25,6 +25,8 @@ MISTAKE_LEVEL = 0.001
 FREE_SCALE_SD = 0.01
 """Sd of a scale error that is let go when lengths are compared with each other."""
 POWER = 0.95
+CLEARLY_LIKELIER = 100.0
+"""A constant error of all lengths than an error of scale, before it is named."""
 
 
 @dataclass(frozen=True)
@@ -130,6 +132,47 @@ def fit_scale(error: Floats, length: Floats, cov: Floats) -> ScaleTest:
     scatters = freedom > 0 and float(chdtrc(freedom, chi2)) < SCATTER_LEVEL
     widened = math.sqrt(chi2 / freedom) if scatters else 1.0
     return ScaleTest(value, widened / math.sqrt(information), widened)
+
+
+@dataclass(frozen=True)
+class ConstantError:
+    """An error that all lengths have alike, whatever their size.
+
+    Attributes:
+        value: In the length unit.
+        sd: Its standard uncertainty.
+    """
+
+    value: float
+    sd: float
+
+
+def constant_rather_than_scale(error: Floats, length: Floats, cov: Floats) -> ConstantError | None:
+    """Whether one error of all lengths explains them better than one that grows with the length.
+
+    Both are one number, fitted by generalised least squares, so their likelihoods compare directly.
+
+    Args:
+        error: (n,) of the lengths.
+        length: (n,) that were calibrated.
+        cov: (n, n) covariance of the errors.
+
+    Returns:
+        The constant error, where it is significant and `CLEARLY_LIKELIER` as likely as a scale error; else None.
+    """
+    factor = cho_factor(cov)
+
+    def fit(pattern: Floats) -> tuple[float, float]:
+        weights = cho_solve(factor, pattern)
+        information = float(weights @ pattern)
+        return float(weights @ error) / information, information
+
+    (value, information), (scale, by_length) = fit(np.ones_like(error)), fit(length)
+    better = value**2 * information - scale**2 * by_length  # by how much chi-squared is lower
+    sd = 1 / math.sqrt(information)
+    if better < 2 * math.log(CLEARLY_LIKELIER) or 2 * ndtr(-abs(value) / sd) >= LEVEL:
+        return None
+    return ConstantError(value, sd)
 
 
 def unlike_the_others(error: Floats, length: Floats, cov: Floats) -> list[int]:
