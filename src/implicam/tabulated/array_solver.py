@@ -7,7 +7,7 @@ left to the exact path; the kernel finds their wrong views itself.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from implicam.geometry import Bools, Floats
 from implicam.tabulated.library import LEFT_TO_EXACT, MEASURED, TOO_FEW_VIEWS
 from implicam.tabulated.sight_lines import SightLines
 from implicam.tabulated.spline_table import SplineTable, slopes, weights
+
+Singles = NDArray[np.float32]
 
 MAX_STEPS, MAX_CONDITION = 8, 1e9
 """As of kernel.c."""
@@ -40,6 +42,19 @@ class Found(NamedTuple):
     left_out: Bools
 
 
+class _Lines(NamedTuple):
+    """Lines of sight of one camera, as of kernel.c; lost (n,) where the table has none of a view; certainty (n,) one
+    over the variance of its noise, zero where there is no view."""
+
+    lost: Bools
+    near: Singles
+    along: Singles
+    across: Singles
+    across_near: Singles
+    pixel: Singles
+    certainty: Singles
+
+
 class ArraySolver:
     """The tables of a rig as NumPy takes them."""
 
@@ -58,7 +73,7 @@ class ArraySolver:
         flat = table.own.reshape(nodes, C, 5)
         self.means = np.ascontiguousarray(flat[:, :, :2].reshape(nodes, 2 * C))
         self.variances = np.ascontiguousarray(flat[:, :, 2:].reshape(nodes, 3 * C))
-        self.sight = [np.ascontiguousarray(points.reshape(-1, 8)[:, :6]) for points in lines.points]
+        self.sight = [points.reshape(-1, 8) for points in lines.points]
         self.any_marked = bool(table.marked.any())
 
     def measure(self, uv: Floats, noise: Floats) -> Found:
@@ -78,7 +93,7 @@ class ArraySolver:
         )  # fmt: skip
         going = np.flatnonzero(m >= 2)
         with np.errstate(all="ignore"):
-            x = self._start(uv[going], seen[going])
+            x = self._start(uv[going], noise[going], seen[going])
             for _ in range(MAX_STEPS):
                 x, going = _those((x, going), self._in_box(x))
                 if not len(going):
@@ -120,30 +135,41 @@ class ArraySolver:
         on = good & ~done
         return x[on], going[on]
 
-    def _start(self, uv: Floats, seen: Bools) -> Floats:
-        """(n, 3) where lines of sight meet."""
-        A, b = np.zeros((6, len(uv))), np.zeros((3, len(uv)))
-        lost = np.zeros(len(uv), dtype=np.bool_)
+    def _start(self, uv: Floats, noise: Floats, seen: Bools) -> Floats:
+        """(n, 3) where lines of sight meet, each as heavy as a pixel is short there; float32 is enough for a start."""
+        lines = [self._lines_of(c, uv[:, c], noise[:, c], seen[:, c]) for c in range(len(self.sight))]
+        lost = np.logical_or.reduce([line.lost for line in lines])
+        x = np.zeros((3, len(uv)), dtype=np.float32)
+        for again in range(2):
+            A, b = np.zeros((6, len(uv)), dtype=np.float32), np.zeros((3, len(uv)), dtype=np.float32)
+            for line in lines:
+                part: Any = np.float32(0.5)
+                if again:
+                    part = np.clip(((x - line.near) * line.along).sum(axis=0), -0.5, 1.5)
+                weight = line.certainty / (line.pixel[0] + part * (line.pixel[1] - line.pixel[0])) ** 2
+                A += weight * line.across
+                b += weight * line.across_near
+            inverse, good = _inverse(A)
+            x = _times(inverse, b)
+        start = x.T.astype(np.float64)
+        start[lost | ~good] = np.nan
+        return start
+
+    def _lines_of(self, c: int, uv: Floats, noise: Floats, seen: Bools) -> _Lines:
+        """The lines of sight of camera c."""
         cells = self.lines.points.shape[1] - 3
-        for c, table in enumerate(self.sight):
-            rows = np.flatnonzero(seen[:, c])
-            t = (uv[rows, c] - self.lines.frames[c, :2]) * self.lines.frames[c, 2:]
-            inside = ((t >= 0) & (t <= cells)).all(axis=1)
-            lost[rows[~inside]] = True
-            rows, t = rows[inside], t[inside]
-            cell = np.minimum(t.astype(np.int32), cells - 1)
-            w, at = weights(t - cell), cell[:, :, None] + np.arange(4, dtype=np.int32)
-            index = at[:, 1, :, None] * (cells + 3) + at[:, 0, None, :]
-            ends = _weighted(w[:, 1, :, None] * w[:, 0, None, :], index, table).T.astype(np.float64)
-            near, d = ends[:3], ends[3:] - ends[:3]
-            d /= np.sqrt((d**2).sum(axis=0))
-            across = np.stack([(1.0 if i == j else 0.0) - d[i] * d[j] for i, j in SYMMETRIC])
-            A[:, rows] += across
-            b[:, rows] += _times(across, near)
-        inverse, good = _inverse(A)
-        x = _times(inverse, b).T
-        x[lost | ~good] = np.nan
-        return x
+        t = (uv - self.lines.frames[c, :2]) * self.lines.frames[c, 2:]
+        inside = ((t >= 0) & (t <= cells)).all(axis=1)
+        t = np.where(inside[:, None], t, 0.0)
+        cell = np.minimum(t.astype(np.int32), cells - 1)
+        w, at = weights((t - cell).astype(np.float32)), cell[:, :, None] + np.arange(4, dtype=np.int32)
+        index = at[:, 1, :, None] * (cells + 3) + at[:, 0, None, :]
+        found = np.ascontiguousarray(_weighted(w[:, 1, :, None] * w[:, 0, None, :], index, self.sight[c]).T)
+        near, d = found[:3], found[3:6] - found[:3]
+        along = d / (d**2).sum(axis=0)
+        across = np.stack([np.float32(i == j) - d[i] * along[j] for i, j in SYMMETRIC])
+        certainty = np.where(inside, noise**-2.0, 0.0).astype(np.float32)
+        return _Lines(seen & ~inside, near, along, across, _times(across, near), found[6:], certainty)
 
     def _in_box(self, x: Floats) -> Bools:
         t = (x - self.table.low) / self.table.step
@@ -155,7 +181,8 @@ class ArraySolver:
         table, (n, C) = self.table, use.shape
         t = (x - table.low) / table.step
         cell = np.minimum(t.astype(np.int32), (table.cells - 1).astype(np.int32))
-        w, d = weights(t - cell), slopes(t - cell) / table.step[:, None]
+        part = (t - cell).astype(np.float32)
+        w, d = weights(part), np.asarray(slopes(part) / table.step[:, None], dtype=np.float32)
         at = cell[:, :, None] + np.arange(4, dtype=np.int32)
         _, ny, nz = table.own.shape[:3]
         index = (at[:, 0, :, None, None] * ny + at[:, 1, None, :, None]) * nz + at[:, 2, None, None, :]
@@ -184,20 +211,18 @@ def _those(arrays: tuple[Floats, NDArray[np.int64]], keep: Bools) -> tuple[Float
     return arrays[0][keep], arrays[1][keep]
 
 
-def _outer(a: Floats, b: Floats, c: Floats) -> Floats:
+def _outer(a: Singles, b: Singles, c: Singles) -> Singles:
     return np.asarray(a[:, :, None, None] * b[:, None, :, None] * c[:, None, None, :])
 
 
-def _weighted(w: Floats, index: NDArray[np.int32], table: NDArray[np.float32]) -> NDArray[np.float32]:
+def _weighted(w: Singles, index: NDArray[np.int32], table: NDArray[np.float32]) -> NDArray[np.float32]:
     """(n, k) sums of rows of a table, with weights."""
     n, each = len(w), w[:1].size if len(w) else 1
     start = np.arange(0, n * each + 1, each, dtype=np.int32)
-    return np.asarray(
-        csr_array((w.reshape(-1).astype(np.float32), index.reshape(-1), start), shape=(n, len(table))) @ table
-    )
+    return np.asarray(csr_array((w.reshape(-1), index.reshape(-1), start), shape=(n, len(table))) @ table)
 
 
-def _inverse(A: Floats) -> tuple[Floats, Bools]:
+def _inverse(A: NDArray[Any]) -> tuple[NDArray[Any], Bools]:
     """Inverses of symmetric matrices (6, n), and where they are good."""
     a, b, c = A[3] * A[5] - A[4] ** 2, A[2] * A[4] - A[1] * A[5], A[1] * A[4] - A[2] * A[3]
     det = A[0] * a + A[1] * b + A[2] * c
@@ -206,7 +231,7 @@ def _inverse(A: Floats) -> tuple[Floats, Bools]:
     return out, np.asarray((det > 0) & (condition < MAX_CONDITION))
 
 
-def _times(A: Floats, x: Floats) -> Floats:
+def _times(A: NDArray[Any], x: NDArray[Any]) -> NDArray[Any]:
     """(3, n) products of symmetric matrices (6, n) and vectors (3, n)."""
     return np.stack(
         [

@@ -33,7 +33,7 @@ typedef struct {
   const float *grid;               /* [x][y][z][camera][8]: remainder of u and v, variances uu, uv, vv */
   const uint8_t *marked;           /* [cell x][y][z][camera] where the table is not accurate; null for nowhere */
   const double *sight_frames;      /* [camera][4]: first u and v, cells per pixel along u and v */
-  const float *sight;              /* [camera][v][u][8]: a near and a far point of the line of sight */
+  const float *sight;              /* [camera][v][u][8]: a near and a far point of the line of sight, pixels there */
   double min_p, disagree_p, agree_p, clearly_better;
   double step_sds;                 /* the last step in standard deviations */
   int64_t suspects_of_two;
@@ -51,6 +51,8 @@ typedef struct {
 /* What is known of it while it is asked which views are wrong. */
 typedef struct {
   double near_point[3], across[6], across_near[3]; /* line of sight: I - d d^T, and that times the near point */
+  double along[3], pixel[2];       /* from the near point, in lengths of the line; length of a pixel near and far */
+  double weight;                   /* of the line, by the noise and the length of a pixel */
   double D[2][3], W[3];            /* slope, and inverse covariance uu, uv, vv at the last place */
   double WD[2][3], Wr[2];          /* r: residual */
   double distance;                 /* r^T W r; or from the line of sight, squared */

@@ -102,8 +102,8 @@ INLINE void NAME(weights)(double part, float w[4], float d[4]) {
   d[3] = 0.5f * f * f;
 }
 
-/* The line of sight of a view: I - d d^T, that times the near point, and the near point; 0 where the table has none. */
-INLINE int NAME(sight)(const Map *map, const Seen *seen, double A[6], double across_near[3], double near_point[3]) {
+/* The line of sight of a view; 0 where the table has none. */
+INLINE int NAME(sight)(const Map *map, const Seen *seen, View *view) {
   const double *frame = map->sight_frames + 4 * seen->camera;
   const int64_t L = map->sight_cells;
   const double tu = (seen->u - frame[0]) * frame[2], tv = (seen->v - frame[1]) * frame[3];
@@ -122,18 +122,32 @@ INLINE int NAME(sight)(const Map *map, const Seen *seen, double A[6], double acr
     for (int i = 0; i < 4; ++i) MADD(along, wu[i], LOAD(row + i * WIDTH));
     MADD(sum, wv[j], along);
   }
-  double d[3], squares = 0;
+  double d[3], squares = 0, *A = view->across;
   for (int a = 0; a < 3; ++a) {
-    near_point[a] = LANE(sum, a);
-    d[a] = LANE(sum, 3 + a) - near_point[a];
+    view->near_point[a] = LANE(sum, a);
+    d[a] = LANE(sum, 3 + a) - view->near_point[a];
     squares += d[a] * d[a];
   }
   if (!(squares > 0)) return 0;
   const double f = 1 / squares;
+  for (int a = 0; a < 3; ++a) view->along[a] = d[a] * f;
+  view->pixel[0] = LANE(sum, 6);
+  view->pixel[1] = LANE(sum, 7);
   A[0] = 1 - d[0] * d[0] * f; A[1] = -d[0] * d[1] * f; A[2] = -d[0] * d[2] * f;
   A[3] = 1 - d[1] * d[1] * f; A[4] = -d[1] * d[2] * f; A[5] = 1 - d[2] * d[2] * f;
-  NAME(times)(A, near_point, across_near);
+  NAME(times)(A, view->near_point, view->across_near);
   return 1;
+}
+
+/* The weight of a line of sight for a point so far along it, 0 at the near point and 1 at the far one. */
+INLINE double NAME(weight_at)(const Seen *seen, const View *view, double part) {
+  const double pixel = view->pixel[0] + part * (view->pixel[1] - view->pixel[0]);
+  return 1 / (seen->variance * pixel * pixel);
+}
+
+INLINE void NAME(add_line)(const View *view, double weight, double A[6], double b[3]) {
+  for (int k = 0; k < 6; ++k) A[k] += weight * view->across[k];
+  for (int k = 0; k < 3; ++k) b[k] += weight * view->across_near[k];
 }
 
 /* Where the lines of sight of the views in use meet best; 0 for nowhere. */
@@ -141,8 +155,7 @@ static int NAME(meet)(const View *views, int64_t m, double x[3]) {
   double A[6] = {0}, b[3] = {0}, inverse[6];
   for (int64_t i = 0; i < m; ++i) {
     if (!views[i].used) continue;
-    for (int k = 0; k < 6; ++k) A[k] += views[i].across[k];
-    for (int k = 0; k < 3; ++k) b[k] += views[i].across_near[k];
+    NAME(add_line)(views + i, views[i].weight, A, b);
   }
   if (!NAME(invert)(A, inverse)) return 0;
   NAME(times)(inverse, b, x);
@@ -609,14 +622,40 @@ static int NAME(without_wrong)(const Map *map, const Seen *seen, View *views, in
 
 /* Which views of a point are wrong that has at least three, and whose views disagree or meet nowhere. */
 static int NAME(mend)(const Map *map, const Seen *seen, View *views, int64_t m, NAME(Place) *found) {
-  for (int64_t i = 0; i < m; ++i)
-    if (!NAME(sight)(map, seen + i, views[i].across, views[i].across_near, views[i].near_point)) return UNSURE;
+  for (int64_t i = 0; i < m; ++i) {
+    if (!NAME(sight)(map, seen + i, views + i)) return UNSURE;
+    views[i].weight = NAME(weight_at)(seen + i, views + i, 0.5);
+  }
   return NAME(without_wrong)(map, seen, views, m, found);
 }
 
 /* What becomes of a point whose views disagree, and none of which is clearly wrong. */
 INLINE int NAME(as_it_is)(const Map *map, double p) {
   return NAME(near)(p, map->min_p) ? LEFT_TO_EXACT : p < map->min_p ? CONTRADICTION : MEASURED;
+}
+
+/* The equations of the place where all lines of sight of a point meet, each as heavy as a pixel is short there; 0 where
+   one of them is not in the table. */
+INLINE int NAME(weighted_lines)(const Map *map, const Seen *seen, View *views, int64_t m, double A[6], double b[3]) {
+  double inverse[6], x[3];
+  for (int k = 0; k < 6; ++k) A[k] = 0;
+  b[0] = b[1] = b[2] = 0;
+  for (int64_t i = 0; i < m; ++i) {
+    if (!NAME(sight)(map, seen + i, views + i)) return 0;
+    NAME(add_line)(views + i, NAME(weight_at)(seen + i, views + i, 0.5), A, b);
+  }
+  if (m == 2) return 1; /* no weight moves where two meet */
+  if (!NAME(invert)(A, inverse)) return 0;
+  NAME(times)(inverse, b, x);
+  for (int k = 0; k < 6; ++k) A[k] = 0;
+  b[0] = b[1] = b[2] = 0;
+  for (int64_t i = 0; i < m; ++i) {
+    double part = 0;
+    for (int a = 0; a < 3; ++a) part += (x[a] - views[i].near_point[a]) * views[i].along[a];
+    part = part < -0.5 ? -0.5 : part > 1.5 ? 1.5 : part;
+    NAME(add_line)(views + i, NAME(weight_at)(seen + i, views + i, part), A, b);
+  }
+  return 1;
 }
 
 static const int NAME(AT)[9] = {0, 1, 2, 1, 3, 4, 2, 4, 5}; /* of a full matrix in one of six numbers */
@@ -651,14 +690,11 @@ static void NAME(block)(const Map *map, int64_t n, const double *uv, const doubl
     }
     views_of[k] = m;
     code[k] = m < 2 ? TOO_FEW_VIEWS : LEFT_TO_EXACT;
-    int looking = m >= 2;
-    for (int64_t i = 0; i < m && looking; ++i) {
-      double across[6] = {0}, across_near[3] = {0}, near_point[3];
-      looking = NAME(sight)(map, of + i, across, across_near, near_point);
-      for (int a = 0; a < 6; ++a) H[a][k] += across[a];
-      for (int a = 0; a < 3; ++a) g[a][k] += across_near[a];
+    if (m >= 2 && NAME(weighted_lines)(map, of, views, m, h, f)) {
+      for (int a = 0; a < 6; ++a) H[a][k] = h[a];
+      for (int a = 0; a < 3; ++a) g[a][k] = f[a];
+      going[number++] = k;
     }
-    if (looking) going[number++] = k;
   }
   NAME(invert_block)(H, inverse, good);
   NAME(times_block)(inverse, g, x);

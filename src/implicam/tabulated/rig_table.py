@@ -19,9 +19,9 @@ from implicam.tabulated.sight_lines import SightLines, tabulate_sight_lines
 from implicam.tabulated.spline_table import SplineTable, box_of, tabulate
 from implicam.threads import cores, side_by_side
 
-STEP_SDS = 0.1
-"""The last step of Gauss-Newton, in standard deviations of the position: its square is what remains of this, the step
-itself of the covariance, both times some hundredths."""
+STEP_SDS, TIED_STEP_SDS = 0.2, 0.1
+"""The last step of Gauss-Newton, in standard deviations of the position, and of cameras that are tied together: its
+square is what remains of this, the step itself of the covariance, both times some hundredths."""
 
 POINTS_PER_TASK = 8192
 """Points at a time of one thread of the kernel."""
@@ -168,7 +168,8 @@ class RigTable:
         made = Map(
             cameras=len(table.projections), sight_cells=self.lines.points.shape[1] - 3,
             min_p=settings.min_p_value, disagree_p=settings.disagree_p_value, agree_p=settings.agree_p_value,
-            clearly_better=settings.clearly_better_ratio, step_sds=STEP_SDS,
+            clearly_better=settings.clearly_better_ratio,
+            step_sds=TIED_STEP_SDS if self.rig.posterior.tied else STEP_SDS,
             suspects_of_two=settings.max_suspects_of_two, unknowns=table.through.shape[5],
         )  # fmt: skip
         made.cells[:], made.low[:], made.per_length[:] = (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from implicam.geometry import Floats
 from implicam.rig_model import CameraModel, FittedRig
-from implicam.tabulated.spline_table import coefficients, filled, sites, weights
+from implicam.tabulated.spline_table import coefficients, filled, sites
 
 SIGHT_CELLS = 24
 """Cells along u and along v."""
@@ -30,7 +30,8 @@ MAX_MOVE = 0.2
 
 class SightLines(NamedTuple):
     """Lines of sight of C cameras: frames (C, 4) first u and v, and cells per pixel along u and v; points
-    (C, v, u, 8) coefficients of a near point (3) and a far one (3), in the working frame."""
+    (C, v, u, 8) coefficients of a near point (3) and a far one (3), in the working frame, and of the length across the
+    line that is a pixel near and far."""
 
     frames: Floats
     points: NDArray[np.float32]
@@ -54,43 +55,12 @@ def tabulate_sight_lines(rig: FittedRig, low: Floats, high: Floats) -> SightLine
         per_cell = (last - first) / SIGHT_CELLS
         v, u = np.meshgrid(first[1] + t * per_cell[1], first[0] + t * per_cell[0], indexing="ij")
         values = _near_and_far(model, np.column_stack([u.ravel(), v.ravel()]), 0.5 * (low + high), high - low)
-        values = values.reshape(len(t), len(t), 6)
-        for k in range(6):
+        values = values.reshape(len(t), len(t), 8)
+        for k in range(8):
             values[..., k] = filled(values[..., k, None])[..., 0]
-        padded = np.zeros((len(t), len(t), 8), dtype=np.float32)
-        padded[..., :6] = np.einsum("iv,ju,vuk->ijk", turn, turn, values)
         frames.append([*first, *(1 / per_cell)])
-        points.append(padded)
+        points.append(np.einsum("iv,ju,vuk->ijk", turn, turn, values).astype(np.float32))
     return SightLines(np.array(frames), np.array(points))
-
-
-def look_along(lines: SightLines, camera: int, uv: Floats) -> tuple[Floats, Floats]:
-    """The lines of sight of one camera.
-
-    Args:
-        lines: The tables.
-        camera: Number of the camera.
-        uv: (n, 2) pixels.
-
-    Returns:
-        Near and far points (n, 3); NaN outside of the table.
-    """
-    cells = lines.points.shape[1] - 3
-    t = (uv - lines.frames[camera, :2]) * lines.frames[camera, 2:]
-    with np.errstate(invalid="ignore"):
-        inside = ((t >= 0) & (t <= cells)).all(axis=1)
-    t = np.where(inside[:, None], t, 0.0)
-    cell = np.minimum(t.astype(np.int64), cells - 1)
-    w = weights(t - cell)
-    near = cell[:, :, None] + np.arange(4)
-    found = np.zeros((len(uv), 6))
-    flat = lines.points[camera].reshape(-1, 8)
-    for j in range(4):
-        row = near[:, 1, j] * (cells + 3)
-        for i in range(4):
-            found += (w[:, 1, j] * w[:, 0, i])[:, None] * flat[row + near[:, 0, i], :6]
-    found[~inside] = np.nan
-    return found[:, :3], found[:, 3:]
 
 
 def _image_range(rig: FittedRig, model: CameraModel, low: Floats, high: Floats) -> tuple[Floats, Floats]:
@@ -104,7 +74,8 @@ def _image_range(rig: FittedRig, model: CameraModel, low: Floats, high: Floats) 
 
 
 def _near_and_far(model: CameraModel, uv: Floats, middle: Floats, sides: Floats) -> Floats:
-    """(n, 6) a near and a far point on the lines of sight of pixels (n, 2), before and behind the middle of the box."""
+    """(n, 8) a near and a far point on the lines of sight of pixels (n, 2), before and behind the middle of the box,
+    and the length of a pixel at both."""
     with np.errstate(all="ignore"):
         centre, directions = model.camera.lines(uv)
         towards = middle - centre
@@ -113,11 +84,14 @@ def _near_and_far(model: CameraModel, uv: Floats, middle: Floats, sides: Floats)
             directions = -directions
         depth = 0.4 * float(np.abs(towards) @ sides) / max(distance, 1e-12)
         ends = (max(distance - depth, 0.4 * distance), distance + depth)
-        return np.concatenate([_seen_there(model, uv, centre, directions, far) for far in ends], axis=1)
+        (near, there), (far, beyond) = (_seen_there(model, uv, centre, directions, end) for end in ends)
+        return np.column_stack([near, far, there, beyond])
 
 
-def _seen_there(model: CameraModel, uv: Floats, centre: Floats, directions: Floats, far: float) -> Floats:
-    """(n, 3) points at that distance that the camera with its field sees at the pixels."""
+def _seen_there(
+    model: CameraModel, uv: Floats, centre: Floats, directions: Floats, far: float
+) -> tuple[Floats, Floats]:
+    """(n, 3) points at that distance that the camera with its field sees at the pixels; (n,) the length of a pixel."""
     start = centre + far * directions
     across = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
     first = np.cross(directions, across)
@@ -133,4 +107,4 @@ def _seen_there(model: CameraModel, uv: Floats, centre: Floats, directions: Floa
         b = (J[:, 0, 0] * off[:, 1] - J[:, 1, 0] * off[:, 0]) / det
         x = x + T[:, :, 0] * a[:, None] + T[:, :, 1] * b[:, None]
     good = np.linalg.norm(x - start, axis=1) < MAX_MOVE * far
-    return np.where(good[:, None], x, start)
+    return np.where(good[:, None], x, start), np.where(good, 1 / np.sqrt(np.abs(det)), np.nan)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -323,7 +323,7 @@ def _pairs(C: int) -> list[tuple[int, int]]:
     return [(c, d) for c in range(C) for d in range(c + 1, C)]
 
 
-def weights(f: Floats) -> Floats:
+def weights(f: NDArray[Any]) -> NDArray[Any]:
     """Weights of uniform cubic B-splines.
 
     Args:
@@ -337,7 +337,7 @@ def weights(f: Floats) -> Floats:
     return np.stack(both, axis=-1) / 6
 
 
-def slopes(f: Floats) -> Floats:
+def slopes(f: NDArray[Any]) -> NDArray[Any]:
     """Slopes of `weights` by f.
 
     Args:
