@@ -24,9 +24,9 @@ from scipy.special import chdtri
 
 import implicam as ic
 from implicam.calibrators.protocol import RigCalibration
-from implicam.rig_model import MeasuredPixels
 from implicam.dataset import Dataset
-from implicam.simulate import Rig, build_rig, moving_board, random_positions, simulate
+from implicam.rig_model import MeasuredPixels
+from implicam.simulate import Rig, build_rig, random_positions, simulate
 from implicam.tabulated import RigTable
 from implicam.tabulated.library import how_it_measures, kernel
 
@@ -85,11 +85,8 @@ def spoilt(uv: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def rig_and_known(name: str) -> tuple[Rig, Dataset]:
-    """A rig, and its known points: 157 at random; *declared*: a position is known to 0.1 mm, which ties the cameras
-    together; *boards*: on a slide that nobody says to be off, so that their errors are found."""
-    if name == "boards":
-        rig = build_rig("bar4", seed=1)
-        return rig, simulate(rig, moving_board(rig, corners=(4, 5), positions=8, step=40.0), seed=1)
+    """A rig, and its known points: 157 at random; *declared*: of bar4, and a position is known to 0.1 mm, which ties the
+    cameras together."""
     rig = build_rig("bar4" if name == "declared" else name, seed=1)
     known = simulate(rig, random_positions(rig, 157, np.random.default_rng(1)), seed=1)
     if name != "declared":
@@ -129,7 +126,7 @@ def live(made: RigCalibration, uv: np.ndarray) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--points", type=int, default=400_000)
-    parser.add_argument("--rigs", default="stereo,bar4,bar6,dome8,declared,boards")
+    parser.add_argument("--rigs", default="stereo,bar4,bar6,dome8,declared")
     options = parser.parse_args()
     peer = opencv(20_000)
     usual = min(seconds(peer, 15)[0], seconds(peer, 15)[0]) / 20_000

@@ -47,12 +47,12 @@ class _Lines(NamedTuple):
     over the variance of its noise, zero where there is no view."""
 
     lost: Bools
-    near: Singles
-    along: Singles
-    across: Singles
-    across_near: Singles
-    pixel: Singles
-    certainty: Singles
+    near: Floats
+    along: Floats
+    across: Floats
+    across_near: Floats
+    pixel: Floats
+    certainty: Floats
 
 
 class ArraySolver:
@@ -136,24 +136,24 @@ class ArraySolver:
         return x[on], going[on]
 
     def _start(self, uv: Floats, noise: Floats, seen: Bools) -> Floats:
-        """(n, 3) where lines of sight meet, each as heavy as a pixel is short there; float32 is enough for a start."""
+        """(n, 3) where lines of sight meet, each as heavy as a pixel is short there."""
         lines = [self._lines_of(c, uv[:, c], noise[:, c], seen[:, c]) for c in range(len(self.sight))]
         lost = np.logical_or.reduce([line.lost for line in lines])
-        x = np.zeros((3, len(uv)), dtype=np.float32)
+        x, two = np.zeros((3, len(uv))), seen.sum(axis=1) == 2  # where two meet, weights hardly matter
         for again in range(2):
-            A, b = np.zeros((6, len(uv)), dtype=np.float32), np.zeros((3, len(uv)), dtype=np.float32)
+            A, b = np.zeros((6, len(uv))), np.zeros((3, len(uv)))
             for line in lines:
-                part: Any = np.float32(0.5)
+                part: Any = 0.5
                 if again:
                     part = np.clip(((x - line.near) * line.along).sum(axis=0), -0.5, 1.5)
+                    part[two] = 0.5
                 weight = line.certainty / (line.pixel[0] + part * (line.pixel[1] - line.pixel[0])) ** 2
                 A += weight * line.across
                 b += weight * line.across_near
             inverse, good = _inverse(A)
             x = _times(inverse, b)
-        start = x.T.astype(np.float64)
-        start[lost | ~good] = np.nan
-        return start
+        x[:, lost | ~good] = np.nan
+        return x.T
 
     def _lines_of(self, c: int, uv: Floats, noise: Floats, seen: Bools) -> _Lines:
         """The lines of sight of camera c."""
@@ -164,11 +164,11 @@ class ArraySolver:
         cell = np.minimum(t.astype(np.int32), cells - 1)
         w, at = weights((t - cell).astype(np.float32)), cell[:, :, None] + np.arange(4, dtype=np.int32)
         index = at[:, 1, :, None] * (cells + 3) + at[:, 0, None, :]
-        found = np.ascontiguousarray(_weighted(w[:, 1, :, None] * w[:, 0, None, :], index, self.sight[c]).T)
+        found = _weighted(w[:, 1, :, None] * w[:, 0, None, :], index, self.sight[c]).T.astype(np.float64, order="C")
         near, d = found[:3], found[3:6] - found[:3]
         along = d / (d**2).sum(axis=0)
-        across = np.stack([np.float32(i == j) - d[i] * along[j] for i, j in SYMMETRIC])
-        certainty = np.where(inside, noise**-2.0, 0.0).astype(np.float32)
+        across = np.stack([float(i == j) - d[i] * along[j] for i, j in SYMMETRIC])
+        certainty = np.where(inside, noise**-2.0, 0.0)
         return _Lines(seen & ~inside, near, along, across, _times(across, near), found[6:], certainty)
 
     def _in_box(self, x: Floats) -> Bools:
@@ -181,8 +181,7 @@ class ArraySolver:
         table, (n, C) = self.table, use.shape
         t = (x - table.low) / table.step
         cell = np.minimum(t.astype(np.int32), (table.cells - 1).astype(np.int32))
-        part = (t - cell).astype(np.float32)
-        w, d = weights(part), np.asarray(slopes(part) / table.step[:, None], dtype=np.float32)
+        w, d = weights(t - cell), slopes(t - cell) / table.step[:, None]
         at = cell[:, :, None] + np.arange(4, dtype=np.int32)
         _, ny, nz = table.own.shape[:3]
         index = (at[:, 0, :, None, None] * ny + at[:, 1, None, :, None]) * nz + at[:, 2, None, None, :]
@@ -211,8 +210,9 @@ def _those(arrays: tuple[Floats, NDArray[np.int64]], keep: Bools) -> tuple[Float
     return arrays[0][keep], arrays[1][keep]
 
 
-def _outer(a: Singles, b: Singles, c: Singles) -> Singles:
-    return np.asarray(a[:, :, None, None] * b[:, None, :, None] * c[:, None, None, :])
+def _outer(a: Floats, b: Floats, c: Floats) -> Singles:
+    """(n, 4, 4, 4) weights of nodes, rounded once: remainders may be a thousand pixels."""
+    return (a[:, :, None, None] * b[:, None, :, None] * c[:, None, None, :]).astype(np.float32)
 
 
 def _weighted(w: Singles, index: NDArray[np.int32], table: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -644,7 +644,7 @@ INLINE int NAME(weighted_lines)(const Map *map, const Seen *seen, View *views, i
     if (!NAME(sight)(map, seen + i, views + i)) return 0;
     NAME(add_line)(views + i, NAME(weight_at)(seen + i, views + i, 0.5), A, b);
   }
-  if (m == 2) return 1; /* no weight moves where two meet */
+  if (m == 2) return 1; /* where two meet, weights hardly matter */
   if (!NAME(invert)(A, inverse)) return 0;
   NAME(times)(inverse, b, x);
   for (int k = 0; k < 6; ++k) A[k] = 0;
