@@ -41,6 +41,7 @@ bench: $(VENV)/.dev
 	$(BIN)/python benchmarks/forward_speed.py
 	$(BIN)/python benchmarks/active_speed.py
 	$(BIN)/python benchmarks/reading.py
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/measuring.py
 
 odd: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/odd_rigs.py -o benchmarks/results/odd_rigs.md

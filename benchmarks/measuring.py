@@ -85,7 +85,7 @@ def spoilt(uv: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def rig_and_known(name: str) -> tuple[Rig, Dataset]:
-    """A rig, and its known points: 157 at random; *declared*: of bar4, and a position is known to 0.1 mm, which ties the
+    """A rig, and its known points: 157 at random; *declared*: of bar4, each known to 0.1 mm, which ties the
     cameras together."""
     rig = build_rig("bar4" if name == "declared" else name, seed=1)
     known = simulate(rig, random_positions(rig, 157, np.random.default_rng(1)), seed=1)
