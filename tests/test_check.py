@@ -238,6 +238,9 @@ def test_what_an_imported_calibration_does_not_know_is_not_said(cli: Cli) -> Non
     told = cli("measure", "imported.implicam", "new.csv", "--json").json
     assert told["median_share_calibration"] is None
     assert any("nothing is known of how well" in note for note in told["notes"])
+    np.savez("new.npz", uv=views(rig, 15).observations.uv)
+    ran = cli("measure", "imported.implicam", "new.npz", "--chunk", "100", "-o", "parts.csv")
+    assert "of the noise of the pixels alone" in ran.err
     imported(replace(rig, cameras=rig.cameras[:3])).save("three.implicam")
     assert "cameras that are not calibrated are not used: cam4 (50)" in cli("measure", "three.implicam", "new.csv").err
     assert "not calibrated" not in ran.err

@@ -317,6 +317,9 @@ def test_the_example_runs(cli: Cli) -> None:
     words = [COMPILERS[0], *command[1].split()[1:]]
     subprocess.run(words, cwd="for-cpp", check=True)
     told = subprocess.run(command[2].split(), cwd="for-cpp", check=True, capture_output=True, text=True).stdout
+    cpp_table.refuse_other_files(
+        Path("for-cpp"), cpp_table._OURS.__contains__, "it"
+    )  # compiled, it can be exported anew
     assert f"2 cameras, calibration {calibration_file.checksum('rig.implicam')[:16]}" in told
     middle = 0.5 * (plain().data.xyz.min(axis=0) + plain().data.xyz.max(axis=0))
     for axis, value in zip("xyz", middle, strict=True):

@@ -203,10 +203,11 @@ def _measure_in_parts(
     with show.progress(json) as progress:
         found = measure_file(fitted, source, output, points_at_once=chunk, progress=progress)
     if json:
-        show.emit_json({"measured": str(output), **asdict(found)})
+        show.emit_json({"measured": str(output), **asdict(found), "notes": _unknown_errors(fitted)})
     else:
         before = f", {found.resumed:,} of them before" if found.resumed else ""
         show.line(f"{output}: {found.rows:,} rows, {found.measured:,} measured{before}")
+        show.notes(_unknown_errors(fitted))
         for alarm in found.alarms:
             show.alarm(f"{alarm}{'' if alarm.endswith('?') else '.'} These rows say that they are doubtful.")
     raise typer.Exit(int(bool(found.alarms)))

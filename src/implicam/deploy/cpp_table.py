@@ -31,6 +31,8 @@ from implicam.rig_model.shot_errors import WORLD_POLYNOMIAL_TERMS
 from implicam.tabulated.spline_table import MAX_PIXEL_ERROR_SDS, MAX_VARIANCE_ERROR, SplineTable, box_of, tabulate
 
 TABLE_FILE, HEADER_FILE, EXAMPLE_FILE = "rig.table", "implicam.hpp", "example.cpp"
+_OURS = {TABLE_FILE, HEADER_FILE, EXAMPLE_FILE, "example", "example.exe"}
+"""With what the first lines of the example say to compile it to."""
 TABLE_VERSION = 1
 MAX_NOT_TABULATED = 0.5
 """Of a camera: part of the cells in which the table may be not accurate enough."""
@@ -70,7 +72,7 @@ def write_cpp(
     The table is exact to 0.3 % of a view's sd and 0.5 % of its variance
     """
     folder = Path(folder)
-    refuse_other_files(folder, {TABLE_FILE, HEADER_FILE, EXAMPLE_FILE}.__contains__, "a calibration for C++")
+    refuse_other_files(folder, _OURS.__contains__, "a calibration for C++")
     rig = _rig(calibration)
     low, high = box_of(rig, calibration.data.xyz)
     table = tabulate(rig, low, high, progress)
