@@ -7,11 +7,12 @@ of 0.1 ms. So we give each task few BLAS threads and run independent tasks side 
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from contextvars import ContextVar, copy_context
 from functools import lru_cache
 from typing import Any, TypeVar
@@ -20,6 +21,10 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+M_MMAP_THRESHOLD = -3
+"""Of mallopt in glibc's malloc.h."""
+LARGE_BYTES = 1 << 19
+
 _MOST_CORES: ContextVar[int] = ContextVar("_MOST_CORES", default=sys.maxsize)
 
 
@@ -27,6 +32,16 @@ def cores() -> int:
     """Cores that the work at hand may use: those of this process, or fewer inside `limit_cores`."""
     own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(own, _MOST_CORES.get())
+
+
+def return_large_memory() -> None:
+    """Let large arrays go back to the system when they are done with, in a process that lives for hours.
+
+    Each thread has a heap of its own, and glibc keeps in it what was freed: with six cameras' pictures that came to
+    300 MB. Other systems do as they always do.
+    """
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
 
 
 @contextmanager

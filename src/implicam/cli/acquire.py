@@ -27,6 +27,7 @@ from implicam.files import refuse_folder
 from implicam.formatting import decimal_number, percent, without_dust
 from implicam.images import opencv
 from implicam.logs import LOG, log_to_file
+from implicam.threads import return_large_memory
 
 if TYPE_CHECKING:
     from implicam.session.controller import SessionController
@@ -163,6 +164,7 @@ def _acquire(
 
     with_options(Setup(), **options)  # what is wrong with the words is said before anything is begun
     opencv()
+    return_large_memory()
     if not unattended:
         import_extra("starlette", "viewer", "the page of implicam acquire")
     if not is_session(folder):
