@@ -262,6 +262,7 @@ def test_cameras_that_are_tied_with_labels_that_are_off(kernel: Kernel) -> None:
     by_tables = made.map.measure_pixels(uv[0:1], None, replace(tables_of(made), compiled=kernel).locate)
     live = Live(made.map, replace(tables_of(made), compiled=kernel)).measure(uv[0])
     np.testing.assert_allclose(live.xyz, by_tables.xyz, rtol=1e-9)
+    assert len(made.map.measure_pixels(uv[:0], None, replace(tables_of(made), compiled=kernel).locate)) == 0
 
 
 def test_without_a_kernel_tied_cameras_are_measured_exactly_and_it_says_why(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,7 +113,7 @@ class RigTable:
     def _as_labelled(self, found: Found, tied: Floats) -> Found:
         """In the world as labelled, eqs. (22) and (28)."""
         labels = self.rig.labels
-        if labels is None:
+        if labels is None or not len(tied):
             return found
 
         def some(part: slice) -> tuple[Floats, Floats]:
