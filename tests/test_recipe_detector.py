@@ -21,7 +21,7 @@ from implicam.detect.model import nothing
 from implicam.errors import UsageError
 from implicam.images import write_picture
 from implicam.session.setup import Setup, open_session
-from implicam.viewer.pictures import BALL, montage
+from implicam.viewer.snapshot import snapshot
 
 pytestmark = pytest.mark.usefixtures("looks_kept")
 
@@ -164,8 +164,11 @@ def test_a_session_finds_it_in_its_live_pictures(tmp_path: Path) -> None:
             assert look.found.points == ("live",)
             assert np.array_equal(look.uv, lamp.detect(look.frame.picture, View(look.camera, "live")).uv[0])
         names = [look.camera for look in controller.state.looks]
-        page = montage(controller.state, names, [1.25] * 2, 800, 400)
-        assert (page == BALL).all(axis=2).sum() > 20
+        shown = snapshot(
+            controller.state, names, np.full(3, np.nan), controller.loop.rule, unit="mm", moves=True, skipped=0
+        )
+        for row, look in zip(shown["cameras"], controller.state.looks, strict=True):
+            assert row["ball"] == look.uv.tolist()
         controller.accept()
         assert controller.loop.points == 1
 

@@ -163,7 +163,7 @@ function take(chunk) {
   }
   by("measured").hidden = false;
   const count = points.names.length;
-  by("count").textContent = [`${count} point${count === 1 ? "" : "s"}`, unmeasured.size && `${unmeasured.size} could not be measured`,
+  by("count").textContent = [`${count} point${count === 1 ? "" : "s"} (sd: per axis)`, unmeasured.size && `${unmeasured.size} could not be measured`,
     notShown && `${notShown} more are not shown`].filter(Boolean).join(", ");
   if (chunk.alarm) say({error: chunk.alarm});
   by("why").hidden = !unmeasured.size;
@@ -174,7 +174,7 @@ function take(chunk) {
     return [name, ...place(points.xyz[k], sd), number(sd, 2)];
   });
   const table = document.createElement("table");  // the newest first
-  for (const [cells, kind] of [[["", "x", "y", "z", `sd per axis, ${world.unit}`], "th"],
+  for (const [cells, kind] of [[["", "x", "y", "z", `sd, ${world.unit}`], "th"],
     ...lines.reverse().map((row) => [row, "td"])]) {
     const line = table.insertRow();
     for (const text of cells) line.append(Object.assign(document.createElement(kind), {textContent: text, title: text}));
