@@ -21,6 +21,7 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.errors import ImplicamError, UsageError
+from implicam.formatting import json_safe
 from implicam.hardware import GuardedRobot
 from implicam.hardware.protocol import format_position
 from implicam.images import Grey, read_picture
@@ -28,7 +29,7 @@ from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, SessionCo
 from implicam.session.typed import PositionQuestion, TypedPosition, parse_position
 from implicam.viewer import words
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, list_cameras, up_of
-from implicam.viewer.snapshot import curve, snapshot
+from implicam.viewer.snapshot import curve, finite_or_none, snapshot
 from implicam.viewer.space import Placing, edges
 from implicam.viewer.web import answer, behind_door, jpeg
 from implicam.viewer.worker import Worker
@@ -296,8 +297,8 @@ class BenchPage:
             self._curved = state.history
             self._curve += 1
         found |= {
-            "scene": self._scene, "curve": self._curve, "measured": _or_none(measured), "complaints": self._complaints,
-            "question": _without_position(self._questioned),
+            "scene": self._scene, "curve": self._curve, "measured": finite_or_none(measured),
+            "complaints": self._complaints, "question": _without_position(self._questioned),
         }  # fmt: skip
         with self._lock:
             self._sent = {**found, "number": self._sent["number"] + 1}
@@ -338,8 +339,8 @@ class BenchPage:
             "names": [] if known is None else [str(name) for name in known.points],
             "skipped": [one.xyz.tolist() for one in controller.session.skipped],
             "judged": controller.loop.judged_at.tolist() if predicted is not None else [],
-            "u95": [] if predicted is None else _list_or_none(predicted.u95),
-            "excess": [] if predicted is None else _list_or_none(predicted.excess),
+            "u95": [] if predicted is None else json_safe(predicted.u95.tolist()),
+            "excess": [] if predicted is None else json_safe(predicted.excess.tolist()),
         }
 
     def curve(self, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -443,14 +444,6 @@ class BenchPage:
 
 def _without_position(question: dict[str, Any] | None) -> dict[str, Any] | None:
     return None if question is None else {key: value for key, value in question.items() if key != "position"}
-
-
-def _or_none(values: Floats) -> list[float] | None:
-    return values.tolist() if np.isfinite(values).all() else None
-
-
-def _list_or_none(values: Floats) -> list[float | None]:
-    return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
 @contextmanager

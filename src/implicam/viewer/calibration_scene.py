@@ -12,7 +12,7 @@ import numpy as np
 from implicam.calibrators import Calibration, RigCalibration
 from implicam.dataset import Floats
 from implicam.dataset.image_bounds import image_bounds
-from implicam.formatting import list_some
+from implicam.formatting import json_safe, list_some
 from implicam.measurement import Measurement
 from implicam.report.instrument import Instrument
 from implicam.rig_model import SOURCES, FittedRig
@@ -85,7 +85,7 @@ def uncertainty_map(instrument: Instrument) -> dict[str, Any]:
             parts[name] = np.sqrt(np.maximum(variance, 0))
     return {
         "axes": [axis.tolist() for axis in instrument.axes],
-        "maps": {name: _or_none(values) for name, values in parts.items()},
+        "maps": {name: json_safe(values.tolist()) for name, values in parts.items()},
     }
 
 
@@ -105,7 +105,7 @@ def measured_points(measurement: Measurement, unit: str) -> dict[str, Any]:
         "xyz": some.xyz.tolist(),
         "cov": upper.tolist(),
         "views": some.views.tolist(),
-        "consistency": _or_none(some.consistency),
+        "consistency": json_safe(some.consistency.tolist()),
         "reason": [str(reason) for reason in some.reason],
         "missing": [
             [str(measurement.points[i]), str(measurement.reason[i]) or "no reason given"]
@@ -113,10 +113,6 @@ def measured_points(measurement: Measurement, unit: str) -> dict[str, Any]:
         ],
         "alarm": measurement.alarm,
     }
-
-
-def _or_none(values: Floats) -> list[float | None]:
-    return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
 def _box(known: Floats, cameras: list[dict[str, Any]]) -> tuple[Floats, Floats]:
@@ -186,7 +182,7 @@ def list_cameras(calibration: object) -> list[dict[str, Any]]:
                 "noise": float(rig.posterior.models[row].noise),
                 "centre": centre.tolist(),
                 "far": far,
-                "picture": [_or_none(one) for one in picture.reshape(-1, 3)],
+                "picture": json_safe(picture.reshape(-1, 3).tolist()),
             }
         )
     return found

@@ -49,7 +49,7 @@ def snapshot(
         "fix": "" if problem is None else problem.fix,
         "message": state.message,
         "target": None if target is None else {"name": target.name, "xyz": target.xyz.tolist()},
-        "position": _or_none(state.position),
+        "position": finite_or_none(state.position),
         "to_go": words.to_go(state, measured, unit),
         "auto": state.auto,
         "buttons": _buttons(state, moves, unit),
@@ -109,7 +109,7 @@ def _camera(state: State, name: str, look: Look | None) -> dict[str, Any]:
         "says": says,
         "kind": kind,
         "reason": look.found.reason if state.phase == "shown" else "",
-        "ball": _or_none(look.uv),
+        "ball": finite_or_none(look.uv),
         "outlines": [_outline(line) for line in look.found.outlines] if len(look.found) else [],
         "target": look.expected.tolist() if planned else None,
     }
@@ -134,5 +134,6 @@ def _numbers(history: Sequence[Step], rule: Rule, unit: str, skipped: int) -> di
     }
 
 
-def _or_none(values: Floats) -> list[float] | None:
+def finite_or_none(values: Floats) -> list[float] | None:
+    """A place for JSON; None where it is not known."""
     return values.tolist() if np.isfinite(values).all() else None
