@@ -155,8 +155,8 @@ def test_all_cameras_together_are_seen_by_known_points_alone() -> None:
 def test_known_points_that_fill_no_volume_show_no_bias_that_is_not_there(along: float) -> None:
     """A turn about their line moves none of them, and where they stand in one place no growth does."""
     rig, calibration = rig_and_calibration()
-    names = np.array([f"q{i}" for i in range(12)])
-    places = calibration.data.xyz.mean(axis=0) + along * np.outer(np.linspace(-1, 1, 12), [1, 0.2, 0.1])
+    names = np.array([f"q{i}" for i in range(20)])
+    places = calibration.data.xyz.mean(axis=0) + along * np.outer(np.linspace(-1, 1, 20), [1, 0.2, 0.1])
     p_values = []
     for seed in range(2):
         data = simulate(rig, Target("line", names, names, places), seed=seed)
