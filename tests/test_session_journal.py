@@ -46,7 +46,7 @@ def shot(name: str, seed: int = 0, n: int = 1, extra: str = "", sd: bool = True)
     uv = rng.uniform(0, 47, (n, 3, 2))
     uv[0, 0] = -0.0, 5e-324 * (1 + seed)  # a zero with a sign, and the smallest numbers; one pixel for all is a mark
     uv[rng.random((n, 3)) < 0.3] = NAN
-    uv[0, 1] = 1 / 3 + seed / 7, 46.999999999999
+    uv[0, 1] = 1 / 3 + seed % 400 / 7, 46.999999999999  # in the picture, however fast points are accepted
     stated = np.where(np.isnan(uv), NAN, rng.uniform(0.01, 1, uv.shape)) if sd else np.full(uv.shape, NAN)
     stated[0, 1, 0] = NAN
     points = np.array([name] if n == 1 else [f"{name} corner, {i}" for i in range(n)])
