@@ -141,7 +141,7 @@ def _acquire(
         bool, typer.Option("--unattended", help="No page: the simulated rig by itself.", rich_help_panel=_PAGE)
     ] = False,
     host: Annotated[
-        str, typer.Option("--host", help="Another than localhost asks for a token.", rich_help_panel=_PAGE)
+        str, typer.Option("--host", help="Another than localhost: others can reach it.", rich_help_panel=_PAGE)
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free.", rich_help_panel=_PAGE)] = 8090,
     token: Annotated[str | None, typer.Option("--token", help="What the page asks for.", rich_help_panel=_PAGE)] = None,

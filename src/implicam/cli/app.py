@@ -93,6 +93,14 @@ Pictures = Annotated[
 Pattern = Annotated[
     str | None, typer.Option(metavar="PATTERN", help='How their names tell camera and shot: "{shot}_{camera}".')
 ]
+_PAGE = "The page"
+Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free.", rich_help_panel=_PAGE)]
+Token = Annotated[
+    str | None, typer.Option("--token", help="What the page asks for (default: a new one).", rich_help_panel=_PAGE)
+]
+Browser = Annotated[
+    bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.", rich_help_panel=_PAGE)
+]
 LeaveOut = Annotated[
     str | None, typer.Option("--leave-out", metavar="shot", help="Hold each shot (a board, a plane) out in turn.")
 ]

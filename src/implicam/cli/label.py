@@ -9,11 +9,9 @@ from typing import Annotated
 import typer
 
 from implicam.cli import show
-from implicam.cli.app import Json, Pattern, Pictures, command
+from implicam.cli.app import Browser, Json, Pattern, Pictures, Port, Token, command
 from implicam.detect.labelling import Labelling
 from implicam.detect.labels import LABELS_FILE, MIN_LABELS
-
-_PAGE = "The page"
 
 
 @command("label")
@@ -27,13 +25,9 @@ def label_command(
     ] = None,
     pictures: Pictures = None,
     pattern: Pattern = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free.", rich_help_panel=_PAGE)] = 8091,
-    token: Annotated[
-        str | None, typer.Option("--token", help="What the page asks for (default: a new one).", rich_help_panel=_PAGE)
-    ] = None,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.", rich_help_panel=_PAGE)
-    ] = True,
+    port: Port = 8091,
+    token: Token = None,
+    browser: Browser = True,
     json: Json = False,
 ) -> None:
     """Click six dots of a known target in each camera's picture; detect --target dots finds the others.

@@ -13,7 +13,7 @@ import typer
 
 from implicam.calibrators import Calibration, load_calibration
 from implicam.cli import show
-from implicam.cli.app import Json, Pattern, command, read_to_measure
+from implicam.cli.app import Browser, Json, Pattern, Port, Token, command, read_to_measure
 from implicam.cli.options import with_table_options
 from implicam.dataset import Dataset, TableOptions
 from implicam.dataset.table_options import DOCUMENTED
@@ -26,8 +26,6 @@ LOOK_SECONDS = 0.25
 """Between two looks at a file that grows."""
 SETTLED_SECONDS = 1.0
 """A file that has not grown for so long is complete: until then its last point may still get views."""
-
-_PAGE = "The page"
 
 
 @command("view")
@@ -42,13 +40,9 @@ def view_command(
         Path | None, typer.Option("--pictures", metavar="FOLDER", help="Of the cameras (default DATASET/images).")
     ] = None,
     pattern: Pattern = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any free.", rich_help_panel=_PAGE)] = 8092,
-    token: Annotated[
-        str | None, typer.Option("--token", help="What the page asks for (default: a new one).", rich_help_panel=_PAGE)
-    ] = None,
-    browser: Annotated[
-        bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.", rich_help_panel=_PAGE)
-    ] = True,
+    port: Port = 8092,
+    token: Token = None,
+    browser: Browser = True,
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:

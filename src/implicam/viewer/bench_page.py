@@ -31,7 +31,7 @@ from implicam.viewer import words
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, list_cameras, up_of
 from implicam.viewer.snapshot import curve, finite_or_none, snapshot
 from implicam.viewer.space import Placing, edges
-from implicam.viewer.web import answer, behind_door, jpeg
+from implicam.viewer.web import SCENE_FILES, answer, behind_door, jpeg
 from implicam.viewer.worker import Worker
 
 if TYPE_CHECKING:
@@ -44,10 +44,7 @@ FILES = {
     "/page.css": "page.css",
     "/acquire.css": "acquire.css",
     "/acquire.js": "acquire.js",
-    "/scene3d.js": "scene3d.js",
-    "/three.module.min.js": "three/three.module.min.js",
-    "/three.core.min.js": "three/three.core.min.js",
-    "/OrbitControls.js": "three/OrbitControls.js",
+    **SCENE_FILES,
 }
 
 REASONS = ("the place cannot be reached", "something is in the way", "the cameras cannot see it", "another reason")
@@ -313,7 +310,6 @@ class BenchPage:
             "moves": self._moves,
             "auto": controller.equipment.robot.alone and not controller.equipment.dry_run,
             "asks": self._asks,
-            "dry_run": controller.equipment.dry_run,
             "reasons": REASONS,
             "cameras": [
                 {"name": camera.name, "width": camera.width, "height": camera.height}
@@ -329,14 +325,12 @@ class BenchPage:
         cameras = list_cameras(state.calibration)
         known = state.data
         return {
-            "number": self._scene,
             "placing": Placing.of(low, high, up_of(cameras)).table,
             "box": [low.tolist(), high.tolist()],
             "edges": edges(space).tolist(),
             "cameras": cameras,
             "grid": [ROWS, COLUMNS],
             "known": [] if known is None else known.xyz.tolist(),
-            "names": [] if known is None else [str(name) for name in known.points],
             "skipped": [one.xyz.tolist() for one in controller.session.skipped],
             "judged": controller.loop.judged_at.tolist() if predicted is not None else [],
             "u95": [] if predicted is None else json_safe(predicted.u95.tolist()),
@@ -412,7 +406,7 @@ class BenchPage:
                     yield f"data: {json.dumps(now)}\n\n"
                 elif time.monotonic() - beat > 2:
                     beat = time.monotonic()
-                    yield ": still here\n\n"  # so that a page notices when it is not
+                    yield "event: beat\ndata:1\n\n"  # so that a page notices when it comes no more
                 await asyncio.sleep(LOOK_SECONDS)
             yield "event: closed\ndata: {}\n\n"
         finally:
@@ -467,10 +461,10 @@ def open_page(
     """
     page, folder = BenchPage(controller), controller.session.folder
     own = {"/report.html": folder / REPORT_FILE, "/calibration.implicam": folder / CALIBRATION_FILE}
-    stake = "it can move the robot"
     with behind_door(
-        page.application, FILES, own, host=host, port=port, token=token, command="implicam acquire", stake=stake
-    ) as url:
+        page.application, FILES, own, host=host, port=port, token=token,
+        command="implicam acquire", extra="viewer", stake="it can move the robot",
+    ) as url:  # fmt: skip
         try:
             page.start()
             yield url, page

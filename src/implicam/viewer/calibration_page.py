@@ -24,7 +24,7 @@ from implicam.images import read_picture
 from implicam.measurement import Measurement, notes_outside
 from implicam.report.instrument import Instrument
 from implicam.viewer.calibration_scene import measured_points, scene, uncertainty_map
-from implicam.viewer.web import answer, behind_door, jpeg
+from implicam.viewer.web import SCENE_FILES, answer, behind_door, jpeg
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -35,10 +35,7 @@ FILES = {
     "/page.css": "page.css",
     "/view.css": "view.css",
     "/view.js": "view.js",
-    "/scene3d.js": "scene3d.js",
-    "/three.module.min.js": "three/three.module.min.js",
-    "/three.core.min.js": "three/three.core.min.js",
-    "/OrbitControls.js": "three/OrbitControls.js",
+    **SCENE_FILES,
 }
 
 MAX_POINTS = 200_000
@@ -190,7 +187,9 @@ def open_page(
     """
     page = CalibrationPage(calibration, pictures)
     stake = "it shows your rig and can end the program"
-    with behind_door(page.application, FILES, port=port, token=token, command="implicam view", stake=stake) as url:
+    with behind_door(
+        page.application, FILES, port=port, token=token, command="implicam view", extra="view", stake=stake
+    ) as url:
         try:
             yield url, page
         finally:

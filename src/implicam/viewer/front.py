@@ -1,11 +1,11 @@
 """The front door of the pages of `acquire` and `label`: who may talk to them, and so to a robot.
 
-The page itself (viser, Starlette) listens on 127.0.0.1 on a port that nobody is told. This small server listens where
+The page itself (Starlette) listens on 127.0.0.1 on a port that nobody is told. This small server listens where
 people look for it, checks each request and passes it on. What it keeps out, and by what:
 
 - a web page elsewhere that opens a WebSocket to this machine: the Origin must be the Host it came to;
 - a name that an attacker's DNS points to this machine (rebinding): only known Hosts are answered;
-- a web page elsewhere that shows ours in a frame, or sends viser's client to another server by its `?websocket=`: the
+- a web page elsewhere that shows ours in a frame, or talks it into connecting to another server: the
   Content-Security-Policy put on every answer;
 - people on the network: a token where the server is not bound to this machine alone, kept in a cookie that scripts
   and other sites cannot use;

@@ -164,7 +164,13 @@ def open_page(
     """
     page = LabelPage(labelling, then)
     with behind_door(
-        page.application, FILES, port=port, token=token, command="implicam label", stake="it can change your labels"
+        page.application,
+        FILES,
+        port=port,
+        token=token,
+        command="implicam label",
+        extra="label",
+        stake="it can change your labels",
     ) as url:
         yield url, page
 

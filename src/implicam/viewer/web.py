@@ -28,6 +28,14 @@ if TYPE_CHECKING:
 
 JPEG_QUALITY = 92
 
+SCENE_FILES = {
+    "/scene3d.js": "scene3d.js",
+    "/three.module.min.js": "three/three.module.min.js",
+    "/three.core.min.js": "three/three.core.min.js",
+    "/OrbitControls.js": "three/OrbitControls.js",
+}
+"""What pages with a scene in three dimensions need besides their own files."""
+
 Endpoint = Callable[["Request"], Awaitable["Response"]]
 
 
@@ -95,6 +103,7 @@ def behind_door(
     port: int,
     token: str | None,
     command: str,
+    extra: str,
     stake: str,
 ) -> Iterator[str]:
     """Serve an application on this machine while the block runs.
@@ -106,7 +115,8 @@ def behind_door(
         host: What to listen on.
         port: Where people find it; 0 for any free one.
         token: What opens it; None for a new one.
-        command: What printed the address, as `implicam label`; its last word is the extra that brings the server.
+        command: What printed the address, as `implicam label`.
+        extra: What brings the server where it is not installed.
         stake: What a stranger could do, in words.
 
     Yields:
@@ -116,7 +126,6 @@ def behind_door(
         MissingExtraError: The web server is not installed.
         ImplicamError: The port is taken, or the host is not this machine.
     """
-    extra = {"acquire": "viewer"}.get(command.split()[-1], command.split()[-1])
     uvicorn = import_extra("uvicorn", extra, f"the page of {command}")
     import_extra("starlette", extra, f"the page of {command}")
     origin = f"http://{secrets.token_hex(16)}.invalid"

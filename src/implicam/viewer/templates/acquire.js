@@ -76,7 +76,7 @@ function dialog(title, text, buttons, pictures = []) {
 }
 
 const question = (asked, go) => dialog(asked.title, asked.text, [
-  [asked.yes, () => go({yes: asked.number, confirmed: true}), "next"], [asked.no ?? "Do not", null]]);
+  [asked.yes, () => go({yes: asked.number}), "next"], [asked.no ?? "Do not", null]]);
 
 function skip() {
   dialog("Skip this target: why?", "It is not proposed again.",
@@ -220,8 +220,7 @@ function drawTiles() {
     says.textContent = one.says;
     reason.textContent = one.reason ?? "";
     reason.hidden = !one.reason;
-    image.hidden = svg.style.display = one.shown ? "" : "none";
-    image.style.display = one.shown ? "" : "none";
+    image.style.display = svg.style.display = one.shown ? "" : "none";
     if (!one.shown) return;
     const size = `${one.width}x${one.height}`;
     if (tile.dataset.size !== size) { tile.dataset.size = size; layOut(); }
@@ -468,6 +467,10 @@ function listen() {
     state = JSON.parse(event.data);
     draw();
   };
+  source.addEventListener("beat", () => {
+    heard = Date.now();
+    if (document.body.dataset.lost && state) { delete document.body.dataset.lost; draw(); }
+  });
   source.onopen = () => { heard = Date.now(); };
   source.addEventListener("closed", () => {
     closed = true;
@@ -476,13 +479,15 @@ function listen() {
     by("detail").textContent = `Everything is in ${about.folder}. This page can be closed.`;
     for (const button of document.querySelectorAll("button")) button.disabled = true;
   });
-  source.onerror = () => {
+  const lost = () => {
     if (closed || document.body.dataset.lost) return;
     document.body.dataset.lost = "yes";
     by("banner").dataset.kind = "bad";
     by("title").textContent = "The connection is lost";
     by("detail").textContent = "Is implicam acquire still running? What was accepted is on disk. This page goes on by itself.";
   };
+  source.onerror = lost;
+  setInterval(() => { if (Date.now() - heard > LOST_MS) lost(); }, 1000);  // a cable, or a phone out of reach
 }
 
 async function begin() {
