@@ -167,6 +167,64 @@ def test_words_for_workspaces(tmp_path: Path) -> None:
         Workspace.hull(np.column_stack([RNG.normal(size=(9, 2)), np.zeros(9)]))
 
 
+def test_the_places_of_a_block_are_lists_and_steps() -> None:
+    block = workspace_from("x=0,50,100 z=-10,7.5 y=0:80:20", None)
+    assert block.places is not None
+    assert [np.unique(block.places[:, axis]).tolist() for axis in range(3)] == [
+        [0, 50, 100],
+        [0, 20, 40, 60, 80],
+        [-10, 7.5],
+    ]
+    assert len(block.places) == 30
+    steps = workspace_from("x=0:0.3:0.1 y=3:0:-1 z=0,1", None).places
+    assert steps is not None
+    assert np.unique(steps, axis=0).shape == (32, 3)
+    loop = Loop(ForwardGP(), block)
+    asked = np.array([target.xyz for target in loop.ask(8)])
+    assert all((block.places == xyz).all(axis=1).any() for xyz in asked)
+    fine = workspace_from("x=0.123,50 y=0,80 z=0,40", None)
+    assert fine.places is not None
+    assert np.array_equal(fine.rounded(fine.places[0]), fine.places[0])  # it is where a hole is
+
+
+@pytest.mark.parametrize(
+    "text", ["x=0,1 y=0,1", "x=0,1 y=0,1 z=0", "x=0,1 x=0,1 z=0,1", "x=0:1 y=0,1 z=0,1", "x=0:9:-1 y=0,1 z=0,1",
+             "x=0:1:1e-9 y=0,1 z=0,1", "x=a y=0,1 z=0,1", "x=nan,1 y=0,1 z=0,1", "x=0:999:1 y=0:999:1 z=0,1", "w=3 x=1"]
+)  # fmt: skip
+def test_places_of_a_block_that_cannot_be_read_say_why(text: str) -> None:
+    with pytest.raises(UsageError) as error:
+        workspace_from(text, None)
+    assert error.value.fix
+    assert error.value.why or "places" in error.value.what
+
+
+def test_the_first_places_are_spread_and_near_each_other() -> None:
+    box = Workspace.box([-120, -80, 0], [120, 80, 240])
+    loop = Loop(ForwardGP(), box)
+    way = np.array([target.xyz for target in loop.ask(8)])
+    spread = box.design(8, 0)
+    assert sorted(map(tuple, way)) == sorted(map(tuple, spread))
+    assert np.linalg.norm(way[0] - box.centre) == np.linalg.norm(spread - box.centre, axis=1).min()
+    assert path_length(way[1:], way[0]) < 0.75 * path_length(spread[1:], spread[0])
+
+
+def test_a_ball_that_is_put_beside_its_place_stands_for_it(rig: Rig, room: Workspace) -> None:
+    loop = Loop(ForwardGP(), room)
+    way = np.array([target.xyz for target in loop.ask(8)])
+    beside = way[:3] + RNG.normal(scale=0.01 * room.size, size=(3, 3))
+    loop.data = simulate(rig, replace(random_positions(rig, 3, np.random.default_rng(1)), xyz=beside), seed=1)
+    loop.refuse(way[3] + 1.0, "it is in the way")
+    assert [target.xyz.tolist() for target in loop.ask(4)] == way[4:].tolist()
+
+
+def test_a_place_for_a_person_is_round_and_inside(room: Workspace) -> None:
+    for xyz in room.candidates(40, 1):
+        found = room.rounded(xyz)
+        assert room.inside(found[None])[0]
+        assert np.linalg.norm(found - xyz) <= 0.01 * room.size
+        assert np.array_equal(found, np.round(found)) or np.array_equal(found, xyz)
+
+
 # outlooks
 
 

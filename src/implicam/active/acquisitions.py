@@ -267,13 +267,23 @@ def choose(
             why="the cameras would see none of them",
             fix="give another workspace (--workspace), one that the cameras look at",
         )
-    order = _path(design.candidates.xyz[chosen], here)
+    order = short_path(design.candidates.xyz[chosen], here)
     return Choice([chosen[k] for k in order], [scores[k] for k in order], (design, chosen[-1]))
 
 
-def _path(xyz: Floats, here: Floats | None) -> list[int]:
-    """A short way through all places (k, 3) from `here`: to the nearest, and on; then pieces are turned round while
-    that helps (2-opt)."""
+def short_path(xyz: Floats, here: Floats | None) -> list[int]:
+    """A short way through all places: to the nearest, and on; then pieces are turned round while that helps (2-opt).
+
+    Args:
+        xyz: (k, 3) places.
+        here: (3,) where the path begins; None for the order in which they are.
+
+    Returns:
+        The numbers of the places, in the order in which to visit them.
+
+    >>> short_path(np.array([[3.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.zeros(3))
+    [1, 2, 0]
+    """
     if here is None:
         return list(range(len(xyz)))
     left, order, place = list(range(len(xyz))), [], here

@@ -18,7 +18,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.spatial import cKDTree
 
-from implicam.active.acquisitions import DEFAULT_ACQUISITION, Acquisition, Choice, acquisition_from_name, choose
+from implicam.active.acquisitions import (
+    DEFAULT_ACQUISITION,
+    Acquisition,
+    Choice,
+    acquisition_from_name,
+    choose,
+    short_path,
+)
 from implicam.active.design_model import (
     ForwardDesignModel,
     InverseDesignModel,
@@ -131,7 +138,7 @@ class Loop:
         workspace: Where targets can be, and where the calibration has to be good.
         acquisition: What scores the candidates.
         rule: When to stop.
-        start: The number of evenly spread points before the first fit.
+        start: The number of evenly spread points before the first fit, on a short way from the middle.
         candidates: How many places are scored for the next target.
         judged: How many places the calibration is judged at.
         reach: The distance that costs as much time as one measurement.
@@ -297,25 +304,41 @@ class Loop:
         return self.calibrator.fit(data, progress)
 
     def _starting_targets(self, number: int, here: Floats | None) -> list[Target]:
-        """Places to begin with: the evenly spread ones that are farthest from what is known and what was refused."""
+        """Places to begin with: the evenly spread ones along a short way from the middle; when they are used up, those
+        that are farthest from what is known and what was refused."""
         used = [*(self.data.xyz if self.data is not None else ()), *(xyz for xyz, _ in self._refused)]
-        pool = self.pool.xyz if self.pool is not None else self.workspace.design(self.start, self.seed)
-        if self.pool is None and len(used) + number > len(pool):
-            pool = self.workspace.candidates(self.candidates, self.seed)
+        if self.pool is None and len(used) + number <= self.start:
+            places = self._left_of_way(used)[:number]
+        else:
+            places = self._farthest(used, number)
+        nowhere = np.full((self._cameras, 2), np.nan)
+        return [Target(self._name(place, k), place, nowhere) for k, place in enumerate(places)]
+
+    def _left_of_way(self, used: Sequence[Floats]) -> list[Floats]:
+        """The places to begin with that are left, each next to the one before. A target is measured near its place, so
+        each point that was used stands for the nearest of them."""
+        spread, middle = self.workspace.design(self.start, self.seed), self.workspace.centre
+        first = spread[np.argmin(np.linalg.norm(spread - middle, axis=1))]
+        left = list(spread[short_path(spread, first)])
+        for place in used:
+            left.pop(int(np.argmin(np.linalg.norm(np.array(left) - place, axis=1))))
+        return left
+
+    def _farthest(self, used: list[Floats], number: int) -> list[Floats]:
+        """Places that are as far from what was used, and from each other, as can be."""
+        pool = self.pool.xyz if self.pool is not None else self.workspace.candidates(self.candidates, self.seed)
         if self.pool is None and self.workspace.places is not None:
             pool = self._not_visited(pool)
-        targets: list[Target] = []
-        nowhere = np.full((self._cameras, 2), np.nan)
-        for k in range(number):
+        places: list[Floats] = []
+        for _ in range(number):
             free = pool[[not any(np.array_equal(xyz, place) for place in used) for xyz in pool]]
             if not len(free):
                 break
-            first = free[0] if not used else free[np.argmax(_distance(free, np.array(used)))]
-            targets.append(Target(self._name(first, k), first, nowhere))
-            used.append(first)
-        if not targets:
+            places.append(free[0] if not used else free[np.argmax(_distance(free, np.array(used)))])
+            used.append(places[-1])
+        if not places:
             raise UsageError("no place of the workspace is left.", fix="give a larger one (--workspace)")
-        return targets
+        return places
 
     @property
     def _cameras(self) -> int:

@@ -29,6 +29,12 @@ START_DISTANCE_RATIO = 0.9
 VIEW_GROWTH, PLACES_IN_VIEW = 2.0, 8192
 """What the cameras see is looked for in the box of the known points made so many times as large, at so many places."""
 
+MAX_PLACES = 100_000
+"""Of a block."""
+
+ROUND_PLACE_RATIO = 1 / 100
+"""Part of the size that a place may be rounded to for a person."""
+
 RELATIVE_TOLERANCE = 1e-9
 """Part of the size by which a point may be outside and still counts as inside."""
 
@@ -231,6 +237,22 @@ class Workspace:
             distance = np.minimum(distance, np.linalg.norm(pool - pool[chosen[-1]], axis=1))
         return pool[chosen]
 
+    def rounded(self, xyz: Floats) -> Floats:
+        """A place as somebody with a ruler wants it: with no more digits than a hundredth of the workspace needs.
+
+        Args:
+            xyz: (3,) a place in the world.
+
+        Returns:
+            (3,) the round place; the place itself where that is outside, or where only some places can be reached.
+
+        >>> Workspace.box([0, 0, 0], [300, 200, 100]).rounded(np.array([12.345, 67.89, 50.5])).tolist()
+        [12.0, 68.0, 50.0]
+        """
+        step = 10.0 ** np.floor(np.log10(ROUND_PLACE_RATIO * self.size))
+        found = np.round(np.round(xyz / step) * step, 12)
+        return found if self.places is None and self.inside(found[None])[0] else xyz
+
     def _pull_in(self, xyz: Floats, part: float) -> Floats:
         """Points moved towards the centre, to `part` of the distance: a billionth less keeps rounding inside."""
         return np.asarray(self.centre + part * (xyz - self.centre), dtype=np.float64)
@@ -270,7 +292,8 @@ def workspace_from(text: str, xyz: Floats | None) -> Workspace:
     """The workspace that an argument of the command line stands for.
 
     Args:
-        text: `x0:x1,y0:y1,z0:z1`, a CSV file of places (x,y,z), or `box` or `hull` of the known points.
+        text: `x0:x1,y0:y1,z0:z1`, a CSV file of places (x,y,z), the holes or slots of a block
+            (`x=0,50,100 y=0:80:20 z=0,40`), or `box` or `hull` of the known points.
         xyz: (n, 3) the known points; None where there are none.
 
     Raises:
@@ -284,16 +307,56 @@ def workspace_from(text: str, xyz: Floats | None) -> Workspace:
         return Workspace.hull(xyz) if text == "hull" else Workspace.box(xyz.min(axis=0), xyz.max(axis=0))
     if text.lower().endswith(".csv"):
         return Workspace.only(read_places(Path(text)))
+    if "=" in text:
+        return Workspace.only(_lattice(text))
     try:
         ends = [[float(end) for end in axis.split(":")] for axis in text.split(",")]
         low, high = np.array(ends, dtype=np.float64).reshape(3, 2).T
     except ValueError as error:
         raise UsageError(
             f"the workspace {text!r} cannot be read.",
-            why="it is x0:x1,y0:y1,z0:z1 in the dataset's unit, a CSV file with x,y,z, or box or hull",
+            why="it is x0:x1,y0:y1,z0:z1 in the dataset's unit, a CSV file with x,y,z, the holes of a block "
+            "(x=0,50,100 y=0:80:20 z=0,40), or box or hull",
             fix="for example --workspace=-120:120,-80:80,0:240",
         ) from error
     return Workspace.box(low, high)
+
+
+def _lattice(text: str) -> Floats:
+    """(n, 3) all places of "x=0,50,100 y=0:80:20 z=0,40": x, y and z each in a list, or from:to:step."""
+    axes: dict[str, list[float]] = {}
+    try:
+        for word in text.split():
+            axis, _, values = word.partition("=")
+            if axis not in ("x", "y", "z") or axis in axes:
+                raise ValueError(f"{word!r} is no x=..., y=... or z=..., once each")
+            axes[axis] = [value for part in values.split(",") for value in _steps(part)]
+        if len(axes) != 3:
+            raise ValueError(f"{' and '.join(axis for axis in 'xyz' if axis not in axes)} is not there")
+    except ValueError as error:
+        raise UsageError(
+            f"the places {text!r} cannot be read.",
+            why=str(error),
+            fix='for example --workspace "x=0,50,100 y=0:80:20 z=0,40": lists, or from:to:step',
+        ) from error
+    count = np.prod([len(values) for values in axes.values()])
+    if count > MAX_PLACES:
+        raise UsageError(f"{text!r} are {count} places.", fix=f"give at most {MAX_PLACES}, or a box: x0:x1,y0:y1,z0:z1")
+    return np.array(list(product(axes["x"], axes["y"], axes["z"])))
+
+
+def _steps(part: str) -> list[float]:
+    """The numbers of "50", or of "0:80:20", both ends among them."""
+    numbers = [float(number) for number in part.split(":")]
+    if not np.isfinite(numbers).all() or len(numbers) not in (1, 3):
+        raise ValueError(f"{part!r} is neither a number nor from:to:step")
+    if len(numbers) == 1:
+        return numbers
+    start, end, step = numbers
+    steps = (end - start) / step if step else np.inf
+    if not -RELATIVE_TOLERANCE <= steps <= MAX_PLACES:
+        raise ValueError(f"{part!r} has no end")
+    return [start + k * step for k in range(int(steps + 1e-6) + 1)]
 
 
 def read_places(path: Path) -> Floats:

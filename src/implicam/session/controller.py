@@ -307,12 +307,16 @@ class SessionController:
 
     def _aim_at(self, xyz: Floats) -> None:
         """The next target, as a person wants it."""
+        self._show(target=self._target_at(xyz))
+
+    def _target_at(self, xyz: Floats) -> Target:
+        """A target anywhere, with its pixels where a calibration predicts them."""
         uv = np.full((len(self.equipment.cameras), 2), np.nan)
         calibration = self.loop.calibration
         if isinstance(calibration, PredictsPixels):
             predicted = calibration.predict(xyz[None])
             uv = np.where(are_on_image(calibration.trained, predicted)[..., None], predicted, np.nan)[0]
-        self._show(target=Target(self.session.next_name(), xyz, uv))
+        return Target(self.session.next_name(), xyz, uv)
 
     def retry(self) -> None:
         """After trouble: connect again, and go on."""
@@ -597,6 +601,8 @@ class SessionController:
         if len(target.uv) == 0:
             target = replace(target, uv=np.full((len(self.equipment.cameras), 2), np.nan))
         moves = self.equipment.robot.moves
+        if not moves:
+            target = self._target_at(self.loop.workspace.rounded(target.xyz))
         words = f"{before}point {self.loop.points + 1}: " + (
             "let the robot go there" if moves else "put the ball there, and type where it is"
         )

@@ -120,7 +120,7 @@ class Setup:
     radius: Annotated[float | None, _real("Of the ball, to correct its outline", "LENGTH")] = None
     bright: Annotated[bool, _real("The ball is lighter than what is behind", flags="--bright/--dark")] = False
     unit: Annotated[str, _real("Of lengths", "UNIT")] = "mm"
-    workspace: Annotated[str, _plan("x0:x1,y0:y1,z0:z1 or a CSV of places: where the ball can be", "WHERE")] = ""
+    workspace: Annotated[str, _plan('x0:x1,y0:y1,z0:z1, a CSV of places, or "x=0,50 y=0:80:20 z=0,40"', "WHERE")] = ""
     below: Annotated[float | None, _plan("Stop at this 95 % uncertainty, everywhere", "LENGTH")] = None
     within: Annotated[float, _plan("Or at so many times what pixel noise leaves", "TIMES")] = 1.2
     converged: Annotated[float | None, _plan("Or when five points changed it by less than so many %", "PERCENT")] = None
