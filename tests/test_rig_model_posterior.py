@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal
 from forward_gp_cases import IMAGE, LENGTHSCALE, covariance_of, design, numeric, se
 from implicam.geometry import look_at
 from implicam.lenses import PERSPECTIVE_K, KannalaBrandt
+from implicam.rig_model import linearise
 from implicam.rig_model.camera import CentralCamera, Prior
 from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.field import empty_field
@@ -390,3 +391,32 @@ def test_leaving_a_view_out_in_closed_form_is_leaving_it_out() -> None:
         np.testing.assert_allclose(unused[i], predicted, atol=1e-9)
         np.testing.assert_allclose(unused[i], residual[i], atol=0.05 * np.sqrt(expected[0, 0]))
         np.testing.assert_allclose(its_spread[i], expected, rtol=0.05, atol=0.05 * expected[0, 0])
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_the_steps_to_the_posterior_do_not_wait_for_a_part_of_the_views(
+    monkeypatch: pytest.MonkeyPatch, *, tied: bool
+) -> None:
+    """Some views ask for another camera than all of them: that is no reason to go halves for ever."""
+    models, points, camera_views = two_cameras(proper=False)
+    errors = None
+    if tied:
+        basis = np.broadcast_to(np.eye(3), (50, 3, 3))
+        errors = ShotErrors(np.zeros(50, dtype=np.int64), basis, np.full((1, 3), 0.01), np.full(3, -1))
+    steps = []
+
+    def counted(*given: object) -> Posterior:
+        steps.append(given)
+        return condition(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(linearise, "condition", counted)
+    by_all = linearise.iterate_linearisation(models, points, camera_views, errors)
+    needed = len(steps)
+    for part in (10, 20, 30):
+        steps.clear()
+        monkeypatch.setattr(linearise, "MAX_MISFIT_VIEWS", part)
+        by_some = linearise.iterate_linearisation(models, points, camera_views, errors)
+        assert len(steps) <= needed + 2
+        for one, other in zip(by_some.models, by_all.models, strict=True):
+            off = one.predict(points)[0] - other.predict(points)[0]
+            assert np.abs(off).max() < 0.02 * one.noise

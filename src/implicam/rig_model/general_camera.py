@@ -42,7 +42,7 @@ PARAMETERS = (
 1 / distance of the origin; where it is across the axis, as an arc; rotation about it."""
 
 SHAPE, TILT, CENTRE, KAPPA, RHO = slice(1, 3), slice(3, 5), slice(5, 7), slice(7, 11), 11
-_POWERS = np.array([2, 4, 6, 8])
+_POWERS = np.array([2.0, 4.0, 6.0, 8.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,30 +165,34 @@ class GeneralCamera:
         bent, by_there, by_lens = self._lens.pixel_and_slopes(there)
         uv, y, w = self._image(bent)
         sign = np.array([-1.0 if self.mirrored else 1.0, 1.0])
-        B, by_p, by_q = self.pixel_shape
-        by_y = self.focal * B
+        by_y, by_p, by_q = (self.focal * each for each in self.pixel_shape)
+        away = y @ by_y.T
         # y by m: (I - y tilt^T) / w
-        by_m = (by_y @ (np.eye(2) - y[:, :, None] * self.tilt)) / w[:, None, None] * sign
+        by_m = (by_y - away[:, :, None] * self.tilt) * (sign / w[:, None])[:, None]
         slope = by_m @ by_there
         by_k = by_m @ by_lens[:, :, 4:]
         rho = self.rho
         by_across, by_rho = self.translation_slopes()
+        # products with one matrix for all points are one product of all rows, which is many times as fast
+        rest = slope.reshape(-1, 3) @ np.column_stack([by_rho, by_across, self.pose.rotation])
+        rest = rest.reshape(n, 2, 6)
+        by_own_rho = by_k.reshape(-1, 4) @ (_POWERS * (self.k - 0.5 * PERSPECTIVE_K) / rho)
         out = np.empty((n, 2, self.size))
-        away = y @ by_y.T
         out[:, :, 0] = away
-        out[:, :, 1], out[:, :, 2] = self.focal * (y @ by_p.T), self.focal * (y @ by_q.T)
-        out[:, :, 3:5] = -away[:, :, None] * y[:, None, :]
-        out[:, :, 5:7] = np.where(np.isnan(uv[:, :1, None]), np.nan, np.eye(2))
-        out[:, :, KAPPA] = by_k / rho**_POWERS
-        out[:, :, RHO] = -away / rho + slope @ by_rho - by_k @ (_POWERS * (self.k - 0.5 * PERSPECTIVE_K) / rho)
-        out[:, :, 12:14] = slope @ by_across
+        out[:, :, 1], out[:, :, 2] = y @ by_p.T, y @ by_q.T
+        out[:, :, TILT] = -away[:, :, None] * y[:, None, :]
+        out[:, :, CENTRE] = np.eye(2)
+        out[np.isnan(uv[:, 0]), :, CENTRE] = np.nan
+        out[:, :, KAPPA] = by_k * rho**-_POWERS
+        out[:, :, RHO] = rest[:, :, 0] - away / rho - by_own_rho.reshape(n, 2)
+        out[:, :, 12:14] = rest[:, :, 1:3]
         out[:, :, 14:] = cross(turned[:, None, :], slope)  # slope . (omega x turned)
         squared = np.sum(there**2, axis=1)
         return View(
             uv,
             0.5 * np.log(squared),
             out,
-            slope @ self.pose.rotation,
+            np.ascontiguousarray(rest[:, :, 3:]),
             there @ self.pose.rotation / squared[:, None],
         )
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from implicam.geometry import Bools, Floats
 from implicam.rig_model.camera_model import CameraViews, apply_covariance_root
 from implicam.rig_model.fit_result import FitResult
+from implicam.rig_model.normal_equations import slices
 from implicam.rig_model.position_errors import Agreement
 from implicam.rig_model.posterior import Posterior
 from implicam.threads import side_by_side
@@ -90,9 +91,14 @@ def posterior_residuals(posterior: Posterior, c: int, points: Floats, seen: Came
     where = points[seen.rows]
     if posterior.displacement is not None:
         where = where + posterior.displacement[seen.rows]
-    rows = model.rows(where)
-    half = apply_covariance_root(rows, posterior.alone[c])
-    return Residuals(seen.uv - rows.mean, half @ half.swapaxes(1, 2), rows.rest, model.noise * seen.relative)
+    n = len(where)
+    residual, reach, rest = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty(n)
+    for part in slices(n):
+        rows = model.rows(where[part])
+        half = apply_covariance_root(rows, posterior.alone[c])
+        residual[part], rest[part] = seen.uv[part] - rows.mean, rows.rest
+        reach[part] = half @ half.swapaxes(1, 2)
+    return Residuals(residual, reach, rest, model.noise * seen.relative)
 
 
 def left_out_residuals_from(at: Residuals, inliers: Bools) -> tuple[Floats, Floats]:
@@ -196,17 +202,20 @@ def left_out_views(
     Returns:
         Per camera, all of its views.
     """
-    found = []
     where = points if posterior.displacement is None else points + posterior.displacement
-    for c, (one, k) in enumerate(zip(seen, inliers, strict=True)):
-        residual, covariance = left_out_residuals(posterior, c, points, one, k)
-        slope = posterior.models[c].predict(where[one.rows])[1]
-        noise2 = (posterior.models[c].noise * one.relative) ** 2
-        values = np.linalg.eigvalsh(covariance) / noise2[:, None]
+
+    def of_camera(c: int) -> LeftOutViews:
+        model, one = posterior.models[c], seen[c]
+        residual, covariance = left_out_residuals(posterior, c, points, one, inliers[c])
+        slope = np.empty((len(one.rows), 2, 3))
+        for part in slices(len(slope)):
+            slope[part] = model.predict(where[one.rows[part]])[1]
+        values = np.linalg.eigvalsh(covariance) / ((model.noise * one.relative) ** 2)[:, None]
         ratio = np.where((values > 0).all(axis=1), values[:, 1], np.inf)  # negative: rounding, at a leverage of one
         inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-        found.append(LeftOutViews(one.rows, residual, inverse, slope, ratio))
-    return found
+        return LeftOutViews(one.rows, residual, inverse, slope, ratio)
+
+    return side_by_side(of_camera, range(len(seen)))
 
 
 def sum_over_cameras(views: list[LeftOutViews], inliers: tuple[Bools, ...], n: int) -> tuple[Agreement, Floats]:

@@ -24,7 +24,10 @@ MAX_MISFIT_VIEWS = 1000
 """Views that say whether a step is for the better."""
 
 MISFIT_TOLERANCE = 1e-3
-"""By how much a step may worsen minus twice the log posterior: rounding and what is left out of the views."""
+"""By how much a step may worsen minus twice the log posterior: rounding."""
+
+SAMPLING_SDS = 4.0
+"""Some of the views may call a step worse that all of them ask for; by so many sds of what that is by chance."""
 
 
 def iterate_linearisation(
@@ -92,7 +95,7 @@ class _Misfit(NamedTuple):
     """How badly a camera fits, with the field that then fits best: what Gauss-Newton must not increase.
 
     prior; points (n, 3), pixels (n, 2) and sd (n,) of at most MAX_MISFIT_VIEWS views; phi (n, m) the field's features
-    over sd, and the Cholesky factor (m, m) of I + phi^T phi.
+    over sd, and the Cholesky factor (m, m) of I + phi^T phi; left_out, the part of all views that these are not.
     """
 
     prior: Prior
@@ -101,29 +104,44 @@ class _Misfit(NamedTuple):
     sd: Floats
     phi: Floats
     factor: Floats
+    left_out: float
 
     @classmethod
     def of(cls, model: CameraModel, points: Floats, seen: CameraViews) -> _Misfit:
         """Of the camera's present field."""
+        every = len(seen.rows)
         seen = thin_views(seen, MAX_MISFIT_VIEWS)
         where = points[seen.rows]
         sd = model.noise * seen.relative
         phi = model.rows(where).phi / sd[:, None]
         factor = np.asarray(np.linalg.cholesky(np.eye(phi.shape[1]) + phi.T @ phi), dtype=np.float64)
-        return cls(model.prior, where, seen.uv, sd, phi, factor)
+        return cls(model.prior, where, seen.uv, sd, phi, factor, 1 - len(seen.rows) / max(every, 1))
 
     def __call__(self, camera: AnyCamera) -> float:
         """Minus twice the log posterior, up to a constant; infinite where the camera loses a point."""
-        y = (self.uv - camera.pixel(self.points)) / self.sd[:, None]
+        y = self._residuals(camera)
         if not (camera.sane and np.isfinite(y).all()):
             return np.inf
         off = self.prior.mean - camera.parameters
+        return self._squares_beside_field(y) + float(off @ self.prior.precision @ off)
+
+    def worsened_by_chance(self, before: AnyCamera, after: AnyCamera) -> float:
+        """By how much these views may call a step worse that is for the better by all views: their slope where all of
+        them are best is that of a random part, and 2 sqrt(length^2 left_out) its sd along a step of that length."""
+        moved = self._residuals(after) - self._residuals(before)
+        return SAMPLING_SDS * 2 * float(np.sqrt(self.left_out * max(self._squares_beside_field(moved), 0.0)))
+
+    def _residuals(self, camera: AnyCamera) -> Floats:
+        return np.asarray((self.uv - camera.pixel(self.points)) / self.sd[:, None])
+
+    def _squares_beside_field(self, y: Floats) -> float:
+        """What the field that fits best leaves of residuals (n, 2)."""
         field = np.linalg.solve(self.factor, self.phi.T @ y)
-        return float(np.sum(y**2) - np.sum(field**2) + off @ self.prior.precision @ off)
+        return float(np.sum(y**2) - np.sum(field**2))
 
     def weights(self, camera: AnyCamera) -> Floats:
         """(m, 2) of the field that then fits best: those of a whole step do not belong to half of it."""
-        y = (self.uv - camera.pixel(self.points)) / self.sd[:, None]
+        y = self._residuals(camera)
         return np.asarray(np.linalg.solve(self.factor.T, np.linalg.solve(self.factor, self.phi.T @ y)))
 
 
@@ -134,12 +152,20 @@ def _downhill(
     now = np.inf if misfit is None else misfit(before.camera)
     for halvings in range(20):
         camera = after.camera if halvings == 0 else before.camera.moved(step * 0.5**halvings)
-        fits = misfit is None or misfit(camera) <= now + MISFIT_TOLERANCE
-        if fits and camera.sane and np.isfinite(camera.pixel(points)).all():
+        if (
+            (misfit is None or _fits(misfit, before.camera, camera, now))
+            and camera.sane
+            and np.isfinite(camera.pixel(points)).all()
+        ):
             if halvings == 0:
                 return after
             return replace(after, camera=camera, weights=after.weights if misfit is None else misfit.weights(camera))
     return before if misfit is None else replace(before, weights=misfit.weights(before.camera))
+
+
+def _fits(misfit: _Misfit, before: AnyCamera, after: AnyCamera, now: float) -> bool:
+    found, most = misfit(after), now + MISFIT_TOLERANCE
+    return found <= most or (np.isfinite(found) and found <= most + misfit.worsened_by_chance(before, after))
 
 
 def _small(step: Floats, root: Floats) -> bool:
