@@ -484,6 +484,7 @@ def test_predicted_pixels_are_where_the_ball_appears(rig: Rig, known: Dataset, r
         assert np.abs(answer.data.observations.uv[0] - target.uv)[there].max() < 5
 
 
+@pytest.mark.slow
 def test_what_was_promised_is_kept(rig: Rig, room: Workspace) -> None:
     """The expected uncertainty after five points is that of the fit with them, within what a new fit changes."""
     ratios = []

@@ -127,6 +127,7 @@ def test_the_kind_is_told_stored_and_found_again(tmp_path: Path) -> None:
     assert {one["lens"] for one in cameras} == {"kannala-brandt"}
 
 
+@pytest.mark.slow
 def test_a_fit_that_grows_keeps_the_kind() -> None:
     known, new = odd_rig(Unusual(tilt=8.0), points=60)
     first = ForwardGP().fit(known.select(np.arange(50)))

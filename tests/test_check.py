@@ -137,6 +137,7 @@ def test_of_two_cameras_nobody_can_say_which() -> None:
     assert "nobody can say which" in found.sentences()[0]
 
 
+@pytest.mark.slow
 def test_all_cameras_together_are_seen_by_known_points_alone() -> None:
     rig, calibration = rig_and_calibration()
     data = simulate(rig, random_positions(rig, 40, np.random.default_rng(11)), seed=11)
@@ -151,6 +152,7 @@ def test_all_cameras_together_are_seen_by_known_points_alone() -> None:
     assert "moved together looks the same" in unknown.sentences()[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("along", [50.0, 0.0], ids=["a line", "one place"])
 def test_known_points_that_fill_no_volume_show_no_bias_that_is_not_there(along: float) -> None:
     """A turn about their line moves none of them, and where they stand in one place no growth does."""
@@ -226,6 +228,7 @@ def test_of_cameras_that_were_never_exact_none_is_said_to_have_moved(cli: Cli, t
     assert "if it alone moved" not in ran.out
 
 
+@pytest.mark.slow
 def test_what_an_imported_calibration_does_not_know_is_not_said(cli: Cli) -> None:
     rig = build_rig("bar4", seed=1)
     calibration = imported(rig)
@@ -286,6 +289,7 @@ def test_a_model_that_is_moved_sees_what_a_moved_camera_sees(kind: str) -> None:
     np.testing.assert_allclose(apply_covariance_root(after.rows(points), own), wanted.half, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_repaired_calibration_is_right_with_true_error_bars_and_in_a_file(tmp_path: Path) -> None:
     rig, calibration = rig_and_calibration()
     there = knocked(rig, 2)
@@ -328,6 +332,7 @@ def test_what_a_movement_costs_is_what_recalibrations_show(method: ic.ForwardGP 
     assert np.mean(normal) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 18))
 
 
+@pytest.mark.slow
 def test_cameras_that_errors_of_known_positions_tie_are_repaired_too() -> None:
     """Their errors stay tied: a shot that is off takes all cameras with it."""
     rig = build_rig("bar6", seed=2)
@@ -354,6 +359,7 @@ def test_what_cannot_be_repaired_is_refused() -> None:
         ic.check_calibration(calibration, views(knocked(knocked(rig, 3), 1), 9)).repair()
 
 
+@pytest.mark.slow
 def test_a_watch_tells_when_a_camera_moves_and_not_before() -> None:
     rig, calibration = rig_and_calibration()
     watch = ic.CalibrationWatch(calibration, window=40, every=20)
@@ -370,6 +376,7 @@ def test_a_watch_tells_when_a_camera_moves_and_not_before() -> None:
         ic.CalibrationWatch(calibration, window=5, every=10)
 
 
+@pytest.mark.slow
 def test_on_the_command_line_with_a_history(cli: Cli) -> None:
     rig, calibration = rig_and_calibration()
     calibration.save("rig.implicam")

@@ -135,6 +135,7 @@ def example(command: str, folder: Path, run: Callable[[str, Path], Ran] = real) 
     return ran
 
 
+@pytest.mark.slow
 def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path, cli: Cli) -> None:
     for module in ("plotly", "matplotlib"):
         pytest.importorskip(module)
@@ -291,6 +292,7 @@ def test_suggest_says_where_and_what_the_cameras_see(made: Path, cli: Cli) -> No
         assert "fix:" in ran.err
 
 
+@pytest.mark.slow
 def test_acquire_goes_on_and_refuses_what_it_cannot(cli: Cli) -> None:
     words = ["acquire", "session", "--unattended", "--json"]
     first = cli(*words, "--rig", "stereo", "--speed", "1000", "--budget", "8")
@@ -602,6 +604,7 @@ def test_a_missing_extra_is_told_before_the_work_with_its_cure(
     assert {path.name for path in Path.cwd().iterdir()} == {"empty.csv"}
 
 
+@pytest.mark.slow
 def test_compare_without_gpytorch_says_what_it_left_out(made: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpytorch", None)
     ran = cli("compare", made / "rig", "--train", "20", "--seeds", "1")

@@ -175,6 +175,7 @@ def test_what_is_wrong_is_said_with_its_cure(words: str, code: int, says: str, p
     assert not (photos.parent / "out").exists()
 
 
+@pytest.mark.slow
 def test_photographs_without_a_board_say_so(photos: Path, cli: Cli) -> None:
     before = (photos / "observations.csv").read_bytes()
     for picture in (photos / "images").rglob("*.png"):
@@ -187,6 +188,7 @@ def test_photographs_without_a_board_say_so(photos: Path, cli: Cli) -> None:
     assert (photos / "observations.csv").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_board_from_photograph_to_numbered_corners(tmp_path: Path, cli: Cli) -> None:
     folder = tmp_path / "board"
     code, _, err = cli(*f"simulate {folder} --images --target board --boards 2 --cameras 2R --seed 2".split())

@@ -110,6 +110,7 @@ def test_the_default_method_is_forward_gp(made: Path, cli: Cli) -> None:
     assert "inverse-gp from 40" in cli("calibrate", made / "rig", "-o", "x.implicam", "--kernel", "matern-5/2").out
 
 
+@pytest.mark.slow
 def test_the_lens_is_an_option_of_forward_gp(made: Path, cli: Cli) -> None:
     ran = cli("calibrate", made / "rig", "-o", "none.implicam", "--lens", "none")
     assert ran.code == 0
@@ -357,6 +358,7 @@ def test_cameras_and_without(cli: Cli) -> None:
     assert of_file["rows"] == of_data["rows"]
 
 
+@pytest.mark.slow
 def test_points_kept_back_are_there_to_evaluate(made: Path, cli: Cli) -> None:
     assert cli("calibrate", made / "rig", "-o", "x.implicam", "--points", "25").code == 0
     ran = cli("evaluate", "x.implicam", made / "rig")
@@ -369,6 +371,7 @@ def test_points_kept_back_are_there_to_evaluate(made: Path, cli: Cli) -> None:
     assert cli("calibrate", made / "rig", "-o", "all.implicam", "--points", "40").code == 0
 
 
+@pytest.mark.slow
 def test_evaluate_in_turn_by_file_or_by_dataset(made: Path, cli: Cli) -> None:
     by_file = cli("evaluate", made / "rig.implicam", "--cv", "4", "--json").json
     by_data = cli("evaluate", made / "rig", "--cv", "4", "--json").json
@@ -417,6 +420,7 @@ def test_info_shows_the_readable_part(made: Path, cli: Cli) -> None:
     assert cli("info", damaged).code == 1
 
 
+@pytest.mark.slow
 def test_report_of_a_calibration_alone_and_with_points(made: Path, cli: Cli) -> None:
     pytest.importorskip("plotly")
     ran = cli("report", made / "rig.implicam")

@@ -688,6 +688,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     return compared
 
 
+@pytest.mark.slow
 def test_shots_from_the_command_line(run: Callable[..., Ran], tmp_path: Path) -> None:
     ran = run("board", "--leave-out", "shot", "--methods", "forward-gp,inverse-gp", "-o", "shots.png", "--json")
     assert (ran.code, ran.err) == (0, "")
@@ -703,6 +704,7 @@ def test_shots_from_the_command_line(run: Callable[..., Ran], tmp_path: Path) ->
     assert [(row["known"], row["seeds"]) for row in some["rows"]] == [(20, 2), (30, 2)]
 
 
+@pytest.mark.slow
 def test_a_lattice_from_the_command_line(run: Callable[..., Ran]) -> None:
     words = ("lattice", "--lattice", "--methods", "inverse-gp", "--seeds", "2")
     told = json.loads(run(*words, "--json").out)

@@ -136,6 +136,7 @@ def test_spheres() -> None:
     assert kstest(p, "uniform").pvalue > 1e-4
 
 
+@pytest.mark.slow
 def test_cylinders() -> None:
     drawn = Drawn(on_cylinder(np.random.default_rng(8), 16), 9)
     axis = Rotation.from_rotvec([0.9, 0.4, 0.0]).as_matrix()[:, 2]

@@ -77,6 +77,7 @@ def test_the_centre_of_a_drawn_ellipse_is_exact(long, short, angle):
     assert edge.ellipse.axes == (pytest.approx(long, abs=0.05), pytest.approx(short, abs=0.05))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "radius", "blur", "nees_of"),
     # With much noise the light's own freedom is not used up, and the fit is a little better than it says.

@@ -47,6 +47,7 @@ def through_the_lenses(studio, shots, covered=0.0):
     return np.concatenate(off), np.concatenate(nees), seen, found, refused
 
 
+@pytest.mark.slow
 def test_all_corners_through_all_lenses_near_and_far_with_right_error_bars(studio):
     off, nees, seen, found, refused = through_the_lenses(studio, (0, 19))
     assert refused == 0
@@ -57,6 +58,7 @@ def test_all_corners_through_all_lenses_near_and_far_with_right_error_bars(studi
     assert 1.7 < nees.mean() < 2.3
 
 
+@pytest.mark.slow
 def test_what_covers_a_board_never_makes_a_number_wrong():
     rig = build_rig("bar6", seed=7)
     studio = Studio(rig, moving_board(rig), Optics(noise=0.02), seed=9, covered=1.0)

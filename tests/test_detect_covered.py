@@ -132,6 +132,7 @@ def test_refined_corners_are_nearer_and_keep_their_error_bars():
     assert rms[1] < 0.7 * rms[0]
 
 
+@pytest.mark.slow
 def test_what_is_in_front_of_a_board_never_makes_a_number_wrong():
     """Bars of any direction and grey, some of them white and along the squares, which look like a margin."""
     numbered = 0

@@ -300,6 +300,7 @@ def test_bad_cells_are_reported_and_the_others_go_on(tmp_path: Path) -> None:
     assert times(journal) - before == {"5.0": 1}
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path: Path) -> None:
     journal, folder = tmp_path / "journal", tmp_path / "out"
     cells = squares(9, journal, seconds=0.1)

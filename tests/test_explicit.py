@@ -149,6 +149,7 @@ def test_pictures_of_other_instants_name_the_camera() -> None:
     assert "same instants" in caught.value.fix
 
 
+@pytest.mark.slow
 def test_corners_that_are_wrong_are_listed() -> None:
     rig, _ = pair()
     data = simulate_boards(rig, each_and_pairs(rig, 8, 4), seed=3, outliers=0.03, missing=0.1)
@@ -183,6 +184,7 @@ def from_boards_alone() -> ExplicitCalibration:
     return Explicit().fit(fisheyes()[1])
 
 
+@pytest.mark.slow
 def test_errors_that_neighbouring_points_share_do_not_turn_the_rig() -> None:
     """As a lens does that no model holds. Weights would give the exact points, which are near, the say."""
     known = points(pair()[0], 60, 5)
@@ -216,6 +218,7 @@ def test_from_boards_it_measures_close_to_the_limit_with_true_error_bars() -> No
     assert 0.90 < overall.level(0.95).ellipsoid.value < 0.99
 
 
+@pytest.mark.slow
 def test_icp_is_the_closed_form_where_the_names_are_right() -> None:
     rig, _ = pair()
     a, b = from_boards(), on_boards("icp").fit(points(rig, 30, 5))
@@ -272,6 +275,7 @@ def test_cameras_that_hardly_meet_have_error_bars_that_say_so() -> None:
     assert 1.8 < np.mean(distances) < 4.5  # 3
 
 
+@pytest.mark.slow
 def test_a_wrong_square_is_told_with_its_size() -> None:
     rig, data = pair()
     known = points(rig, 40, 5)
@@ -289,6 +293,7 @@ def test_a_wrong_square_is_told_with_its_size() -> None:
     assert float(caught.value.why.split("known points are ")[1].split(" times")[0]) == pytest.approx(0.1, rel=0.01)
 
 
+@pytest.mark.slow
 def test_boards_may_be_in_another_unit() -> None:
     rig, data = pair()
     target = data.extra["target"]
@@ -317,6 +322,7 @@ def test_corners_of_a_board_share_its_declared_error() -> None:
     assert 1.0 < np.mean(distances) < 7.0  # 3; 16 when each corner counted as a point of its own
 
 
+@pytest.mark.slow
 def test_boards_alone_hold_nothing_out() -> None:
     calibration = from_boards_alone()
     assert calibration.residuals["held_out"] == "the corners of the boards are measured"
@@ -326,6 +332,7 @@ def test_boards_alone_hold_nothing_out() -> None:
         Explicit(align="icp").fit(points(fisheyes()[0], 30, 1))
 
 
+@pytest.mark.slow
 def test_small_boards_end_in_the_pose_that_all_cameras_see() -> None:
     """A small board: one camera cannot tell a tilt from its mirror image; two can."""
     for seed in range(3):
@@ -431,6 +438,7 @@ def test_from_points_it_reaches_the_limit(count: int, ratio: float) -> None:
     assert 0.91 < overall.level(0.95).ellipsoid.value < 0.98
 
 
+@pytest.mark.slow
 def test_declared_errors_of_the_known_points_are_used() -> None:
     rig = build_rig("bar6", seed=3, lens_error=0.0, cameras="2R")
     known = points(rig, 60, 5, robot_noise=0.5)
@@ -499,6 +507,7 @@ def test_a_calibration_from_boards_is_saved_whole(tmp_path: Path) -> None:
     assert (tmp_path / "again" / "rig.implicam").read_bytes() == (tmp_path / "rig.implicam").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_same_data_give_the_same_bits() -> None:
     rig, data = pair()
     others = points(rig, 20, 6).observations

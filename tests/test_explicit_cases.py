@@ -146,6 +146,7 @@ def test_a_file_of_before_has_square_pixels() -> None:
     assert loaded.fitted.choices == calibration.fitted.choices
 
 
+@pytest.mark.slow
 def test_boards_find_pixels_of_any_shape_as_opencv_does() -> None:
     """Truth: fx 195, fy 231, centre (134.5, 89.5), baseline 90 mm, 4 degrees. cv2 has fewer unknowns, no prior."""
     data = read_dataset(CASES / "nonsquare-boards")
@@ -325,6 +326,7 @@ def flipped(data: Dataset, cameras: list[int], axis: int) -> Dataset:
     return with_uv(data, uv)
 
 
+@pytest.mark.slow
 def test_known_points_in_a_mirror() -> None:
     data = stretched(1.0)
     with pytest.raises(FitError, match="cam1, cam2 and cam3 see the known points as in a mirror") as caught:

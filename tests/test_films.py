@@ -93,6 +93,7 @@ def copied(folder: Path, to: Path) -> Path:
     return to
 
 
+@pytest.mark.slow
 def test_a_moving_ball_tells_the_offset_to_a_millisecond(two_films: Path, cli: Cli) -> None:
     run = cli("detect", two_films, "--target", "ball", "--unit", "mm")
     assert run.code == 0, run.err
@@ -117,6 +118,7 @@ def test_a_moving_ball_tells_the_offset_to_a_millisecond(two_films: Path, cli: C
     assert len(again.sheets) == 2
 
 
+@pytest.mark.slow
 def test_a_table_of_times_says_it_all(tmp_path: Path) -> None:
     folder = tmp_path / "rig"
     own = np.arange(90) / 30, np.delete(OFFSET + np.arange(75) / 25, [20, 21, 50])  # cam2 has lost three pictures

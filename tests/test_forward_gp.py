@@ -406,6 +406,7 @@ def test_an_error_that_all_known_positions_share_is_in_every_measurement() -> No
     assert in_sds(measured, exact.xyz).max() < 0.1
 
 
+@pytest.mark.slow
 def test_error_bars_stay_honest_with_a_noisy_robot() -> None:
     nees = []
     for seed in range(3):

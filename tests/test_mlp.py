@@ -378,6 +378,7 @@ def test_a_batch_of_datasets_is_the_single_fits_with_counted_seeds() -> None:
     assert MLP().fit_many([]) == []
 
 
+@pytest.mark.slow
 def test_it_learns_what_a_linear_map_cannot() -> None:
     """Positions by least squares from pixels: what a network without its bends could do, on wide lenses.
 

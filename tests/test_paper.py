@@ -165,6 +165,7 @@ def test_an_empty_folder_is_an_error_that_says_what_is_missing(tmp_path: Path) -
 # --- what they compute ---
 
 
+@pytest.mark.slow
 def test_the_full_plan_is_the_papers() -> None:
     cells = ball.cells(Source(0), FULL)
     runs = {}
@@ -288,6 +289,7 @@ def test_a_row_of_the_board_is_mean_and_spread_over_the_test_points() -> None:
     assert 0.5 < off["rmse"] / row["rmse"] < 2
 
 
+@pytest.mark.slow
 def test_the_papers_preset_cannot_state_less_than_ten_millimetres() -> None:
     pytest.importorskip("gpytorch")
     row = board.learn(Source(0).options, "2R", 2, PAPER)["rows"][0]
@@ -599,6 +601,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Source, Any]:
     return folder / "out", source, reproduce(EXPERIMENTS, folder / "out", source, TINY, jobs=1)
 
 
+@pytest.mark.slow
 def test_measured_data_of_another_rig_run_through(done: tuple[Path, Source, Any]) -> None:
     out, source, made = done
     assert made.failures == {}
@@ -621,6 +624,7 @@ def test_measured_data_of_another_rig_run_through(done: tuple[Path, Source, Any]
     assert json.loads((out / "summary.json").read_text())["cells"]["failed"] == 0
 
 
+@pytest.mark.slow
 def test_run_again_nothing_is_computed_twice(done: tuple[Path, Source, Any]) -> None:
     out, source, made = done
     before = (out / "ball.csv").read_bytes()
@@ -638,6 +642,7 @@ def test_one_experiment_keeps_the_others_in_the_account(done: tuple[Path, Source
     assert json.dumps(again.summary["ball"]) == json.dumps(made.summary["ball"])  # a NaN is not equal to itself
 
 
+@pytest.mark.slow
 def test_other_plans_have_results_of_their_own(done: tuple[Path, Source, Any]) -> None:
     out, source, _ = done
     assert {path.name for path in (out / "cells").iterdir()} == {f"tiny-{source.name}"}
@@ -675,6 +680,7 @@ def command(*words: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, 
     return int(ended.value.code or 0), said.out, said.err
 
 
+@pytest.mark.slow
 def test_the_command_prints_tables_or_json_and_goes_on_from_what_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -236,6 +236,7 @@ def test_positions_in_another_order_are_no_matter_of_more_points() -> None:
     assert any("tell little of any coordinate" in note for note in calibration.notes)
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_knocked_half_way() -> None:
     xyz = random_points(40)
     uv = views(ring(), xyz)

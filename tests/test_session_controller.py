@@ -93,6 +93,7 @@ def test_the_reticle_is_where_the_ball_will_be(after_ten: SessionController) -> 
         assert np.linalg.norm(look.uv - look.expected) < 5
 
 
+@pytest.mark.slow
 def test_the_live_ball_is_measured(controller: SessionController, after_ten: SessionController) -> None:
     assert np.isnan(controller.measured_live).all()  # nothing is known yet
     after_ten.go()

@@ -46,6 +46,7 @@ def whole_sets(folder: Path, cameras: Sequence[str]) -> list[str]:
     return shots[0]
 
 
+@pytest.mark.slow
 def test_detect_reads_what_was_shot_and_the_numbers_go_on(cli: Cli, tmp_path: Path) -> None:
     assert cli("shoot", "shots", "--cameras", "2R", "--unit", "m", "--rig", "bar6", "--count", "2").code == 0
     ran = cli("shoot", "-o", "shots", "--cameras", "2R", "--json", "--seed", "7")

@@ -109,6 +109,7 @@ def test_a_tilted_sensor_is_as_far_behind_the_lens_as_the_middle_of_the_image_sa
     np.testing.assert_allclose(one, other, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_no_lens_model_explains_the_smooth_error() -> None:
     """Refit everything the lens has, and its rotation: most of the error stays."""
     left = []

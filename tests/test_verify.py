@@ -431,6 +431,7 @@ def test_a_browser_prints_the_protocol(tmp_path: Path) -> None:
     assert not (tmp_path / "other.pdf").exists()
 
 
+@pytest.mark.slow
 def test_the_command_writes_protocol_and_table_and_ends_with_the_decision(made: Path, cli: Cli) -> None:
     file, lengths = made / "rig.implicam", made / "rig" / "lengths"
     ran = cli("verify", file, lengths, "--mpe", "2 + L/100", "--by", "me", "--next", "1")
