@@ -36,7 +36,7 @@ from implicam.simulate import build_rig, simulate
 from implicam.viewer import words
 from implicam.viewer.calibration_scene import list_cameras, up_of
 from implicam.viewer.snapshot import curve, snapshot
-from implicam.viewer.space import Placing, edges, turned_up, upwards
+from implicam.viewer.space import Placing, edges, levels, turned_up, upwards
 from implicam.viewer.worker import Worker
 
 NOWHERE = np.full(2, np.nan)
@@ -78,6 +78,27 @@ def test_a_camera_that_does_not_see_the_target_says_so(stereo: Any) -> None:
     _, calibration = stereo
     state = aiming(look("left", uv=(100, 100)), calibration=calibration)
     assert words.verdict(state, state.looks[0])[0] == "target not in view"
+
+
+def test_rough_circles_are_said_to_be_rough() -> None:
+    state = aiming(look("left", uv=(100, 100)))
+    assert "No circles yet" in words.headline(state, False).detail
+    u, v = 100.0, 100.0
+    for circle, says in (([u + 30, v, 40], "in the rough circle"), ([u + 50, v, 40], "not in the rough circle")):
+        rough = np.array([circle])
+        assert words.verdict(state, state.looks[0], rough[0])[0] == says
+        assert "rough" in words.headline(replace(state, rough=rough), False).detail
+        nowhere = np.full(3, np.nan)
+        shown = snapshot(replace(state, rough=rough), ["left"], nowhere, Budget(9), unit="mm", moves=False, skipped=0)
+        assert (shown["cameras"][0]["rough"], shown["cameras"][0]["target"]) == (circle, None)
+
+
+def test_the_levels_of_a_block() -> None:
+    block = Workspace.only([[x, y, z] for x in (0, 50, 100) for y in (0, 20) for z in (5, 9)])
+    assert levels(block.places) == [[0, 50, 100], [0, 20], [5, 9]]
+    assert block.places is not None
+    assert levels(block.places[1:]) is None
+    assert levels(None) is None
 
 
 def test_pictures_of_the_point_before_get_the_reticle_of_the_next() -> None:

@@ -550,8 +550,7 @@ def resect_rays(xyz: Floats, rays: Floats) -> Pose:
 def poses_from_rays(xyz: Floats, rays: Floats) -> list[Pose]:
     """All locally best poses of a camera that sees four or more known points, flat or not, on given rays.
 
-    Orthogonal iteration (Lu, Hager & Mjolsness 2000): points are brought onto their rays in turn with the rotation that
-    fits best; here from 24 evenly spread rotations, so that no guess is needed.
+    By orthogonal iteration from 24 evenly spread rotations, so that no guess is needed.
 
     Args:
         xyz: (n, 3) known points in the world.
@@ -561,30 +560,59 @@ def poses_from_rays(xyz: Floats, rays: Floats) -> list[Pose]:
         `camera_from_world` of each, the best first; few points may have more than one. Only poses with all points in
         front of the camera are among them.
     """
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    solve = np.linalg.inv(across.mean(axis=0))
-    centred = xyz - xyz.mean(axis=0)
-    R = np.asarray(Rotation.create_group("O").as_matrix(), dtype=np.float64)
+    centre, turns = xyz.mean(axis=0), rotations_to_start()
+    R, t, off = orthogonal_iteration(xyz - centre, np.broadcast_to(rays, (len(turns), *rays.shape)), turns, 200)
+    found: list[Pose] = []
+    for k in np.argsort(off):
+        pose = Pose(R[k], t[k] - R[k] @ centre)
+        if np.isfinite(off[k]) and all(np.trace(pose.rotation.T @ one.rotation) < 3 - 1e-3 for one in found):
+            found.append(pose)
+    return found
+
+
+def rotations_to_start() -> Floats:
+    """(24, 3, 3) evenly spread rotations, those of a cube: near enough to any other for an iteration to find it."""
+    return np.asarray(Rotation.create_group("O").as_matrix(), dtype=np.float64)
+
+
+def orthogonal_iteration(xyz: Floats, rays: Floats, R: Floats, steps: int) -> tuple[Floats, Floats, Floats]:
+    """Poses of cameras that see the same known points on given rays, from k guesses of their rotations.
+
+    Lu, Hager & Mjolsness (2000): points are brought onto their rays in turn with the rotation that fits best.
+
+    Args:
+        xyz: (n, 3) known points, with their mean in the origin.
+        rays: (k, n, 3) unit vectors in the frame of each camera.
+        R: (k, 3, 3) rotations to start from.
+        steps: How many.
+
+    Returns:
+        (k, 3, 3) rotations, (k, 3) translations, and (k,) the sum of the squared angles in radians that are left;
+        infinite where a point is behind the camera.
+
+    >>> xyz = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, -1, -1]])
+    >>> there = xyz + np.array([0, 0, 5.0])
+    >>> rays = there / np.linalg.norm(there, axis=1, keepdims=True)
+    >>> bool(np.allclose(orthogonal_iteration(xyz, rays[None], np.eye(3)[None], 9)[1], [[0, 0, 5]]))
+    True
+    """
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
+    solve = np.linalg.inv(across.mean(axis=1))
 
     def shift(R: Floats) -> Floats:
         """(k, 3) the best translations."""
-        pull = np.einsum("nij,knj->ki", across, centred @ R.swapaxes(1, 2))
-        return np.asarray(-pull @ solve.T / len(xyz), dtype=np.float64)
+        pull = (across @ (xyz @ R.swapaxes(1, 2))[..., None]).mean(axis=1)
+        return np.asarray(-(solve @ pull)[..., 0], dtype=np.float64)
 
-    for _ in range(200):
-        there = centred @ R.swapaxes(1, 2) + shift(R)[:, None]
+    for _ in range(steps):
+        there = xyz @ R.swapaxes(1, 2) + shift(R)[:, None]
         onto = rays * np.maximum(np.sum(there * rays, axis=2), 0)[..., None]
-        R = _nearest_rotations(np.einsum("kni,nj->kij", onto - onto.mean(axis=1, keepdims=True), centred))
+        R = _nearest_rotations((onto - onto.mean(axis=1, keepdims=True)).swapaxes(1, 2) @ xyz)
     t = shift(R)
-    there = centred @ R.swapaxes(1, 2) + t[:, None]
+    there = xyz @ R.swapaxes(1, 2) + t[:, None]
     along = np.sum(there * rays, axis=2)
     off = np.sum(np.arctan2(np.linalg.norm(there - along[..., None] * rays, axis=2), along) ** 2, axis=1)
-    found: list[Pose] = []
-    for k in np.argsort(off):
-        pose = Pose(R[k], t[k] - R[k] @ xyz.mean(axis=0))
-        if (along[k] > 0).all() and all(np.trace(pose.rotation.T @ one.rotation) < 3 - 1e-3 for one in found):
-            found.append(pose)
-    return found
+    return R, t, np.where((along > 0).all(axis=1), off, np.inf)
 
 
 def _resect_many(xyz: Floats, rays: Floats) -> tuple[Floats, Floats, Bools]:

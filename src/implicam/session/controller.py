@@ -49,6 +49,7 @@ from implicam.hardware.protocol import format_position
 from implicam.images import blank
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
+from implicam.rig_model.rough import rough_views
 from implicam.session.detections import Look, reject_implausible
 from implicam.session.journal import Session
 from implicam.session.typed import (
@@ -59,6 +60,7 @@ from implicam.session.typed import (
     questions_after,
     questions_before,
 )
+from implicam.threads import side_by_side
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,6 +78,9 @@ STOP_REPEAT_SECONDS = 2.0
 HISTORY_KEY = "history"
 """The settings of the session that hold the curve of the uncertainty: "history 12" after 12 points. Older sessions have
 all of it in "history"."""
+
+MAX_ROUGH_POINTS = 12
+"""Known points from which a camera that is not calibrated yet is looked at roughly: the last ones."""
 
 MIN_REPORTED_POINTS = 12
 """Known points from which a report by cross-validation says anything."""
@@ -127,6 +132,7 @@ class State:
     target: Target | None = None
     position: Floats = field(default_factory=lambda: np.full(3, np.nan))
     typed: TypedPosition | None = None
+    rough: Floats = field(default_factory=lambda: np.full((0, 3), np.nan))
     looks: tuple[Look, ...] = ()
     history: tuple[Step, ...] = ()
     stop: str = ""
@@ -307,7 +313,7 @@ class SessionController:
 
     def _aim_at(self, xyz: Floats) -> None:
         """The next target, as a person wants it."""
-        self._show(target=self._target_at(xyz))
+        self._show(target=self._target_at(xyz), rough=self._rough_circles(xyz))
 
     def _target_at(self, xyz: Floats) -> Target:
         """A target anywhere, with its pixels where a calibration predicts them."""
@@ -609,9 +615,32 @@ class SessionController:
         self._show(
             phase="aim",
             target=replace(target, name=self.session.next_name()),
+            rough=self._rough_circles(target.xyz),
             message=words + self._explain_uncalibrated(),
             problem=None,
         )
+
+    def _rough_circles(self, xyz: Floats) -> Floats:
+        """(cameras, 3) where those that are not calibrated see a place, from few known points."""
+        data, calibration = self.loop.data, self.loop.calibration
+        circles = np.full((len(self.equipment.cameras), 3), np.nan)
+        if data is None:
+            return circles
+        sd = float(np.nan_to_num(np.max(self.equipment.robot.sd)))
+        known, uv = data.xyz[-MAX_ROUGH_POINTS:], data.observations.uv[-MAX_ROUGH_POINTS:]
+        names: Sequence[str] = () if calibration is None else data.observations.camera_names
+        if isinstance(calibration, PredictsPixels):
+            names = calibration.camera_names
+        cameras = self.session.cameras  # with the size of their pictures
+
+        def circle(c: int) -> Floats:
+            found = rough_views(known, uv[:, c], (cameras[c].width or 0, cameras[c].height or 0), xyz[None], sd)
+            return np.append(found.uv[0], found.radius)
+
+        left = [c for c, camera in enumerate(cameras) if camera.name not in names]
+        for c, found in zip(left, side_by_side(circle, left), strict=True):
+            circles[c] = found
+        return circles
 
     def _explain_uncalibrated(self) -> str:
         """Which cameras have not seen enough of the known points yet, in words."""

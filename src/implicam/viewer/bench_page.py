@@ -30,7 +30,7 @@ from implicam.session.typed import PositionQuestion, TypedPosition, parse_positi
 from implicam.viewer import words
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, list_cameras, up_of
 from implicam.viewer.snapshot import curve, finite_or_none, snapshot
-from implicam.viewer.space import Placing, edges
+from implicam.viewer.space import Placing, edges, levels
 from implicam.viewer.web import SCENE_FILES, answer, behind_door, jpeg
 from implicam.viewer.worker import Worker
 
@@ -44,6 +44,8 @@ FILES = {
     "/page.css": "page.css",
     "/acquire.css": "acquire.css",
     "/acquire.js": "acquire.js",
+    "/reach.css": "reach.css",
+    "/reach.js": "reach.js",
     **SCENE_FILES,
 }
 
@@ -328,6 +330,7 @@ class BenchPage:
             "placing": Placing.of(low, high, up_of(cameras)).table,
             "box": [low.tolist(), high.tolist()],
             "edges": edges(space).tolist(),
+            "levels": levels(space.places),
             "cameras": cameras,
             "grid": [ROWS, COLUMNS],
             "known": [] if known is None else known.xyz.tolist(),

@@ -39,6 +39,7 @@ def snapshot(
     problem = state.problem if state.phase == "trouble" else None
     looks = {look.camera: look for look in state.looks}
     target = state.target
+    circles = state.rough if len(state.rough) == len(cameras) else np.full((len(cameras), 3), np.nan)
     return {
         "version": state.version,
         "phase": state.phase,
@@ -53,7 +54,7 @@ def snapshot(
         "to_go": words.to_go(state, measured, unit),
         "auto": state.auto,
         "buttons": _buttons(state, moves, unit),
-        "cameras": [_camera(state, name, looks.get(name)) for name in cameras],
+        "cameras": [_camera(state, name, looks.get(name), rough) for name, rough in zip(cameras, circles, strict=True)],
         "numbers": _numbers(state.history, rule, unit, skipped),
         "report": state.report is not None,
     }
@@ -91,7 +92,7 @@ def _buttons(state: State, moves: bool, unit: str) -> dict[str, dict[str, Any]]:
     }
 
 
-def _camera(state: State, name: str, look: Look | None) -> dict[str, Any]:
+def _camera(state: State, name: str, look: Look | None, rough: Floats) -> dict[str, Any]:
     """What one camera shows, in pixels of its picture, and what there is to say of it."""
     problem = words.trouble_of(state, name)
     if problem or look is None or look.frame is None:
@@ -99,8 +100,9 @@ def _camera(state: State, name: str, look: Look | None) -> dict[str, Any]:
         says = "camera trouble" if problem else "no picture"
         return {"name": name, "shown": False, "says": says, "kind": "bad" if problem else "idle", "reason": reason}
     height, width = look.frame.picture.shape
-    says, kind = words.verdict(state, look)
-    planned = np.isfinite(look.expected).all() and state.phase in ("aim", "moving", "shown")
+    says, kind = words.verdict(state, look, rough)
+    aims = state.phase in ("aim", "moving", "shown")
+    planned = np.isfinite(look.expected).all() and aims
     return {
         "name": name,
         "shown": True,
@@ -112,6 +114,7 @@ def _camera(state: State, name: str, look: Look | None) -> dict[str, Any]:
         "ball": finite_or_none(look.uv),
         "outlines": [_outline(line) for line in look.found.outlines] if len(look.found) else [],
         "target": look.expected.tolist() if planned else None,
+        "rough": finite_or_none(rough) if aims and not planned else None,
     }
 
 

@@ -70,6 +70,15 @@ def upwards(up: Floats, along: Floats) -> Floats:
     return np.asarray(axes[int(np.argmax(axes @ mean))])
 
 
+def levels(places: Floats | None) -> list[list[float]] | None:
+    """The values of x, y and z of places (n, 3) in a lattice, as of a block's holes; None where they are none."""
+    if places is None:
+        return None
+    found = [np.unique(places[:, axis]) for axis in range(3)]
+    whole = np.prod([len(values) for values in found]) == len(np.unique(places, axis=0))
+    return [values.tolist() for values in found] if whole else None
+
+
 def edges(workspace: Workspace) -> Floats:
     """(n, 2, 3) the edges of the workspace's hull: pairs of corners on two planes that are not the same."""
     size, corners = workspace.size, workspace.vertices

@@ -55,6 +55,16 @@ def _aim(state: State, point: str, moves: bool) -> Headline:
         return Headline(f"{point}: by itself", "The next target is gone to without asking.", "busy")
     if moves:
         return Headline(f"{point}: press Go", "The robot takes the ball to the circle.", "ask")
+    if not np.isfinite(state.target.uv).any() and np.isfinite(state.rough).any():
+        return Headline(
+            f"{point}: put the ball here",
+            "Somewhere in the dashed circles, which are rough; then say where it is.",
+            "ask",
+        )
+    if not np.isfinite(state.target.uv).any():
+        return Headline(
+            f"{point}: put the ball here", "Measure its way there, and say where it is. No circles yet.", "ask"
+        )
     return Headline(f"{point}: put the ball here", "Into the circle in every picture; then say where it is.", "ask")
 
 
@@ -150,15 +160,25 @@ def away(look: Look) -> float:
     return float(np.linalg.norm(look.uv - look.expected))
 
 
-def verdict(state: State, look: Look) -> tuple[str, str]:
-    """What there is to say of one camera, in a few words, and whether it is good, bad, idle, or asks for something."""
+def verdict(state: State, look: Look, rough: Floats | None = None) -> tuple[str, str]:
+    """What there is to say of one camera, in a few words, and whether it is good, bad, idle, or asks for something.
+
+    Args:
+        state: Of the controller.
+        look: What the camera shows.
+        rough: (3,) u, v and radius of the circle for the target, of a camera that is not calibrated; NaN for none.
+    """
     found, planned = len(look.found) > 0, state.target is not None and bool(np.isfinite(look.expected).all())
     if found and planned:
         distance = away(look)
         if state.phase == "shown":
             return f"found, {distance:.0f} px from the circle", "good"
         return ("on target", "good") if distance <= ON_TARGET_PX else (f"{distance:.0f} px to go", "ask")
-    if state.calibration is not None and not planned and state.target is not None:
+    roughly = rough is not None and bool(np.isfinite(rough).all())
+    if found and rough is not None and roughly:
+        inside = np.linalg.norm(look.uv - rough[:2]) <= rough[2]
+        return ("in the rough circle", "good") if inside else ("not in the rough circle", "ask")
+    if state.calibration is not None and not planned and state.target is not None and not roughly:
         return "target not in view", "idle"
     if found:
         return "ball found", "good"

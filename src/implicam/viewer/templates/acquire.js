@@ -1,6 +1,7 @@
 // The page of a guided session: what is on the screen, and the buttons. The session is on the server; scene3d.js draws.
 
 import {Scene3D, cividis} from "./scene3d.js";
+import {drawReach} from "./reach.js";
 
 const by = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
@@ -112,6 +113,7 @@ function draw() {
   for (const [axis, words] of axes) by("axes").append(Object.assign(document.createElement("span"), {textContent: ` ${axis} ${words}`.trimEnd()}));
   drawButtons();
   drawPlace();
+  drawHow();
   drawTiles();
   drawNumbers();
   drawComplaints();
@@ -156,6 +158,21 @@ function drawPlace() {  // beside where the target is, to be typed: where the ba
     by(axis).value = "";
     by(axis).placeholder = number(state.target.xyz[i], 6);
   });
+}
+
+// By hand: how to get there, open until the circles in the pictures say it.
+function drawHow() {
+  const box = by("reach"), target = state.phase === "aim" && state.target;
+  box.hidden = about.moves || !target || !world;
+  if (box.hidden) return;
+  const first = state.numbers.usual || state.cameras.some((one) => one.rough) ? "known" : "first";
+  if (!box.dataset.stage) {
+    by("tool").value = world.levels ? "block" : "ruler";
+    try { by("tool").value = localStorage.getItem("implicam-tool") ?? by("tool").value; } catch { /* not kept */ }
+  }
+  if (box.dataset.stage !== first) { box.dataset.stage = first; box.open = first === "first"; }
+  by("steps").textContent = drawReach(by("drawing"), by("tool").value, target.xyz,
+    {box: world.box, levels: world.levels, rotation: world.placing.rotation, unit: about.unit});
 }
 
 function drawComplaints() {
@@ -278,6 +295,10 @@ function drawMarks(svg, one, tile) {
     if (state.phase === "shown") loupe(tile, one, ball, Math.max(most, 6));
   }
   if (state.phase !== "shown" || !ball) tile.querySelector(".loupe")?.remove();
+  if (!target && one.rough) {  // somewhere in here: from four to seven points
+    const [u, v, r] = one.rough;
+    stroke("circle", {cx: u + 0.5, cy: v + 0.5, r, "stroke-dasharray": `${10 * pixel} ${8 * pixel}`}, "aim");
+  }
   if (!target) return;
   stroke("circle", {cx: target[0], cy: target[1], r: radius}, "aim");
   for (const [x, y] of [[1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -433,6 +454,7 @@ async function refreshScene() {
   colourCloud();
   scene.fit();
   drawMoving();
+  drawHow();
   document.body.dataset.ready = "yes";
 }
 
@@ -511,6 +533,10 @@ async function begin() {
     if (event.key === "Enter" && event.target.tagName === "INPUT" && !by("go").disabled) by("go").click();
   });
   by("there").addEventListener("click", () => { for (const axis of ["x", "y", "z"]) by(axis).value = by(axis).placeholder; });
+  by("tool").addEventListener("change", () => {
+    try { localStorage.setItem("implicam-tool", by("tool").value); } catch { /* not kept */ }
+    drawHow();
+  });
   by("list").addEventListener("toggle", refreshPoints);
   by("whole").addEventListener("click", () => scene?.aim());
   by("colour").addEventListener("change", colourCloud);
