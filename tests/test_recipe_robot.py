@@ -181,7 +181,7 @@ def test_a_session_whose_driver_is_gone_says_so(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(UsageError, match=r"cannot go on: 'toy:1' names no robot") as error:
         open_session(tmp_path / "s", None)
     assert "it was begun with --camera cam1=toy:0 --camera cam2=toy:1 --robot toy:1" in error.value.why
-    assert "install the package again" in error.value.fix
+    assert "Where a package brought what is missing, install it again" in error.value.fix
 
 
 def test_the_command_line_knows_it(cli: Cli) -> None:

@@ -271,7 +271,7 @@ def check_pictures(pictures: Mapping[str, Grey], cameras: Sequence[Camera]) -> N
         if None not in size and picture.shape != size:
             raise ImageError(
                 f"the picture of {name!r} has {picture.shape[1]} x {picture.shape[0]} pixels.",
-                why=f"the session began with {size[1]} x {size[0]}",
+                why=f"this camera began here with {size[1]} x {size[0]}",
                 fix="give the whole picture, as the camera takes it",
             )
 

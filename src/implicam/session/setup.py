@@ -365,7 +365,7 @@ def _found_again(session: Session, setup: Setup, say: Callable[[str], None]) -> 
         raise UsageError(
             f"the session in {session.folder} cannot go on: {error.what}",
             why=f"it was begun with {words}; what was measured is kept" + (f". {error.why}" if error.why else ""),
-            fix=f"install the package again that brought what is missing, or name another: {error.fix}",
+            fix=f"{error.fix}. Where a package brought what is missing, install it again; or name another",
         ) from error
 
 
