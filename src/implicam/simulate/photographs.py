@@ -236,7 +236,7 @@ class Studio:
         grid = xyz.reshape(rows, columns, 3)
         right = (grid[0, -1] - grid[0, 0]) / (columns - 1)
         down = (grid[-1, 0] - grid[0, 0]) / (rows - 1)
-        return Checkerboard(grid[0, 0], right, down, rows, columns, self._light)
+        return Checkerboard(grid[0, 0], right, down, rows, columns, self._light, self.target.marks)
 
     @cached_property
     def _looks(self) -> list[_Look]:

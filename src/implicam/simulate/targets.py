@@ -28,6 +28,7 @@ class Target:
         facing: (3,) or (n, 3) the side that a board shows, a unit vector in the world; None for a ball, which has none.
         board: Rows and columns of its inner corners; None for a ball.
         takes: (n, cameras) which cameras take a picture; None for all of them.
+        marks: What is printed in the white squares of a board, as `scene.Checkerboard` has it; None for nothing.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Target:
     facing: Floats | None = None
     board: tuple[int, int] | None = None
     takes: NDArray[np.bool_] | None = None
+    marks: NDArray[np.float32] | None = None
 
 
 def ball_grid(rig: Rig, shape: tuple[int, int, int] = (5, 5, 7)) -> Target:
