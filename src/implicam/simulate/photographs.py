@@ -405,6 +405,8 @@ def record(
     """
     if optics is None:
         return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, missing=missing, outliers=outliers))
+    if target.wand is not None:
+        raise UsageError("a wand cannot be photographed yet.", fix="leave out --images")
     if outliers > 0:
         raise UsageError(
             "wrong detections cannot be photographed.", why="they come from the detector", fix="leave out --outliers"
