@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
-from implicam import threads
+from dask_cluster import cluster  # noqa: F401  a fixture
+from implicam import threads, workers
 from implicam.calibration_file import package_version
 from implicam.calibrators import InverseGP
 from implicam.errors import ImplicamError, MissingExtraError, UsageError
-from implicam.experiments import Cell, run, workers
+from implicam.experiments import Cell, run
 from implicam.experiments.stored import canonical, decode, encode, failure_file, result_file
 from implicam.files import npz_bytes, read_npz
 from implicam.simulate import simulated
@@ -86,7 +86,7 @@ def keep(folder: Path, cell: Cell, values: dict[str, Any]) -> Path:
     """A result as an earlier run would have left it."""
     path = result_file(folder, cell.name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(encode(cell.task.work, cell.task.options, 1.5, values))
+    path.write_bytes(encode(str(cell.work), canonical(cell.options), 1.5, values))
     return path
 
 
@@ -124,7 +124,7 @@ def test_a_cell_is_its_name_its_options_and_where_its_work_is_found() -> None:
     cell = Cell(algebra, "ball/2R/inverse-gp/157", given)
     given["a"] = 7
     assert cell == Cell(f"{__name__}:algebra", "ball/2R/inverse-gp/157", {"a": 0.1, "b": [1, 2]})
-    assert cell.task.options == '{"a": 0.1, "b": [1, 2]}'
+    assert cell.task.arguments["options"] == '{"a": 0.1, "b": [1, 2]}'
 
 
 def test_names_that_share_a_file_and_odd_numbers_of_processes_are_refused(tmp_path: Path) -> None:
@@ -347,22 +347,6 @@ def test_a_folder_that_cannot_be_is_an_error(tmp_path: Path) -> None:
 
 
 # --- a cluster ---
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[Any]:
-    dask = pytest.importorskip("dask")
-    distributed = pytest.importorskip("distributed")
-    # Fewer deaths, as each restart takes seconds; and no giving up of workers that are being restarted, which a
-    # LocalCluster does with those that were away when it looked.
-    few = {"distributed.scheduler.allowed-failures": 1, "distributed.deploy.lost-worker-timeout": "1 hour"}
-    with (
-        dask.config.set(few),
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=60
-        ) as local,
-    ):
-        yield local
 
 
 def bits(values: dict[str, Any]) -> dict[str, bytes]:

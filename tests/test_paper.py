@@ -713,7 +713,7 @@ def test_wrong_usage_is_told_and_leaves_nothing(
     words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("implicam.experiments.workers.CONNECT_SECONDS", 1)
+    monkeypatch.setattr("implicam.workers.CONNECT_SECONDS", 1)
     code, _, err = command(*words, capsys=capsys)
     assert code in (1, 2)
     assert said in err

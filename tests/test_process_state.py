@@ -17,10 +17,10 @@ import pytest
 from threadpoolctl import threadpool_info
 
 from implicam import threads
-from implicam.experiments.workers import LocalProcesses, Task, attempt, compute_all
 from implicam.files import replacing, replacing_folder
 from implicam.images import opencv
 from implicam.simulate import Studio, build_rig, random_positions
+from implicam.workers import LocalProcesses, Task, attempt, compute_all
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def broken() -> dict[str, Any]:
 @pytest.mark.parametrize("work", [many_threads, broken])
 def test_a_cell_leaves_the_process_as_it_was(work: Any) -> None:
     before = [pool["num_threads"] for pool in threadpool_info()], threads.cores
-    attempt(Task(f"{__name__}:{work.__name__}", "cell", "{}"))
+    attempt(Task(f"{__name__}:{work.__name__}", "cell", {}))
     assert ([pool["num_threads"] for pool in threadpool_info()], threads.cores) == before
 
 

@@ -13,7 +13,8 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam import calibration_file
+from implicam.calibrators.elsewhere import bytes_of_calibration, calibration_of_bytes
 from implicam.calibrators.protocol import RigCalibration
 from implicam.dataset import Floats, Names
 from implicam.dataset.cells import guard_cell
@@ -33,6 +35,10 @@ from implicam.files import convert_write_errors, refuse_other_files, replacing, 
 from implicam.measurement import DOUBTFUL, MEASURED_COLUMNS
 from implicam.progress import Progress, silent
 from implicam.rig_model import MeasuredPixels
+from implicam.workers import Task, compute_on_cluster
+
+PARTS_A_WORKER = 2
+"""Parts that each thread of a cluster's workers has: one that is measured, one that waits."""
 
 POINTS_AT_ONCE = 100_000
 """Points of a part: some 100 MB with ten cameras."""
@@ -44,6 +50,15 @@ Columns = dict[str, Floats]
 
 ARRAYS = ("xyz", "cov", "consistency", "views", "code", "share_calibration", "left_out")
 """Members of an .npz that is written; further point, where the points have names."""
+
+
+class NumberedPart(NamedTuple):
+    """A part, its number, and that of its first row; points (n,) names, which every point has by now."""
+
+    number: int
+    first: int
+    points: list[str]
+    uv: Floats
 
 
 class Part(NamedTuple):
@@ -76,6 +91,7 @@ def measure_file(
     target: str | Path,
     *,
     points_at_once: int = POINTS_AT_ONCE,
+    scheduler: str | None = None,
     progress: Progress = silent,
 ) -> BulkResult:
     """Measure a table of any length, and go on where an earlier call was ended.
@@ -90,6 +106,7 @@ def measure_file(
         source: The table.
         target: The file to write; one that is there is replaced when all is measured.
         points_at_once: Points of a part.
+        scheduler: The address of a Dask scheduler whose workers measure; they read and write no files.
         progress: Is told how many rows are measured.
 
     Returns:
@@ -98,8 +115,8 @@ def measure_file(
     Raises:
         UsageError: An ending, a column, or the parts of an earlier call do not fit.
         DatasetError: The table has a mistake; names the row and the cure.
-        MissingExtraError: What reads or writes Parquet is not installed.
-        ImplicamError: A file cannot be written.
+        MissingExtraError: What reads or writes Parquet, or `distributed`, is not installed.
+        ImplicamError: A file cannot be written, or there is no such cluster.
 
     >>> import numpy as np
     >>> import implicam as ic
@@ -119,24 +136,66 @@ def measure_file(
             )
     if points_at_once < 1:
         raise UsageError(f"parts of {points_at_once} points are none.", fix=f"take {POINTS_AT_ONCE}")
-    names = calibration.camera_names
     parts = _Parts(target, _plan(calibration, source, points_at_once))
-    rows = resumed = parts.rows
-    read = _READERS[source.suffix.lower()](source, names, points_at_once, len(parts.done))
-    try:
-        for part in read:
-            check_views(part.uv, np.full_like(part.uv, np.nan), _cameras(calibration), _place(source, rows))
-            found = calibration.measure_pixels(part.uv)
-            points = part.points or [f"p{i + 1:07d}" for i in range(rows, rows + len(part.uv))]
-            parts.add(points, found, rows)
-            rows += len(part.uv)
-            progress("measuring", rows, rows)
-    except OSError as error:
-        raise DatasetError(f"{source} cannot be read.", why=str(error), fix="check the file") from error
-    if not rows:
+    resumed = parts.rows
+    read = _numbered(calibration, source, points_at_once, len(parts.done), resumed)
+    for part, found in _measured(calibration, read, scheduler):
+        parts.add(part, found)
+        progress("measuring", parts.rows, parts.rows)
+    if not parts.rows:
         raise DatasetError(f"{source} has no points.", fix="give one row for each point")
     parts.put_together()
-    return BulkResult(rows, parts.measured, resumed, tuple(parts.alarms))
+    return BulkResult(parts.rows, parts.measured, resumed, tuple(parts.alarms))
+
+
+def _numbered(
+    calibration: RigCalibration, source: Path, points_at_once: int, number: int, first: int
+) -> Iterator[NumberedPart]:
+    """The parts of a table from one on, checked."""
+    try:
+        for part in _READERS[source.suffix.lower()](source, calibration.camera_names, points_at_once, number):
+            check_views(part.uv, np.full_like(part.uv, np.nan), _cameras(calibration), _place(source, first))
+            points = part.points or [f"p{i + 1:07d}" for i in range(first, first + len(part.uv))]
+            yield NumberedPart(number, first, points, part.uv)
+            number, first = number + 1, first + len(part.uv)
+    except OSError as error:
+        raise DatasetError(f"{source} cannot be read.", why=str(error), fix="check the file") from error
+
+
+def _measured(
+    calibration: RigCalibration, parts: Iterator[NumberedPart], scheduler: str | None
+) -> Iterator[tuple[NumberedPart, MeasuredPixels]]:
+    """Each part and what was found; on a cluster in the order in which they end."""
+    if scheduler is None:
+        yield from ((part, calibration.measure_pixels(part.uv)) for part in parts)
+        return
+    content, sent = bytes_of_calibration(calibration), dict[str, NumberedPart]()  # type: ignore[arg-type]
+
+    def tasks() -> Iterator[Task]:
+        for part in parts:
+            name = f"part {part.number}"
+            sent[name] = part
+            yield Task(f"{__name__}:measure_part", name, {"calibration": content, "uv": part.uv})
+
+    for name, found in compute_on_cluster(scheduler, tasks(), a_worker=PARTS_A_WORKER):
+        part = sent.pop(name)
+        yield part, replace(found, uv=part.uv)
+
+
+def measure_part(calibration: bytes, uv: Floats) -> MeasuredPixels:
+    """What a worker does.
+
+    Args:
+        calibration: The bytes of its file.
+        uv: (n, C, 2) pixels.
+
+    Returns:
+        What was found, without the pixels, which the caller has.
+    """
+    rig = calibration_of_bytes(calibration)
+    assert isinstance(rig, RigCalibration)
+    found = rig.measure_pixels(uv)
+    return replace(found, uv=np.empty((0, *uv.shape[1:])), find_alarm=partial(str, found.alarm))
 
 
 def _cameras(calibration: RigCalibration) -> list[Any]:
@@ -177,7 +236,7 @@ class _Parts:
         if self.ending == ".parquet":
             import_extra("pyarrow.parquet", "parquet", "writing Parquet")
         self.folder = target.with_name(f"{target.name}.parts")
-        self.done: list[dict[str, Any]] = []
+        self.done: dict[int, dict[str, Any]] = {}
         path = self.folder / PLAN
         if not self._file(0, ".json").exists():  # nothing is done
             refuse_other_files(self.folder, _is_part, "a measurement in parts")
@@ -193,35 +252,35 @@ class _Parts:
                 fix="delete the folder to begin anew, or name another file to write",
             )
         while (said := self._file(len(self.done), ".json")).exists() and self._file(len(self.done)).exists():
-            self.done.append(json.loads(said.read_text(encoding="utf-8")))
+            self.done[len(self.done)] = json.loads(said.read_text(encoding="utf-8"))
 
     @property
     def rows(self) -> int:
         """Of the parts that are done."""
-        return sum(int(part["rows"]) for part in self.done)
+        return sum(int(part["rows"]) for part in self.done.values())
 
     @property
     def measured(self) -> int:
         """How many of these have a position."""
-        return sum(int(part["measured"]) for part in self.done)
+        return sum(int(part["measured"]) for part in self.done.values())
 
     @property
     def alarms(self) -> list[str]:
         """Of the parts."""
-        return [part["alarm"] for part in self.done if part["alarm"]]
+        return [part["alarm"] for _, part in sorted(self.done.items()) if part["alarm"]]
 
     def _file(self, number: int, ending: str = "") -> Path:
         return self.folder / f"part-{number:06d}{ending or self.ending}"
 
-    def add(self, points: list[str], found: MeasuredPixels, first: int) -> None:
-        """Write the next part, and then that it is done."""
-        number, alarm = len(self.done), found.alarm
-        with replacing(self._file(number)) as temporary:
-            _WRITERS[self.ending](temporary, points, found, bool(alarm))
-        told = f"from row {first + 1} on: {alarm}" if alarm else ""
-        said = {"rows": len(points), "measured": int(found.measured.sum()), "alarm": told}
-        write_text(self._file(number, ".json"), json.dumps(said))
-        self.done.append(said)
+    def add(self, part: NumberedPart, found: MeasuredPixels) -> None:
+        """Write a part, and then that it is done."""
+        alarm = found.alarm
+        with replacing(self._file(part.number)) as temporary:
+            _WRITERS[self.ending](temporary, part.points, found, bool(alarm))
+        told = f"from row {part.first + 1} on: {alarm}" if alarm else ""
+        said = {"rows": len(part.points), "measured": int(found.measured.sum()), "alarm": told}
+        write_text(self._file(part.number, ".json"), json.dumps(said))
+        self.done[part.number] = said
 
     def put_together(self) -> None:
         """Make one file of all parts, and take these away."""

@@ -20,6 +20,7 @@ import difflib
 import importlib
 from collections.abc import Iterable
 from types import ModuleType
+from typing import Any
 
 
 class ImplicamError(Exception):
@@ -42,6 +43,10 @@ class ImplicamError(Exception):
         super().__init__(what, why, fix)
         self.what, self.why, self.fix = what, why, fix
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As another process sends it: not by its arguments, which differ from class to class."""
+        return _restored, (type(self), self.args, self.__dict__)
+
     def __str__(self) -> str:
         lines = [self.what]
         if self.why:
@@ -49,6 +54,13 @@ class ImplicamError(Exception):
         if self.fix:
             lines.append(f"  fix: {self.fix}")
         return "\n".join(lines)
+
+
+def _restored(kind: type[ImplicamError], args: tuple[Any, ...], said: dict[str, Any]) -> ImplicamError:
+    error = kind.__new__(kind, *args)
+    error.args = args
+    error.__dict__.update(said)
+    return error
 
 
 class DatasetError(ImplicamError):

@@ -24,6 +24,7 @@ from implicam.calibrators.position_processes import PositionProcesses
 from implicam.dataset import Dataset, Floats
 from implicam.dataset.image_bounds import are_on_image
 from implicam.errors import UsageError
+from implicam.gp.low_rank import pivoted_cholesky
 from implicam.rig_model import Sensitivity
 
 Bools = NDArray[np.bool_]
@@ -250,9 +251,10 @@ class ForwardDesignModel:
             judged = slice(m, None)
             A = total[good] @ np.linalg.solve(S[judged][good], part.slope[judged][good]).swapaxes(1, 2)
             moved = (root * (A @ part.half[judged][good])).reshape(-1, part.half.shape[2])
-            h = part.half[:m] @ _root(moved.T @ moved)
+            q = part.half.shape[2]
+            h = (part.half[:m].reshape(-1, q) @ _root(moved.T @ moved)).reshape(m, part.half.shape[1], -1)
             observed = S[:m] + self._of_place(part)
-            found += np.einsum("nij,nij->n", np.linalg.solve(observed, h), h)
+            found += np.einsum("nij,nij->n", np.linalg.inv(observed), h @ h.swapaxes(1, 2))
         return np.where(self.useful, found, 0.0)
 
     def information(self) -> Floats:
@@ -311,8 +313,9 @@ def noise_floor_covariance(rig: PredictsPixels, places: Places) -> Floats:
 def _masked(part: Sensitivity, seen: Bools) -> Sensitivity:
     """Zero slope and spread, unit noise, where a camera does not see a place; changed in place: they are large."""
     unseen = ~seen.repeat(2, axis=1)
-    for values in (part.slope, part.half):
-        unseen |= ~np.isfinite(values).all(axis=2)
+    with np.errstate(invalid="ignore"):  # of infinities; the sum of what is finite is finite
+        for values in (part.slope, part.half):
+            unseen |= ~np.isfinite(values.sum(axis=2))
     for values, instead in ((part.slope, 0.0), (part.half, 0.0), (part.rest, 0.0), (part.noise, 1.0)):
         values[unseen] = instead
     return part
@@ -323,10 +326,8 @@ def _covariance(part: Sensitivity) -> Floats:
 
 
 def _root(M: Floats) -> Floats:
-    """(q, k) R with M = R R^T to a billionth, k as small as that allows: few of all unknowns matter."""
-    values, vectors = np.linalg.eigh(M)
-    kept = values > 1e-9 * max(values[-1], 0.0)
-    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]), dtype=np.float64)
+    """(q, k) R with M = R R^T to a millionth of its largest, k small: few of all unknowns matter."""
+    return pivoted_cholesky(M, 1e-6 * float(np.diagonal(M).max(initial=0.0)))[1]
 
 
 def _diagonal(variances: Floats) -> Floats:

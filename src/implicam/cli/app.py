@@ -77,6 +77,10 @@ def command(name: str) -> Callable[[Function], Function]:
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines.")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="ADDRESS", help="Compute on a Dask cluster, such as tcp://10.0.0.5:8786."),
+]
 Seed = Annotated[int, typer.Option("--seed", min=0, metavar="N", help="The same seed gives the same numbers.")]
 Method = Annotated[
     str | None, typer.Option("--method", metavar="NAME", help=f"Calibration method (default {DEFAULT_METHOD}).")

@@ -32,6 +32,7 @@ import implicam.cli.verify
 import implicam.cli.view  # noqa: F401  these register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
+from implicam.calibrators.elsewhere import fit_on_cluster
 from implicam.calibrators.explicit.boards import has_boards
 from implicam.calibrators.protocol import SETTINGS, RigCalibration
 from implicam.cli import show
@@ -43,6 +44,7 @@ from implicam.cli.app import (
     LeaveOut,
     Method,
     Report,
+    Scheduler,
     Seed,
     Without,
     app,
@@ -126,6 +128,7 @@ def _calibrate(
     settings: SettingsFile = None,
     seed: Seed = 0,
     force: Annotated[bool, typer.Option("--force", help="Write the file even if it is not usable.")] = False,
+    scheduler: Scheduler = None,
     json: Json = False,
     **options: Any,
 ) -> None:
@@ -138,7 +141,7 @@ def _calibrate(
         method = Explicit.method  # nothing else can be made of boards
     made = with_settings(calibrator_from_options(method, seed, options), settings)
     with show.progress(json) as progress:
-        calibration = made.fit(data, progress)
+        calibration = made.fit(data, progress) if scheduler is None else fit_on_cluster(made, data, scheduler)
         verdict = judge(calibration, progress)
     written = force or verdict.word != NOT_USABLE
     if written:
@@ -181,16 +184,27 @@ def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path |
 
 
 def _measure_in_parts(
-    calibration: Path, source: Path, output: Path, chunk: int | None, *, others: Sequence[object], json: bool
+    calibration: Path,
+    source: Path,
+    output: Path,
+    chunk: int | None,
+    scheduler: str | None,
+    *,
+    others: Sequence[object],
+    json: bool,
 ) -> None:
     """A table of any length, if that is wanted, and leave."""
     if chunk is None:
+        if scheduler is not None:
+            raise UsageError(
+                "--scheduler goes with --chunk: a cluster measures tables in parts.", fix="add --chunk 100000"
+            )
         return
     from implicam.bulk import measure_file
 
     if any(others):
         raise UsageError(
-            "--chunk goes with no other option of measure but -o and --json.",
+            "--chunk goes with no other option of measure but -o, --scheduler and --json.",
             why="a table of any length has the columns u_CAMERA, v_CAMERA and point, and nothing else is read",
             fix="leave the other options out, or measure it as a whole",
         )
@@ -201,7 +215,7 @@ def _measure_in_parts(
             fix="measure it as a whole, or calibrate with forward-gp or explicit",
         )
     with show.progress(json) as progress:
-        found = measure_file(fitted, source, output, points_at_once=chunk, progress=progress)
+        found = measure_file(fitted, source, output, points_at_once=chunk, scheduler=scheduler, progress=progress)
     if json:
         show.emit_json({"measured": str(output), **asdict(found), "notes": _unknown_errors(fitted)})
     else:
@@ -236,6 +250,7 @@ def measure_command(
             "goes on.",
         ),
     ] = None,
+    scheduler: Scheduler = None,
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
@@ -246,7 +261,8 @@ def measure_command(
     """
     refuse_folder(output)
     must_not_replace(output, calibration, dataset)
-    _measure_in_parts(calibration, dataset, output, chunk, others=(table != DOCUMENTED, between, pairs), json=json)
+    others = table != DOCUMENTED, between, pairs
+    _measure_in_parts(calibration, dataset, output, chunk, scheduler, others=others, json=json)
     check_table_name(output)
     wanted = [*([between] if between else ()), *(read_pairs(pairs) if pairs else ())]
     beside = output.with_name("distances.csv")

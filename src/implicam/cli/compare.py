@@ -12,7 +12,7 @@ import typer
 
 from implicam.calibrators import calibrator_from_name
 from implicam.cli import show
-from implicam.cli.app import Cameras, Json, LeaveOut, Without, check_figure, command, must_be_shot, read
+from implicam.cli.app import Cameras, Json, LeaveOut, Scheduler, Without, check_figure, command, must_be_shot, read
 from implicam.cli.compare_table import compare_failures, compare_table
 from implicam.cli.options import with_table_options
 from implicam.compare import (
@@ -57,6 +57,7 @@ def compare_command(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Figure to write (.png, .pdf or .svg).")] = None,
     cameras: Cameras = None,
     without: Without = None,
+    scheduler: Scheduler = None,
     table: TableOptions = DOCUMENTED,
     json: Json = False,
 ) -> None:
@@ -69,7 +70,7 @@ def compare_command(
     names = [name.strip() for name in methods.split(",")] if methods else _available_methods()
     chosen = {name: calibrator_from_name(name) for name in names}
     with show.progress(json) as progress:
-        trials = compare_on(splits, chosen, progress)
+        trials = compare_on(splits, chosen, progress, scheduler)
     if output is not None:
         _write_figure(trials, data.length_unit, output)
     if json:

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from implicam.cli import show
-from implicam.cli.app import Json, Seed, command, command_line, must_be_folder
+from implicam.cli.app import Json, Scheduler, Seed, command, command_line, must_be_folder
 from implicam.errors import UsageError
 from implicam.formatting import decimal_number
 from implicam.logs import LOG, log_to_file
@@ -46,9 +46,7 @@ def paper_command(
     jobs: Annotated[
         int | None, typer.Option("--jobs", min=1, metavar="N", help="Processes (default: one a core).")
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Compute on a Dask cluster instead.")
-    ] = None,
+    scheduler: Scheduler = None,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:

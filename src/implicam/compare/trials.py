@@ -17,6 +17,7 @@ from implicam.errors import DatasetError, FitError, ImplicamError, NumericalErro
 from implicam.evaluation import Evaluation, evaluate
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
+from implicam.workers import Task, compute_on_cluster
 
 NAN = float("nan")
 _WHAT = "comparing"
@@ -94,7 +95,12 @@ class _Judged:
     squared: Mapping[str, float]
 
 
-def compare_on(splits: Sequence[Split], methods: Mapping[str, Calibrator], progress: Progress = silent) -> list[Trial]:
+def compare_on(
+    splits: Sequence[Split],
+    methods: Mapping[str, Calibrator],
+    progress: Progress = silent,
+    scheduler: str | None = None,
+) -> list[Trial]:
     """Fit and judge every method on every split.
 
     A fit that fails is a trial with a reason. Where methods measure different points, their errors are those of easy
@@ -105,13 +111,15 @@ def compare_on(splits: Sequence[Split], methods: Mapping[str, Calibrator], progr
     Args:
         splits: Which points train and which judge.
         methods: Name -> method.
-        progress: Called before each fit.
+        progress: Called before each fit; of a cluster, after each.
+        scheduler: The address of a Dask scheduler whose workers fit and judge, side by side.
 
     Returns:
         The trials, in the order of the splits, then of the methods.
 
     Raises:
         UsageError: There is no method or no split.
+        ImplicamError: There is no such cluster.
         DatasetError: Known positions are missing, or the parts of a split have different length units.
     """
     if not methods or not splits:
@@ -119,8 +127,11 @@ def compare_on(splits: Sequence[Split], methods: Mapping[str, Calibrator], progr
     _check_lengths(splits)
     total, done = len(methods) * len(splits), 0
     trials: list[Trial] = []
-    for _, group in groupby(splits, key=lambda split: split.cell):
-        cell = list(group)
+    cells = [list(group) for _, group in groupby(splits, key=lambda split: split.cell)]
+    if scheduler is not None:
+        found = _on_cluster(cells, methods, scheduler, _Counting(progress, 0, total))
+        return [trial for judged in found for trial in _with_common(judged)]
+    for cell in cells:
         judged = {}
         for name, method in methods.items():
             judged[name] = _judge_cell(name, method, cell, _Counting(progress, done, total))
@@ -128,6 +139,45 @@ def compare_on(splits: Sequence[Split], methods: Mapping[str, Calibrator], progr
         trials += _with_common(judged)
     progress(_WHAT, total, total)
     return trials
+
+
+def _on_cluster(
+    cells: Sequence[Sequence[Split]], methods: Mapping[str, Calibrator], scheduler: str, counting: _Counting
+) -> list[dict[str, list[_Judged]]]:
+    """Of each cell what every method did on its splits, each on some worker; a method that fits many at once gets all
+    splits of a cell."""
+    tasks: list[Task] = []
+    places: dict[str, tuple[int, str, int]] = {}
+    for number, cell in enumerate(cells):
+        for name, method in methods.items():
+            size = len(cell) if isinstance(method, FitsMany) else 1
+            for start in range(0, len(cell), size):
+                some = cell[start : start + size]
+                given = {"name": name, "method": method, "splits": some}
+                tasks.append(Task(f"{__name__}:judge_splits", f"{name}, fit {len(tasks)}", given))
+                places[tasks[-1].name] = number, name, start
+    found: list[dict[str, list[Any]]] = [{name: [None] * len(cell) for name in methods} for cell in cells]
+    done = 0
+    for task, judged in compute_on_cluster(scheduler, tasks):
+        number, name, start = places[task]
+        found[number][name][start : start + len(judged)] = judged
+        done += len(judged)
+        counting(done)
+    return found
+
+
+def judge_splits(name: str, method: Calibrator, splits: Sequence[Split]) -> list[_Judged]:
+    """What a worker does: a method on some splits of one kind.
+
+    Args:
+        name: Of the method.
+        method: The method.
+        splits: Which points train and which judge.
+
+    Returns:
+        Of each split the trial, and the squared errors.
+    """
+    return _judge_cell(name, method, splits, _Counting(silent, 0, len(splits)))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import json
 import os
 import pkgutil
 import re
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -20,11 +21,20 @@ from typing import Any
 
 from implicam.calibration_file import package_version
 from implicam.errors import ImplicamError, UsageError
-from implicam.experiments.stored import Stored, Values, canonical, decode, failure_file, result_file, write_result
-from implicam.experiments.workers import DaskCluster, LocalProcesses, Task, compute_all
+from implicam.experiments.stored import (
+    Stored,
+    Values,
+    canonical,
+    decode,
+    encode,
+    failure_file,
+    result_file,
+    write_result,
+)
 from implicam.files import write_text
 from implicam.progress import Progress, silent
 from implicam.threads import cores
+from implicam.workers import DaskCluster, LocalProcesses, Task, compute_all
 
 Work = Callable[..., Mapping[str, Any]]
 
@@ -71,7 +81,29 @@ class Cell:
     @property
     def task(self) -> Task:
         """The cell as it is sent to a worker."""
-        return Task(str(self.work), self.name, canonical(self.options))
+        own = f"{compute_cell.__module__}:{compute_cell.__name__}"
+        return Task(own, self.name, {"work": str(self.work), "options": canonical(self.options)})
+
+
+def compute_cell(work: str, options: str) -> bytes:
+    """What a worker does for a cell.
+
+    Args:
+        work: The dotted name of the cell's function.
+        options: Its options as JSON text.
+
+    Returns:
+        The bytes of the result file.
+    """
+    start = time.perf_counter()
+    values = pkgutil.resolve_name(work)(**json.loads(options))
+    return encode(work, options, time.perf_counter() - start, values)
+
+
+def _failure(name: str, error: ImplicamError) -> str:
+    """Why a cell has no result, in three lines."""
+    fix = error.fix or f"read the traceback in {name}.failed.txt; the next run tries this cell again"
+    return str(ImplicamError(f"{name}: {error.what}", why=error.why, fix=fix))
 
 
 def _dotted_name(work: str | Work) -> str:
@@ -146,12 +178,12 @@ def run(
         _make_folder(folder)
         with closing(compute_all(_workers(len(missing), jobs, scheduler), missing)) as all_done:
             for done in all_done:
-                if done.failure:
-                    failures[done.name] = done.failure
-                    write_text(failure_file(folder, done.name), f"{done.failure}\n\n{done.trace}")
+                if done.error is not None:
+                    failures[done.name] = _failure(done.name, done.error)
+                    write_text(failure_file(folder, done.name), f"{failures[done.name]}\n\n{done.trace}")
                 else:
-                    write_result(folder, done.name, done.content)
-                    stored[done.name] = decode(done.content)
+                    write_result(folder, done.name, done.value)
+                    stored[done.name] = decode(done.value)
                 progress(what, len(stored) + len(failures), len(cells))
     return _collect(cells, stored, failures, already, notes)
 
@@ -210,7 +242,7 @@ def _read_stored(cells: Sequence[Cell], folder: Path) -> tuple[dict[str, Stored]
         except ImplicamError as error:
             notes.append(f"{path} is damaged and was computed again: {error.why}")
             continue
-        if (result.work, result.options) == (cell.work, cell.task.options):
+        if (result.work, result.options) == (cell.work, canonical(cell.options)):
             stored[cell.name] = result
         else:
             other += 1

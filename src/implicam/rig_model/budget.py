@@ -62,8 +62,8 @@ def uncertainty_budget(
     D, own = np.zeros((n, C, 2, 3)), np.zeros((n, C, 3))
     halves = []
     for c, model in enumerate(posterior.models):
-        rows = model.rows(points)
-        D[:, c] = np.where(seen[:, c, None, None], model.predict(points)[1], 0.0)
+        rows, slope = model.rows_and_slope(points)
+        D[:, c] = np.where(seen[:, c, None, None], slope, 0.0)
         own[:, c] = np.stack(
             [np.full(n, noise[c] ** 2 - misfit[c] ** 2), rows.rest + misfit[c] ** 2, rows.rest], axis=1
         )

@@ -74,16 +74,8 @@ class CameraModel:
         Returns:
             Mean pixels (n, 2) and their derivative by the point (n, 2, 3); NaN where the lens has no answer.
         """
-        view, measured = self._views(points)
-        q = self.coordinates(measured)
-        K = self.field.kernel(q, self.field.inducing)
-        by_q = self.field.slope(q, K, self._coefficients)
-        by_point = (
-            view.by_point
-            + by_q[:, :, :2] @ (measured.by_point / self.image.half)
-            + by_q[:, :, 2, None] * (measured.distance_by_point[:, None, :] / self.depth.unit)
-        )
-        return view.uv + K @ self._coefficients, by_point
+        at = self._look(points)
+        return at.view.uv + at.K @ self._coefficients, self._slope(at)
 
     def rows(self, points: Floats) -> Rows:
         """How the pixels of points depend on the camera's unknowns, about the present mean.
@@ -94,12 +86,50 @@ class CameraModel:
         Returns:
             Mean pixels and their slopes; of these `by_point` is that of the camera without its field.
         """
+        return self._rows(self._look(points))
+
+    def rows_and_slope(self, points: Floats) -> tuple[Rows, Floats]:
+        """`rows` and the slope of `predict` at once, in little more than the time of one.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            How the pixels depend on the camera's unknowns; and (n, 2, 3) their derivative by the point, the field's
+            included.
+        """
+        at = self._look(points)
+        return self._rows(at), self._slope(at)
+
+    def _look(self, points: Floats) -> _Looked:
         view, measured = self._views(points)
-        K = self.field.kernel(self.coordinates(measured), self.field.inducing)
-        phi = self.field.features_from(K)
+        q = self.coordinates(measured)
+        return _Looked(view, measured, q, self.field.kernel(q, self.field.inducing))
+
+    def _rows(self, at: _Looked) -> Rows:
+        phi = self.field.features_from(at.K)
         left = np.maximum(1 - np.sum(phi**2, axis=1), 0)
-        mean = view.uv + K @ self._coefficients
-        return Rows(mean, view.by_parameters, self.signal * phi, self.signal**2 * left, view.by_point)
+        mean = at.view.uv + at.K @ self._coefficients
+        return Rows(mean, at.view.by_parameters, self.signal * phi, self.signal**2 * left, at.view.by_point)
+
+    def _slope(self, at: _Looked) -> Floats:
+        by_q = self.field.slope(at.q, at.K, self._coefficients)
+        by_point = (
+            at.view.by_point
+            + by_q[:, :, :2] @ (at.measured.by_point / self.image.half)
+            + by_q[:, :, 2, None] * (at.measured.distance_by_point[:, None, :] / self.depth.unit)
+        )
+        return np.asarray(by_point, dtype=np.float64)
+
+
+class _Looked(NamedTuple):
+    """What a camera sees of n points, and its field camera; where the field is looked up (n, 3), and its covariance
+    with the inducing points (n, m)."""
+
+    view: View
+    measured: View
+    q: Floats
+    K: Floats
 
 
 class Rows(NamedTuple):
@@ -128,6 +158,11 @@ def apply_covariance_root(rows: Rows, root: Floats) -> Floats:
         (n, 2, q) in pixels.
     """
     n, p, m = len(rows.J), rows.J.shape[2], rows.phi.shape[1]
+    used = root.any(axis=1)  # of a rig whose cameras are tied, many rows are of other cameras alone
+    if not used.all():
+        wide = np.zeros((n, 2, len(root)))
+        wide[:, :, used] = apply_covariance_root(rows, root[used])
+        return wide
     out = (rows.J.reshape(2 * n, p) @ root[:, :p].T).reshape(n, 2, len(root))  # a stack of products takes ten times
     for i in range(2):
         out[:, i] += rows.phi @ root[:, p + i * m : p + (i + 1) * m].T

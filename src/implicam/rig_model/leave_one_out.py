@@ -289,9 +289,8 @@ def left_out_points(fitted: FitResult, points: Floats, seen: tuple[CameraViews, 
     for c, (one, inliers) in enumerate(zip(seen, fitted.inliers, strict=True)):
         used, pair = one.select(inliers), slice(2 * c, 2 * c + 2)
         model, where = posterior.models[c], (points + shift)[used.rows]
-        rows = model.rows(where)
+        rows, slope[used.rows, pair] = model.rows_and_slope(where)
         residual[used.rows, pair] = used.uv - rows.mean
-        slope[used.rows, pair] = model.predict(where)[1]
         noise2[used.rows, pair] = (model.noise * used.relative)[:, None] ** 2
         half[used.rows, pair] = apply_covariance_root(rows, posterior.root(c))
     own = slope @ (errors.root * errors.size[:, None, None])

@@ -143,12 +143,11 @@ def see_moved(
     """
     off = points - stand.centre - motion.shift
     before = off @ motion.rotation + stand.centre
-    uv, slope = model.predict(before)
-    rows = model.rows(before)
+    rows, slope = model.rows_and_slope(before)
     grown = 1 + motion.zoom
     by_point = grown * slope @ motion.rotation.T
     by_turn = by_point @ cross_matrices(off) @ stand.axes
-    about = uv - stand.middle
+    about = rows.mean - stand.middle
     by_step = np.concatenate([by_turn, -by_point @ stand.axes, about[..., None]], axis=2)
     half = np.zeros((len(points), 2, 0)) if root is None else grown * apply_covariance_root(rows, root)
     return MovedViews(stand.middle + grown * about, by_point, by_step, half, grown**2 * rows.rest)

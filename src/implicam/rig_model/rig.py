@@ -27,6 +27,7 @@ from implicam.rig_model.repair import Repair, all_repaired
 from implicam.rig_model.settings import DEFAULT_SETTINGS, RigModelSettings
 from implicam.rig_model.training_data import Frame, stated_noise, view_noise
 from implicam.rig_model.triangulate import Labels, Located, locate, shared_errors
+from implicam.threads import side_by_side
 
 Locator = Callable[[Floats, Floats], Located]
 """Finds where points are from pixels (n, C, 2) and noise (n, C), in the working frame."""
@@ -335,17 +336,26 @@ class FittedRig:
             together. NaN where a lens has no answer.
         """
         points = self.frame.to_working(np.asarray(xyz, dtype=np.float64))
+        n, tied, loss = len(points), self.posterior.tied, information_loss(self.degrees)
+        groups = [self.cameras] if tied else [(c,) for c in self.cameras]
         parts = []
-        for number, (c, model) in enumerate(zip(self.cameras, self.posterior.models, strict=True)):
-            rows = model.rows(points)
-            slope = model.predict(points)[1] / self.frame.scale
-            half = apply_covariance_root(rows, self.posterior.root(number))
-            noise = np.full((len(points), 2), model.noise**2 * information_loss(self.degrees))
-            parts.append(Sensitivity((c,), slope, half, rows.rest[:, None].repeat(2, axis=1), noise))
-        if not self.posterior.tied:
-            return parts
-        together = (np.concatenate([part[i] for part in parts], axis=1) for i in range(1, len(Sensitivity._fields)))
-        return [Sensitivity(self.cameras, *together)]
+        for number, group in enumerate(groups):
+            r, q = 2 * len(group), len(self.posterior.root(number))
+            parts.append(
+                Sensitivity(group, np.empty((n, r, 3)), np.zeros((n, r, q)), np.empty((n, r)), np.empty((n, r)))
+            )
+
+        def fill(number: int) -> None:
+            model, root = self.posterior.models[number], self.posterior.root(number)
+            part, pair = (parts[0], slice(2 * number, 2 * number + 2)) if tied else (parts[number], slice(0, 2))
+            first = int(root.any(axis=1).argmax())  # of tied cameras, the unknowns before are of others
+            rows, slope = model.rows_and_slope(points)
+            part.slope[:, pair] = slope / self.frame.scale
+            part.half[:, pair, first:] = apply_covariance_root(rows, root[first:])
+            part.rest[:, pair], part.noise[:, pair] = rows.rest[:, None], model.noise**2 * loss
+
+        side_by_side(fill, range(len(self.cameras)))
+        return parts
 
     def budget(self, xyz: Floats, seen: Bools) -> Budget:
         """Where the uncertainty of positions would come from, if they were measured.

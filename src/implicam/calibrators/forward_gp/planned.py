@@ -155,7 +155,7 @@ class PlannedRig:
     def _information_of(self, i: int, xyz: Floats, used: Bools) -> Floats:
         """(n, 3, 3) what the view of one camera alone says of each place, in the working frame."""
         points, model = self.frame.to_working(xyz[used]), self.models[i]
-        rows, slope = model.rows(points), model.predict(points)[1]
+        rows, slope = model.rows_and_slope(points)
         half = apply_covariance_root(rows, self.alone[i])
         S = half @ half.swapaxes(1, 2) + (model.noise**2 + rows.rest)[:, None, None] * np.eye(2)
         found = np.zeros((len(xyz), 3, 3))

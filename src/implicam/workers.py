@@ -1,31 +1,30 @@
-"""Who computes the cells: processes on this machine (joblib's loky), or the workers of a Dask cluster.
+"""Who computes tasks that need nothing of each other: processes on this machine (joblib's loky), or the workers of a
+Dask cluster.
 
-Both compute the same way: one cell at a time in a process, on one thread, and the result comes back as the bytes of
-its file; only the caller writes. So the numbers depend neither on how many there are nor on where they are.
+Both compute the same way: one task at a time in a process, on one thread, and the result comes back; only the caller
+writes. So the numbers depend neither on how many there are nor on where they are.
 
-A process that dies (a crash in a library, no memory left) takes with it cells that had no part in it. So what was under
-way is computed again afterwards, each alone: a cell whose process dies again and again then is itself the cause.
+A process that dies (a crash in a library, no memory left) takes with it tasks that had no part in it. So what was under
+way is computed again afterwards, each alone: a task whose process dies again and again then is itself the cause.
 """
 
 from __future__ import annotations
 
-import json
 import pkgutil
 import re
 import sys
 import threading
-import time
 import traceback
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
 from implicam.errors import ImplicamError, UsageError, import_extra
-from implicam.experiments.stored import encode
 from implicam.threads import limit_cores
 
 CONNECT_SECONDS = 10
@@ -33,7 +32,9 @@ POLL_SECONDS = 5  # waiting for results, ask so often whether any can come
 NO_WORKER_SECONDS = 120  # before a cluster is given up
 
 _ADDRESS = re.compile(r"([a-z]+://)?[^\s/]+:[0-9]{1,5}")
-_ONE_CELL_AT_A_TIME = threading.Lock()
+_SAME_EVERYWHERE = ("implicam", "numpy", "scipy", "distributed")
+"""What a worker must have in the caller's version: else numbers differ, or nothing works."""
+_ONE_TASK_AT_A_TIME = threading.Lock()
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "NUMEXPR_NUM_THREADS"), "1"
 )
@@ -43,58 +44,77 @@ class Task(NamedTuple):
     """What is sent to a worker.
 
     Attributes:
-        work: The dotted name of the function.
-        name: Of the cell.
-        options: As JSON text.
+        work: The dotted name of the function, "package.module:function".
+        name: Of the task.
+        arguments: By name, as the function takes them; they are pickled.
     """
 
     work: str
     name: str
-    options: str
+    arguments: Mapping[str, Any]
 
 
 class Attempt(NamedTuple):
     """What comes back from a worker.
 
     Attributes:
-        name: Of the cell.
-        content: The bytes of the result file; empty where there is no result.
-        failure: Why there is none, in three lines.
+        name: Of the task.
+        value: What the function returned; None where it did not.
+        error: Why it did not; None where it did.
         trace: The traceback.
     """
 
     name: str
-    content: bytes = b""
-    failure: str = ""
+    value: Any = None
+    error: ImplicamError | None = None
     trace: str = ""
 
 
 def attempt(task: Task) -> Attempt:
-    """Compute one cell in this process; an error of the cell is returned, not raised.
+    """Compute one task in this process; its error is returned, not raised.
 
     Args:
-        task: The cell.
+        task: What to compute.
     """
-    with _ONE_CELL_AT_A_TIME, _one_thread():
-        start = time.perf_counter()
+    with _ONE_TASK_AT_A_TIME, _one_thread():
         try:
-            values = pkgutil.resolve_name(task.work)(**json.loads(task.options))
-            return Attempt(task.name, encode(task.work, task.options, time.perf_counter() - start, values))
+            return Attempt(task.name, pkgutil.resolve_name(task.work)(**task.arguments))
         except (Exception, SystemExit) as error:
-            return Attempt(task.name, failure=str(_explain(task, error)), trace=traceback.format_exc())
+            return Attempt(task.name, error=_explain(error), trace=traceback.format_exc())
 
 
-def _explain(task: Task, error: BaseException) -> ImplicamError:
-    fix = f"read the traceback in {task.name}.failed.txt; the next run tries this cell again"
+def _explain(error: BaseException) -> ImplicamError:
     if isinstance(error, ImplicamError):
-        return ImplicamError(f"{task.name}: {error.what}", why=error.why, fix=error.fix or fix)
+        return error
     place = traceback.extract_tb(error.__traceback__)[-1]
     message = " ".join(str(error).split())[:500]
     return ImplicamError(
-        f"{task.name}: {type(error).__name__}{': ' * bool(message)}{message}",
+        f"{type(error).__name__}{': ' * bool(message)}{message}",
         why=f"raised in {place.name}, {place.filename}:{place.lineno}",
-        fix=fix,
     )
+
+
+def compute_on_cluster(
+    scheduler: str, tasks: Iterable[Task], *, a_worker: int | None = None
+) -> Iterator[tuple[str, Any]]:
+    """Compute tasks by the workers of a Dask cluster.
+
+    Args:
+        scheduler: The address of its scheduler.
+        tasks: What to compute; they are taken as they are handed over.
+        a_worker: How many are handed over before results come, for each thread of a worker; None for all.
+
+    Yields:
+        The name of each task and what it returned, in the order in which they end.
+
+    Raises:
+        ImplicamError: There is no such cluster, it cannot compute, or a task failed; the others are then given up.
+    """
+    with closing(compute_all(DaskCluster(scheduler, a_worker), tasks)) as all_done:
+        for done in all_done:
+            if done.error is not None:
+                raise done.error
+            yield done.name, done.value
 
 
 @contextmanager
@@ -131,7 +151,7 @@ class Workers(Protocol):
         """Start `attempt` somewhere.
 
         Args:
-            task: The cell.
+            task: What to compute.
         """
 
     def check(self) -> None:
@@ -145,12 +165,12 @@ class Workers(Protocol):
         """Stop what still runs."""
 
 
-def compute_all(workers: Workers, tasks: Sequence[Task]) -> Generator[Attempt, None, None]:
+def compute_all(workers: Workers, tasks: Iterable[Task]) -> Generator[Attempt, None, None]:
     """Compute all tasks. Close the generator to stop the workers early.
 
     Args:
         workers: What computes.
-        tasks: The cells.
+        tasks: What to compute.
 
     Yields:
         The attempts, in the order in which they end.
@@ -171,7 +191,7 @@ def compute_all(workers: Workers, tasks: Sequence[Task]) -> Generator[Attempt, N
         workers.close()
 
 
-def _compute(workers: Workers, tasks: Sequence[Task]) -> Iterator[tuple[Task, Attempt | None]]:
+def _compute(workers: Workers, tasks: Iterable[Task]) -> Iterator[tuple[Task, Attempt | None]]:
     """Each task and what came of it; None where its process died."""
     waiting, running = iter(tasks), dict[Future[Attempt], Task]()
     while True:
@@ -207,24 +227,24 @@ def _compute_alone(workers: Workers, task: Task) -> Attempt:
             if done is not None:
                 return done
     error = ImplicamError(
-        f"{task.name}: the process that computed it died, again and again.",
-        why="a crash in a library, or no memory left; in the end it ran alone, so no other cell is the cause",
-        fix="look for the process in the system's log; the next run tries this cell again",
+        "the process that computed it died, again and again.",
+        why="a crash in a library, or no memory left; in the end it ran alone, so nothing else is the cause",
+        fix="look for the process in the system's log; the next run tries it again",
     )
-    return Attempt(task.name, failure=str(error), trace="The process died and left no traceback.\n")
+    return Attempt(task.name, error=error, trace="The process died and left no traceback.\n")
 
 
 class LocalProcesses:
     """Processes on this machine, by joblib.
 
-    A cell whose process dies three times, twice of them alone, has failed.
+    A task whose process dies three times, twice of them alone, has failed.
     """
 
     death: type[Exception] = BrokenProcessPool
     retries = 2
 
     def __init__(self, jobs: int) -> None:
-        self._loky = import_extra("joblib.externals.loky", "paper", "computing cells side by side")
+        self._loky = import_extra("joblib.externals.loky", "paper", "computing side by side")
         self.at_once = jobs
         # loky replaces a process whose memory has grown, loses nothing by it, and says so as if something were wrong.
         # It does so in a thread of its own, so that the filter has to stand as long as the processes do.
@@ -236,7 +256,7 @@ class LocalProcesses:
         """Start `attempt`; where a process has died, in new ones.
 
         Args:
-            task: The cell.
+            task: What to compute.
         """
         future: Future[Attempt] = self._pool().submit(attempt, task)
         return future
@@ -256,15 +276,15 @@ class LocalProcesses:
 class DaskCluster:
     """The workers of a Dask scheduler at an address such as tcp://10.0.0.5:8786; they need implicam installed.
 
-    Dask itself tries a cell again where its worker died (`distributed.scheduler.allowed-failures`, 3 times); what it
-    gives up, perhaps because of another cell on the same worker, is tried once more alone. All cells are handed over at
-    once, so that a cluster that adapts its size sees how many there are.
+    Dask itself tries a task again where its worker died (`distributed.scheduler.allowed-failures`, 3 times); what it
+    gives up, perhaps because of another task on the same worker, is tried once more alone. All tasks are handed over at
+    once, unless they are large, so that a cluster that adapts its size sees how many there are.
     """
 
-    at_once, retries = sys.maxsize, 1
+    retries = 1
 
-    def __init__(self, address: str) -> None:
-        distributed = import_extra("distributed", "cluster", "computing cells on a Dask cluster")
+    def __init__(self, address: str, a_worker: int | None = None) -> None:
+        distributed = import_extra("distributed", "cluster", "computing on a Dask cluster")
         if not _ADDRESS.fullmatch(address):  # Client would refuse it, too, and leave a thread behind
             raise UsageError(
                 f"{address!r} is not the address of a Dask scheduler.",
@@ -281,15 +301,52 @@ class DaskCluster:
                 why=" ".join(str(error).split()) or type(error).__name__,
                 fix="start one with `dask scheduler`, and give the address that it prints",
             ) from error
+        try:
+            self._check_versions()
+        except ImplicamError:
+            self._client.close()
+            raise
+        self.at_once = sys.maxsize
+        if a_worker is not None:
+            self.at_once = a_worker * max(1, sum(self._client.nthreads().values()))
         self._executor = self._client.get_executor(pure=False)
+
+    def _check_versions(self) -> None:
+        """All workers that are there have what is needed, in our versions.
+
+        Raises:
+            ImplicamError: One has not; names it and the package.
+        """
+        for package in _SAME_EVERYWHERE:
+            ours = version(package)
+            for worker, theirs in self._client.run(version, package, on_error="return").items():
+                fix = (
+                    f"install {package} {ours} where the worker runs (pip install {package}=={ours}), and start it anew"
+                )
+                if isinstance(theirs, PackageNotFoundError):
+                    raise ImplicamError(
+                        f"the worker {worker} has no {package}.",
+                        why="what is computed there is computed by it",
+                        fix='pip install "implicam[cluster]" where the worker runs' if package == "implicam" else fix,
+                    )
+                if theirs != ours:
+                    raise ImplicamError(
+                        f"the worker {worker} has {package} {theirs}; here is {ours}.",
+                        why="the same numbers everywhere take the same versions everywhere",
+                        fix=fix,
+                    )
 
     def submit(self, task: Task) -> Future[Attempt]:
         """Start `attempt` on any worker.
 
         Args:
-            task: The cell.
+            task: What to compute.
         """
-        future: Future[Attempt] = self._executor.submit(attempt, task)
+        dask = import_extra("dask", "cluster", "computing on a Dask cluster")
+        with dask.config.set(
+            {"distributed.admin.large-graph-warning-threshold": "4 GiB"}
+        ):  # a part of a table is large
+            future: Future[Attempt] = self._executor.submit(attempt, task)
         return future
 
     def check(self) -> None:
