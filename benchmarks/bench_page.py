@@ -2,8 +2,9 @@
 
     python benchmarks/bench_page.py [--points 20] [--rig bar6] [--browsers 1]
 
-Simulated cameras (bar6: six of 1280 x 800) that render their pictures, a robot that takes no time. A client that reads
-the stream of states stands for each browser, and fetches every picture that is shown, as a browser does.
+Simulated cameras (bar6: six of 1280 x 800) that draw their pictures, a robot that takes no time. A client that reads
+the stream of states stands for each browser, and fetches every picture that is shown, as a browser does. CPU is that of
+the whole process meanwhile, live pictures and clients with it; drawn: the part of it that real cameras would not take.
 """
 
 from __future__ import annotations
@@ -21,9 +22,28 @@ from http.cookiejar import CookieJar
 from pathlib import Path
 from typing import Any
 
+from implicam.hardware.simulated import PhotographingCamera
 from implicam.session.setup import Setup, open_session
 from implicam.threads import return_large_memory
 from implicam.viewer.bench_page import open_page
+
+DRAWN = [0.0]
+"""Seconds of CPU that the simulated cameras took."""
+
+
+def count_drawing() -> None:
+    """Let the simulated cameras say how long they take."""
+    take, lock = PhotographingCamera.frame, threading.Lock()
+
+    def frame(camera: PhotographingCamera, timeout: float = 5.0) -> Any:
+        begin = time.thread_time()
+        try:
+            return take(camera, timeout)
+        finally:
+            with lock:
+                DRAWN[0] += time.thread_time() - begin
+
+    PhotographingCamera.frame = frame  # type: ignore[method-assign]
 
 
 class Browser:
@@ -50,15 +70,15 @@ class Browser:
                             self.opener.open(f"{self.base}picture.jpg?camera={one['name']}&width=480").read()
                     self.state = state
 
-    def presses(self, word: str, phase: str) -> float:
-        """Seconds until the page is in a phase, with all its pictures."""
-        begin = time.monotonic()
+    def presses(self, word: str, phase: str) -> tuple[float, float, float]:
+        """Until the page is in a phase, with all its pictures: seconds, those of CPU, of these to draw pictures."""
+        begin, spent, drew = time.monotonic(), time.process_time(), DRAWN[0]
         request = urllib.request.Request(self.base + "api/do", json.dumps({"word": word}).encode())
         self.opener.open(request).read()
         version = self.state.get("version", -1)
         while self.state["phase"] != phase or self.state["version"] == version:
             time.sleep(0.005)
-        return time.monotonic() - begin
+        return time.monotonic() - begin, time.process_time() - spent, DRAWN[0] - drew
 
     def waits(self, phase: str) -> None:
         """Until the page is in a phase."""
@@ -81,6 +101,7 @@ def main() -> None:
     parser.add_argument("--browsers", type=int, default=1)
     options = parser.parse_args()
     return_large_memory()
+    count_drawing()
     with tempfile.TemporaryDirectory() as folder:
         setup = Setup(rig=options.rig, budget=options.points + 5, speed=1e9)
         with open_session(Path(folder) / "session", setup) as controller, open_page(controller) as (url, _):
@@ -94,9 +115,11 @@ def main() -> None:
     print(
         f"{options.rig}, {options.points} points, {options.browsers} browsers; memory {memory:.0f} MB with the clients"
     )
-    print(f"{'':18} {'median':>8} {'last 5':>8} {'longest':>8}  s")
+    print(f"{'':18} {'median':>8} {'last 5':>8} {'longest':>8}  s {'CPU, last 5':>14} {'of it drawn':>12}  s")
     for name, times in (("Go to found", go), ("Accept to target", accept)):
-        print(f"{name:18} {statistics.median(times):8.2f} {statistics.median(times[-5:]):8.2f} {max(times):8.2f}")
+        passed, spent, drawn = (list(column) for column in zip(*times, strict=True))
+        last, cpu, draw = (statistics.median(column[-5:]) for column in (passed, spent, drawn))
+        print(f"{name:18} {statistics.median(passed):8.2f} {last:8.2f} {max(passed):8.2f} {cpu:16.2f} {draw:12.2f}")
 
 
 if __name__ == "__main__":

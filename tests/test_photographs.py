@@ -11,7 +11,7 @@ from implicam.errors import UsageError
 from implicam.images import opencv, read_picture
 from implicam.picture_names import find_pictures
 from implicam.simulate import Optics, Studio, build_rig, moving_board, random_positions, record, views
-from implicam.simulate.photographs import PADDING_PX, Occluder, lines_of_sight
+from implicam.simulate.photographs import PADDING_PX, LinesOfSight, Occluder
 
 cv2 = opencv()
 STILL = Optics(noise=0, blur=0.7, vignetting=0, uneven=0, clutter=False, bits=16)
@@ -25,8 +25,10 @@ def balls(seed=1, n=2, optics=STILL, spec="bar6", cameras="cam1", **more):
 @pytest.mark.parametrize(("spec", "camera"), [("bar6", 0), ("bar6", 1), ("bar6", 5), ("stereo", 0)])
 def test_lines_of_sight_are_those_of_the_camera(spec, camera):
     view = build_rig(spec, seed=2).cameras[camera]
-    directions = lines_of_sight(view)
+    sight = LinesOfSight(view)
+    directions = sight.at(0, view.height + 2 * PADDING_PX, 0, view.width + 2 * PADDING_PX)
     assert directions.shape == (view.height + 2 * PADDING_PX, view.width + 2 * PADDING_PX, 3)
+    assert np.array_equal(sight.at(100, 190, 300, 420), directions[100:190, 300:420])
     rng = np.random.default_rng(0)
     u, v = rng.integers(0, view.width, 3000), rng.integers(0, view.height, 3000)
     along = directions[v + PADDING_PX, u + PADDING_PX].astype(float)

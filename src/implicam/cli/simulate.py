@@ -12,7 +12,7 @@ import typer
 
 from implicam.cli import show
 from implicam.cli.app import Json, Seed, command, must_be_folder
-from implicam.dataset import folder_files, write_dataset
+from implicam.dataset import Dataset, folder_files, write_dataset
 from implicam.dataset.folder import csv_text, format_cells
 from implicam.errors import UsageError
 from implicam.files import toml_text
@@ -21,6 +21,7 @@ from implicam.simulate import (
     Rig,
     Unusual,
     as_boards,
+    as_wand,
     ball_grid,
     build_rig,
     each_and_pairs,
@@ -30,8 +31,10 @@ from implicam.simulate import (
     record,
     simulate,
     step_gauge,
+    waved_wand,
     write_rig,
 )
+from implicam.simulate import Target as Shown
 
 GAUGE_U = 5e-6
 """Expanded uncertainty (k = 2) of a step gauge, over its length."""
@@ -43,6 +46,7 @@ class Target(StrEnum):
     ball = "ball"
     board = "board"
     boards = "boards"
+    wand = "wand"
 
 
 class Positions(StrEnum):
@@ -67,7 +71,7 @@ def simulate_command(
         str, typer.Option(metavar="NAME", help="bar6 (the paper's), grid9, dome8, any barN, gridAxB ..., or RIG.toml.")
     ] = "bar6",
     target: Annotated[
-        Target, typer.Option(help="A ball on a robot, a board on a slide, boards held by hand.")
+        Target, typer.Option(help="A ball on a robot, a board on a slide, boards held by hand, a waved wand.")
     ] = Target.ball,
     positions: Annotated[Positions, typer.Option(help="Where the ball goes.")] = Positions.grid,
     points: Annotated[int, typer.Option(min=1, metavar="N", help="How many random positions.")] = 157,
@@ -75,6 +79,10 @@ def simulate_command(
     boards: Annotated[int, typer.Option(min=1, metavar="N", help="How many positions of the board.")] = 20,
     each: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every camera alone.")] = 10,
     pairs: Annotated[int, typer.Option(min=0, metavar="N", help="boards: pictures by every two neighbours.")] = 4,
+    frames: Annotated[int, typer.Option(min=1, metavar="N", help="wand: in how many frames it is seen.")] = 200,
+    wand: Annotated[
+        float | None, typer.Option(min=0, metavar="LENGTH", help="Its length; 0.6 of the volume's shortest edge.")
+    ] = None,
     check: Annotated[
         int,
         typer.Option(
@@ -138,22 +146,22 @@ def simulate_command(
         cameras=cameras, unusual=Unusual(tilt, mirror, aspect, window),
     )  # fmt: skip
     shots = seed if shots_seed is None else shots_seed
+    rng = np.random.default_rng([shots, _SEEDS.get(target, 1)])
     if target is Target.board:
         shown = moving_board(built, positions=boards)
     elif target is Target.boards:
-        shown = held_boards(built, each_and_pairs(built, each, pairs), np.random.default_rng([shots, 9]))
-    elif positions is Positions.grid:
-        shown = ball_grid(built, _grid(grid))
+        shown = held_boards(built, each_and_pairs(built, each, pairs), rng)
+    elif target is Target.wand:
+        shown = waved_wand(built, frames, rng, length=wand)
     else:
-        shown = random_positions(built, points, np.random.default_rng([shots, 1]))
+        shown = ball_grid(built, _grid(grid)) if positions is Positions.grid else random_positions(built, points, rng)
     optics = Optics(noise=image_noise, blur=image_blur) if images else None
     files = {"truth.toml": toml_text({**write_rig(built), "shots_seed": shots})}
     with show.progress(json) as progress:
         recorded = record(
             built, shown, seed=shots, robot_noise=robot_noise, missing=missing, outliers=outliers, optics=optics
         )
-        if target is Target.boards:  # nobody knows where a hand held them
-            recorded = replace(recorded, data=as_boards(recorded.data, shown))
+        recorded = replace(recorded, data=_as_seen(recorded.data, shown, target))
         parts = {"": recorded}
         if check:
             target_points = random_positions(built, check, np.random.default_rng([shots, 2]))
@@ -180,6 +188,17 @@ def simulate_command(
     if check:
         show.line(f"{out / 'check'}: {check} random positions to judge by")
         show.line(f"{out / 'lengths'}: a step gauge on seven lines, for implicam verify")
+
+
+_SEEDS = {Target.boards: 9, Target.wand: 11}
+"""Of what is shown at random, beside the number of the shots."""
+
+
+def _as_seen(data: Dataset, shown: Shown, target: Target) -> Dataset:
+    """Without the positions that nobody knows: where a hand held a board or a wand."""
+    if target is Target.boards:
+        return as_boards(data, shown)
+    return as_wand(data, shown) if target is Target.wand else data
 
 
 def _lengths(rig: Rig, seed: int) -> dict[str, str]:

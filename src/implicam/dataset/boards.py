@@ -43,6 +43,20 @@ def corner_name(shot: str, number: int) -> str:
     return f"{shot}-c{number + 1:03d}"
 
 
+def corner_shots(points: NDArray[np.str_]) -> NDArray[np.str_]:
+    """The shot of each point of a dataset without known positions, which says it in the name of a corner.
+
+    Args:
+        points: (n,) names.
+
+    Returns:
+        (n,) names of shots; of a point that is no corner its own.
+    """
+    found = [CORNER.fullmatch(str(point)) for point in points]
+    shots = [match["shot"] if match else str(point) for point, match in zip(points, found, strict=True)]
+    return np.array(shots, dtype=np.str_)
+
+
 def is_board(target: object) -> TypeGuard[Mapping[str, Any]]:
     """Whether an entry `target` of dataset.toml describes a board.
 

@@ -436,8 +436,8 @@ class Dataset(Plotted):
                 why="there is no points.csv in its folder, no columns x, y and z in its table, or no xyz in its arrays",
                 fix="calibrate from its boards alone: --method explicit; or add points.csv with point,shot,x,y,z"
                 if isinstance(self.extra.get("target"), Mapping) and "rows" in self.extra["target"]
-                else "add points.csv with point,shot,x,y,z, the columns x, y and z, or xyz=; without them a dataset "
-                "can only be measured and checked",
+                else "add points.csv with point,shot,x,y,z, the columns x, y and z, or xyz=; or calibrate from a wand "
+                "whose length you know: --wand 500; without either a dataset can only be measured and checked",
             )
         return self.known
 

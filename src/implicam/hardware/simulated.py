@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
 
 import numpy as np
 
 from implicam.errors import HardwareError
 from implicam.hardware.protocol import Floats, Frame, check_position
 from implicam.simulate import Optics, Rig, Studio, Target
+from implicam.threads import cores
 
 SEED_STEP = 1_000_003
 """From one picture's seed to the next one's: their noise is not the same."""
@@ -98,14 +101,17 @@ class PhotographingCamera:
     """Stands in for a camera: photographs the ball of a `SimulatedRobot` through a simulated lens.
 
     fail_for: the next n calls of `frame` fail, as if it were unplugged. cover: the ball is hidden
-    in the next n pictures.
+    in the next n pictures. drawing: entered while a picture is made; None for nothing.
     """
 
     live = True
 
-    def __init__(self, studio: Studio, camera: int, robot: SimulatedRobot) -> None:
+    def __init__(
+        self, studio: Studio, camera: int, robot: SimulatedRobot, drawing: AbstractContextManager[Any] | None = None
+    ) -> None:
         self.name = studio.rig.cameras[camera].name
         self._studio, self._camera, self._robot = studio, camera, robot
+        self._drawing = nullcontext() if drawing is None else drawing
         self._fails = self._covers = self._number = 0
 
     def fail_for(self, n: int) -> None:
@@ -145,7 +151,8 @@ class PhotographingCamera:
         self._number += 1
         here = _ball_at(self._hidden_place() if hidden else self._robot.true_position)
         studio = self._studio.showing(here, seed=self._studio.seed + SEED_STEP * self._number)
-        return Frame(studio.picture(self._camera, 0), self._number, time.time())
+        with self._drawing:
+            return Frame(studio.picture(self._camera, 0), self._number, time.time())
 
     def close(self) -> None:
         """Nothing to release."""
@@ -182,7 +189,8 @@ def simulated_rig(
     robot = SimulatedRobot(middle, sd=sd, speed=speed, rng=np.random.default_rng([seed, 11]))
     ball = _ball_at(middle)
     studio = Studio(rig, ball, optics or Optics(), seed).showing(ball, seed=seed)
-    return [PhotographingCamera(studio, c, robot) for c in range(len(rig.cameras))], robot
+    drawing = threading.Semaphore(cores())  # more at once take no less time, and 25 MB each
+    return [PhotographingCamera(studio, c, robot, drawing) for c in range(len(rig.cameras))], robot
 
 
 def _ball_at(xyz: Floats) -> Target:

@@ -49,7 +49,7 @@ MAX_RADIUS_RATIO = 0.2
 MIN_WEIGHT = 1e-3
 """Of a camera, beside the best."""
 
-RADIUS_SDS = 3.2
+RADIUS_SDS = 3.6
 """Standard deviations along the worst direction that the circle's radius is, were the pixels' error known; more for few
 points, which tell little of it."""
 

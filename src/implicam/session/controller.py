@@ -465,6 +465,8 @@ class SessionController:
             frames = self._take_frames(self.equipment.trigger)
             if self.equipment.trigger is not None:
                 self._next_pulse = time.monotonic() + self.equipment.pulse_every
+            if self.state.phase != phase:  # one that waits for the cameras does not wait for the balls as well
+                return
             looks = self._detect_all(frames, live=True)
             if self.state.phase == phase:
                 self._show(looks=looks)

@@ -5,7 +5,8 @@
     settings   key, value (JSON), time of the last change
     shots      number (the order of accepting), name, state, time, notes (JSON)
                state: accepted; undone (taken back, kept); begun (its pictures are being written, it is no point yet)
-    points     one row a point: shot, number (its place in the shot), point, x, y, z, sd_x, sd_y, sd_z, more
+    points     one row a point: shot, number (its place in the shot), point, x, y, z, sd_x, sd_y, sd_z, more;
+               the corners of boards at places that nobody knows have no numbers
     views      one row a view: shot, point, camera, u, v, sd_u, sd_v, more
     skipped    number, x, y, z, reason, time
     events     number, time, what, more (JSON)
@@ -33,6 +34,7 @@ from typing import Any
 import numpy as np
 
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Names, Observations
+from implicam.dataset.boards import corner_shots
 from implicam.dataset.folder import POINTS, VIEWS
 from implicam.dataset.model import MAX_CELL_CHARACTERS
 from implicam.errors import DatasetError, ImplicamError, UsageError
@@ -433,16 +435,18 @@ def insert_shot(database: Database, data: Dataset, notes: str) -> None:
 
     Args:
         database: An open one.
-        data: The points of one shot, with known positions, in the session's unit and with its cameras.
+        data: The points of one shot, in the session's unit and with its cameras; with known positions, or corners of a
+            board at a place that nobody knows.
         notes: JSON text.
     """
-    shot = str(data.shots[0])
+    shot = str(shots_of(data)[0])
     database.run("DELETE FROM shots WHERE name = ? AND state = 'begun'", shot)
     database.run("INSERT INTO shots (name, state, time, notes) VALUES (?, 'accepted', ?, ?)", shot, now(), notes)
-    known, seen = data.positions, data.observations
+    known, seen = data.known, data.observations
+    nowhere: list[float | None] = [None] * 6
     for i, point in enumerate(data.points.tolist()):
-        more = json_text({key: str(text[i]) for key, text in known.extra.items()}, "a column")
-        numbers = _nulls_for_nan(known.xyz[i], known.sd[i])
+        more = json_text({} if known is None else {key: str(text[i]) for key, text in known.extra.items()}, "a column")
+        numbers = nowhere if known is None else _nulls_for_nan(known.xyz[i], known.sd[i])
         database.run("INSERT INTO points VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", shot, i, point, *numbers, more)
     for i, k in np.argwhere(seen.seen):
         more = json_text({key: str(text[i, k]) for key, text in seen.extra.items()}, "a column")
@@ -483,9 +487,11 @@ def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
     if not shots:
         return None
     names, n, c = points.names, len(points.names), len(empty.cameras)
-    known = KnownPositions(
-        _text(points.shots), points.numbers[:, :3], points.numbers[:, 3:], _read_extra_columns(points.more, (n,))
-    )
+    known = None
+    if not np.isnan(points.numbers).all():  # else corners of boards at places that nobody knows
+        known = KnownPositions(
+            _text(points.shots), points.numbers[:, :3], points.numbers[:, 3:], _read_extra_columns(points.more, (n,))
+        )
     row_of = {name: i for i, name in enumerate(names)}
     camera_of = {name: k for k, name in enumerate(empty.observations.camera_names)}
     i = np.array([row_of[name] for name in views.names], dtype=np.intp)
@@ -497,7 +503,19 @@ def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
     observations = Observations(
         _text(names), empty.cameras, table[..., :2], table[..., 2:], _read_extra_columns(views.more, (n, c), (i, k))
     )
-    return Dataset(empty.name, empty.length_unit, observations, known)
+    data = Dataset(empty.name, empty.length_unit, observations, known, empty.extra)
+    if known is None and shots_of(data).tolist() != points.shots:
+        raise ValueError("a point without a position is no corner of its shot")
+    return data
+
+
+def shots_of(data: Dataset) -> Names:
+    """The shot of each point: as the known positions say it, or the names of corners.
+
+    Args:
+        data: Of a session.
+    """
+    return corner_shots(data.points) if data.known is None else data.known.shots
 
 
 @dataclass

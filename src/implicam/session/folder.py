@@ -17,6 +17,7 @@ from implicam.files import convert_write_errors, replacing
 from implicam.images import Grey, write_picture
 from implicam.logs import LOG
 from implicam.session.database import DATABASE
+from implicam.threads import side_by_side
 
 UNDONE = "undone"
 """The folder of what was taken out of the dataset: undone/<camera>/<shot>.png, and tables edited by hand."""
@@ -179,11 +180,15 @@ def write_pictures(folder: Path, shot: str, pictures: Mapping[str, Grey]) -> Non
         shot: Its name.
         pictures: Camera name -> grey (height, width), from 0 to 1, or uint8.
     """
-    for camera, picture in pictures.items():
-        path = picture_path(folder, camera, shot)
+
+    def write(camera: str) -> None:
+        path, picture = picture_path(folder, camera, shot), pictures[camera]
         write_picture(path, picture, bits=_choose_bits(picture))
-        for place in (path.parent, folder / IMAGES, folder):
-            flush_folder(place)
+        flush_folder(path.parent)
+
+    side_by_side(write, pictures, calls_blas=False)  # the disk is waited for, and compression lets others work
+    for place in (folder / IMAGES, folder):
+        flush_folder(place)
 
 
 def set_pictures_aside(folder: Path, shots: Iterable[str], cameras: Sequence[Camera]) -> None:

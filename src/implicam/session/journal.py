@@ -40,11 +40,15 @@ from implicam.session.database import (
     now,
     read_accepted,
     read_cameras,
+    shots_of,
 )
 
 _LOG = logging.getLogger(__name__)
 
-__all__ = ["Event", "Session", "Skipped"]
+__all__ = ["TARGET_KEY", "Event", "Session", "Skipped"]
+
+TARGET_KEY = "target_table"
+"""The setting of a session that is the table [target] of its dataset: which board it shows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +78,15 @@ class Session:
         self.folder = folder
         with _reporting_damage(self.folder):
             ((self.name, self.length_unit),) = database.rows("SELECT name, length_unit FROM session")
+            self._settings = _read_settings(database)
             self.cameras = read_cameras(database)
             for camera in self.cameras:
                 files.check_file_name(camera.name, "camera")
             for (shot,) in database.rows("SELECT name FROM shots"):
                 files.check_file_name(shot, "shot")
-            self._empty = _make_empty_dataset(self.name, self.length_unit, self.cameras)
+            self._empty = _make_empty_dataset(self.name, self.length_unit, self.cameras, self._settings.get(TARGET_KEY))
             self._data = read_accepted(database, self._empty)
             self._tables = files.Tables.of(self._data, self._empty)
-            self._settings = _read_settings(database)
         database.end_of_reading()
 
     @classmethod
@@ -96,7 +100,7 @@ class Session:
             name: Of the session and its dataset.
             length_unit: That of all positions.
             cameras: In their order; the folders of their pictures are named after them.
-            settings: Plain values, kept as JSON.
+            settings: Plain values, kept as JSON; `TARGET_KEY` is the table [target] of its dataset.
 
         Raises:
             UsageError: Something else is in the folder, or a setting has no form in JSON.
@@ -104,7 +108,8 @@ class Session:
             ImplicamError: The folder cannot be written.
         """
         folder = Path(folder).absolute()
-        description_text(_make_empty_dataset(name, length_unit, cameras))  # refuses what a dataset cannot hold
+        target = settings.get(TARGET_KEY)
+        description_text(_make_empty_dataset(name, length_unit, cameras, target))  # refuses what a dataset cannot hold
         for camera in cameras:
             files.check_file_name(camera.name, "camera")
         values = {key: json_text(value, f"the setting {key!r}") for key, value in settings.items()}
@@ -182,8 +187,9 @@ class Session:
         """Add one shot; it is on disk when this returns, and where it raises, nothing was added.
 
         Args:
-            point: The known positions and the views of all cameras, one point of a ball or several of a board, of one
-                shot whose name is new. Its numbers are kept bit by bit, its columns too; its dataset name is not.
+            point: The views of all cameras, one point of a ball or several of a board, of one shot whose name is new;
+                with known positions, or all shots of the session without. Its numbers are kept bit by bit, its columns
+                too; its dataset name is not.
             pictures: Camera name -> grey (height, width) from 0 to 1; 16 bits are written where 8 would lose something.
             notes: Plain values, kept as JSON beside the shot.
 
@@ -195,7 +201,7 @@ class Session:
         """
         with self._lock:
             shot = self._check_shot(point)
-            name = str(shot.shots[0])
+            name = str(shots_of(shot)[0])
             files.check_pictures(pictures, self.cameras)
             noted = json_text(dict(notes), "a note")
             data = join(self._data, shot) if self._data else shot
@@ -217,7 +223,7 @@ class Session:
         with self._lock:
             if self._data is None:
                 return None
-            last = str(self._data.shots[-1])
+            last = str(shots_of(self._data)[-1])
             self.remove(last)
             return last
 
@@ -231,7 +237,7 @@ class Session:
             UsageError: There is no accepted shot of this name.
         """
         with self._lock:
-            if self._data is None or shot not in self._data.shots.tolist():
+            if self._data is None or shot not in shots_of(self._data).tolist():
                 raise UsageError(f"there is no point {shot!r} in the session.", fix="name one that was accepted")
             with self._database.transaction():
                 self._database.run("UPDATE shots SET state = 'undone', time = ? WHERE name = ?", now(), shot)
@@ -322,7 +328,15 @@ class Session:
 
     def _check_shot(self, point: Dataset) -> Dataset:
         """The shot as the session keeps it; DatasetError where it does not fit."""
-        names = sorted(set(point.shots.tolist()))
+        if "target" not in self._empty.extra:
+            _ = point.positions  # no board: without positions it is nothing
+        if self._data is not None and (point.known is None) != (self._data.known is None):
+            raise DatasetError(
+                "a session has known positions or none.",
+                why="what was accepted before is of the other kind",
+                fix="begin another session in another folder",
+            )
+        names = sorted(set(shots_of(point).tolist()))
         if len(names) != 1:
             raise DatasetError(f"{len(names)} shots at once: {', '.join(names[:5])}.", fix="accept one after the other")
         files.check_file_name(names[0], "shot")
@@ -345,7 +359,7 @@ class Session:
                 f"the shot {names[0]!r} was seen by no camera.", fix="take it again, or skip the target and say why"
             )
         observations = Observations(seen.points, self.cameras, seen.uv, seen.sd, seen.extra)
-        return Dataset(self.name, self.length_unit, observations, point.positions)
+        return Dataset(self.name, self.length_unit, observations, point.known, self._empty.extra)
 
     def _commit_begun(self, shot: str) -> None:
         """Commit that files of this name are about to appear, so that a kill leaves none unknown."""
@@ -404,9 +418,12 @@ def _read_settings(database: Database) -> dict[str, Any]:
     return {key: json.loads(text) for key, text in database.rows("SELECT key, value FROM settings")}
 
 
-def _make_empty_dataset(name: str, length_unit: str, cameras: Sequence[Camera]) -> Dataset:
+def _make_empty_dataset(
+    name: str, length_unit: str, cameras: Sequence[Camera], target: Mapping[str, Any] | None = None
+) -> Dataset:
     none = np.empty((0, len(cameras), 2))
-    return Dataset(name, length_unit, Observations(np.array([], dtype=np.str_), tuple(cameras), none, none))
+    observations = Observations(np.array([], dtype=np.str_), tuple(cameras), none, none)
+    return Dataset(name, length_unit, observations, None, {"target": dict(target)} if target else {})
 
 
 def _check_cameras(given: Sequence[Camera], ours: Sequence[Camera]) -> None:

@@ -25,10 +25,12 @@ from implicam.active import (
     workspace_from,
 )  # fmt: skip
 from implicam.active.acquisitions import ACQUISITIONS, DEFAULT_ACQUISITION
+from implicam.active.board_loop import Pictures
 from implicam.active.design_model import can_design_experiments, design_error, design_methods
 from implicam.addresses import without_secrets
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
+from implicam.dataset.boards import BOARD_KINDS
 from implicam.dataset.units import METRES_PER_UNIT
 from implicam.detect import Ball
 from implicam.errors import DatasetError, HardwareError, UsageError, did_you_mean
@@ -55,9 +57,10 @@ from implicam.hardware import (
 )
 from implicam.registry import Option
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
+from implicam.session.board_setup import BALL, SIZES, board_detector, board_hardware, made_board_session
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
-from implicam.session.journal import Session
+from implicam.session.journal import TARGET_KEY, Session
 from implicam.session.trust import (
     DEVICES,
     check_nothing_native,
@@ -83,6 +86,7 @@ one that is live or triggered."""
 _rig = partial(Option, panel="Without hardware")
 _real = partial(Option, panel="Cameras and robot")
 _plan = partial(Option, panel="Where, and how long")
+_shown = partial(Option, panel="What is shown to the cameras")
 
 Tool = tuple[float, ...]
 
@@ -95,7 +99,9 @@ class Setup:
     `seed`. robot: "" for what goes with the cameras, else a spec of `robot_from`. workspace: words as `workspace_from`
     takes them, "" for what the robot can reach. reach: as in `Loop`. sd: standard uncertainty of the robot's positions,
     or of what a person types, None for the robot's own. tool: the ball's centre in the frame of a UR robot's flange,
-    None for the TCP that is set on it. `cameras` and `tool` may be the words of a command line.
+    None for the TCP that is set on it. target: what is shown, and of a board held by hand its size; then `workspace` is
+    in the frame of the first camera, and "" for where it is seen well. `cameras` and `tool` may be the words of a
+    command line.
 
     Raises:
         UsageError: a value is not possible.
@@ -103,6 +109,14 @@ class Setup:
 
     rig: Annotated[str, _rig("bar6, grid9, dome8 ..., or a drawing RIG.toml")] = "bar6"
     rig_cameras: Annotated[str | None, _rig("Some of its cameras: 2R, cam1,cam4", "LIST", flags="--cameras")] = None
+    target: Annotated[str, _shown(lambda: f"{', '.join((BALL, *BOARD_KINDS))}")] = BALL
+    board: Annotated[str | None, _shown("Of a board: inner corners, squares or tags, 8x11", "RxC")] = None
+    square: Annotated[float | None, _shown("Edge of its squares", "LENGTH", 0)] = None
+    marker: Annotated[float | None, _shown("charuco: edge of its markers", "LENGTH", 0)] = None
+    tag: Annotated[float | None, _shown("aprilgrid: edge of its tags", "LENGTH", 0)] = None
+    spacing: Annotated[float | None, _shown("aprilgrid: between two tags", "LENGTH", 0)] = None
+    dictionary: Annotated[str | None, _shown("charuco, aprilgrid: OpenCV's name of the markers")] = None
+    legacy: Annotated[bool, _shown("charuco: printed with OpenCV before 4.6", flags="--legacy/--no-legacy")] = False
     cameras: Annotated[
         tuple[tuple[str, str], ...],
         _real(lambda: f"One a camera; WHAT is {list_specs(CAMERAS)}", "NAME=WHAT", flags="--camera", kind=list[str]),
@@ -153,6 +167,8 @@ class Setup:
                 raise UsageError(f"{what} = {value:g} is not possible.", fix="give a number greater than zero")
         if not 0 <= self.pulse_every < np.inf:
             raise UsageError(f"--pulse-every {self.pulse_every:g} is no time.", fix="give seconds, or 0 for no pulse")
+        if self.target != BALL:
+            board_detector(self)
         if self.budget < MIN_POINTS_PER_CAMERA:
             raise UsageError(
                 f"{self.budget} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
@@ -198,7 +214,7 @@ class Setup:
     @property
     def rule(self) -> Rule:
         """When to stop."""
-        rule = Within(self.within) | Budget(self.budget)
+        rule = Within(self.within) | (Budget if self.target == BALL else Pictures)(self.budget)
         if self.below is not None:
             rule = Below(self.below) | rule
         if self.converged is not None:
@@ -255,7 +271,8 @@ def position_from_text(text: str, option: str) -> Floats:
     return position
 
 
-Hardware = tuple[list[FrameSource], Robot, Workspace]
+Hardware = tuple[list[FrameSource], Robot, Workspace | None]
+"""The workspace is None for a board that nobody has said the volume of."""
 
 
 def open_session(
@@ -314,7 +331,11 @@ def open_session(
             name=folder.absolute().name,
             length_unit=setup.unit,
             cameras=sized,
-            settings={**setup.as_settings(), CAMERAS_KEY: keep_settings(hardware[0])},
+            settings={
+                **setup.as_settings(),
+                CAMERAS_KEY: keep_settings(hardware[0]),
+                **({} if setup.target == BALL else {TARGET_KEY: board_detector(setup).describe()}),
+            },
         )
         remember(folder, setup.as_settings())
         return _made(session, setup, hardware, auto)
@@ -374,7 +395,7 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
     before = Setup.from_settings(session.settings)
     if setup is None:
         return before
-    same = ("rig", "rig_cameras", "unit", "seed") if before.simulated else ("unit",)
+    same = ["unit", "target", *SIZES, *(("rig", "rig_cameras", "seed") if before.simulated else ())]
     for key in same:
         if getattr(setup, key) != getattr(before, key):
             raise UsageError(
@@ -390,14 +411,18 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
     cameras, robot, workspace = hardware
     trigger = trigger_of(setup)
     radius = setup.radius
-    if radius is None and setup.simulated:
+    if radius is None and setup.simulated and setup.target == BALL:
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
     waits = trigger is None and not all(source.live for source in cameras)
     timeout = PICTURE_TIMEOUT_SECONDS if waits else LIVE_TIMEOUT_SECONDS
+    detector = Ball(bright=setup.bright) if setup.target == BALL else board_detector(setup)
     equipment = Equipment(
-        cameras, robot, Ball(bright=setup.bright), trigger, radius, timeout, setup.dry_run, setup.unit,
+        cameras, robot, detector, trigger, radius, timeout, setup.dry_run, setup.unit,
         setup.pulse_every,
     )  # fmt: skip
+    if setup.target != BALL:
+        return made_board_session(session, setup, equipment, workspace)
+    assert workspace is not None
     loop = Loop(
         calibrator_from_name(setup.method),
         workspace,
@@ -410,6 +435,10 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
 
 
 def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
+    if setup.target != BALL:
+        if setup.simulated:
+            trigger_of(setup)  # there must be none
+        return board_hardware(setup, None if setup.simulated else cameras_of(setup))
     if setup.simulated:
         return _simulated(setup)
     cameras = cameras_of(setup)

@@ -12,6 +12,7 @@ from implicam.dataset import Dataset
 from implicam.simulate.camera import SimulatedCamera, SmoothError, error_process
 from implicam.simulate.noise import (
     as_boards,
+    as_wand,
     cramer_rao_limit,
     each_and_pairs,
     simulate,
@@ -31,6 +32,7 @@ from implicam.simulate.targets import (
     moving_board,
     random_positions,
     step_gauge,
+    waved_wand,
 )
 from implicam.simulate.truth import write_rig
 from implicam.simulate.window import Window
@@ -52,6 +54,7 @@ __all__ = [
     "Unusual",
     "Window",
     "as_boards",
+    "as_wand",
     "ball_grid",
     "build_rig",
     "cramer_rao_limit",
@@ -69,6 +72,7 @@ __all__ = [
     "simulated",
     "step_gauge",
     "views",
+    "waved_wand",
     "with_limit",
     "write_rig",
 ]

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import TRUTH_COLUMNS, Camera, Dataset, Floats, KnownPositions, Names, Observations
+from implicam.dataset.wand import FRAME, MARKER, Wand
 from implicam.errors import UsageError
 from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.rigs import Rig
-from implicam.simulate.targets import Target, held_boards
+from implicam.simulate.targets import WAND_ENDS, WAND_JITTER_RATIO, Target, held_boards
 
 Bools = NDArray[np.bool_]
 
@@ -125,6 +126,23 @@ def as_boards(data: Dataset, target: Target) -> Dataset:
     square = float(np.linalg.norm(target.xyz[1] - target.xyz[0]))
     kind = {"kind": "board", "rows": rows, "columns": columns, "square": square}
     return replace(data, known=None, extra={**data.extra, "target": kind})
+
+
+def as_wand(data: Dataset, target: Target) -> Dataset:
+    """A recording of a wand without its positions, but with its length, and whose frame and marker each point is.
+
+    A marker that no camera saw is not in it.
+
+    Args:
+        data: The recording.
+        target: The wand that was recorded.
+    """
+    assert target.wand is not None
+    described = Wand(WAND_ENDS, target.wand, jitter=WAND_JITTER_RATIO * target.wand).as_table()
+    marker = np.array([str(point).rsplit(" ", 1)[1] for point in data.points], dtype=np.str_)
+    columns = {FRAME: data.shots, MARKER: marker}
+    unknown = replace(data, known=None, extra={**data.extra, "target": described}, columns=columns)
+    return unknown.select(data.observations.seen.any(axis=1))
 
 
 def each_and_pairs(rig: Rig, each: int, pairs: int) -> list[tuple[str, ...]]:

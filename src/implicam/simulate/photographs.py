@@ -7,7 +7,7 @@ that the target covers, two by two rays a pixel, and then the optics and the sen
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -236,7 +236,7 @@ class Studio:
         grid = xyz.reshape(rows, columns, 3)
         right = (grid[0, -1] - grid[0, 0]) / (columns - 1)
         down = (grid[-1, 0] - grid[0, 0]) / (rows - 1)
-        return Checkerboard(grid[0, 0], right, down, rows, columns, self._light)
+        return Checkerboard(grid[0, 0], right, down, rows, columns, self._light, self.target.marks)
 
     @cached_property
     def _looks(self) -> list[_Look]:
@@ -301,7 +301,7 @@ class Studio:
         cv2 = opencv()
         fine = ((right - left) * RAYS_PER_PIXEL_SIDE, (bottom - top) * RAYS_PER_PIXEL_SIDE)
         ground = cv2.resize(look.sharp[window], fine, interpolation=cv2.INTER_LINEAR)
-        directions = cv2.resize(look.directions[window], fine, interpolation=cv2.INTER_LINEAR)
+        directions = cv2.resize(look.sight.at(*box), fine, interpolation=cv2.INTER_LINEAR)
         patch = thing.paint(Rays(look.camera.camera_from_world.centre, directions), ground)
         if cover is not None:
             patch = _paint_occluder(patch, cover, (left, top))
@@ -405,6 +405,8 @@ def record(
     """
     if optics is None:
         return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, missing=missing, outliers=outliers))
+    if target.wand is not None:
+        raise UsageError("a wand cannot be photographed yet.", fix="leave out --images")
     if outliers > 0:
         raise UsageError(
             "wrong detections cannot be photographed.", why="they come from the detector", fix="leave out --outliers"
@@ -427,44 +429,63 @@ class _Look:
     def __init__(self, camera: SimulatedCamera, optics: Optics, rng: np.random.Generator) -> None:
         cv2 = opencv()
         self.camera = camera
-        self.directions = lines_of_sight(camera)
+        self.sight = LinesOfSight(camera)
         self.sharp = np.pad(
             background(camera.width, camera.height, rng, clutter=optics.clutter), PADDING_PX, mode="edge"
         )
         self.blurred = cv2.GaussianBlur(self.sharp, (0, 0), optics.blur) if optics.blur > 0 else self.sharp
-        v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
-        middle = np.array([camera.width - 1, camera.height - 1]) / 2
-        radius = ((u - middle[0]) ** 2 + (v - middle[1]) ** 2) / np.sum(middle**2)
-        self.vignette = np.asarray(1 - optics.vignetting * radius, np.float32)
+        self.vignette = _vignette(camera.width, camera.height, optics.vignetting)
 
 
-def lines_of_sight(camera: SimulatedCamera) -> NDArray[np.float32]:
+class LinesOfSight:
     """The directions that the pixels of a camera look along.
 
     Computed at every eighth pixel and interpolated by a bicubic spline, exact to much less than a thousandth of a
-    pixel. Pixels beyond the image circle of the lens look where its rim looks; nothing that the lens sees falls there.
+    pixel; where they are wanted only, because those of all pixels take 12 MB a camera. Pixels beyond the image circle
+    of the lens look where its rim looks; nothing that the lens sees falls there.
 
     Args:
         camera: The camera; without a window.
-
-    Returns:
-        (height + 2 PADDING_PX, width + 2 PADDING_PX, 3) unit vectors in the world.
     """
-    size = np.array([camera.width, camera.height])
-    us, vs = (np.linspace(-PADDING_PX, n - 1 + PADDING_PX, (n + 2 * PADDING_PX) // 8 + 2) for n in size)
-    grid = np.stack(np.meshgrid(us, vs), axis=2).reshape(-1, 2)
-    straight = grid.copy()
-    for _ in range(6):  # the smooth error changes by less than a per cent from pixel to pixel
-        straight = grid - camera.error.at(straight)
-    rays, seen = camera.ray_from_pixel(straight)
-    middle = np.array([camera.lens.cx, camera.lens.cy])
-    while not seen.all():
-        straight[~seen] = middle + 0.98 * (straight[~seen] - middle)
-        rays[~seen], seen[~seen] = camera.ray_from_pixel(straight[~seen])
-    directions = (rays @ camera.camera_from_world.rotation).reshape(len(vs), len(us), 3)
-    u, v = np.arange(-PADDING_PX, size[0] + PADDING_PX), np.arange(-PADDING_PX, size[1] + PADDING_PX)
-    planes = [RectBivariateSpline(vs, us, directions[:, :, k])(v, u) for k in range(3)]
-    return np.stack(planes, axis=2).astype(np.float32)
+
+    def __init__(self, camera: SimulatedCamera) -> None:
+        size = np.array([camera.width, camera.height])
+        us, vs = (np.linspace(-PADDING_PX, n - 1 + PADDING_PX, (n + 2 * PADDING_PX) // 8 + 2) for n in size)
+        grid = np.stack(np.meshgrid(us, vs), axis=2).reshape(-1, 2)
+        straight = grid.copy()
+        for _ in range(6):  # the smooth error changes by less than a per cent from pixel to pixel
+            straight = grid - camera.error.at(straight)
+        rays, seen = camera.ray_from_pixel(straight)
+        middle = np.array([camera.lens.cx, camera.lens.cy])
+        while not seen.all():
+            straight[~seen] = middle + 0.98 * (straight[~seen] - middle)
+            rays[~seen], seen[~seen] = camera.ray_from_pixel(straight[~seen])
+        directions = (rays @ camera.camera_from_world.rotation).reshape(len(vs), len(us), 3)
+        self._splines = [RectBivariateSpline(vs, us, directions[:, :, k]) for k in range(3)]
+
+    def at(self, top: int, bottom: int, left: int, right: int) -> NDArray[np.float32]:
+        """The directions in a part of the padded picture.
+
+        Args:
+            top: Its first row; row `PADDING_PX` is the picture's first.
+            bottom: The row after its last.
+            left: Its first column.
+            right: The column after its last.
+
+        Returns:
+            (bottom - top, right - left, 3) unit vectors in the world.
+        """
+        v, u = np.arange(top, bottom) - PADDING_PX, np.arange(left, right) - PADDING_PX
+        return np.stack([spline(v, u) for spline in self._splines], axis=2).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def _vignette(width: int, height: int, strength: float) -> NDArray[np.float32]:
+    """(height, width) the part of the light that a lens lets through; one array for all cameras of a size."""
+    v, u = np.mgrid[:height, :width].astype(np.float32)
+    middle = np.array([width - 1, height - 1]) / 2
+    radius = ((u - middle[0]) ** 2 + (v - middle[1]) ** 2) / np.sum(middle**2)
+    return np.asarray(1 - strength * radius, np.float32)
 
 
 def _paint_occluder(patch: Grey, cover: Occluder, corner: tuple[int, int]) -> Grey:

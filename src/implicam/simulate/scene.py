@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
+from implicam.images import opencv
 
 Patch = NDArray[np.float32]
 """(rows, columns), one value per ray; or (rows, columns, 3), one vector."""
@@ -163,6 +164,8 @@ class Checkerboard:
         rows: Of inner corners.
         columns: Of inner corners.
         light: The lamp.
+        marks: What is printed in its white squares, from 0, nothing, to 1, black: (k (rows + 1), k (columns + 1)), k
+            samples a square; None for nothing.
     """
 
     corner: Floats
@@ -171,6 +174,7 @@ class Checkerboard:
     rows: int
     columns: int
     light: Light
+    marks: Patch | None = None
 
     def paint(self, rays: Rays, ground: Patch) -> Patch:
         """Paint it over what is behind it; seen from behind it is plain grey.
@@ -190,11 +194,26 @@ class Checkerboard:
         cover = _inside(x, -2, self.columns + 1) * _inside(y, -2, self.rows + 1)
         printed = _inside(x, -1, self.columns) * _inside(y, -1, self.rows)
         black = 0.5 + 0.5 * _stripes(x) * _stripes(y)
+        if self.marks is not None:
+            black = np.maximum(black, self._marks_at(self.marks, x, y))
         albedo = 0.78 - 0.70 * black * printed
         value = np.nan_to_num(np.asarray(albedo * self.light.at(hit), np.float32))
         if (rays.centre - self.corner) @ facing < 0:
             value = np.full_like(value, 0.3)  # its back
         return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
+
+    def _marks_at(self, marks: Patch, x: Patch, y: Patch) -> Patch:
+        """The marks where rays meet the board, averaged over about what a sample covers."""
+        cv2 = opencv()
+        with np.errstate(invalid="ignore"):
+            step = float(np.nanmedian(np.hypot(*np.gradient(x)))) if min(x.shape) > 1 else 1.0
+        samples = marks.shape[1] / (self.columns + 1)
+        part = float(np.clip(1 / max(step * samples, 1e-3), 0.02, 1.0))
+        small = cv2.resize(marks, None, fx=part, fy=part, interpolation=cv2.INTER_AREA)
+        across, along = small.shape[1] / (self.columns + 1), small.shape[0] / (self.rows + 1)
+        u, v = ((x + 1) * across - 0.5).astype(np.float32), ((y + 1) * along - 0.5).astype(np.float32)
+        found = cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        return np.asarray(found, np.float32)
 
     def reach(self) -> Floats:
         """(4, 3) the corners of the sheet, in the world."""

@@ -28,6 +28,8 @@ class Target:
         facing: (3,) or (n, 3) the side that a board shows, a unit vector in the world; None for a ball, which has none.
         board: Rows and columns of its inner corners; None for a ball.
         takes: (n, cameras) which cameras take a picture; None for all of them.
+        marks: What is printed in the white squares of a board, as `scene.Checkerboard` has it; None for nothing.
+        wand: Length of a wand, whose two ends the points are in turn; None for no wand.
     """
 
     name: str
@@ -37,6 +39,8 @@ class Target:
     facing: Floats | None = None
     board: tuple[int, int] | None = None
     takes: NDArray[np.bool_] | None = None
+    marks: NDArray[np.float32] | None = None
+    wand: float | None = None
 
 
 def ball_grid(rig: Rig, shape: tuple[int, int, int] = (5, 5, 7)) -> Target:
@@ -68,6 +72,51 @@ def random_positions(rig: Rig, n: int, rng: np.random.Generator) -> Target:
     """
     _check_counts(n=(n,))
     return _balls(rig, "random", rng.uniform(-0.5, 0.5, size=(n, 3)))
+
+
+WAND_SHARE = 0.6
+"""Length of a wand over the shortest edge of the working volume."""
+WAND_ENDS = ("a", "b")
+"""Names of its markers."""
+WAND_JITTER_RATIO = 1e-4
+"""Sd of its length from frame to frame, over the length: it bends, and a marker is not quite round."""
+WAND_TRIAL_COUNT = 1000
+"""Places and directions that are tried for each frame."""
+
+
+def waved_wand(rig: Rig, frames: int, rng: np.random.Generator, *, length: float | None = None) -> Target:
+    """A wand with two markers, waved by hand in the working volume: any place, any direction, both ends inside.
+
+    Args:
+        rig: The rig.
+        frames: How often it is seen.
+        rng: Random numbers.
+        length: Between the markers, in the rig's unit; None for 0.6 of the volume's shortest edge.
+
+    Raises:
+        UsageError: A number is below 1, or the wand does not fit into the volume.
+    """
+    _check_counts(frames=(frames,))
+    size = rig.volume.size
+    usual = WAND_SHARE * float(size.min()) if length is None else length
+    if not 0 < usual < float(np.linalg.norm(size)):
+        raise UsageError(
+            f"a wand of {usual:g} {rig.length_unit} does not fit into the volume of this rig.",
+            fix=f"it is {', '.join(f'{edge:g}' for edge in size)} {rig.length_unit} large",
+        )
+    ends = np.empty((frames, 2, 3))
+    for frame in range(frames):
+        along = rng.normal(size=(WAND_TRIAL_COUNT, 3))
+        along *= usual * (1 + WAND_JITTER_RATIO * rng.normal()) / np.linalg.norm(along, axis=1)[:, None]
+        middle = rng.uniform(-0.5, 0.5, size=(WAND_TRIAL_COUNT, 3)) * size
+        tried = middle[:, None] + np.array([[-0.5], [0.5]]) * along[:, None]
+        inside = np.flatnonzero((np.abs(tried) <= size / 2).all(axis=(1, 2)))
+        if not len(inside):
+            raise UsageError(f"a wand of {usual:g} {rig.length_unit} hardly fits into the volume.", fix="a shorter one")
+        ends[frame] = tried[inside[0]]
+    names = np.array([f"{frame + 1} {end}" for frame in range(frames) for end in WAND_ENDS])
+    shots = np.repeat([f"{frame + 1}" for frame in range(frames)], 2)
+    return Target("wand", names, shots, rig.volume.world_from_box.apply(ends.reshape(-1, 3)), wand=usual)
 
 
 GAUGE_SHARE = 0.95

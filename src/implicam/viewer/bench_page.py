@@ -25,6 +25,7 @@ from implicam.formatting import json_safe
 from implicam.hardware import GuardedRobot
 from implicam.hardware.protocol import format_position
 from implicam.images import Grey, read_picture
+from implicam.session.board_session import BoardController
 from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, SessionController, State
 from implicam.session.typed import PositionQuestion, TypedPosition, parse_position
 from implicam.viewer import words
@@ -120,9 +121,9 @@ class BenchPage:
         if word == "close":
             self.closed.set()
             return {}
-        if not isinstance(word, str) or word not in words.allowed(self._controller.state, self._moves):
+        if not isinstance(word, str) or word not in self._buttons_of(self._controller.state):
             raise UsageError(f"{word!r} is none of the buttons.", fix="reload the page")
-        if not words.allowed(self._controller.state, self._moves)[word]:
+        if not self._buttons_of(self._controller.state)[word]:
             raise UsageError("that cannot be done now.", why=words.headline(self._controller.state, self._moves).title)
         if word == "auto":
             return self._set_auto(given)
@@ -137,6 +138,10 @@ class BenchPage:
         self._allowed = None
         self._controller.stop_robot()
         return {}
+
+    def _buttons_of(self, state: State) -> dict[str, bool]:
+        """Which buttons make sense now."""
+        return words.allowed(state, self._moves)
 
     def _action(self, word: str, given: Mapping[str, Any]) -> Callable[[], Any] | dict[str, Any]:
         """What the worker is to do, or what has to be asked before."""
@@ -273,9 +278,7 @@ class BenchPage:
         controller = self._controller
         measured = controller.measured_live if state.phase == "aim" else np.full(3, np.nan)
         skipped = controller.session.skipped
-        found = snapshot(
-            state, self._names, measured, controller.loop.rule, unit=self._unit, moves=self._moves, skipped=len(skipped)
-        )
+        found = self._snapshot(state, measured, len(skipped))
         looks = {look.camera: look for look in state.looks}
         for row in found["cameras"]:
             look = looks.get(row["name"])
@@ -301,6 +304,11 @@ class BenchPage:
         }  # fmt: skip
         with self._lock:
             self._sent = {**found, "number": self._sent["number"] + 1}
+
+    def _snapshot(self, state: State, measured: Floats, skipped: int) -> dict[str, Any]:
+        """What the pages are to show of a state."""
+        rule = self._controller.loop.rule
+        return snapshot(state, self._names, measured, rule, unit=self._unit, moves=self._moves, skipped=skipped)
 
     def about(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """What does not change while the page is open."""
@@ -372,12 +380,16 @@ class BenchPage:
         """The picture that was kept of a known point by a camera."""
         from starlette.responses import Response
 
-        data, point = self._controller.session.data, given.get("point")
-        known = data is not None and point in data.points.tolist()
-        file = self._controller.session.pictures_of(str(point)).get(str(given.get("camera"))) if known else None
+        point = str(given.get("point"))
+        kept = self._controller.session.pictures_of(point) if self._has(point) else {}
+        file = kept.get(str(given.get("camera")))
         if file is None:
             raise ImplicamError("there is no such picture.", fix="reload the page")
         return Response(jpeg(read_picture(file), bright=False, width=WIDTHS_PX[1]), media_type="image/jpeg")
+
+    def _has(self, point: str) -> bool:
+        data = self._controller.session.data
+        return data is not None and point in data.points.tolist()
 
     def picture(self, given: Mapping[str, Any]) -> Response:
         """The last picture of a camera, as wide as it is shown."""
@@ -443,6 +455,12 @@ def _without_position(question: dict[str, Any] | None) -> dict[str, Any] | None:
     return None if question is None else {key: value for key, value in question.items() if key != "position"}
 
 
+def _page_of(controller: SessionController) -> BenchPage:
+    from implicam.viewer.board_page import BoardPage  # late: it is built on this page
+
+    return BoardPage(controller) if isinstance(controller, BoardController) else BenchPage(controller)
+
+
 @contextmanager
 def open_page(
     controller: SessionController, *, host: str = "127.0.0.1", port: int = 0, token: str | None = None
@@ -462,7 +480,7 @@ def open_page(
         MissingExtraError: The web server is not installed.
         ImplicamError: It cannot listen there.
     """
-    page, folder = BenchPage(controller), controller.session.folder
+    page, folder = _page_of(controller), controller.session.folder
     own = {"/report.html": folder / REPORT_FILE, "/calibration.implicam": folder / CALIBRATION_FILE}
     with behind_door(
         page.application, FILES, own, host=host, port=port, token=token,

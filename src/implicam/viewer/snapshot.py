@@ -55,7 +55,7 @@ def snapshot(
         "auto": state.auto,
         "buttons": _buttons(state, moves, unit),
         "cameras": [_camera(state, name, looks.get(name), rough) for name, rough in zip(cameras, circles, strict=True)],
-        "numbers": _numbers(state.history, rule, unit, skipped),
+        "numbers": numbers_of(state.history, rule, unit, skipped),
         "report": state.report is not None,
     }
 
@@ -124,8 +124,15 @@ def _outline(line: Floats) -> list[list[float]]:
     return np.round(kept[::step], 2).tolist()  # type: ignore[no-any-return]
 
 
-def _numbers(history: Sequence[Step], rule: Rule, unit: str, skipped: int) -> dict[str, Any]:
-    """Points, the 95 % uncertainty, and how far each rule is from stopping."""
+def numbers_of(history: Sequence[Step], rule: Rule, unit: str, skipped: int) -> dict[str, Any]:
+    """Points, the 95 % uncertainty, and how far each rule is from stopping.
+
+    Args:
+        history: The steps so far.
+        rule: When to stop.
+        unit: The length unit.
+        skipped: How many targets were left out.
+    """
     step = history[-1] if history else Step(0)
     known = bool(np.isfinite(step.usual))
     return {

@@ -19,6 +19,7 @@ from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
 from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings, Training
+from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, fit_to_wand
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -34,6 +35,7 @@ from implicam.calibrators.protocol import (
 from implicam.dataset import Dataset, remove_copies
 from implicam.dataset.requirements import require_dataset
 from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
+from implicam.dataset.wand import Wand, wand_of
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
 from implicam.lenses import LENSES
@@ -59,6 +61,12 @@ class ForwardGP(CalibratorBase):
     """Our method. lens: `auto`, the camera model that the data choose for each camera; `central`, an ordinary camera
     with one model for all lenses; or `none`, a linear projection and the GP for the rest.
 
+    wand: the distance between two markers that were waved at places nobody knows (the columns `frame` and `marker` say
+    which they are), in the dataset's unit; wand_sd: its standard uncertainty, one error for all frames; wand_jitter:
+    how much it varies from frame to frame; wand_ends: the names of the two, where there are others: single points.
+    What [target] of the dataset says of a wand holds where these are not given. Cameras are ordinary ones then (`lens`
+    does not count). docs/wand.md.
+
     seed changes nothing: no part of this method is left to chance. settings: all priors and thresholds; a calibration
     file carries them, so that a refit years later is the same fit.
 
@@ -71,6 +79,10 @@ class ForwardGP(CalibratorBase):
     """
 
     lens: str = field(default=AUTO, metadata=option("auto, central or none"))
+    wand: float = field(default=0.0, metadata=option("length of a wand waved at places nobody knows", "LENGTH"))
+    wand_sd: float = field(default=0.0, metadata=option("standard uncertainty of that length", "LENGTH"))
+    wand_jitter: float = field(default=0.0, metadata=option("sd of the length from frame to frame", "LENGTH"))
+    wand_ends: str = field(default="", metadata=option("the wand's two markers, if there are others", "A,B"))
     seed: int = 0
     settings: ForwardGPSettings = DEFAULT_SETTINGS
 
@@ -85,7 +97,30 @@ class ForwardGP(CalibratorBase):
                 why=f"it has one model for all lenses; {', '.join(LENSES)} are lenses of explicit",
                 fix=f"choose one of {', '.join(LENS_OPTIONS)}, or write --method explicit --lens NAME",
             )
+        for name in ("wand", "wand_sd", "wand_jitter"):
+            length = getattr(self, name)
+            if not (np.isfinite(length) and length >= 0):
+                raise UsageError(f"{name} = {length}; it is a length.", fix="for example wand = 500")
+        if self.wand_ends and len(self._ends) != 2:
+            raise UsageError(f"wand_ends = {self.wand_ends!r}; a wand has two ends.", fix="two names, as in pt1,pt2")
         super().__post_init__()
+
+    @property
+    def _ends(self) -> tuple[str, ...]:
+        return tuple(name.strip() for name in self.wand_ends.split(",") if name.strip())
+
+    def _wand(self, data: Dataset) -> Wand | None:
+        """The wand, as the options and the data state it; None where the data are known points."""
+        told = wand_of(data)
+        if not self.wand and (told is None or data.known is not None):
+            return None
+        told = told or Wand()
+        return Wand(
+            self._ends or told.ends,
+            self.wand or told.length,
+            self.wand_sd or told.length_sd,
+            self.wand_jitter or told.jitter,
+        )
 
     @classmethod
     def variants(cls) -> dict[str, dict[str, Any]]:
@@ -93,10 +128,11 @@ class ForwardGP(CalibratorBase):
         return {lens: {"lens": lens} for lens in LENS_OPTIONS}
 
     def fit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
-        """Fit to all known points that any camera saw.
+        """Fit to all known points that any camera saw; or to a wand, whose markers then have the positions that the fit
+        gives them.
 
         Args:
-            data: Known points and what the cameras saw of them.
+            data: Known points, or the markers of a wand, and what the cameras saw of them.
             progress: Is told how far the fit is.
 
         Returns:
@@ -107,6 +143,11 @@ class ForwardGP(CalibratorBase):
         """
         require_dataset(data)
         with explain_fit_error(data):
+            wand = self._wand(data)
+            if wand is not None:
+                with solvable(), blas_threads(1):
+                    kept, frame, fitted, waved = fit_to_wand(data, wand, self.settings, progress)
+                return ForwardGPCalibration(self, kept, frame, fitted, waved=waved)
             return self._fit(data, progress)
 
     def _fit(
@@ -139,6 +180,7 @@ class ForwardGPCalibration(RigCalibration):
     frame: Frame
     fitted: FitResult
     repairs: tuple[Repair, ...] = ()
+    waved: Waved | None = None
 
     method: ClassVar[str] = "forward-gp"
 
@@ -182,6 +224,8 @@ class ForwardGPCalibration(RigCalibration):
     @cached_property
     def diagnosis(self) -> Diagnosis:
         """How it agrees with its own data."""
+        if self.waved is not None:
+            return WandDiagnosis(self.used, self.frame, self.fitted, self.waved)
         return Diagnosis(self.used, self.frame, self.fitted)
 
     @property
@@ -193,6 +237,31 @@ class ForwardGPCalibration(RigCalibration):
     def unused(self) -> tuple[Unused, ...]:
         """The known points of which no view is used."""
         return (*self.diagnosis.unused, *list_copied_points(self.data))
+
+    def refit(self, data: Dataset, progress: Progress = silent) -> ForwardGPCalibration:
+        """The same method with the same options on other known points.
+
+        Args:
+            data: Known points of the same cameras.
+            progress: Is told how far the fit is.
+
+        Returns:
+            The new calibration.
+
+        Raises:
+            FitError: Fewer than two cameras can be calibrated.
+            UsageError: The calibration is from a wand: no known point can be held out.
+        """
+        self._refuse_wand()
+        return self.calibrator.fit(data, progress)
+
+    def _refuse_wand(self) -> None:
+        if self.waved is not None:
+            raise UsageError(
+                "this calibration was made from a wand, without known points, so none can be held out or added.",
+                fix="calibrate the whole dataset of the wand again, or evaluate with a dataset of known points: "
+                "implicam evaluate FILE DATASET",
+            )
 
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> ForwardGPCalibration:
         """As `refit`, starting from what is known: for a few points more, in half of the time.
@@ -210,6 +279,7 @@ class ForwardGPCalibration(RigCalibration):
         Raises:
             FitError: Fewer than two cameras can be calibrated.
         """
+        self._refuse_wand()
         if anew:
             return self.calibrator.fit(data, progress)
         return self.calibrator._fit(data, progress, self)
@@ -284,9 +354,19 @@ class ForwardGPCalibration(RigCalibration):
         return out * self.frame.scale**2
 
     def summary(self) -> FitSummary:
-        """Leave-one-out errors of the known points, and the noise of each camera."""
-        errors, sds = self.diagnosis.leave_one_out
+        """Leave-one-out errors of the known points, or of the wand's lengths; and the noise of each camera."""
         noise = (model.noise for model in self.posterior.models)
+        if self.waved is not None:
+            return FitSummary(
+                points_used=len(self.used),
+                points_unused=len(self.waved.unused),
+                views_rejected=len(self.rejected),
+                held_out="the length of the wand in each frame, from what the cameras saw there, is right",
+                leave_one_out_rms={"length": float(np.sqrt(np.mean(self.waved.errors**2)))},
+                leave_one_out_mean_sd={"length": float(np.mean(self.waved.sds))},
+                noise_px=dict(zip(self.camera_names, map(float, noise), strict=True)),
+            )
+        errors, sds = self.diagnosis.leave_one_out
         return FitSummary(
             points_used=len(self.used) - len(self.diagnosis.unused),
             points_unused=len(self.diagnosis.unused),
@@ -300,7 +380,9 @@ class ForwardGPCalibration(RigCalibration):
         """The options with all settings; and per camera lens, field, weights and covariance, in the working frame."""
         table, arrays = saved.state(self.fitted, self.data.observations.camera_names)
         moved, moved_arrays = repairs_state(self.repairs)
-        return self.calibrator.as_table() | table | moved, arrays | moved_arrays | {"frame": self.frame.as_array()}
+        waved, waved_arrays = ({}, {}) if self.waved is None else self.waved.state()
+        arrays = arrays | moved_arrays | waved_arrays | {"frame": self.frame.as_array()}
+        return self.calibrator.as_table() | table | moved | waved, arrays
 
     @classmethod
     def from_state(cls, data: Dataset, table: Mapping[str, Any], arrays: Arrays) -> ForwardGPCalibration:
@@ -317,8 +399,10 @@ class ForwardGPCalibration(RigCalibration):
         Raises:
             KeyError, ValueError, TypeError: Something is missing or does not fit.
         """
-        calibrator = ForwardGP.from_table(table)
+        before_wands = {name: getattr(ForwardGP, name) for name in ("wand", "wand_sd", "wand_jitter", "wand_ends")}
+        calibrator = ForwardGP.from_table({**before_wands, **table})
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = remove_copies(data)
         fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, calibrator.settings)
-        return cls(calibrator, data, working, fitted, repairs_from_state(table, arrays, fitted.posterior))
+        repairs = repairs_from_state(table, arrays, fitted.posterior)
+        return cls(calibrator, data, working, fitted, repairs, Waved.from_state(table, arrays))

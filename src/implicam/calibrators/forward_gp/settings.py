@@ -146,6 +146,11 @@ class ForwardGPSettings(RigModelSettings):
     max_points_for_position_errors: int = 400
     """Points that errors of known positions are estimated from; more cost time and tell little more."""
 
+    # a wand
+    usual_wand_jitter_ratio: float = 1e-4
+    """Sd of the length of a wand from frame to frame, over the length, where it is not stated: flex, and what is taken
+    for the middle of a marker."""
+
     # cameras as linear projections with a large field
     min_views_without_lens: int = 40
     """Views that a camera without a lens model takes: its field must learn what a lens would say."""

@@ -80,6 +80,7 @@ const question = (asked, go) => dialog(asked.title, asked.text, [
   [asked.yes, () => go({yes: asked.number}), "next"], [asked.no ?? "Do not", null]]);
 
 function skip() {
+  if (about.boards) { press("skip"); return; }
   dialog("Skip this target: why?", "It is not proposed again.",
     [...about.reasons.map((reason) => [reason, () => press("skip", {reason})]), ["do not skip", null, "next"]]);
 }
@@ -104,7 +105,7 @@ function draw() {
     state.phase === "done" && state.message].filter(Boolean).join("\n");
   const target = state.phase === "aim" && state.target;
   by("aim").hidden = !target;
-  if (target) by("target").textContent = place(target.xyz);
+  if (target) by("target").textContent = target.words ?? place(target.xyz);
   const shown = state.phase === "shown" && state.position;
   by("to-go").hidden = !state.to_go && !shown;
   by("way").textContent = state.to_go ? `${state.to_go.total} to go` : shown ? "ball at" : "";
@@ -151,8 +152,8 @@ function drawButtons() {
 }
 
 function drawPlace() {  // beside where the target is, to be typed: where the ball really is
-  by("place").hidden = about.moves || state.phase === "done";
-  if (about.moves || !state.target || state.target.name === typed) return;
+  by("place").hidden = about.moves || about.boards || state.phase === "done";
+  if (about.moves || about.boards || !state.target || state.target.name === typed) return;
   typed = state.target.name;
   ["x", "y", "z"].forEach((axis, i) => {  // empty: what nobody typed is not known
     by(axis).value = "";
@@ -163,7 +164,7 @@ function drawPlace() {  // beside where the target is, to be typed: where the ba
 // By hand: how to get there, open until the circles in the pictures say it.
 function drawHow() {
   const box = by("reach"), target = state.phase === "aim" && state.target;
-  box.hidden = about.moves || !target || !world;
+  box.hidden = about.moves || about.boards || !target || !world;
   if (box.hidden) return;
   const first = state.numbers.usual || state.cameras.some((one) => one.rough) ? "known" : "first";
   if (!box.dataset.stage) {
@@ -200,13 +201,17 @@ function makeTiles() {
     top.className = "top";
     reason.className = "reason";
     top.append(label, says);
+    const bar = document.createElement("i");
+    bar.className = "part";
+    bar.hidden = true;
+    top.append(bar);
     tile.append(image, svg, top, reason);
     by("cameras").append(tile);
     const button = document.createElement("button");
     button.textContent = name;
     button.addEventListener("click", () => { chosen = i; drawTiles(); });
     by("which").append(button);
-    tile.parts = {image, svg, says, reason};
+    tile.parts = {image, svg, says, reason, bar};
   });
   new ResizeObserver(layOut).observe(by("cameras"));
 }
@@ -228,7 +233,12 @@ function layOut() {
 
 function drawTiles() {
   [...by("cameras").children].forEach((tile, i) => {
-    const one = state.cameras[i], {image, svg, says, reason} = tile.parts;
+    const one = state.cameras[i], {image, svg, says, reason, bar} = tile.parts;
+    bar.hidden = one.part === undefined;  // how far its calibration is, red to green
+    if (!bar.hidden) {
+      Object.assign(bar.style, {width: `${100 * one.part}%`, background: `hsl(${Math.round(125 * one.part)} 75% 45%)`});
+      bar.title = one.told;
+    }
     tile.classList.toggle("chosen", i === chosen);
     by("which").children[i].setAttribute("aria-current", i === chosen);
     tile.dataset.kind = one.kind;
@@ -283,6 +293,9 @@ function drawMarks(svg, one, tile) {
     element(name, {...attributes, class: "halo", "stroke-width": (wide + 3) * pixel}, svg);
     element(name, {...attributes, class: kind, "stroke-width": wide * pixel}, svg);
   };
+  if (one.hold) stroke("polygon", {points: one.hold.map(centre).map((p) => p.join()).join(" ")}, "aim", 3.5);
+  for (const [u, v] of one.corners ?? [])
+    element("circle", {cx: u + 0.5, cy: v + 0.5, r: 2.2 * pixel, class: "corner", "stroke-width": 0.8 * pixel}, svg);
   const radius = Math.max(16, tile.clientHeight / 16) * pixel;
   const ball = centre(one.ball), target = centre(one.target);
   if (ball) {
@@ -338,9 +351,10 @@ function loupe(tile, one, ball, radius) {  // in the corner that is farthest fro
 function drawNumbers() {
   const {points, skipped, usual, worst, progress} = state.numbers;
   const bold = (text) => Object.assign(document.createElement("b"), {textContent: text});
-  by("numbers").replaceChildren(bold(String(points)), ` point${points === 1 ? "" : "s"}${skipped ? ` · ${skipped} skipped` : ""}`,
+  const word = state.numbers.word ?? "point";
+  by("numbers").replaceChildren(bold(String(points)), ` ${word}${points === 1 ? "" : "s"}${skipped ? ` · ${skipped} skipped` : ""}`,
     ...(usual ? [" · ", bold(usual), " in 95 % of the workspace, ", bold(worst), " everywhere"]
-      : [" · no calibration yet: the first places are spread evenly"]));
+      : [about.boards ? " · no calibration yet: each camera is shown what it has not seen" : " · no calibration yet: the first places are spread evenly"]));
   by("meaning").hidden = !usual;
   by("rules").replaceChildren(...progress.filter(Boolean).map((words) =>
     Object.assign(document.createElement("li"), {textContent: `stop at: ${words}`})));
@@ -358,6 +372,7 @@ async function refreshPoints() {
   listed = key;
   let rows;
   try { rows = (await ask("api/points")).points; } catch { listed = null; return; }
+  if (about.boards) { listBoards(rows); return; }
   const table = document.createElement("table"), cell = (kind, text) => Object.assign(document.createElement(kind), {textContent: text});
   table.insertRow().append(...["", "x", "y", "z", "cameras", `off, ${about.unit}`, ""].map((text) => cell("th", text)));
   for (const row of rows.reverse()) {
@@ -375,7 +390,23 @@ async function refreshPoints() {
   by("points").replaceChildren(table);
 }
 
-const lookAt = (row) => dialog(row.name, place(row.xyz), [["close", null, "next"]], about.cameras.map(({name}) =>
+function listBoards(rows) {
+  const table = document.createElement("table"), cell = (kind, text) => Object.assign(document.createElement(kind), {textContent: text});
+  table.insertRow().append(...["", "corners", "cameras", ""].map((text) => cell("th", text)));
+  for (const row of rows.reverse()) {
+    const acts = cell("td", "");
+    table.insertRow().append(cell("td", row.name), cell("td", row.corners), cell("td", row.cameras), acts);
+    for (const [label, act] of [["look", () => lookAt({...row, words: `${row.corners} corners`})], ["delete", () => remove(row)]]) {
+      const button = cell("button", label);
+      button.disabled = label !== "look" && !state.buttons.delete.enabled;
+      button.addEventListener("click", act);
+      acts.append(button);
+    }
+  }
+  by("points").replaceChildren(table);
+}
+
+const lookAt = (row) => dialog(row.name, row.words ?? place(row.xyz), [["close", null, "next"]], about.cameras.map(({name}) =>
   [name, `kept.jpg?camera=${encodeURIComponent(name)}&point=${encodeURIComponent(row.name)}`]));
 const remove = (row) => dialog(`Delete ${row.name}?`, "It is kept in the session as undone, and its pictures in undone/.",
   [["Delete", () => press("delete", {point: row.name})], ["keep it", null, "next"]]);
@@ -408,7 +439,7 @@ async function refreshCurve() {
     }
   for (let points = 0; points <= most; points += most / 5)
     element("text", {x: x(points), y: high - 18, "text-anchor": "middle"}, svg, String(points));
-  element("text", {x: (left + wide - right) / 2, y: high - 4, "text-anchor": "middle"}, svg, `known points; 95 % uncertainty, ${about.unit}`);
+  element("text", {x: (left + wide - right) / 2, y: high - 4, "text-anchor": "middle"}, svg, `${about.boards ? "boards" : "known points"}; 95 % uncertainty, ${about.unit}`);
   for (const one of data.stops) {
     element("line", {x1: left, x2: wide - right, y1: y(one.value), y2: y(one.value), class: "rule"}, svg);
     element("text", {x: wide - right, y: y(one.value) - 4, "text-anchor": "end", class: "rule-word"}, svg, "stop");
@@ -473,7 +504,7 @@ function colourCloud() {
 
 function drawMoving() {
   if (!scene || !world) return;
-  const target = state.target && ["aim", "moving", "shown"].includes(state.phase) ? [state.target.xyz] : [];
+  const target = state.target?.xyz && ["aim", "moving", "shown"].includes(state.phase) ? [state.target.xyz] : [];
   scene.setBalls("target", target, "ask", 0.05, "target");
   const here = state.phase === "aim" ? state.measured : state.position;
   scene.setBalls("ball", here ? [here] : [], "found", 0.04);
@@ -519,6 +550,16 @@ async function begin() {
   by("stop").hidden = !about.moves;
   by("stop").append(" ", Object.assign(document.createElement("kbd"), {textContent: "Esc"}));
   by("by-itself").hidden = !about.auto;
+  if (about.boards) {
+    for (const word of ["accept", "redo"]) by(word).hidden = true;
+    by("auto").nextSibling.textContent = " take pictures by itself, when the board is held still"
+      + (about.simulated ? " (cameras, board and the hand that holds it are simulated)" : "");
+    for (const kind of ["wanted", "ball"]) { const dot = document.querySelector(`.dots .${kind}`); dot.nextSibling.remove(); dot.remove(); }
+    document.querySelector(".dots .known").nextSibling.textContent = "corners ";
+    by("list").querySelector("summary").textContent = "Boards";
+    by("meaning").textContent = "These are predictions of the calibration, for a position measured anywhere in the volume, "
+      + "in the frame that fits it best; the report at the end measures boards that were held out.";
+  }
   makeTiles();
   for (const word of Object.values(KEYS)) by(word).addEventListener("click", () => word === "skip" ? skip() : press(word));
   by("stop").addEventListener("click", () => press("stop"));

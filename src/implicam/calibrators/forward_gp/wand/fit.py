@@ -1,0 +1,371 @@
+"""From a wand to a fitted rig: start, adjustment, sizes of the fields, posterior, and what contradicts the rest.
+
+The order of docs/method.md, section "Wand".
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.calibrators.forward_gp.settings import ForwardGPSettings
+from implicam.calibrators.forward_gp.wand.bundle import FrameEquations, Lengths
+from implicam.calibrators.forward_gp.wand.gauge import posterior_in_gauge
+from implicam.calibrators.forward_gp.wand.sizes import add_priors, estimate_sizes, size_fields, white_models
+from implicam.calibrators.forward_gp.wand.start import Started, bundle_of, consensus, prior_of, start
+from implicam.calibrators.forward_gp.wand.waves import Waves
+from implicam.errors import FitError
+from implicam.geometry import Bools, Floats, Pose
+from implicam.progress import Progress
+from implicam.rig_model import (
+    CameraModel,
+    CameraViews,
+    CentralCamera,
+    Hyperparameters,
+    InitialCamera,
+    Posterior,
+    lens_only_model,
+    solve_normal,
+)
+from implicam.rig_model.posterior import move_to_mean
+
+Item = TypeVar("Item")
+
+_LOG = logging.getLogger(__name__)
+
+MAX_ROUNDS = 5
+MAX_GAUSS_NEWTON_STEPS = 6
+MIN_VIEWS_PER_CAMERA = 12
+MIN_CHECKED_PLACES = 12
+
+TOO_LITTLE = "too few of its views agree with the places that the other cameras know."
+
+MAX_DISTANCE_RATIO = 4.0
+"""Of a place from the middle of all, over the third quartile of these: what is farther away is a wrong match."""
+
+MIN_CHECKED_VARIANCE = 0.01
+"""Part of a view's variance that its place leaves in a direction; below it nothing but the view itself tells of it."""
+
+LENIENT_RATIO = 1.5
+"""Lens models leave errors that are alike in neighbouring views: how much larger noise is taken to be before fields."""
+
+
+@dataclass(frozen=True, eq=False)
+class WandFit:
+    """A rig fitted to a wand, in units of the wand's length, about the middle of the places, axes of the first camera.
+
+    Attributes:
+        posterior: What is known of the cameras, in the working frame.
+        cameras: Their numbers.
+        uncalibrated: Number and why of the others.
+        used: (2 F, C) which views are used.
+        lengths: (F,) of which frames the length is used.
+        places: (2 F, 3) in the working frame, NaN where unknown.
+        checked: (2 F,) which places say where the world is: those that something checks.
+        hyper: Lengthscales, signal, noise.
+        scale: Of the working frame.
+        length_errors: (k,) of the frames whose length is used: wand as measured from its views alone, less its length;
+            length_sds: (k,) of these.
+    """
+
+    posterior: Posterior
+    cameras: tuple[int, ...]
+    uncalibrated: tuple[tuple[int, str], ...]
+    used: Bools
+    lengths: Bools
+    places: Floats
+    checked: Bools
+    hyper: Hyperparameters
+    scale: float
+    length_errors: Floats
+    length_sds: Floats
+
+
+def fit_wand(waves: Waves, settings: ForwardGPSettings, length_sd: float, progress: Progress) -> WandFit:
+    """Fit every camera that can be fitted.
+
+    Args:
+        waves: What was seen, lengths in units of the wand's.
+        settings: Priors and thresholds.
+        length_sd: Sd of the length of the wand itself, over that length: one error for all frames.
+        progress: Is told how far the fit is.
+
+    Raises:
+        FitError: Fewer than two cameras can be fitted.
+    """
+    progress("starting", 0, 3)
+    started = start(waves, settings)
+    progress("adjusting", 1, 3)
+    state = _adjusted(waves, started, settings)
+    progress("fitting", 2, 3)
+    state = _with_fields(state, settings)
+    progress("fitting", 3, 3)
+    return _finished(state, length_sd)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """cameras: numbers; models; places (F, 2, 3) in the working frame, whose unit is `scale`; known (2 F,) places with
+    two views or more in use; used (2 F, C of all); lengths (F,) in use."""
+
+    waves: Waves
+    cameras: tuple[int, ...]
+    models: tuple[CameraModel, ...]
+    places: Floats
+    used: Bools
+    lengths: Bools
+    scale: float
+    hyper: Hyperparameters | None = None
+    equations: FrameEquations | None = None
+    root: Floats | None = None
+
+    @property
+    def known(self) -> Bools:
+        """(2 F,) places with two views in use."""
+        return np.asarray(self.used.sum(axis=1) >= 2)
+
+    @property
+    def seen(self) -> list[CameraViews]:
+        """Per camera the views in use."""
+        known = self.known
+        return [
+            views.select(self.used[views.rows, c] & known[views.rows])
+            for c, views in ((c, self.waves.seen[c]) for c in self.cameras)
+        ]
+
+    @property
+    def length_rows(self) -> Lengths:
+        """The lengths in use."""
+        return self.lengths_of(np.flatnonzero(self.lengths & self.known.reshape(-1, 2).all(axis=1)))
+
+    def lengths_of(self, frames: NDArray[np.int64]) -> Lengths:
+        """The wand in some frames.
+
+        Args:
+            frames: Their numbers.
+        """
+        sd = np.full(len(frames), self.waves.jitter / self.scale)
+        return Lengths(frames, self.waves.length / self.scale, sd)
+
+
+def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings) -> _State:
+    """Lenses alone, robustly; then again with what agrees."""
+    cameras, near = started.cameras, 6.0
+    numbers = tuple(sorted(cameras))
+    half = np.array([waves.images[c].half for c in numbers]) / 640
+    sigma = 1.0
+    for relative in (0.002, 0.001, 0.001):
+        places, agree = consensus(waves, cameras, near)
+        known = np.isfinite(places[:, 0])
+        bundle = bundle_of(waves, cameras, places, settings)
+        seen = [waves.seen[c].select(agree[waves.seen[c].rows, c]) for c in numbers]
+        frames = np.flatnonzero(known.reshape(-1, 2).all(axis=1) & waves.ends)
+        sd = np.full(len(frames), max(relative * waves.length, waves.jitter))
+        bundle = bundle.adjusted(
+            seen, sigma * half, Lengths(frames, waves.length, sd), robust=True, max_steps=25, tolerance=1e-4
+        )
+        cameras = dict(zip(numbers, bundle.cameras, strict=True))
+        off = np.concatenate([e / h for e, h in zip(bundle.errors(seen), half, strict=True)])
+        # a place takes up a part of its views' errors: of two views three numbers of four
+        free = max(1 - 3 * known.sum() / (2 * len(off)), 0.1)
+        sigma = max(float(np.median(off)) / 1.1774 / np.sqrt(free), 0.02)
+        near = max(5 * sigma, 1.0)
+        _LOG.info("adjusted: sigma %.3f px of 1280", sigma)
+    places, agree = consensus(waves, cameras, near)
+    at = np.where(np.isfinite(bundle.places.reshape(-1, 3)) & known[:, None], bundle.places.reshape(-1, 3), places)
+    known = np.isfinite(at[:, 0]) & (agree.sum(axis=1) >= 2)
+    away = np.linalg.norm(at - np.median(at[known], axis=0), axis=1)
+    known &= ~(away > MAX_DISTANCE_RATIO * np.quantile(away[known], 0.75))
+    agree &= known[:, None]
+    middle = at[known].mean(axis=0)
+    scale = float(np.sqrt(np.mean((at[known] - middle) ** 2)))
+    turn = cameras[numbers[0]].pose.rotation
+    working = np.where(known[:, None], (at - middle) @ turn.T / scale, 0.0).reshape(-1, 2, 3)
+    models = []
+    for c in numbers:
+        pose = cameras[c].pose @ Pose(turn.T, middle)
+        camera = CentralCamera(cameras[c].lens, Pose(pose.rotation, pose.translation / scale))
+        prior = prior_of(camera, waves.images[c], waves.seen[c].uv[agree[waves.seen[c].rows, c]], settings)
+        noise = LENIENT_RATIO * sigma * waves.images[c].half / 640
+        models.append(lens_only_model(InitialCamera(camera, prior, agree[:, c]), waves.images[c], noise))
+    none = np.zeros(waves.frames, dtype=np.bool_)
+    state = _State(waves, numbers, tuple(models), working, agree, none, scale)
+    # a wrong marker and a stiff length would pull everything: lengths are first judged by the views alone
+    state = _judged(_relocated(state), settings)
+    return _judged(_solved(state, fields=False), settings)
+
+
+def _with_fields(state: _State, settings: ForwardGPSettings) -> _State:
+    """Sizes, posterior and what contradicts it, until nothing changes."""
+    stated = state.waves.stated[list(state.cameras)]
+    search = True
+    for number in range(MAX_ROUNDS):
+        hyper = estimate_sizes(
+            state.models, state.places, state.seen, state.length_rows, stated, settings, state.hyper, search=search
+        )
+        sized = size_fields(
+            state.models, state.places.reshape(-1, 3), state.seen, hyper, settings.typical_log_distance_sd
+        )
+        state = _solved(replace(state, models=sized, hyper=hyper), fields=True)
+        judged = _judged(state, settings)
+        changed = float(np.mean(judged.used != state.used)) + float(np.mean(judged.lengths != state.lengths))
+        _LOG.info(
+            "round %d: lengthscale %s signal %.3g noise %.3g px, %.2g %% changed", number, hyper.lengthscale[0],
+            hyper.signal[0], hyper.noise[0], 100 * changed,
+        )  # fmt: skip
+        if not changed or number == MAX_ROUNDS - 1:
+            break
+        search = number == 0 or changed > 0.01
+        state = judged
+    return state
+
+
+def _solved(state: _State, *, fields: bool) -> _State:
+    """Gauss-Newton for cameras and places, exact for the fields."""
+    models, places = state.models, state.places
+    for number in range(MAX_GAUSS_NEWTON_STEPS):
+        equations = _equations(replace(state, models=models, places=places))
+        L, G, g = equations.halved()
+        root, mean, _ = solve_normal(equations.A - G.T @ G, equations.b - G.T @ g)
+        back = (g - G @ mean).reshape(-1, 6, 1)
+        step = np.linalg.solve(L.swapaxes(1, 2), back)[..., 0].reshape(-1, 2, 3)
+        means = np.split(mean, np.cumsum([model.size for model in models])[:-1])
+        sd = np.split(np.sqrt(np.sum(root**2, axis=0)), np.cumsum([model.size for model in models])[:-1])
+        models = move_to_mean(models, means)
+        places = places + np.where(state.known.reshape(-1, 2)[..., None], step, 0.0)
+        small = all(np.all(np.abs(mean[:14]) <= 0.05 * sd[:14]) for mean, sd in zip(means, sd, strict=True))
+        if small or (number > 2 and not fields):
+            break
+    return replace(state, models=models, places=places, equations=equations, root=root)
+
+
+def _equations(state: _State) -> FrameEquations:
+    """Those of all views and lengths in use, with the priors."""
+    white, lengths = white_models(state.models, state.places.reshape(-1, 3), state.seen), state.length_rows
+    found = FrameEquations.of(white, len(state.places), (lengths.frames, *lengths.linear(state.places)))
+    add_priors(found, state.models, fields=True)
+    return found
+
+
+def _relocated(state: _State) -> _State:
+    """Places where views and lengths in use have them, with the cameras as they are."""
+    for _ in range(3):
+        equations = _equations(state)
+        L, _, g = equations.halved()
+        step = np.linalg.solve(L.swapaxes(1, 2), g.reshape(-1, 6, 1))[..., 0].reshape(-1, 2, 3)
+        step = np.where(state.known.reshape(-1, 2)[..., None], np.clip(step, -0.5, 0.5), 0.0)
+        state = replace(state, places=state.places + step)
+    return replace(state, equations=_equations(state))
+
+
+def _frame_covariance(equations: FrameEquations) -> Floats:
+    """(F, 6, 6) of the places, if the cameras are as they are."""
+    scale = 1 / np.sqrt(np.einsum("fii->fi", equations.H))
+    both = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.inv(equations.H * both) * both, dtype=np.float64)
+
+
+def _judged(state: _State, settings: ForwardGPSettings) -> _State:
+    """Which views and lengths agree with all others, eq. (V5): each is judged as if it had not been used."""
+    spread, limit = _frame_covariance(_known(state.equations)), settings.max_squared_mahalanobis
+    lengths = _lengths_that_agree(state, spread, limit)
+    used = _views_that_agree(state, spread, limit)
+    # of two views that contradict each other, or the length, nobody knows which is wrong
+    few = state.used.sum(axis=1) <= 2
+    used[few & (used.sum(axis=1) < 2)] = False
+    wrong = np.repeat(state.waves.ends & ~lengths, 2)
+    used[wrong & (used.sum(axis=1) <= 2)] = False
+    used[used.sum(axis=1) < 2] = False
+    return _without_poor_cameras(replace(state, used=used, lengths=lengths))
+
+
+def _lengths_that_agree(state: _State, spread: Floats, limit: float) -> Bools:
+    """(F,) frames of the wand whose length agrees with what the cameras saw, or that have none."""
+    whole = np.flatnonzero(state.known.reshape(-1, 2).all(axis=1) & state.waves.ends)
+    used = state.length_rows
+    off, slope = state.lengths_of(whole).linear(state.places)
+    leverage = np.einsum("ki,kij,kj->k", slope, spread[whole], slope)
+    left = np.where(np.isin(whole, used.frames), np.maximum(1 - leverage, 1e-9), 1 + leverage)
+    agree = state.waves.ends.copy()
+    agree[whole] = off**2 / left <= limit
+    return agree
+
+
+def _views_that_agree(state: _State, spread: Floats, limit: float) -> Bools:
+    """(2 F, C) views that agree with all others of their place; of places that are not known, as they were."""
+    flat, known, used = state.places.reshape(-1, 3), state.known, state.used.copy()
+    block = spread.reshape(-1, 2, 3, 2, 3)
+    for c, model in zip(state.cameras, state.models, strict=True):
+        views = state.waves.seen[c].select(known[state.waves.seen[c].rows])
+        mean, slope = model.predict(flat[views.rows])
+        unit = (model.noise * views.relative)[:, None]
+        off, D = (views.uv - mean) / unit, slope / unit[..., None]
+        h = D @ block[views.rows // 2, views.rows % 2, :, views.rows % 2] @ D.swapaxes(1, 2)
+        own = np.where(state.used[views.rows, c], -1.0, 1.0)  # a view in use has drawn its place to itself
+        values, vectors = np.linalg.eigh(np.nan_to_num(np.eye(2) + own[:, None, None] * h))
+        turned = np.einsum("nij,ni->nj", vectors, np.nan_to_num(off, nan=1e3))
+        each = np.where(values > MIN_CHECKED_VARIANCE, turned**2 / np.maximum(values, 1e-12), 0)
+        used[views.rows, c] = each.sum(axis=1) <= limit
+    return used
+
+
+def _without_poor_cameras(state: _State) -> _State:
+    """Without cameras of which too few views agree with the others."""
+    counts = state.used.sum(axis=0)
+    good = [number for number, c in enumerate(state.cameras) if counts[c] >= MIN_VIEWS_PER_CAMERA]
+    if len(good) == len(state.cameras):
+        return state
+    if len(good) < 2:
+        raise FitError(
+            f"{len(good)} of {len(state.waves.seen)} cameras can be calibrated from this wand; a position takes two.",
+            why="the views of the others contradict each other",
+            fix="look whether frames and markers belong together in all cameras, and wave the wand where they see it "
+            "together",
+        )
+    used = state.used.copy()
+    used[:, [c for number, c in enumerate(state.cameras) if number not in good]] = False
+    used[used.sum(axis=1) < 2] = False
+    hyper = None if state.hyper is None else Hyperparameters(*(values[good] for values in state.hyper))
+    kept = tuple(state.cameras[number] for number in good), tuple(state.models[number] for number in good)
+    return _without_poor_cameras(replace(state, cameras=kept[0], models=kept[1], used=used, hyper=hyper))
+
+
+def _finished(state: _State, length_sd: float) -> WandFit:
+    """The covariance of all cameras in the gauge of the places that something checks."""
+    known, waves = state.known, state.waves
+    equations, root, hyper = _known(state.equations), _known(state.root), _known(state.hyper)
+    whole = state.lengths & known.reshape(-1, 2).all(axis=1) & waves.ends
+    checked = known & ((state.used.sum(axis=1) >= 3) | np.repeat(whole, 2))
+    if checked.sum() < MIN_CHECKED_PLACES:
+        raise FitError(
+            f"{checked.sum()} markers of the wand are where something checks them; it takes {MIN_CHECKED_PLACES}.",
+            why="two views meet nearly anywhere; a third one, or the length of the wand, must agree",
+            fix="wave the wand longer where two cameras or more see both its markers",
+        )
+    posterior = posterior_in_gauge(state.models, state.places, checked, equations, root, length_sd)
+    lengths = state.length_rows
+    off, slope = lengths.linear(state.places)
+    leverage = np.einsum("ki,kij,kj->k", slope, _frame_covariance(equations)[lengths.frames], slope)
+    left, unit = np.maximum(1 - leverage, 1e-6), state.scale * lengths.sd
+    return WandFit(
+        posterior,
+        state.cameras,
+        tuple((c, TOO_LITTLE) for c in range(len(waves.seen)) if c not in state.cameras),
+        state.used,
+        whole,
+        np.where(known[:, None], state.places.reshape(-1, 3), np.nan),
+        checked,
+        hyper,
+        state.scale,
+        -off / left * unit,
+        unit * np.sqrt(leverage / left),
+    )
+
+
+def _known(value: Item | None) -> Item:
+    assert value is not None
+    return value

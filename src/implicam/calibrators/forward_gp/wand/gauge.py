@@ -1,0 +1,130 @@
+"""Where the world is: the covariance of the cameras, and what it is relative to, eqs. (V7) and (V8).
+
+No view and no length says where the world is. An adjustment holds something, such as the pose of a camera; what that
+leaves uncertain is uncertain relative to it. The S-transformation (Baarda 1973) tells the same relative to something
+else: here to all places of the wand together, as least squares would lay them over the true ones. So errors are
+smallest where the wand was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.wand.bundle import FrameEquations
+from implicam.geometry import Bools, Floats, Pose, cross_matrices, rotation_from_vector, vector_from_rotation
+from implicam.rig_model import CameraModel, CentralCamera, Posterior, solve_normal
+from implicam.rig_model.general_camera import AnyCamera
+from implicam.rig_model.normal_equations import name_failing_camera
+
+
+def posterior_in_gauge(
+    models: Sequence[CameraModel],
+    places: Floats,
+    anchors: Bools,
+    equations: FrameEquations,
+    root: Floats,
+    length_sd: float,
+) -> Posterior:
+    """What is known of the cameras, in a world that is laid over the anchors.
+
+    Args:
+        models: The cameras at the optimum.
+        places: (F, 2, 3).
+        anchors: (2 F,) the places that say where the world is.
+        equations: At the optimum, priors included.
+        root: (P, P) of the covariance of the cameras, with whatever was held.
+        length_sd: Relative sd of the length of the wand, an error that all frames share.
+
+    Returns:
+        All cameras tied.
+    """
+    flat, F, P = places.reshape(-1, 3), len(places), root.shape[1]
+    middle = flat[anchors].mean(axis=0)
+    lever = flat - middle
+    motion = np.zeros((2 * F, 3, 6))  # of a place, by a turn about the middle and a shift
+    motion[:, :, :3], motion[:, :, 3:] = -cross_matrices(lever), np.eye(3)
+    motion[~anchors] = 0.0
+    onto = np.linalg.inv(np.einsum("nki,nkj->ij", motion, motion)) @ motion.reshape(-1, 6).T  # (6, 6 F)
+    # places follow the cameras by -H^-1 G, and have the error of their own views besides
+    scale = 1 / np.sqrt(np.einsum("fii->fi", equations.H))
+    inverse = np.linalg.inv(equations.H * scale[:, :, None] * scale[:, None, :]) * scale[:, :, None] * scale[:, None, :]
+    by_frame = onto.reshape(6, F, 6).swapaxes(0, 1)  # (F, 6, 6)
+    follow = -np.einsum("fki,fij,fjp->kp", by_frame, inverse, equations.G, optimize=True)  # (6, P)
+    own = np.einsum("fki,fij,flj->kl", by_frame, inverse, by_frame, optimize=True)  # (6, 6)
+    N = cameras_move_with_the_world(models, middle)  # (P, 6): how the cameras' numbers change when the world is moved
+    # the world is moved so that the anchors stay
+    turned = root @ (np.eye(P) - N @ follow).T
+    lower = np.linalg.cholesky(0.5 * (own + own.T) + 1e-15 * np.trace(own) * np.eye(6))
+    parts = [turned, (N @ lower).T]
+    if length_sd > 0:
+        parts.append(length_sd * cameras_grow_with_the_world(models, middle)[None])
+    joint = np.linalg.qr(np.concatenate(parts), mode="r")  # of as many rows as unknowns
+    starts = np.concatenate([[0], np.cumsum([model.size for model in models])])
+    alone = []
+    for c, (start, end) in enumerate(pairwise(starts)):
+        own = equations.A[start:end, start:end]
+        with name_failing_camera(c):
+            alone.append(solve_normal(own, np.zeros(len(own)))[0])
+    return Posterior(tuple(models), tuple(alone), np.ascontiguousarray(joint), (), 0.0)
+
+
+def cameras_move_with_the_world(models: Sequence[CameraModel], middle: Floats) -> Floats:
+    """How the numbers of all cameras change when all places turn about the middle, and shift.
+
+    Args:
+        models: The cameras.
+        middle: (3,).
+
+    Returns:
+        (P, 6), by a turn (radians) and a shift.
+    """
+    h = 1e-6
+    columns = []
+    for d in h * np.eye(6):
+        both = []
+        for sign in (1.0, -1.0):
+            turn = rotation_from_vector(sign * d[:3])
+            # places x become turn (x - middle) + middle + shift; a camera that sees them as before looks back
+            forth = Pose(turn, middle - turn @ middle + sign * d[3:])
+            both.append([_pose_step(model.camera, model.camera.in_frame(forth.inverse())) for model in models])
+        slopes = [(one - two) / (2 * h) for one, two in zip(*both, strict=True)]
+        columns.append(np.concatenate([_padded(slope, model) for slope, model in zip(slopes, models, strict=True)]))
+    return np.array(columns).T
+
+
+def cameras_grow_with_the_world(models: Sequence[CameraModel], middle: Floats) -> Floats:
+    """How they change when the world grows about the middle.
+
+    Args:
+        models: The cameras.
+        middle: (3,).
+
+    Returns:
+        (P,), by a relative growth.
+    """
+    out = []
+    for model in models:
+        assert isinstance(model.camera, CentralCamera)
+        slope = np.zeros(model.camera.size)
+        # x grows to middle + s (x - middle): R x + T becomes s times itself where T' = s T + (s - 1) R middle
+        slope[-3:] = model.camera.pose.translation + model.camera.pose.rotation @ middle
+        out.append(_padded(slope, model))
+    return np.concatenate(out)
+
+
+def _pose_step(before: AnyCamera, after: AnyCamera) -> Floats:
+    """(p,) the step from one to the other: of the pose alone."""
+    assert isinstance(before, CentralCamera)
+    assert isinstance(after, CentralCamera)
+    step = np.zeros(before.size)
+    step[-6:-3] = vector_from_rotation(after.pose.rotation @ before.pose.rotation.T)
+    step[-3:] = after.pose.translation - before.pose.translation
+    return step
+
+
+def _padded(slope: Floats, model: CameraModel) -> Floats:
+    """With the weights of the field, which do not change."""
+    return np.concatenate([slope, np.zeros(model.size - len(slope))])

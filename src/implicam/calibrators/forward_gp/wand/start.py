@@ -1,0 +1,291 @@
+"""All cameras from no guess: the best pair first, then one camera after the other, eqs. (V3) and (V4)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from implicam.calibrators.forward_gp.wand.bundle import Bundle, Lengths, rows_of
+from implicam.calibrators.forward_gp.wand.pairs import (
+    MIN_SHARED_POINTS,
+    MIN_WHOLE_FRAMES,
+    PairStart,
+    meet_two,
+    pair_starts,
+)
+from implicam.calibrators.forward_gp.wand.waves import Waves
+from implicam.errors import FitError
+from implicam.geometry import Bools, Floats, Pose
+from implicam.rig_model import MIN_POINTS_PER_CAMERA, CentralCamera, Image, Prior, RigModelSettings
+from implicam.rig_model.initialise import start_camera
+
+_LOG = logging.getLogger(__name__)
+
+MAX_PAIRS = 4
+"""Pairs of cameras that are tried as the first."""
+
+SCHEDULE = ((4.0, 0.03), (1.5, 0.01), (1.0, 0.003))
+"""Noise in pixels of an image of 1280, and sd of the length over the length, of the steps of an adjustment."""
+
+JUDGED_LENGTH_SD = 0.005
+"""Sd of the length over the length, by which pairs are compared, with a noise of one pixel of 1280."""
+
+BEST_STARTS = (8, 3, 2)
+"""So many rungs of the ladder go through each step."""
+
+GOOD_PX, GOOD_SHARE = 2.0, 0.5
+"""Median error in pixels of 1280, and share of shared views that agree, of a pair that is good enough to go on with."""
+
+NEAR_PX = 6.0
+"""In pixels of 1280: a view that far off does not belong to a place, until the fit itself judges it better."""
+
+
+@dataclass(frozen=True, eq=False)
+class Started:
+    """Cameras by number, in units of the wand's length: places (2 F, 3), NaN where unknown, and agree (2 F, C) which
+    views agree."""
+
+    cameras: dict[int, CentralCamera]
+    places: Floats
+    agree: Bools
+
+
+def prior_of(camera: CentralCamera, image: Image, uv: Floats, settings: RigModelSettings) -> Prior:
+    """The prior of an ordinary camera that is used where it saw something.
+
+    Args:
+        camera: As it is now.
+        image: Where its pixels are measured from.
+        uv: (n, 2) what it saw.
+        settings: The prior's sds.
+    """
+    rays, good = camera.lens.ray_from_pixel(uv)
+    angle = np.arccos(np.clip(rays[good, 2], -1, 1))
+    widest = float(np.quantile(angle, 0.98)) if len(angle) else 1.0
+    return camera.prior(image, max(widest, 0.02), settings)
+
+
+def start(waves: Waves, settings: RigModelSettings) -> Started:
+    """Every camera that can be started.
+
+    Args:
+        waves: What was seen, in units of the wand's length.
+        settings: Priors.
+
+    Raises:
+        FitError: No two cameras can be.
+    """
+    first = _best_pair(waves, settings)
+    cameras = first
+    while True:
+        places, agree = consensus(waves, cameras)
+        left = [c for c in range(len(waves.seen)) if c not in cameras]
+        joined = {c: found for c in left if (found := _resected(waves, c, places, settings)) is not None}
+        if not joined:
+            break
+        cameras = _adjusted_together(waves, cameras | joined, settings)
+        _LOG.info("cameras %s", sorted(cameras))
+    return Started(cameras, places, agree)
+
+
+def _best_pair(waves: Waves, settings: RigModelSettings) -> dict[int, CentralCamera]:
+    uv = waves.uv
+    seen = np.isfinite(uv).all(axis=2).astype(np.int64)
+    shared = np.einsum("ni,nj->ij", seen, seen)
+    pairs = sorted(combinations(range(seen.shape[1]), 2), key=lambda pair: -shared[pair])
+    best: tuple[float, dict[int, CentralCamera]] | None = None
+    for pair in pairs[:MAX_PAIRS]:
+        found = _pair(waves, pair, settings)
+        if found is None:
+            continue
+        score, cameras, good = found
+        _LOG.info("pair %s: score %.3g, %s", pair, score, "good" if good else "poor")
+        if best is None or score < best[0]:
+            best = score, cameras
+        if good:
+            break
+    if best is None:
+        most = max((int(shared[pair]) for pair in pairs), default=0)
+        raise FitError(
+            "no two cameras can be started from this wand.",
+            why=f"the two that share most see {most} markers at the same time; it takes {MIN_SHARED_POINTS}, and both "
+            f"markers in {MIN_WHOLE_FRAMES} frames, that agree on two cameras",
+            fix="wave the wand longer where the cameras see it together, turned in all directions, near and far",
+        )
+    return best[1]
+
+
+def _pair(
+    waves: Waves, pair: tuple[int, int], settings: RigModelSettings
+) -> tuple[float, dict[int, CentralCamera], bool] | None:
+    """The cost per view of two cameras, they, and whether they are good enough."""
+    uv = waves.uv[:, pair]
+    both = np.flatnonzero(np.isfinite(uv).all(axis=(1, 2)))
+    if len(both) < MIN_SHARED_POINTS:
+        return None
+    marker = np.where(waves.ends[both // 2], both % 2, -1)
+    images = [waves.images[c] for c in pair]
+    starts = pair_starts(uv[both], both // 2, marker, images, waves.length)[: BEST_STARTS[0]]
+    if not starts:
+        return None
+    part = _part(waves, pair, both)
+    every = _whole(part, np.isin(np.arange(2 * part.frames), both))
+    found = [
+        _Trial(_bundle_of(one, part, both, uv[both], images, settings), _part(waves, pair, both[one.inliers]), 0.0)
+        for one in starts
+    ]
+    scale = np.array([image.half for image in images]) / 640
+    for (px, relative), most in zip(SCHEDULE, BEST_STARTS, strict=True):
+        sd = relative * waves.length
+        found = sorted((trial.adjusted(px * scale, sd).judged(part, every, scale) for trial in found[:most]), key=_cost)
+    score, bundle = found[0].cost, found[0].bundle
+    off = np.max([e / (image.half / 640) for e, image in zip(bundle.errors(part.seen), images, strict=True)], axis=0)
+    near = off < NEAR_PX
+    good = bool(near.mean() > GOOD_SHARE and np.median(off[near]) < GOOD_PX)
+    return score / len(both), dict(zip(pair, bundle.cameras, strict=True)), good
+
+
+class _Trial(NamedTuple):
+    """Two cameras, the views that agreed when they were found, and the cost of all views."""
+
+    bundle: Bundle
+    agreed: Waves
+    cost: float
+
+    def adjusted(self, noise: Floats, length_sd: float) -> _Trial:
+        """To the views that agreed: wrong ones among them would draw it elsewhere while the noise is large."""
+        places = np.zeros(2 * self.agreed.frames, dtype=np.bool_)
+        places[self.agreed.seen[0].rows] = True
+        lengths = _whole(self.agreed, places)
+        lengths = lengths._replace(sd=np.full(len(lengths.frames), length_sd))
+        bundle = self.bundle.adjusted(self.agreed.seen, noise, lengths, robust=True, max_steps=12, tolerance=1e-3)
+        return self._replace(bundle=bundle)
+
+    def judged(self, every: Waves, lengths: Lengths, scale: Floats) -> _Trial:
+        """By all views, of a pixel, and all lengths."""
+        lengths = lengths._replace(sd=np.full(len(lengths.frames), JUDGED_LENGTH_SD * every.length))
+        return self._replace(cost=self.bundle.cost(every.seen, scale, lengths, robust=True))
+
+
+def _cost(trial: _Trial) -> float:
+    return trial.cost
+
+
+def _part(waves: Waves, cameras: Sequence[int], rows: np.ndarray | None = None) -> Waves:
+    """Some cameras, and their views of some places."""
+    mask = np.ones(2 * waves.frames, dtype=np.bool_) if rows is None else np.isin(np.arange(2 * waves.frames), rows)
+    return replace(
+        waves,
+        seen=tuple(rows_of(mask, waves.seen[c]) for c in cameras),
+        images=tuple(waves.images[c] for c in cameras),
+        stated=waves.stated[list(cameras)],
+    )
+
+
+def _whole(waves: Waves, known: Bools) -> Lengths:
+    """The frames of which both markers (2 F,) are known."""
+    frames = np.flatnonzero(known.reshape(-1, 2).all(axis=1) & waves.ends)
+    return Lengths(frames, waves.length, np.full(len(frames), 1.0))
+
+
+def _bundle_of(
+    one: PairStart, part: Waves, both: np.ndarray, uv: Floats, images: Sequence[Image], settings: RigModelSettings
+) -> Bundle:
+    rays = np.stack([camera.lens.ray_from_pixel(uv[:, c])[0] for c, camera in enumerate(one.cameras)])
+    x, before = meet_two(rays, one.cameras[1].pose)
+    middle = np.median(x[before & one.inliers], axis=0)
+    places = np.tile(middle, (2 * part.frames, 1))
+    places[both] = np.where((before & np.isfinite(x).all(axis=1))[:, None], x, middle)
+    priors = tuple(prior_of(c, i, uv[:, k], settings) for k, (c, i) in enumerate(zip(one.cameras, images, strict=True)))
+    # about the middle of what was seen: a turn of a camera about a far origin would move everything
+    cameras = tuple(c.in_frame(Pose(np.eye(3), middle)) for c in one.cameras)
+    return Bundle(cameras, (places - middle).reshape(-1, 2, 3), priors)
+
+
+def consensus(
+    waves: Waves, cameras: dict[int, CentralCamera], near_px: Floats | float = NEAR_PX
+) -> tuple[Floats, Bools]:
+    """Where each place is, by those two of its views that most others agree with.
+
+    Args:
+        waves: What was seen.
+        cameras: By number.
+        near_px: How far views that agree are off, in pixels of an image of 1280.
+
+    Returns:
+        (2 F, 3), NaN where fewer than two views agree; and (2 F, C) which agree.
+    """
+    n, uv = 2 * waves.frames, waves.uv
+    lines = {c: camera.lines(uv[:, c]) for c, camera in cameras.items()}
+    best, places, agree = np.zeros(n), np.full((n, 3), np.nan), np.zeros(uv.shape[:2], dtype=np.bool_)
+    for i, j in combinations(sorted(cameras), 2):
+        rows = np.flatnonzero(np.isfinite(lines[i][1]).all(axis=1) & np.isfinite(lines[j][1]).all(axis=1))
+        if not len(rows):
+            continue
+        # in the frame of camera i without its turn
+        x, before = meet_two(
+            np.stack([lines[i][1][rows], lines[j][1][rows]]), Pose(np.eye(3), lines[i][0] - lines[j][0])
+        )
+        x = x + lines[i][0]
+        off = np.full((len(rows), uv.shape[1]), np.inf)
+        for c, camera in cameras.items():
+            away = np.linalg.norm(camera.pixel(x) - uv[rows, c], axis=1) / (waves.images[c].half / 640)
+            off[:, c] = np.where(np.isfinite(away), away, np.inf)
+        inside = off < near_px
+        inside[~before] = False
+        both = inside[:, i] & inside[:, j]
+        worth = np.where(both, inside.sum(axis=1) + 0.5 - 0.5 * np.mean(np.minimum(off / near_px, 1), axis=1), 0)
+        better = worth > best[rows]
+        best[rows[better]], places[rows[better]], agree[rows[better]] = worth[better], x[better], inside[better]
+    return places, agree
+
+
+def _resected(waves: Waves, c: int, places: Floats, settings: RigModelSettings) -> CentralCamera | None:
+    """A camera from the places that the others know; None where they are too few, or do not fix it."""
+    seen = waves.seen[c]
+    known = np.isfinite(places[seen.rows]).all(axis=1)
+    if known.sum() < MIN_POINTS_PER_CAMERA:
+        return None
+    try:
+        found = start_camera(places[seen.rows[known]], seen.uv[known], waves.images[c], "central", settings)
+    except (FitError, np.linalg.LinAlgError):
+        return None
+    error = np.linalg.norm(found.camera.pixel(places[seen.rows[known]]) - seen.uv[known], axis=1)[found.inliers]
+    good = found.inliers.sum() >= MIN_POINTS_PER_CAMERA and np.median(error) < 5 * waves.images[c].half / 640
+    return found.camera if good and isinstance(found.camera, CentralCamera) else None
+
+
+def _adjusted_together(
+    waves: Waves, cameras: dict[int, CentralCamera], settings: RigModelSettings
+) -> dict[int, CentralCamera]:
+    """A short robust adjustment of all cameras so far."""
+    places, agree = consensus(waves, cameras)
+    bundle = bundle_of(waves, cameras, places, settings)
+    used = sorted(cameras)
+    seen = [waves.seen[c].select(agree[waves.seen[c].rows, c]) for c in used]
+    noise = np.array([waves.images[c].half for c in used]) / 640
+    lengths = _whole(waves, np.isfinite(places[:, 0]))
+    lengths = lengths._replace(sd=np.full(len(lengths.frames), 0.002 * waves.length))
+    bundle = bundle.adjusted(seen, noise, lengths, robust=True, max_steps=10, tolerance=1e-3)
+    return dict(zip(used, bundle.cameras, strict=True))
+
+
+def bundle_of(waves: Waves, cameras: dict[int, CentralCamera], places: Floats, settings: RigModelSettings) -> Bundle:
+    """Cameras and places as one.
+
+    Args:
+        waves: What was seen.
+        cameras: By number.
+        places: (2 F, 3), NaN where unknown: these are put where the others are.
+        settings: Priors.
+    """
+    middle = np.nanmedian(places, axis=0)
+    whole = np.where(np.isfinite(places), places, middle).reshape(-1, 2, 3)
+    used = sorted(cameras)
+    priors = tuple(prior_of(cameras[c], waves.images[c], waves.seen[c].uv, settings) for c in used)
+    return Bundle(tuple(cameras[c] for c in used), whole, priors)

@@ -1,0 +1,132 @@
+"""A wand: two markers a known distance apart, seen again and again at places that nobody knows.
+
+A dataset without known positions whose points are markers in frames: the columns `frame` and `marker` say which. The
+table [target] of dataset.toml may say more:
+
+    kind = "wand", ends = ["a", "b"], length = 500.0, length_sd = 0.05, jitter = 0.02
+
+ends: the two markers of the wand, where there are others besides; length: between them, in the dataset's unit;
+length_sd: standard uncertainty of the length, one error for all frames; jitter: how much the length varies from frame
+to frame, by flex and by what a detector takes for the middle of a marker. Other markers are single points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from implicam.dataset.model import Dataset
+from implicam.errors import DatasetError, did_you_mean
+
+WAND = "wand"
+"""Kind of the target."""
+
+FRAME, MARKER = "frame", "marker"
+"""Columns of points."""
+
+
+class Wand(NamedTuple):
+    """What is known of a wand: names of its two markers (none: the only two there are), its length (0: not stated), its
+    standard uncertainty, and the sd of the length from frame to frame (0: not stated), in the dataset's unit."""
+
+    ends: tuple[str, ...] = ()
+    length: float = 0.0
+    length_sd: float = 0.0
+    jitter: float = 0.0
+
+    def as_table(self) -> dict[str, Any]:
+        """The table [target]."""
+        stated = {"length": self.length, "length_sd": self.length_sd, "jitter": self.jitter}
+        ends = {"ends": list(self.ends)} if self.ends else {}
+        return {"kind": WAND, **ends, **{name: value for name, value in stated.items() if value}}
+
+
+def wand_of(data: Dataset) -> Wand | None:
+    """What [target] says of a wand.
+
+    Args:
+        data: The dataset.
+
+    Returns:
+        The wand; None where the target is another.
+
+    Raises:
+        DatasetError: The table makes no sense.
+    """
+    target = data.extra.get("target")
+    if not isinstance(target, Mapping) or target.get("kind") != WAND:
+        return None
+    ends = target.get("ends", ())
+    if not isinstance(ends, list | tuple) or len(ends) not in (0, 2) or not all(isinstance(one, str) for one in ends):
+        raise _error(f"ends = {ends!r} must be the names of two markers")
+    numbers = {}
+    for name in ("length", "length_sd", "jitter"):
+        value = target.get(name, 0.0)
+        if type(value) not in (int, float) or not 0 <= value < 1e9:
+            raise _error(f"{name} = {value!r} must be a length")
+        numbers[name] = float(value)
+    return Wand(tuple(ends), **numbers)
+
+
+def marker_rows(data: Dataset, ends: tuple[str, ...]) -> tuple[list[str], NDArray[np.int64]]:
+    """Frames of the wand, and single points.
+
+    Args:
+        data: Markers in frames.
+        ends: Names of the wand's two markers; none where the data have no others.
+
+    Returns:
+        (F,) the name of each frame, and (F, 2) the rows of both ends in the data, -1 for one that is not there; after
+        the wand's frames those of single points, in the first column.
+
+    Raises:
+        DatasetError: The points are no markers in frames, the ends are not among them, or cannot be told.
+    """
+    columns = data.further_columns()
+    if not {FRAME, MARKER} <= columns.keys():
+        raise DatasetError(
+            f"dataset {data.name!r} does not say which of its points are the two ends of a wand at one instant.",
+            why=f"it has no columns {FRAME!r} and {MARKER!r}",
+            fix="add them: a row a point, with the number of the frame and the name of the marker (docs/formats.md)",
+        )
+    frames, markers = (columns[name].tolist() for name in (FRAME, MARKER))
+    names = list(dict.fromkeys(markers))
+    if not ends:
+        if len(names) != 2:
+            raise DatasetError(
+                f"dataset {data.name!r} has {len(names)} markers ({', '.join(names[:5])}), and a wand two.",
+                why="which of them are its ends is not said",
+                fix="--wand-ends A,B (the others are single points)",
+            )
+        ends = tuple(names)
+    for end in ends:
+        if end not in names:
+            raise DatasetError(
+                f"dataset {data.name!r} has no marker {end!r}{did_you_mean(end, names)}.",
+                fix=f"its markers are {', '.join(names[:10])}",
+            )
+    at: dict[str, list[int]] = {}
+    single = []
+    for row, (frame, marker) in enumerate(zip(frames, markers, strict=True)):
+        if marker not in ends:
+            single.append(row)
+            continue
+        place = at.setdefault(frame, [-1, -1])
+        if place[ends.index(marker)] >= 0:
+            raise DatasetError(
+                f"marker {marker!r} is twice in frame {frame!r} of dataset {data.name!r}.", fix="keep one of the two"
+            )
+        place[ends.index(marker)] = row
+    rows = [*at.values(), *([row, -1] for row in single)]
+    return [*at, *(frames[row] for row in single)], np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+def _error(why: str) -> DatasetError:
+    return DatasetError(
+        "[target] in dataset.toml does not describe a wand.",
+        why=why,
+        fix='it needs kind = "wand"; and may have ends, length, length_sd and jitter, in the dataset\'s length unit',
+    )

@@ -1,0 +1,378 @@
+"""A board held by hand: which pose tells most, what a session keeps of it, and sessions played by a simulated hand."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import implicam as ic
+from board_pictures import checkered, corners_of, photograph, rotated
+from implicam.active.board_coverage import framing_of, is_new, unseen_framing, usual_pixels
+from implicam.active.board_design import BoardDesign, BoardShape, board_pose
+from implicam.active.board_loop import BoardLoop, BoardTarget, Pictures
+from implicam.active.stopping import Step
+from implicam.dataset import Dataset, KnownPositions, read_dataset
+from implicam.dataset.boards import corner_positions
+from implicam.detect import Charuco, View
+from implicam.detect.sharpness import edge_width
+from implicam.errors import DatasetError, UsageError
+from implicam.geometry import Pose, look_at, rotation_from_vector
+from implicam.hardware.simulated_hand import match_pose, simulated_hand
+from implicam.session.board_session import BoardController
+from implicam.session.journal import TARGET_KEY, Session
+from implicam.session.setup import Setup, open_session
+from implicam.simulate import build_rig, simulate_boards
+
+BOARD = {"kind": "board", "rows": 5, "columns": 7, "square": 20.0}
+CHARUCO = Charuco(9, 12, 13.29, 10.0)
+
+
+def shape_of(table: dict[str, Any], *, whole: bool = True) -> BoardShape:
+    flat = corner_positions(table)
+    return BoardShape(np.column_stack([flat, np.zeros(len(flat))]), float(table["square"]), whole)
+
+
+@pytest.fixture(scope="module")
+def rig() -> Any:
+    return build_rig("stereo", seed=1, lens_error=0.0)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Any:
+    """In a world of its own; a design takes any that predicts pixels."""
+    return ic.Explicit(lens="brown-conrady").fit(ic.simulated("stereo", points=30, seed=1))
+
+
+@pytest.fixture(scope="module")
+def design(calibration: Any) -> BoardDesign:
+    return BoardDesign.of(calibration, shape_of(BOARD))
+
+
+@pytest.fixture(scope="module")
+def poses(design: BoardDesign) -> list[Pose]:
+    return design.candidates(30, np.random.default_rng(2))
+
+
+# --- the design of the experiment -----------------------------------------------------------------------------------
+
+
+def test_the_gain_of_a_pose_is_what_the_covariance_loses(design, poses):
+    gains = design.gains(poses[:4])
+    assert (gains > 0).all()
+    for pose, gain in zip(poses[:4], gains, strict=True):
+        now, then = (np.trace(one.at_judged.total, axis1=1, axis2=2) for one in (design, design.after(pose)))
+        assert np.nanmean(now - then) == pytest.approx(gain, rel=1e-6)
+        assert (then <= now * (1 + 1e-9))[np.isfinite(now)].all()
+        assert (then >= np.trace(design.at_judged.floor, axis1=1, axis2=2) * (1 - 1e-9))[np.isfinite(now)].all()
+    assert np.nanmean(design.after(poses[0]).pixel_sd()) < np.nanmean(design.pixel_sd())
+
+
+def test_the_pose_of_the_board_is_integrated_out(design, calibration, poses):
+    """Against the whole normal matrix of unknowns and pose, inverted."""
+    pose = poses[int(np.argmax(design.gains(poses)))]
+    (S,) = design._informations([pose], None)
+    xyz = pose.apply(design.shape.some())
+    linear = design._linear(xyz, np.tile(design.visible([pose]), (len(xyz), 1)))
+    many = np.sqrt(len(design.shape.corners) / len(xyz))
+    weight = np.where(linear.seen, many / linear.sd, 0)[..., None]
+    H = (linear.half * weight).reshape(-1, linear.half.shape[2])
+    steps = np.eye(6)
+    K = []
+    for step in steps:  # numerically: turned about the board's origin, shifted
+        moved = 1e-4 * step
+        there = rotation_from_vector(moved[:3]) @ pose.rotation
+        far = design.shape.some() @ there.T + pose.translation + moved[3:]
+        K.append((calibration.predict(far) - calibration.predict(xyz)).reshape(len(xyz), -1) / 1e-4)
+    K = (np.stack(K, axis=2) * weight).reshape(-1, 6)
+    joint = np.block([[np.eye(len(S)) + H.T @ H, H.T @ K], [K.T @ H, K.T @ K]])
+    marginal = np.linalg.inv(joint)[: len(S), : len(S)]
+    assert np.allclose(np.linalg.inv(np.eye(len(S)) + S), marginal, atol=1e-4)
+
+
+def test_errors_that_move_the_whole_rig_do_not_count(design):
+    moved, rigid = design._moved
+    xyz = design.judged.xyz[design._counted]
+    for axis in np.eye(3):
+        for motion in (np.broadcast_to(axis, xyz.shape), np.cross(axis, xyz - xyz.mean(axis=0))):
+            assert np.abs(np.einsum("nk,nkq->q", motion, moved)).max() < 1e-6 * np.abs(moved).max() * motion.size
+    assert rigid.shape == moved.shape
+
+
+def test_candidates_are_seen_well_and_a_pose_is_found_again(design, calibration, poses):
+    seen = design.visible(poses)
+    assert len(poses) > 10
+    assert seen.any(axis=1).all()
+    best = poses[int(np.argmax(seen.sum(axis=1)))]
+    uv = np.where(
+        design.visible([best])[0][None, :, None], calibration.predict(best.apply(design.shape.corners)), np.nan
+    )
+    found = board_pose(calibration, design.shape.corners, uv)
+    assert np.abs(found.apply(design.shape.corners) - best.apply(design.shape.corners)).max() < 1e-3
+    turned = Pose(best.rotation @ np.diag([1.0, -1.0, -1.0]), best.translation)
+    assert not design.visible([turned]).any()  # its back
+
+
+# --- before there is a calibration ----------------------------------------------------------------------------------
+
+
+def test_a_camera_is_shown_what_it_has_not_seen():
+    shape, size, seen = shape_of(BOARD), (1280, 800), []
+    for _ in range(5):
+        framing = unseen_framing(shape, size, seen)
+        assert is_new(framing, seen)
+        uv = usual_pixels(framing.camera_from_board.apply(shape.corners), size)
+        assert ((uv > 0) & (uv < size)).all()
+        again = framing_of(shape, shape.corners, uv, size)
+        assert again is not None
+        assert np.allclose(again.features, framing.features, atol=1e-6)
+        seen.append(framing)
+        assert not is_new(again, seen)
+
+
+def boards_of_rig(rig: Any, count: int) -> Dataset:
+    names = [camera.name for camera in rig.cameras]
+    return simulate_boards(rig, [names] * count, seed=3)
+
+
+@pytest.fixture(scope="module")
+def eight(rig: Any) -> Dataset:
+    return boards_of_rig(rig, 8)
+
+
+@pytest.fixture(scope="module")
+def loop(rig: Any, eight: Dataset) -> BoardLoop:
+    """With eight boards, fitted."""
+    found = BoardLoop(
+        ic.Explicit(lens="brown-conrady"), shape_of(dict(eight.extra["target"])), eight.cameras, rule=Pictures(8)
+    )
+    assert isinstance(found.ask()[0], BoardTarget)
+    found.reset(eight)
+    assert found.problem is None
+    return found
+
+
+def test_the_loop_says_where_why_and_how_far(loop):
+    assert loop.points == 8
+    assert loop.stop == "all 8 boards of the budget are taken"
+    (target,) = loop.ask()
+    assert target.pose is not None
+    assert target.score > 0
+    assert target.words.endswith("mm from it")
+    assert " would become " in target.why
+    for c, outline in enumerate(target.outlines):
+        assert (outline is None) == np.isnan(target.corners[c]).all()
+    progress = loop.camera_progress()
+    assert [one.boards for one in progress] == [8, 8]
+    assert all(0.4 < one.part <= 1 for one in progress)
+    step = loop.history[-1]
+    assert step.points == 8
+    assert step.usual < step.worst < 50
+
+
+def test_a_board_where_one_was_is_worth_little_and_one_in_the_outline_enough(loop):
+    (target,) = loop.ask()
+    calibration, shape = loop.calibration, loop.shape
+    seen = loop.design.visible([target.pose])[0]
+    uv = calibration.predict(target.pose.apply(shape.corners))
+    numbers = np.arange(len(shape.corners))
+    views = {name: (numbers, uv[:, c]) for c, name in enumerate(calibration.trained.camera_names) if seen[c]}
+    assert loop.worth(views, target).enough
+    assert loop.worth(views, target).share == pytest.approx(1, abs=0.05)
+    best = replace(target, score=20 * target.score)
+    assert not loop.worth(views, best).enough
+    assert "5 %" in loop.worth(views, best).reason
+
+
+def test_a_board_more_is_predicted_before_it_is_fitted(loop, rig, eight):
+    more = BoardLoop(loop.calibrator, loop.shape, loop.cameras)
+    more.data = eight
+    more.adopt(eight, loop.calibration)
+    before = more.history[-1]
+    more.tell(boards_of_rig(rig, 9))
+    assert [step.points for step in more.history] == [8, 9]
+    assert more.history[-1].usual < before.usual
+
+
+def test_pictures_are_counted_in_words():
+    rule = Pictures(3)
+    assert rule.progress([Step(2)]) == "2 of 3 boards"
+    assert not rule.met([Step(2)])
+
+
+# --- pictures -------------------------------------------------------------------------------------------------------
+
+
+def test_edges_are_measured_sharp_and_blurred():
+    h = rotated(0.2, 30)
+    uv, flat = corners_of(5, 7, h), corner_positions({**BOARD, "square": 1.0})
+    for blur in (0.8, 2.5):
+        picture = photograph(checkered(5, 7), h, blur=blur, noise=0.003, fine=3)
+        width = edge_width(picture, flat, uv)
+        assert width == pytest.approx(2.5 * np.hypot(blur, 0.3), rel=0.25), blur
+
+
+def test_a_hand_follows_an_outline_and_its_board_is_read(rig):
+    cameras, hand = simulated_hand(rig, CHARUCO.describe(), seed=1)
+    camera = rig.cameras[0]
+    place = camera.camera_from_world.inverse().apply(np.array([20.0, 10.0, 420.0]))
+    middle = hand.corners.mean(axis=0)
+    frame = look_at(camera.camera_from_world.centre, place, -camera.camera_from_world.rotation[1]).rotation.T
+    goal = Pose(frame @ rotation_from_vector([0.3, -0.2, 0.1]), np.zeros(3))
+    goal = Pose(goal.rotation, place - goal.rotation @ middle)
+    pixels = np.stack([one.pixel_from_world(goal.apply(hand.corners))[0] for one in rig.cameras])
+    found = match_pose(rig, hand.corners, pixels)
+    assert np.abs(found.apply(hand.corners) - goal.apply(hand.corners)).max() < 0.05
+    hand.follow(hand.corners, pixels)
+    off = np.linalg.norm(hand.pose().apply(middle) - goal.apply(middle))
+    assert 0 < off < 60
+    frame = cameras[0].frame()
+    seen = CHARUCO.detect(frame.picture, View("cam1", "p001"))
+    assert len(seen) > 60, seen.reason
+    numbers = [int(point[-3:]) - 1 for point in seen.points]
+    true, _ = camera.pixel_from_world(hand.pose().apply(hand.corners)[numbers])
+    assert np.abs(seen.uv - true).max() < 0.1
+
+
+# --- what a session keeps, and what it refuses ----------------------------------------------------------------------
+
+
+def test_boards_at_unknown_places_are_kept_and_come_back(tmp_path, eight):
+    target = dict(eight.extra["target"])
+    shots = np.array([point.rpartition("-c")[0] for point in eight.points.tolist()])
+    names = list(dict.fromkeys(shots.tolist()))
+    with Session.create(
+        tmp_path / "s", name="b", length_unit="mm", cameras=eight.cameras, settings={TARGET_KEY: target}
+    ) as session:
+        for name in names[:3]:
+            session.accept(eight.select(shots == name))
+        assert session.undo() == names[2]
+        other = eight.select(shots == names[3])
+        somewhere = KnownPositions(
+            np.full(len(other), names[3]), np.zeros((len(other), 3)), np.full((len(other), 3), 1.0)
+        )
+        with pytest.raises(DatasetError, match="known positions or none"):
+            session.accept(replace(other, known=somewhere))
+    with Session.open(tmp_path / "s") as session:
+        data = session.data
+        assert data.known is None
+        assert list(dict.fromkeys(point.rpartition("-c")[0] for point in data.points.tolist())) == names[:2]
+        assert np.array_equal(
+            data.observations.uv, eight.select(np.isin(shots, names[:2])).observations.uv, equal_nan=True
+        )
+    read = read_dataset(tmp_path / "s")
+    assert read.known is None
+    assert read.extra["target"] == target
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"target": "charcuo"}, "did you mean 'charuco'"),
+        ({"target": "board", "board": "8x11"}, "size of the squares"),
+        ({"target": "board", "board": "8x11", "square": 13290.0}, "no size for a board"),
+        ({"target": "charuco", "tag": 3.0}, "no option --tag"),
+        ({"target": "charuco", "robot": "ur:10.0.0.1"}, "holds no board"),
+        ({"target": "charuco", "method": "inverse-gp"}, "takes no boards"),
+        ({"target": "aprilgrid", "board": "6x6", "tag": 20.0, "spacing": 6.0}, "cannot show"),
+    ],
+)
+def test_what_a_session_with_a_board_cannot_be(tmp_path, options, says):
+    with pytest.raises(UsageError) as caught:
+        open_session(tmp_path / "s", Setup(rig="stereo", **options)).close()
+    assert says in str(caught.value)
+    assert caught.value.fix
+
+
+# --- played sessions ------------------------------------------------------------------------------------------------
+
+
+def controller_of(folder: Path, **options: Any) -> BoardController:
+    made = open_session(folder, Setup(rig="stereo", target="charuco", **options))
+    assert isinstance(made, BoardController)
+    made.loop.calibrator = ic.Explicit(lens="brown-conrady")  # of a choice of lenses each fit takes twice as long
+    return made
+
+
+@pytest.mark.slow
+def test_a_session_is_played_to_its_end_and_goes_on_after_it_was_left(tmp_path):
+    folder = tmp_path / "s"
+    with controller_of(folder, budget=9) as controller:
+        controller._hand.seconds, controller._background = 0.0, False
+        controller.start()
+        while controller.loop.points < 4:
+            controller.live()
+            controller.step()
+        assert controller.state.taken == controller.loop.points
+    assert len(list((folder / "images" / "cam1").glob("*.png"))) == 4
+    with open_session(folder, None) as controller:
+        assert controller.loop.rule is not None
+        path = controller.run()
+        assert controller.state.phase == "done", controller.state.problem
+        assert controller.state.stop
+        assert controller.loop.points >= 5
+        assert path is not None
+        assert path.exists()
+        boards = controller.loop.points
+    found = ic.load_calibration(path)
+    assert set(found.camera_names) == {"cam1", "cam2"}
+    if boards >= 9:
+        assert "held by hand" in (folder / "report.html").read_text()
+    again = ic.Explicit(lens="brown-conrady").fit(read_dataset(folder))  # the folder is a dataset of boards
+    assert set(again.camera_names) == {"cam1", "cam2"}
+
+
+@pytest.mark.slow
+def test_a_session_in_a_browser_shows_outline_corners_and_progress(tmp_path, chromium):
+    playwright = pytest.importorskip("playwright.sync_api")
+    from implicam.viewer.bench_page import open_page
+
+    with controller_of(tmp_path / "s", budget=30) as controller:
+        controller._hand.seconds = 0.3
+        with open_page(controller) as (url, _), playwright.sync_playwright() as play:
+            browser = play.chromium.launch(**chromium)
+            page = browser.new_page(viewport={"width": 1280, "height": 800})
+            errors: list[str] = []
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            page.goto(url)
+            page.wait_for_selector("svg polygon.aim", timeout=60_000)
+            page.wait_for_selector("svg circle.corner", timeout=60_000)
+            assert page.is_hidden("#place")
+            assert page.is_hidden("#stop")
+            assert page.is_hidden("#accept")
+            assert "simulated" in page.inner_text("#by-itself")
+            page.wait_for_function("window.implicam.state.numbers.points >= 1", timeout=120_000)
+            page.uncheck("#auto")
+            page.wait_for_function("!window.implicam.state.auto")
+            before = controller.loop.points
+            end = time.monotonic() + 60
+            while controller.loop.points == before and time.monotonic() < end:  # at the key, wherever it is
+                page.keyboard.press("g")
+                time.sleep(2)
+            assert controller.loop.points > before
+            page.wait_for_selector(".part:not([hidden])")
+            browser.close()
+            assert not errors
+
+
+def test_a_moving_or_a_blurred_board_is_refused_with_the_reason(tmp_path):
+    controller = controller_of(tmp_path / "s", budget=9)
+    try:
+        table = controller.equipment.detector.describe()
+        flat = corner_positions(table)
+        here = {"cam1": (np.arange(len(flat)), 2 * flat + 100)}
+        assert controller._judge(()).reason == "no camera sees the board"
+        controller.state = replace(controller.state, looks=())
+        controller._views = lambda looks: here  # type: ignore[method-assign]
+        controller._last = {"cam1": (here["cam1"][0], here["cam1"][1] + 14)}
+        judged = controller._judge(())
+        assert not judged.ready
+        assert judged.reason == "hold it still: it moves by 20 px"
+        assert threading.active_count() < 50
+    finally:
+        controller.close()
