@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
@@ -21,6 +22,8 @@ from implicam.calibrators import ForwardGP
 from implicam.dataset import read_dataset
 from implicam.detect.labelling import Labelling
 from implicam.detect.model import View
+from implicam.hardware import Person
+from implicam.session.controller import SessionController
 from implicam.session.setup import Setup, open_session
 from implicam.viewer import bench_page
 from implicam.viewer.calibration_page import LiveView
@@ -78,12 +81,9 @@ def view(folder: Path) -> None:
 
 
 def acquire(folder: Path) -> None:
-    """The page of `implicam acquire` with eleven points."""
-    with (
-        open_session(folder / "session", Setup(rig="bar6", speed=1e6)) as controller,
-        bench_page.open_page(controller) as (url, _),
-        sync_playwright() as playwright,
-    ):
+    """The page of `implicam acquire`: with eleven points by a robot; and without a robot, with five."""
+    session = open_session(folder / "session", Setup(rig="bar6", speed=1e6))
+    with session as controller, bench_page.open_page(controller) as (url, _), sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1440, "height": 900}, color_scheme="dark")
         page.goto(url)
@@ -93,6 +93,34 @@ def acquire(folder: Path) -> None:
         page.wait_for_selector("#go:enabled", timeout=60_000)
         page.wait_for_timeout(4000)
         page.screenshot(path=IMAGES / "acquire.png")
+        browser.close()
+    by_hand(folder)
+
+
+def by_hand(folder: Path) -> None:
+    """The page before there is a calibration: the drawing of how to reach x, y, z, and rough circles."""
+    made = open_session(folder / "by-hand", Setup(rig="bar6", speed=1e6, workspace="-560:-380,-420:-240,-300:-130"))
+    hand = made.equipment.robot  # holds the ball where the person says
+    by_person = replace(made.equipment, robot=Person(lambda wish: None))
+    with (
+        SessionController(made.session, by_person, made.loop) as controller,
+        bench_page.open_page(controller) as (url, _),
+        sync_playwright() as playwright,
+    ):
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        page = browser.new_page(viewport={"width": 1440, "height": 900}, color_scheme="light")
+        page.goto(url)
+        for k in range(6):
+            page.wait_for_selector("#go:enabled", timeout=60_000)
+            assert controller.state.target is not None
+            hand.move(controller.state.target.xyz - [0, 9 if k == 5 else 0, 0])
+            if k < 5:
+                page.click("#there")
+                page.click("#go:enabled", timeout=60_000)
+                page.click("#accept:enabled", timeout=60_000)
+        page.click("#reach summary")
+        page.wait_for_timeout(4000)
+        page.screenshot(path=IMAGES / "acquire-by-hand.png")
         browser.close()
 
 

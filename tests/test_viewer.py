@@ -37,6 +37,7 @@ from implicam.viewer import words
 from implicam.viewer.calibration_scene import list_cameras, up_of
 from implicam.viewer.snapshot import curve, snapshot
 from implicam.viewer.space import Placing, edges, levels, turned_up, upwards
+from implicam.viewer.volume import volume
 from implicam.viewer.worker import Worker
 
 NOWHERE = np.full(2, np.nan)
@@ -91,6 +92,26 @@ def test_rough_circles_are_said_to_be_rough() -> None:
         nowhere = np.full(3, np.nan)
         shown = snapshot(replace(state, rough=rough), ["left"], nowhere, Budget(9), unit="mm", moves=False, skipped=0)
         assert (shown["cameras"][0]["rough"], shown["cameras"][0]["target"]) == (circle, None)
+
+
+def test_the_volume_is_that_of_the_places_between_which_it_lies() -> None:
+    box = Workspace.box([-100, 0, 50], [100, 160, 90])
+    judged = box.judged(400)
+    field = np.exp(0.01 * judged[:, 0] - 0.02 * judged[:, 1])
+    found = volume(box, judged, {"u95": field})
+    assert found is not None
+    assert [(axis[0], axis[-1]) for axis in found["axes"]] == [(-100, 100), (0, 160), (50, 90)]
+    x, y, _ = np.meshgrid(*found["axes"], indexing="ij")
+    assert np.allclose(found["maps"]["u95"], np.exp(0.01 * x - 0.02 * y).ravel())  # linear in the logarithm
+    blind = np.where(judged[:, 0] > 30, np.nan, field)
+    some = volume(box, judged, {"u95": blind})
+    assert some is not None
+    missing = np.array([value is None for value in some["maps"]["u95"]]).reshape(x.shape)
+    assert missing[x > 70].all()
+    assert not missing[x < -10].any()
+    assert volume(box, judged, {"u95": np.full(len(judged), np.nan)}) is None
+    turned = Workspace.hull(box.vertices @ rotation_from_vector([0, 0, 0.3]).T)
+    assert volume(turned, turned.judged(400), {"u95": field}) is None
 
 
 def test_the_levels_of_a_block() -> None:

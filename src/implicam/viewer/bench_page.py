@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from implicam.active import PredictedCovariance
 from implicam.dataset import Floats
 from implicam.errors import ImplicamError, UsageError
 from implicam.formatting import json_safe
@@ -32,6 +33,7 @@ from implicam.viewer import words
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, list_cameras, up_of
 from implicam.viewer.snapshot import curve, finite_or_none, snapshot
 from implicam.viewer.space import Placing, edges, levels
+from implicam.viewer.volume import volume
 from implicam.viewer.web import SCENE_FILES, answer, behind_door, jpeg
 from implicam.viewer.worker import Worker
 
@@ -87,6 +89,7 @@ class BenchPage:
         self._drawn: tuple[Any, ...] = ()  # what the scene was made of
         self._scene, self._curve = 0, 0  # numbers of the versions that a page compares
         self._curved: Any = None
+        self._volume: tuple[PredictedCovariance | None, dict[str, Any] | None] = (None, None)
         self._watching, self._last_watched = 0, time.monotonic()
         self._yes: dict[str, tuple[Any, float]] = {}  # number -> what a yes with it allows, and until when
         self._position: TypedPosition | None = None  # that was typed last
@@ -346,7 +349,17 @@ class BenchPage:
             "judged": controller.loop.judged_at.tolist() if predicted is not None else [],
             "u95": [] if predicted is None else json_safe(predicted.u95.tolist()),
             "excess": [] if predicted is None else json_safe(predicted.excess.tolist()),
+            "volume": self._volume_of(predicted),
         }
+
+    def _volume_of(self, predicted: PredictedCovariance | None) -> dict[str, Any] | None:
+        """The uncertainty on a grid, computed once for all pages."""
+        if predicted is None:
+            return None
+        if self._volume[0] is not predicted:
+            loop, fields = self._controller.loop, {"u95": predicted.u95, "excess": predicted.excess}
+            self._volume = predicted, volume(loop.workspace, loop.judged_at, fields)
+        return self._volume[1]
 
     def curve(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The uncertainty against the number of points."""

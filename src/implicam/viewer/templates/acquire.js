@@ -499,7 +499,10 @@ function colourCloud() {
   by("high").textContent = `≥ ${number(high)} ${unit}`;
   const part = Number(by("threshold").value) / 100, level = known[Math.min(Math.floor(part * known.length), known.length - 1)];
   by("level").textContent = `${number(level)} ${unit}`;
-  scene.setCloud(world.judged, values, low, high, level);
+  if (!world.volume) return scene.setCloud(world.judged, values, low, high, level);
+  scene.setMap(world.volume.axes, world.volume.maps[by("colour").value]);
+  Object.assign(scene, {bottom: low, top: high});
+  scene.setThreshold(part >= 1 ? Infinity : level);
 }
 
 function drawMoving() {
