@@ -236,6 +236,14 @@ def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
         page.goto(url)
         for k, texts in enumerate(typed):
             page.wait_for_selector("#go:enabled")
+            assert by_hand.state.target is not None
+            where = [f"{value:g}".replace("-", "−") for value in by_hand.state.target.xyz]
+            for tool in ("ruler", "block", "slide-x", "slide-z"):
+                page.select_option("#tool", tool)
+                page.wait_for_function(
+                    "(where) => where.every((one) => document.getElementById('drawing').textContent.includes(one))",
+                    arg=where,
+                )
             for axis, text in zip("xyz", texts, strict=True):
                 assert page.input_value(f"#{axis}") == ""  # what nobody typed is not known
                 page.fill(f"#{axis}", text)
