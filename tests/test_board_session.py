@@ -16,20 +16,21 @@ from board_pictures import checkered, corners_of, photograph, rotated
 from implicam.active.board_coverage import framing_of, is_new, unseen_framing, usual_pixels
 from implicam.active.board_design import BoardDesign, BoardShape, board_pose
 from implicam.active.board_loop import BoardLoop, BoardTarget, Pictures
+from implicam.active.board_poses import POSE_COLUMN, KnownPose, KnownPosesLoop, described, poses_from, poses_of
 from implicam.active.stopping import Step
-from implicam.dataset import Dataset, KnownPositions, read_dataset
+from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
 from implicam.dataset.boards import corner_positions
 from implicam.detect import Charuco, View
 from implicam.detect.sharpness import edge_width
 from implicam.errors import DatasetError, UsageError
-from implicam.geometry import Pose, look_at, rotation_from_vector
-from implicam.hardware.simulated_hand import match_pose, simulated_hand
+from implicam.geometry import Pose, look_at, rotation_from_vector, vector_from_rotation
+from implicam.hardware.simulated_hand import board_target, match_pose, simulated_hand
 from implicam.session.board_session import BoardController
 from implicam.session.journal import TARGET_KEY, Session
 from implicam.session.setup import Setup, open_session
-from implicam.simulate import build_rig, simulate_boards
+from implicam.simulate import build_rig, simulate, simulate_boards
 
-BOARD = {"kind": "board", "rows": 5, "columns": 7, "square": 20.0}
+BOARD = {"kind": "board", "rows": 5, "columns": 8, "square": 20.0}
 CHARUCO = Charuco(9, 12, 13.29, 10.0)
 
 
@@ -210,9 +211,9 @@ def test_pictures_are_counted_in_words():
 
 def test_edges_are_measured_sharp_and_blurred():
     h = rotated(0.2, 30)
-    uv, flat = corners_of(5, 7, h), corner_positions({**BOARD, "square": 1.0})
+    uv, flat = corners_of(5, 8, h), corner_positions({**BOARD, "square": 1.0})
     for blur in (0.8, 2.5):
-        picture = photograph(checkered(5, 7), h, blur=blur, noise=0.003, fine=3)
+        picture = photograph(checkered(5, 8), h, blur=blur, noise=0.003, fine=3)
         width = edge_width(picture, flat, uv)
         assert width == pytest.approx(2.5 * np.hypot(blur, 0.3), rel=0.25), blur
 
@@ -289,6 +290,106 @@ def test_what_a_session_with_a_board_cannot_be(tmp_path, options, says):
     assert caught.value.fix
 
 
+# --- known poses ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def slots(rig: Any) -> tuple[KnownPose, ...]:
+    """A board in front of both cameras, at four depths."""
+    shape = shape_of(BOARD)
+    box = rig.volume.world_from_box
+    depths = rig.volume.size[2] * np.array([-0.4, -0.1, 0.2, 0.4])
+    poses = [Pose(box.rotation, box.apply(np.array([0.0, 0.0, z]) - shape.middle)) for z in depths]
+    return tuple(KnownPose(f"slot {k}", pose) for k, pose in enumerate(poses, start=1))
+
+
+def corners_at(rig: Any, slots: tuple[KnownPose, ...], count: int) -> Dataset:
+    """What the cameras see of the board in the first slots, as known points."""
+    parts = []
+    for k, (name, pose) in enumerate(slots[:count], start=1):
+        seen = simulate(rig, board_target(BOARD, pose), seed=k)
+        shot, n = f"p{k:03d}", len(seen)
+        names = np.array([point.replace("held", shot) for point in seen.points.tolist()])
+        known = KnownPositions(np.full(n, shot), seen.xyz, np.full((n, 3), np.nan), {POSE_COLUMN: np.full(n, name)})
+        observations = Observations(names, seen.cameras, seen.observations.uv, seen.observations.sd)
+        parts.append(Dataset("b", "mm", observations, known, {"target": BOARD}))
+    return ic.join(parts)
+
+
+def test_poses_are_read_with_normals_turns_and_as_a_slide(tmp_path):
+    file = tmp_path / "poses.csv"
+    file.write_text("pose,x,y,z,nx,ny,nz\nA,1,2,3,0,0,-1\nB,4,5,6,0,-1,-1\n")
+    a, b = poses_from(str(file))
+    assert (a.name, b.name) == ("A", "B")
+    assert np.allclose(a.pose.rotation, np.eye(3))
+    assert np.allclose(b.pose.rotation[:, 2], [0, 0.5**0.5, 0.5**0.5])
+    assert np.allclose(b.pose.rotation[:, 0], [1, 0, 0])
+    assert np.linalg.det(b.pose.rotation) == pytest.approx(1)
+    file.write_text("pose,x,y,z,rx,ry,rz\nA,1,2,3,0.1,0.2,0.3\nB,4,5,6,0,0,0\n")
+    assert np.allclose(poses_from(str(file))[0].pose.rotation, rotation_from_vector([0.1, 0.2, 0.3]))
+    slide = poses_from("x=0 y=0 z=0:190:10")
+    assert len(slide) == 20
+    assert slide[-1].pose.translation.tolist() == [0, 0, 190]
+    kept = poses_of(described(slide))
+    assert [one.name for one in kept] == [one.name for one in slide]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("pose,x,y\nA,1,2\n", "has the columns"),
+        ("pose,x,y,z\nA,1,2,3\nA,1,2,4\n", "'A' twice"),
+        ("pose,x,y,z\nA,1,2,3\n", "1 poses"),
+        ("pose,x,y,z,nx,ny,nz\nA,1,2,3,1,0,0\nB,1,2,3,0,0,1\n", "lies along x"),
+        ("pose,x,y,z,nx,ny,nz\nA,1,2,3,0,0,0\nB,1,2,3,0,0,1\n", "normal is zero"),
+        ("pose,x,y,z\nA,1,2,nan\nB,1,2,3\n", "not finite"),
+        ("pose,x,y,z\nA,1,2,\nB,1,2,3\n", "row 2"),
+        ("pose,x,y,z,nx,ny,nz,rx,ry,rz\nA,1,2,3,0,0,1,0,0,0\nB,1,2,3,0,0,1,0,0,0\n", "has the columns"),
+    ],
+)
+def test_poses_that_are_none(tmp_path, text, says):
+    file = tmp_path / "poses.csv"
+    file.write_text(text)
+    with pytest.raises(UsageError) as caught:
+        poses_from(str(file))
+    assert says in str(caught.value)
+    assert caught.value.fix
+
+
+def test_a_board_goes_through_known_poses_by_number(rig, slots):
+    cameras = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
+    loop = KnownPosesLoop(ic.Explicit(lens="brown-conrady"), shape_of(BOARD), cameras, poses=slots)
+    (first,) = loop.ask()
+    assert first.words.startswith("pose 1 of 4: slot 1, corner 1 at x ")
+    assert first.known
+    assert all(outline is None for outline in first.outlines)
+    data = corners_at(rig, slots, 3)
+    loop.reset(data)
+    assert loop.problem is None
+    assert loop.taken == ["slot 1", "slot 2", "slot 3"]
+    (last,) = loop.ask()
+    assert last.words.startswith("pose 4 of 4: slot 4")
+    assert loop.name_of(last) == "slot 4"
+    assert all(outline is not None for outline in last.outlines)
+
+    def seen(pose: Pose) -> dict[str, Any]:
+        xyz = pose.apply(loop.shape.corners)
+        return {one.name: (np.arange(len(xyz)), one.pixel_from_world(xyz)[0]) for one in rig.cameras}
+
+    assert loop.worth(seen(slots[3].pose), last).enough
+    still = loop.worth(seen(slots[2].pose), last)  # nobody has moved it yet
+    assert not still.enough
+    assert "px from where this pose must be" in still.reason
+    again = replace(last, pose=slots[2].pose)
+    assert loop.worth(seen(slots[2].pose), again).reason == "move it on to this pose"
+    assert loop.history[-1].worst > 0
+    assert [one.words for one in loop.camera_progress()] == ["3 of 4 poses"] * 2
+    loop.reset(corners_at(rig, slots, 4))
+    assert loop.stop == "all 4 poses are taken"
+    with pytest.raises(UsageError, match="all 4 poses"):
+        loop.ask()
+
+
 # --- played sessions ------------------------------------------------------------------------------------------------
 
 
@@ -328,6 +429,27 @@ def test_a_session_is_played_to_its_end_and_goes_on_after_it_was_left(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_session_goes_through_the_slots_of_a_block_and_calibrates_by_any_method(tmp_path, slots):
+    file = tmp_path / "poses.csv"
+    rows = [[name, *pose.translation, *vector_from_rotation(pose.rotation)] for name, pose in slots]
+    file.write_text("\n".join(["pose,x,y,z,rx,ry,rz", *(",".join(map(str, row)) for row in rows)]))
+    setup = Setup(rig="stereo", seed=1, target="board", board="5x8", square=20.0, poses=str(file))
+    with open_session(tmp_path / "s", setup) as controller:
+        assert isinstance(controller, BoardController)
+        controller._hand.seconds, controller._background = 0.0, False
+        controller.start()
+        file.unlink()  # the session has them
+        for _ in slots:
+            controller.go()
+        assert controller.state.stop == "all 4 poses are taken"
+        path = controller.finish()
+    assert ic.load_calibration(path).method == "forward-gp"
+    data = read_dataset(tmp_path / "s")
+    assert set(data.known.extra[POSE_COLUMN].tolist()) == {name for name, _ in slots}
+    assert (tmp_path / "s" / "report.html").exists()
+
+
+@pytest.mark.slow
 def test_a_session_in_a_browser_shows_outline_corners_and_progress(tmp_path, chromium):
     playwright = pytest.importorskip("playwright.sync_api")
     from implicam.viewer.bench_page import open_page
@@ -347,7 +469,7 @@ def test_a_session_in_a_browser_shows_outline_corners_and_progress(tmp_path, chr
             assert page.is_hidden("#accept")
             assert "simulated" in page.inner_text("#by-itself")
             page.wait_for_function("window.implicam.state.numbers.points >= 1", timeout=120_000)
-            page.uncheck("#auto")
+            page.click("#auto")
             page.wait_for_function("!window.implicam.state.auto")
             before = controller.loop.points
             end = time.monotonic() + 60

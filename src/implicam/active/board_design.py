@@ -467,7 +467,7 @@ def _linear(rig: PredictsPixels, xyz: Floats, seen: Bools) -> _Linear:
         good: Bools = np.asarray(np.isfinite(part.slope).all(axis=2) & np.isfinite(part.half).all(axis=2))
         slope[:, rows] = np.where(good[..., None], part.slope, 0)
         half[:, rows, start : start + q] = np.where(good[..., None], part.half, 0)
-        variance[:, rows] = part.noise + part.rest
+        variance[:, rows] = np.where(good, part.noise + part.rest, 1.0)  # NaN where a lens has no answer
         there[:, rows] = good & seen[:, list(part.cameras)].repeat(2, axis=1)
         start += q
     return _Linear(slope, half, np.sqrt(variance), there)

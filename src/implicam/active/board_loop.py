@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +82,7 @@ class BoardTarget(Target):
         words: How to hold it: "left third of cam2, left side 30 degrees away, 400 mm from it".
         why: Why there.
         pose: In the frame of the calibration; None where there is none.
+        known: Whether the board is put exactly there, so that its corners are known points.
     """
 
     outlines: tuple[Floats | None, ...] = ()
@@ -89,6 +90,7 @@ class BoardTarget(Target):
     words: str = ""
     why: str = ""
     pose: Pose | None = None
+    known: bool = False
 
 
 class CameraProgress(NamedTuple):
@@ -295,6 +297,14 @@ class BoardLoop:
             return Worth(False, share, "hold it as the outline shows")
         return Worth(False, share, f"so it tells {100 * share:.0f} % of what the outline would: go on to the outline")
 
+    def name_of(self, target: BoardTarget) -> str:
+        """The name of a known pose; that of the picture, where the pose is not known.
+
+        Args:
+            target: What was asked for.
+        """
+        return target.name
+
     def camera_progress(self) -> list[CameraProgress]:
         """How far each camera is, in the order of the dataset."""
         return [self._progress_of(c) for c in range(len(self._names))]
@@ -451,13 +461,6 @@ class BoardLoop:
         assert self.data is not None
         assert isinstance(self.calibration, PredictsPixels)
         (seen,) = self.design.visible([pose])
-        rim = self.calibration.predict(pose.apply(_densified(self.shape.outline)))
-        some = np.where(
-            seen[:, None, None], self.calibration.predict(pose.apply(self.shape.some())).swapaxes(0, 1), np.nan
-        )
-        middle = pose.apply(self.shape.middle)
-        uv = np.where(seen[:, None], self.calibration.predict(middle[None])[0], np.nan)
-        outlines = tuple(rim[:, c] if seen[c] else None for c in range(len(seen)))
         then = self.design.after(pose)
         known, later = self.design.pixel_sd(), then.pixel_sd()
         unit = self.data.length_unit
@@ -466,8 +469,22 @@ class BoardLoop:
             better = np.nan_to_num(known / later)
         helped = self._names[int(np.argmax(better))]
         why = f"Of {CANDIDATES} poses it tells most, mostly about {helped}: {sd:.2g} {unit} would become {sd_then:.2g}"
-        return BoardTarget(
-            f"p{self.points + 1:03d}", middle, uv, gain, outlines, some, self._words(pose, seen, uv), why, pose
+        middle, none = pose.apply(self.shape.middle), np.zeros((0, 2))
+        target = BoardTarget(f"p{self.points + 1:03d}", middle, none, gain, why=why, pose=pose)
+        target = self._with_pixels(target, pose, seen)
+        return replace(target, words=self._words(pose, seen, target.uv))
+
+    def _with_pixels(self, target: BoardTarget, pose: Pose, seen: Bools) -> BoardTarget:
+        """With where the cameras that see it see it."""
+        assert isinstance(self.calibration, PredictsPixels)
+        rim = self.calibration.predict(pose.apply(_densified(self.shape.outline)))
+        some = self.calibration.predict(pose.apply(self.shape.some())).swapaxes(0, 1)
+        middle = self.calibration.predict(pose.apply(self.shape.middle)[None])[0]
+        return replace(
+            target,
+            uv=np.where(seen[:, None], middle, np.nan),
+            outlines=tuple(rim[:, c] if seen[c] else None for c in range(len(seen))),
+            corners=np.where(seen[:, None, None], some, np.nan),
         )
 
     def _words(self, pose: Pose, seen: Bools, uv: Floats) -> str:

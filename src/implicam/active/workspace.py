@@ -308,7 +308,7 @@ def workspace_from(text: str, xyz: Floats | None) -> Workspace:
     if text.lower().endswith(".csv"):
         return Workspace.only(read_places(Path(text)))
     if "=" in text:
-        return Workspace.only(_lattice(text))
+        return Workspace.only(lattice_places(text))
     try:
         ends = [[float(end) for end in axis.split(":")] for axis in text.split(",")]
         low, high = np.array(ends, dtype=np.float64).reshape(3, 2).T
@@ -322,8 +322,19 @@ def workspace_from(text: str, xyz: Floats | None) -> Workspace:
     return Workspace.box(low, high)
 
 
-def _lattice(text: str) -> Floats:
-    """(n, 3) all places of "x=0,50,100 y=0:80:20 z=0,40": x, y and z each in a list, or from:to:step."""
+def lattice_places(text: str, option: str = "--workspace") -> Floats:
+    """All places of a lattice, as the holes of a block or the stops of a slide.
+
+    Args:
+        text: "x=0,50,100 y=0:80:20 z=0,40": x, y and z each in a list, or from:to:step.
+        option: Of the command line, which the error names.
+
+    Returns:
+        (n, 3), z changing fastest.
+
+    Raises:
+        UsageError: The text cannot be read, or there are too many places.
+    """
     axes: dict[str, list[float]] = {}
     try:
         for word in text.split():
@@ -337,7 +348,7 @@ def _lattice(text: str) -> Floats:
         raise UsageError(
             f"the places {text!r} cannot be read.",
             why=str(error),
-            fix='for example --workspace "x=0,50,100 y=0:80:20 z=0,40": lists, or from:to:step',
+            fix=f'for example {option} "x=0,50,100 y=0:80:20 z=0,40": lists, or from:to:step',
         ) from error
     count = np.prod([len(values) for values in axes.values()])
     if count > MAX_PLACES:

@@ -89,6 +89,16 @@ class SimulatedHand:
             self._from, self._begun = self.pose(), time.monotonic()
             self._to = Pose(turn, middle - turn @ self._middle)
 
+    def put(self, pose: Pose) -> None:
+        """Begin to move to a known pose, as into a slot: exactly.
+
+        Args:
+            pose: world_from_board.
+        """
+        with self._lock:
+            self._from, self._begun = self.pose(), time.monotonic()
+            self._to = pose
+
     def pose(self, when: float | None = None) -> Pose:
         """world_from_board on its way, without the tremor.
 

@@ -22,15 +22,19 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from implicam.active.board_loop import BoardLoop, BoardTarget, CameraProgress, Ints
-from implicam.dataset import Camera, Dataset, Floats, Observations
+from implicam.active.board_poses import POSE_COLUMN
+from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.dataset.boards import corner_name
 from implicam.detect import Detected, View
 from implicam.detect.sharpness import edge_width
 from implicam.errors import FitError, ImplicamError, UsageError
+from implicam.evaluation import leave_out_shots
 from implicam.formatting import json_safe
+from implicam.geometry import Pose
 from implicam.hardware import Frame
 from implicam.images import blank
 from implicam.progress import Progress, silent
+from implicam.report import report_of, write_report
 from implicam.session.board_report import write_board_report
 from implicam.session.controller import (
     CALIBRATION_FILE,
@@ -73,6 +77,13 @@ class Hand(Protocol):
         Args:
             corners: (n, 3) on the board.
             pixels: (cameras, n, 2); NaN where nothing is asked for.
+        """
+
+    def put(self, pose: Pose) -> None:
+        """Put the board exactly somewhere, as into a slot.
+
+        Args:
+            pose: world_from_board.
         """
 
 
@@ -206,7 +217,11 @@ class BoardController(SessionController):
         while self.state.auto and self.state.phase == "aim" and not self.state.stop and self.state.target is not None:
             before = self.loop.points
             self.live()
-            self.step()
+            known = isinstance(self.state.target, BoardTarget) and self.state.target.known
+            if known and self.loop.calibration is None and self._hand is not None:
+                self._take(asked=True)  # nothing can check yet where the simulated hand has put it: it is there
+            else:
+                self.step()
             progress("boards", self.loop.points, max(self.loop.points, self.loop.start))
             refused = 0 if self.loop.points > before else refused + 1
             if refused >= MAX_REFUSED:
@@ -242,7 +257,11 @@ class BoardController(SessionController):
             report.unlink(missing_ok=True)  # it may be of an earlier calibration
             words = f"{self.loop.points} boards. Saved: {path}"
             try:
-                write_board_report(report, self.session.name, self.loop.calibrator, calibration, data)
+                if data.known is None:
+                    write_board_report(report, self.session.name, self.loop.calibrator, calibration, data)
+                else:
+                    title = f"{self.session.name}: a board at known poses"
+                    write_report(report, report_of(leave_out_shots(self.loop.calibrator.fit, data), title))
                 words += f" and {report}"
             except ImplicamError as error:
                 words += f". No report: {error.what}"
@@ -263,15 +282,21 @@ class BoardController(SessionController):
     # private
 
     def _aim(self, before: str = "") -> None:
-        with self._loop_lock:
-            (target,) = self.loop.ask()
+        try:
+            with self._loop_lock:
+                (target,) = self.loop.ask()
+        except UsageError as error:  # all known poses are taken
+            self._show(phase="aim", target=None, message=f"{before}{error.what}")
+            return
         target = replace(target, name=self.session.next_name())
         self._last, self._still_since = {}, 0.0
         self._show(
             phase="aim", target=target, message=f"{before}{target.words}", problem=None, judgement=Judgement(False, ""),
             cameras=tuple(self.loop.camera_progress()),
         )  # fmt: skip
-        if self._hand is not None:
+        if self._hand is not None and target.known and target.pose is not None:
+            self._hand.put(target.pose)
+        elif self._hand is not None:
             self._hand.follow(self.loop.shape.some(), target.corners)
 
     def _fit(self) -> None:
@@ -326,19 +351,24 @@ class BoardController(SessionController):
     def _take(self, *, asked: bool) -> None:
         """Take a set of pictures and keep it; UsageError with the reason where it is of no use."""
         target = self._require_target()
+        assert isinstance(target, BoardTarget)
         with self._camera_lock:
             frames = self._take_frames(self.equipment.trigger)
         looks = self._detect_all(frames)
         views = self._views(looks)
         moved = _moved(self._last, views)
         why = self._refusal(looks, views)
+        if not why and asked and target.known:
+            worth = self.loop.worth(views, target)
+            if np.isfinite(worth.share) and not worth.enough:
+                why = worth.reason
         if not why and not asked and not moved <= 3 * STILL_PX:  # at the key it may be another place than the last look
             why = "the board moved"
         if why:
             _LOG.info("%s not taken: %s", target.name, why)
             self._show(looks=looks, judgement=Judgement(False, why))
             raise UsageError(f"no picture was kept: {why}.", fix="hold the board still, in sight of a camera")
-        shot = self._make_shot(target.name, looks)
+        shot = self._make_shot(target, looks)
         pictures = {look.camera: look.frame.picture for look in looks if look.frame is not None}
         notes = {
             "target": target.xyz.tolist() if np.isfinite(target.xyz).all() else [],
@@ -428,8 +458,9 @@ class BoardController(SessionController):
             return Detected(reason=f"the picture is {why}")
         return self.equipment.detector.detect(frame.picture, View(camera, "live"))
 
-    def _make_shot(self, name: str, looks: Sequence[Look]) -> Dataset:
-        """What the cameras see, as corners of one board at a place that nobody knows."""
+    def _make_shot(self, target: BoardTarget, looks: Sequence[Look]) -> Dataset:
+        """What the cameras see, as corners of one board; with their positions, where those are known."""
+        name = target.name
         numbers = sorted({_number(point) for look in looks for point in look.found.points})
         row = {number: i for i, number in enumerate(numbers)}
         uv, sd = (np.full((len(numbers), len(looks), 2), np.nan) for _ in range(2))
@@ -438,7 +469,13 @@ class BoardController(SessionController):
                 uv[row[_number(point)], c], sd[row[_number(point)], c] = place, spread
         names = np.array([corner_name(name, number) for number in numbers])
         cameras: Sequence[Camera] = self.session.cameras
-        return Dataset(self.session.name, self.session.length_unit, Observations(names, tuple(cameras), uv, sd))
+        known = None
+        if target.known and target.pose is not None:
+            xyz = target.pose.apply(self.loop.shape.corners[numbers])
+            spread = np.broadcast_to(np.array(self.equipment.robot.sd, dtype=np.float64), xyz.shape)
+            columns = {POSE_COLUMN: np.full(len(numbers), self.loop.name_of(target))}
+            known = KnownPositions(np.full(len(numbers), name), xyz, spread, columns)
+        return Dataset(self.session.name, self.session.length_unit, Observations(names, tuple(cameras), uv, sd), known)
 
 
 def _number(point: str) -> int:

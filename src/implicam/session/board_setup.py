@@ -10,6 +10,7 @@ import numpy as np
 from implicam.active import Workspace, workspace_from
 from implicam.active.board_design import BoardShape
 from implicam.active.board_loop import BoardLoop
+from implicam.active.board_poses import KnownPosesLoop, described, poses_from, poses_of
 from implicam.calibrators import DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset.boards import BOARD_KINDS, check_size, corner_positions
 from implicam.detect import TARGETS, Detector, options_of
@@ -18,7 +19,7 @@ from implicam.hardware import FrameSource, Person
 from implicam.hardware.simulated_hand import simulated_hand
 from implicam.session.board_session import BoardController
 from implicam.session.controller import Equipment
-from implicam.session.journal import Session
+from implicam.session.journal import TARGET_KEY, Session
 
 if TYPE_CHECKING:
     from implicam.session.setup import Setup
@@ -36,6 +37,9 @@ EXAMPLE_BOARDS: dict[str, dict[str, Any]] = {
     "charuco": {"board": "9x12", "square": 13.29, "marker": 10.0},
 }
 """Of a simulated session that says no size: in mm, that of the paper."""
+
+POSES_KEY = "known_poses"
+"""The setting of a session that holds the known poses of its board, as `described` gives them."""
 
 SIZES = ("board", "square", "marker", "tag", "spacing", "dictionary", "legacy")
 """The options of a session that say what the board is."""
@@ -74,6 +78,19 @@ def board_detector(setup: Setup) -> Detector:
     return detector
 
 
+def board_settings(setup: Setup) -> dict[str, Any]:
+    """What a session keeps of its board: the table [target], and known poses, whatever becomes of their file.
+
+    Args:
+        setup: With a target that is a board.
+
+    Raises:
+        UsageError: The poses cannot be read.
+    """
+    kept: dict[str, Any] = {TARGET_KEY: board_detector(setup).describe()}
+    return kept if not setup.poses else {**kept, POSES_KEY: described(poses_from(setup.poses))}
+
+
 def shape_of(detector: Detector) -> BoardShape:
     """The board that a detector finds.
 
@@ -99,6 +116,8 @@ def board_hardware(
         UsageError: Simulated cameras cannot show such a board, or a robot is named.
     """
     detector = board_detector(setup)
+    if setup.poses:
+        poses_from(setup.poses)  # what is wrong with them is said before anything is begun
     if setup.robot not in ("", Person.spec):
         raise UsageError(
             f"the robot {setup.robot!r} holds no board.",
@@ -109,7 +128,8 @@ def board_hardware(
     if cameras is None:
         found, _ = simulated_hand(setup.built(), detector.describe(), seed=setup.seed, seconds=HAND_SECONDS)
         cameras = list(found)
-    return cameras, Person(lambda _: None), volume
+    sd = (setup.sd if setup.sd is not None else np.nan,) * 3
+    return cameras, Person(lambda _: None, sd), volume
 
 
 def made_board_session(
@@ -126,11 +146,18 @@ def made_board_session(
     Raises:
         UsageError: The method takes no boards.
     """
+    kept = session.settings.get(POSES_KEY)
+    hand = getattr(equipment.cameras[0], "hand", None)  # only simulated cameras know who holds the board
+    if kept:
+        known = KnownPosesLoop(
+            calibrator_from_name(setup.method), shape_of(equipment.detector), session.cameras, volume, setup.rule,
+            setup.seed, poses=poses_of(kept),
+        )  # fmt: skip
+        return BoardController(session, equipment, known, hand=hand)
     method = BOARD_METHOD if setup.method == DEFAULT_METHOD else setup.method
     if method.partition(":")[0] != BOARD_METHOD:
         raise UsageError(f"{method} takes no boards held by hand.", fix=f"--method {BOARD_METHOD}, or leave it out")
     loop = BoardLoop(
         calibrator_from_name(method), shape_of(equipment.detector), session.cameras, volume, setup.rule, setup.seed
     )
-    hand = getattr(equipment.cameras[0], "hand", None)  # only simulated cameras know who holds the board
     return BoardController(session, equipment, loop, hand=hand)

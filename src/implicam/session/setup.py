@@ -57,10 +57,17 @@ from implicam.hardware import (
 )
 from implicam.registry import Option
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
-from implicam.session.board_setup import BALL, SIZES, board_detector, board_hardware, made_board_session
+from implicam.session.board_setup import (
+    BALL,
+    SIZES,
+    board_detector,
+    board_hardware,
+    board_settings,
+    made_board_session,
+)
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
-from implicam.session.journal import TARGET_KEY, Session
+from implicam.session.journal import Session
 from implicam.session.trust import (
     DEVICES,
     check_nothing_native,
@@ -117,6 +124,9 @@ class Setup:
     spacing: Annotated[float | None, _shown("aprilgrid: between two tags", "LENGTH", 0)] = None
     dictionary: Annotated[str | None, _shown("charuco, aprilgrid: OpenCV's name of the markers")] = None
     legacy: Annotated[bool, _shown("charuco: printed with OpenCV before 4.6", flags="--legacy/--no-legacy")] = False
+    poses: Annotated[
+        str, _shown('A board at known poses, one after the other: a CSV, or "x=0 y=0 z=0:190:10"', "WHAT")
+    ] = ""
     cameras: Annotated[
         tuple[tuple[str, str], ...],
         _real(lambda: f"One a camera; WHAT is {list_specs(CAMERAS)}", "NAME=WHAT", flags="--camera", kind=list[str]),
@@ -169,6 +179,10 @@ class Setup:
             raise UsageError(f"--pulse-every {self.pulse_every:g} is no time.", fix="give seconds, or 0 for no pulse")
         if self.target != BALL:
             board_detector(self)
+        elif self.poses:
+            raise UsageError(
+                "--poses are those of a board.", fix=f"--target {'|'.join(BOARD_KINDS)}; a ball: --workspace"
+            )
         if self.budget < MIN_POINTS_PER_CAMERA:
             raise UsageError(
                 f"{self.budget} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
@@ -334,7 +348,7 @@ def open_session(
             settings={
                 **setup.as_settings(),
                 CAMERAS_KEY: keep_settings(hardware[0]),
-                **({} if setup.target == BALL else {TARGET_KEY: board_detector(setup).describe()}),
+                **({} if setup.target == BALL else board_settings(setup)),
             },
         )
         remember(folder, setup.as_settings())
@@ -395,7 +409,7 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
     before = Setup.from_settings(session.settings)
     if setup is None:
         return before
-    same = ["unit", "target", *SIZES, *(("rig", "rig_cameras", "seed") if before.simulated else ())]
+    same = ["unit", "target", "poses", *SIZES, *(("rig", "rig_cameras", "seed") if before.simulated else ())]
     for key in same:
         if getattr(setup, key) != getattr(before, key):
             raise UsageError(

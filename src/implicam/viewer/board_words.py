@@ -39,7 +39,11 @@ def _aim(state: BoardState) -> Headline:
     if state.stop:
         return Headline(f"Good enough: {state.stop}", "Finish now, or go on for even better.", "good")
     why = f"{target.why}." if isinstance(target, BoardTarget) and target.why else ""  # it may begin with a camera
+    if target is None:
+        return Headline("No pose is left", state.message, "ask")
     board = f"Board {len(state.history) + 1}: hold it into the outline"
+    if isinstance(target, BoardTarget) and target.known:
+        board = f"Put it at {target.words.partition(',')[0]}"
     if judged.ready:
         return Headline("Hold it there …" if state.auto else "Take it now", why, "good")
     return Headline(f"{board}" if not judged.reason else _sentence(judged.reason), why, "ask")
