@@ -53,6 +53,7 @@ def test_nothing_is_shown_that_could_mislead() -> None:
     wrong[2] += [310, -180]
     for known, seen in (
         (xyz[:3], uv[:3]),  # any focal length fits
+        (np.repeat(xyz[:3], 2, axis=0), np.repeat(uv[:3], 2, axis=0)),
         (xyz[:5], missed),
         (xyz[:6], wrong),
         (np.tile(xyz[:1], (5, 1)), uv[:5]),  # one place

@@ -89,7 +89,7 @@ def rough_views(known: Floats, uv: Floats, size: tuple[int, int], places: Floats
     """
     nothing = RoughViews(np.full((len(places), 2), np.nan), np.full(len(places), np.nan))
     seen = np.isfinite(uv).all(axis=1)
-    if seen.sum() < MIN_ROUGH_POINTS:
+    if len(np.unique(known[seen], axis=0)) < MIN_ROUGH_POINTS:  # one that was measured again tells nothing new
         return nothing
     centre, longer = known[seen].mean(axis=0), float(max(size))
     spread = float(np.sqrt(np.mean((known[seen] - centre) ** 2)))
