@@ -257,6 +257,21 @@ def test_the_error_of_the_wand_itself_is_the_same_part_of_every_distance(waving:
 
 
 @pytest.mark.slow
+def test_a_camera_whose_markers_are_exchanged_is_named() -> None:
+    rig = build_rig("bar3", seed=3)
+    target = waved_wand(rig, 70, np.random.default_rng(3))
+    recorded = simulate(rig, target, seed=3)
+    uv = recorded.observations.uv.copy()
+    uv[0::2, 1], uv[1::2, 1] = recorded.observations.uv[1::2, 1], recorded.observations.uv[0::2, 1]
+    whole = np.isfinite(uv).all(axis=2).reshape(-1, 2, 3).all(axis=1).repeat(2, axis=0)
+    uv[~whole] = np.nan
+    observations = replace(recorded.observations, uv=uv, extra={})
+    calibration = ForwardGP(wand=target.wand or 0.0).fit(as_wand(replace(recorded, observations=observations), target))
+    assert calibration.camera_names == ("cam1", "cam3")
+    assert any("exchange them in all its frames" in note for note in calibration.notes)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", ["stereo", "bar6", "dome4"])
 def test_rigs_from_no_guess_with_wrong_and_missing_views(spec: str) -> None:
     ratio, inside, nees = judged(wave(spec, 200, 7, outliers=0.1, missing=0.3))

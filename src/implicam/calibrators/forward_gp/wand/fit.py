@@ -16,7 +16,15 @@ from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.calibrators.forward_gp.wand.bundle import FrameEquations, Lengths
 from implicam.calibrators.forward_gp.wand.gauge import posterior_in_gauge
 from implicam.calibrators.forward_gp.wand.sizes import add_priors, estimate_sizes, size_fields, white_models
-from implicam.calibrators.forward_gp.wand.start import Started, bundle_of, consensus, prior_of, start
+from implicam.calibrators.forward_gp.wand.start import (
+    MIN_LENGTH_SHARE,
+    Started,
+    bundle_of,
+    consensus,
+    describe_stranger,
+    prior_of,
+    start,
+)
 from implicam.calibrators.forward_gp.wand.waves import Waves
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose
@@ -40,9 +48,13 @@ _LOG = logging.getLogger(__name__)
 MAX_ROUNDS = 5
 MAX_GAUSS_NEWTON_STEPS = 6
 MIN_VIEWS_PER_CAMERA = 12
+MAX_FIRST_PAIRS = 4
+"""Pairs of cameras from which the whole fit is tried, where it comes to nothing."""
+
 MIN_CHECKED_PLACES = 12
 
-TOO_LITTLE = "too few of its views agree with the places that the other cameras know."
+LARGEST_STEP_WF = (-0.5, 0.5)
+"""Of a place along each axis in one step."""
 
 MAX_DISTANCE_RATIO = 4.0
 """Of a place from the middle of all, over the third quartile of these: what is farther away is a wrong match."""
@@ -97,14 +109,35 @@ def fit_wand(waves: Waves, settings: ForwardGPSettings, length_sd: float, progre
     Raises:
         FitError: Fewer than two cameras can be fitted.
     """
-    progress("starting", 0, 3)
-    started = start(waves, settings)
+    tried: list[tuple[int, ...]] = []
+    failure: FitError | np.linalg.LinAlgError | None = None
+    while len(waves.seen) > 2 or not tried:  # a mirrored camera, or one out of step, makes a first pair of its own
+        progress("starting", 0, 3)
+        try:
+            started = start(waves, settings, tried)
+        except FitError as error:
+            raise failure or error from error
+        tried.append(started.first)
+        try:
+            return _from_start(waves, started, settings, length_sd, progress)
+        except (FitError, np.linalg.LinAlgError) as error:
+            failure = failure or error
+            _LOG.info("from %s: %s", started.first, error)
+        if len(tried) == MAX_FIRST_PAIRS:
+            break
+    assert failure is not None
+    raise failure
+
+
+def _from_start(
+    waves: Waves, started: Started, settings: ForwardGPSettings, length_sd: float, progress: Progress
+) -> WandFit:
     progress("adjusting", 1, 3)
     state = _adjusted(waves, started, settings)
     progress("fitting", 2, 3)
     state = _with_fields(state, settings)
     progress("fitting", 3, 3)
-    return _finished(state, length_sd)
+    return _finished(state, settings, length_sd)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,9 +234,9 @@ def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings) -> _S
 
 def _with_fields(state: _State, settings: ForwardGPSettings) -> _State:
     """Sizes, posterior and what contradicts it, until nothing changes."""
-    stated = state.waves.stated[list(state.cameras)]
     search = True
     for number in range(MAX_ROUNDS):
+        stated = state.waves.stated[list(state.cameras)]
         hyper = estimate_sizes(
             state.models, state.places, state.seen, state.length_rows, stated, settings, state.hyper, search=search
         )
@@ -230,22 +263,27 @@ def _solved(state: _State, *, fields: bool) -> _State:
     for number in range(MAX_GAUSS_NEWTON_STEPS):
         equations = _equations(replace(state, models=models, places=places))
         L, G, g = equations.halved()
-        root, mean, _ = solve_normal(equations.A - G.T @ G, equations.b - G.T @ g)
+        S = equations.A - G.T @ G
+        if not (np.diag(S) > 0).all():
+            raise np.linalg.LinAlgError("the views do not fix the cameras")
+        root, mean, _ = solve_normal(S, equations.b - G.T @ g)
         back = (g - G @ mean).reshape(-1, 6, 1)
         step = np.linalg.solve(L.swapaxes(1, 2), back)[..., 0].reshape(-1, 2, 3)
         means = np.split(mean, np.cumsum([model.size for model in models])[:-1])
         sd = np.split(np.sqrt(np.sum(root**2, axis=0)), np.cumsum([model.size for model in models])[:-1])
         models = move_to_mean(models, means)
-        places = places + np.where(state.known.reshape(-1, 2)[..., None], step, 0.0)
+        places = places + np.where(state.known.reshape(-1, 2)[..., None], np.clip(step, *LARGEST_STEP_WF), 0.0)
         small = all(np.all(np.abs(mean[:14]) <= 0.05 * sd[:14]) for mean, sd in zip(means, sd, strict=True))
         if small or (number > 2 and not fields):
             break
-    return replace(state, models=models, places=places, equations=equations, root=root)
+    # a stiff length bends the way of a place: how far it fits is known when the places have come to rest
+    return _relocated(replace(state, models=models, places=places, root=root))
 
 
-def _equations(state: _State) -> FrameEquations:
-    """Those of all views and lengths in use, with the priors."""
-    white, lengths = white_models(state.models, state.places.reshape(-1, 3), state.seen), state.length_rows
+def _equations(state: _State, *, with_fields: bool = False) -> FrameEquations:
+    """Those of all views and lengths in use, with the priors; with_fields as of `white_models`."""
+    flat, lengths = state.places.reshape(-1, 3), state.length_rows
+    white = white_models(state.models, flat, state.seen, with_fields=with_fields)
     found = FrameEquations.of(white, len(state.places), (lengths.frames, *lengths.linear(state.places)))
     add_priors(found, state.models, fields=True)
     return found
@@ -254,10 +292,9 @@ def _equations(state: _State) -> FrameEquations:
 def _relocated(state: _State) -> _State:
     """Places where views and lengths in use have them, with the cameras as they are."""
     for _ in range(3):
-        equations = _equations(state)
-        L, _, g = equations.halved()
+        L, _, g = _equations(state, with_fields=True).halved()
         step = np.linalg.solve(L.swapaxes(1, 2), g.reshape(-1, 6, 1))[..., 0].reshape(-1, 2, 3)
-        step = np.where(state.known.reshape(-1, 2)[..., None], np.clip(step, -0.5, 0.5), 0.0)
+        step = np.where(state.known.reshape(-1, 2)[..., None], np.clip(step, *LARGEST_STEP_WF), 0.0)
         state = replace(state, places=state.places + step)
     return replace(state, equations=_equations(state))
 
@@ -334,7 +371,7 @@ def _without_poor_cameras(state: _State) -> _State:
     return _without_poor_cameras(replace(state, cameras=kept[0], models=kept[1], used=used, hyper=hyper))
 
 
-def _finished(state: _State, length_sd: float) -> WandFit:
+def _finished(state: _State, settings: ForwardGPSettings, length_sd: float) -> WandFit:
     """The covariance of all cameras in the gauge of the places that something checks."""
     known, waves = state.known, state.waves
     equations, root, hyper = _known(state.equations), _known(state.root), _known(state.hyper)
@@ -346,24 +383,40 @@ def _finished(state: _State, length_sd: float) -> WandFit:
             why="two views meet nearly anywhere; a third one, or the length of the wand, must agree",
             fix="wave the wand longer where two cameras or more see both its markers",
         )
+    _refuse_contradicted(state, whole)
     posterior = posterior_in_gauge(state.models, state.places, checked, equations, root, length_sd)
     lengths = state.length_rows
     off, slope = lengths.linear(state.places)
     leverage = np.einsum("ki,kij,kj->k", slope, _frame_covariance(equations)[lengths.frames], slope)
     left, unit = np.maximum(1 - leverage, 1e-6), state.scale * lengths.sd
+    places = np.where(known[:, None], state.places.reshape(-1, 3), np.nan)
+    strangers = [c for c in range(len(waves.seen)) if c not in state.cameras]
     return WandFit(
         posterior,
         state.cameras,
-        tuple((c, TOO_LITTLE) for c in range(len(waves.seen)) if c not in state.cameras),
+        tuple((c, describe_stranger(waves, c, places, settings)) for c in strangers),
         state.used,
         whole,
-        np.where(known[:, None], state.places.reshape(-1, 3), np.nan),
+        places,
         checked,
         hyper,
         state.scale,
         -off / left * unit,
         unit * np.sqrt(leverage / left),
     )
+
+
+def _refuse_contradicted(state: _State, whole: Bools) -> None:
+    """Stop where most frames contradict the wand: what they fit is no rig."""
+    seen = np.isfinite(state.waves.uv[:, list(state.cameras), 0]).sum(axis=1) >= 2
+    shown = seen.reshape(-1, 2).all(axis=1) & state.waves.ends
+    if whole.sum() < MIN_LENGTH_SHARE * shown.sum():
+        raise FitError(
+            f"the length of the wand agrees with what the cameras saw in {whole.sum()} of {shown.sum()} frames only.",
+            why="its markers are exchanged in some pictures, cameras were not in step, one looks into "
+            "a mirror or through a window, or most views are wrong",
+            fix="leave out one camera after the other (--without NAME) to see which it is",
+        )
 
 
 def _known(value: Item | None) -> Item:

@@ -50,13 +50,16 @@ class Evidence(NamedTuple):
         return 0.5 * (quadratic / noise**2 + float(np.sum(np.log(v)))) + self.degrees * float(np.log(noise))
 
 
-def white_models(models: Sequence[CameraModel], places: Floats, seen: Sequence[CameraViews]) -> list[WhiteRows]:
+def white_models(
+    models: Sequence[CameraModel], places: Floats, seen: Sequence[CameraViews], *, with_fields: bool = False
+) -> list[WhiteRows]:
     """The views in units of their noise, slopes by lens, pose and the weights of the field.
 
     Args:
-        models: The C cameras where they are linearised; the weights of their fields count as zero.
+        models: The C cameras where they are linearised.
         places: (2 F, 3).
         seen: Per camera the views to use.
+        with_fields: Residuals are those of the cameras as they are, and not with the weights of their fields at zero.
     """
     found = []
     for model, views in zip(models, seen, strict=True):
@@ -67,6 +70,8 @@ def white_models(models: Sequence[CameraModel], places: Floats, seen: Sequence[C
         J[:, :, :p], J[:, 0, p : p + m], J[:, 1, p + m :] = rows.J, rows.phi, rows.phi
         unit = (model.noise * views.relative)[:, None]
         off, J, D = (views.uv - rows.mean) / unit, J / unit[..., None], rows.by_point / unit[..., None]
+        if with_fields:
+            off = off - J[:, :, p:] @ model.weights.T.ravel()
         found.append(WhiteRows(views.rows, np.nan_to_num(off), np.nan_to_num(J), np.nan_to_num(D)))
     return found
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -41,6 +41,10 @@ BEST_STARTS = (8, 3, 2)
 GOOD_PX, GOOD_SHARE = 2.0, 0.5
 """Median error in pixels of 1280, and share of shared views that agree, of a pair that is good enough to go on with."""
 
+GOOD_LENGTH, MIN_LENGTH_SHARE = 0.02, 0.35
+"""By how much a wand's length may be off, over the length, in at least this share of the frames that show it: of two
+cameras with a fifth of wrong views 0.41 of the frames have four right ones."""
+
 NEAR_PX = 6.0
 """In pixels of 1280: a view that far off does not belong to a place, until the fit itself judges it better."""
 
@@ -48,8 +52,9 @@ NEAR_PX = 6.0
 @dataclass(frozen=True, eq=False)
 class Started:
     """Cameras by number, in units of the wand's length: places (2 F, 3), NaN where unknown, and agree (2 F, C) which
-    views agree."""
+    views agree; first, the two that all others were joined to."""
 
+    first: tuple[int, ...]
     cameras: dict[int, CentralCamera]
     places: Floats
     agree: Bools
@@ -70,18 +75,19 @@ def prior_of(camera: CentralCamera, image: Image, uv: Floats, settings: RigModel
     return camera.prior(image, max(widest, 0.02), settings)
 
 
-def start(waves: Waves, settings: RigModelSettings) -> Started:
+def start(waves: Waves, settings: RigModelSettings, tried: Collection[tuple[int, ...]] = ()) -> Started:
     """Every camera that can be started.
 
     Args:
         waves: What was seen, in units of the wand's length.
         settings: Priors.
+        tried: Pairs that are not to be the first: it came to nothing.
 
     Raises:
         FitError: No two cameras can be.
     """
-    first = _best_pair(waves, settings)
-    cameras = first
+    cameras = _best_pair(waves, settings, tried)
+    first = tuple(cameras)
     while True:
         places, agree = consensus(waves, cameras)
         left = [c for c in range(len(waves.seen)) if c not in cameras]
@@ -90,16 +96,18 @@ def start(waves: Waves, settings: RigModelSettings) -> Started:
             break
         cameras = _adjusted_together(waves, cameras | joined, settings)
         _LOG.info("cameras %s", sorted(cameras))
-    return Started(cameras, places, agree)
+    return Started(first, cameras, places, agree)
 
 
-def _best_pair(waves: Waves, settings: RigModelSettings) -> dict[int, CentralCamera]:
+def _best_pair(
+    waves: Waves, settings: RigModelSettings, tried: Collection[tuple[int, ...]]
+) -> dict[int, CentralCamera]:
     uv = waves.uv
     seen = np.isfinite(uv).all(axis=2).astype(np.int64)
     shared = np.einsum("ni,nj->ij", seen, seen)
     pairs = sorted(combinations(range(seen.shape[1]), 2), key=lambda pair: -shared[pair])
     best: tuple[float, dict[int, CentralCamera]] | None = None
-    for pair in pairs[:MAX_PAIRS]:
+    for pair in [pair for pair in pairs if pair not in tried][:MAX_PAIRS]:
         found = _pair(waves, pair, settings)
         if found is None:
             continue
@@ -146,8 +154,13 @@ def _pair(
     score, bundle = found[0].cost, found[0].bundle
     off = np.max([e / (image.half / 640) for e, image in zip(bundle.errors(part.seen), images, strict=True)], axis=0)
     near = off < NEAR_PX
-    good = bool(near.mean() > GOOD_SHARE and np.median(off[near]) < GOOD_PX)
-    return score / len(both), dict(zip(pair, bundle.cameras, strict=True)), good
+    across = bundle.places[every.frames, 1] - bundle.places[every.frames, 0]
+    right = np.abs(np.linalg.norm(across, axis=1) / waves.length - 1) < GOOD_LENGTH
+    at = np.zeros(2 * part.frames, dtype=np.bool_)
+    at[both] = near
+    right &= at[2 * every.frames] & at[2 * every.frames + 1]
+    good = near.mean() > GOOD_SHARE and np.median(off[near]) < GOOD_PX and right.mean() > MIN_LENGTH_SHARE
+    return score / len(both), dict(zip(pair, bundle.cameras, strict=True)), bool(good)
 
 
 class _Trial(NamedTuple):
@@ -245,8 +258,11 @@ def consensus(
     return places, agree
 
 
-def _resected(waves: Waves, c: int, places: Floats, settings: RigModelSettings) -> CentralCamera | None:
-    """A camera from the places that the others know; None where they are too few, or do not fix it."""
+def _resected(
+    waves: Waves, c: int, places: Floats, settings: RigModelSettings, min_share: float = 0.0
+) -> CentralCamera | None:
+    """A camera from the places that the others know; None where they are too few, or do not fix it, or fewer than a
+    share of them agree."""
     seen = waves.seen[c]
     known = np.isfinite(places[seen.rows]).all(axis=1)
     if known.sum() < MIN_POINTS_PER_CAMERA:
@@ -257,7 +273,35 @@ def _resected(waves: Waves, c: int, places: Floats, settings: RigModelSettings) 
         return None
     error = np.linalg.norm(found.camera.pixel(places[seen.rows[known]]) - seen.uv[known], axis=1)[found.inliers]
     good = found.inliers.sum() >= MIN_POINTS_PER_CAMERA and np.median(error) < 5 * waves.images[c].half / 640
+    good = good and found.inliers.mean() >= min_share
     return found.camera if good and isinstance(found.camera, CentralCamera) else None
+
+
+def describe_stranger(waves: Waves, c: int, known: Floats, settings: RigModelSettings) -> str:
+    """Why a camera does not belong to the others, as far as it can be told.
+
+    Args:
+        waves: What was seen.
+        c: Its number.
+        known: (2 F, 3) places, NaN where unknown.
+        settings: Priors.
+
+    Returns:
+        A part of a sentence.
+    """
+    there = int(np.isfinite(known[waves.seen[c].rows]).all(axis=1).sum())
+    if there < MIN_POINTS_PER_CAMERA:
+        return f"it saw {there} of the markers that the others place, and it takes {MIN_POINTS_PER_CAMERA}."
+    whole = known.reshape(-1, 2, 3)
+    shifted = {
+        "its two markers are exchanged: exchange them in all its frames": whole[:, ::-1],
+        "its frames are one ahead of the others'": np.roll(whole, -1, axis=0),
+        "its frames are one behind the others'": np.roll(whole, 1, axis=0),
+    }
+    for why, places in shifted.items():
+        if _resected(waves, c, places.reshape(-1, 3), settings, min_share=0.5) is not None:
+            return f"{why}."
+    return "too few of its views agree with the places that the other cameras know."
 
 
 def _adjusted_together(
