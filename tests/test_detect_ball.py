@@ -353,6 +353,74 @@ def test_a_ball_that_never_moves_is_kept():
     assert Ball().settle({}) == {}
 
 
+def taken_by(places, shots=6):
+    """What three cameras find of discs at places, {camera: place of a shot, None for no disc}."""
+    made = {
+        View(camera, f"shot{i}"): noisy(plates(place(i)) if place(i) else plates(), 31 * k + i)
+        for k, (camera, place) in enumerate(places.items())
+        for i in range(shots)
+    }
+    return {view: Ball().detect(picture, view) for view, picture in made.items()}
+
+
+def walks(i):
+    return (60.3 + 12 * i, 50.7 + 5 * i)
+
+
+def rests(i):
+    return (100.2, 90.7)
+
+
+def test_what_rests_while_other_cameras_see_the_ball_move_is_furniture():
+    settled = Ball().settle(taken_by({"cam1": rests, "cam2": walks, "cam3": walks}))
+    assert [len(found) for found in settled.values()] == [0] * 6 + [1] * 12
+
+
+def test_what_rests_for_one_camera_of_three_is_furniture_and_for_most_a_ball():
+    alone = Ball().settle(taken_by({"cam1": rests, "cam2": lambda i: None, "cam3": lambda i: None}, 3))
+    assert not any(len(found) for found in alone.values())
+    most = Ball().settle(taken_by({"cam1": rests, "cam2": rests, "cam3": lambda i: None}, 3))
+    assert sum(len(found) for found in most.values()) == 6
+
+
+def test_a_ball_shown_several_times_at_each_place_is_kept():
+    settled = Ball().settle(taken_by({"cam1": lambda i: walks(i // 3), "cam2": lambda i: walks(2 - i // 3)}))
+    assert all(len(found) for found in settled.values())
+
+
+def test_a_disc_before_grey_is_no_ball_where_other_pictures_show_white():
+    """The picture that does not show the white plate has nothing else to tell what is white."""
+    grey = {View("cam1", "shot0"): Ball().detect(noisy(0.45 * plates(rests(0)), 0), View("cam1", "shot0"))}
+    assert len(Ball().settle(grey)[View("cam1", "shot0")]) == 1
+    settled = Ball().settle(
+        grey | {view: one for view, one in taken_by({"cam1": walks}, 4).items() if view not in grey}
+    )
+    assert [len(found) for found in settled.values()] == [0, 1, 1, 1]
+    assert "as white" in settled[View("cam1", "shot0")].reason
+
+
+@pytest.mark.parametrize("cut", [0.35, 0.6])
+def test_a_disc_with_a_flat_side_is_no_ball(cut):
+    """The end of a cable, or a disc that something covers: its edge is not whole."""
+    picture, u = drawn(120, (60.3, 59.6), 12), np.arange(120)
+    whole = Ball().detect(noisy(picture, 0), VIEW)
+    assert len(whole) == 1
+    assert whole.uv[0] == pytest.approx([60.3, 59.6], abs=0.1)
+    covered = np.where(u < 60.3 - cut * 12, OUTER, picture).astype(np.float32)
+    assert len(Ball().detect(noisy(covered, 0), VIEW)) == 0
+
+
+def test_a_long_disc_is_a_ball_only_far_from_the_middle_of_the_picture():
+    """Only there a sphere is an ellipse so long."""
+    patch = noisy(drawn(80, (40.2, 39.7), 14, 14 * 0.74, 0.4), 0)
+    found = []
+    for left, top in ((160, 110), (315, 215)):
+        picture = np.full((300, 400), OUTER, np.float32)
+        picture[top : top + 80, left : left + 80] = patch
+        found.append(len(Ball().detect(noisy(picture, 1), VIEW)))
+    assert found == [0, 1]
+
+
 def test_settling_keeps_cameras_apart():
     at, found = (100.2, 90.7), {}
     for k in range(3):  # the same place in three cameras is a coincidence

@@ -178,6 +178,17 @@ def test_white_bars_along_the_squares_never_make_a_number_wrong():
     assert sum(numbered for numbered, _ in results) >= 15
 
 
+def test_slow_detectors_are_asked_only_where_the_board_cannot_be_read(monkeypatch):
+    asked = []
+    monkeypatch.setattr("implicam.detect.board.from_opencv", lambda picture, scale: asked.append("OpenCV") or [])
+    monkeypatch.setattr("implicam.detect.board.from_libcbdetect", lambda picture, scale: asked.append("paper") or [])
+    picture = picture_of(covered((0.3, 0.2, 1.8, 0.3)), rotated(-0.4, 26, tilt=(0.02, 0.01)))
+    assert 30 < len(Board().detect(picture, VIEW)) < 88
+    assert asked == []
+    assert len(Board().detect(np.full((200, 200), 0.5, np.float32) + 0.2 * (np.arange(200) > 99), VIEW)) == 0
+    assert asked == ["OpenCV", "paper"]
+
+
 def test_one_corner_of_a_board_is_refused_with_both_its_readings():
     """The black corner square is at two corners of the board; the hidden rest would say at which."""
     h = rotated(0.1, 26)

@@ -10,11 +10,11 @@ moves.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +43,16 @@ MAX_PLACES, MAX_EDGES_FITTED = 10, 4
 MIN_RIVAL_QUALITY_RATIO = 0.6
 """An edge whose rough quality is less than this part of the best one's is no rival of a ball that was found."""
 
-MIN_AXIS_RATIO = 0.65
-"""A sphere far off the axis of a wide lens is an ellipse; its shorter axis is at least this part of the longer."""
+MIN_AXIS_RATIO, MIN_MIDDLE_AXIS_RATIO, OFF_AXIS_DIAGONALS = 0.65, 0.8, 0.35
+"""A sphere far off the axis of a wide lens is an ellipse; its shorter axis is at least this part of the longer, in the
+middle of the picture the second (a tilted sensor, a window seen aslant), as far from it as the third says the first."""
 
-MIN_EDGE_SHARE = 0.7
-"""Part of the edge that must be seen."""
+MIN_EDGE_SHARE, MAX_BROKEN_SHARE = 0.7, 0.17
+"""Part of the edge that must be seen; and the part that may be broken, by a stem, a cable, a highlight: four sectors, a
+stem of the ball's radius. What is broken farther is the end of a cable, or a disc that something covers."""
+
+MAX_UNEVEN_STEPS = 0.4
+"""How much the light of what is behind the ball may vary around it, in times the step at the edge: light and shadow."""
 
 MIN_STEP_NOISES, MAX_RESIDUAL_STEPS = 8.0, 0.12
 """The step at the edge in times its noise; and what the fit may leave over, as a part of the step."""
@@ -73,9 +78,10 @@ or as little, from one picture to the next."""
 MIN_RIVAL_SCORE_RATIO = 0.75
 """A second ball whose score is this part of the first's is one too many."""
 
-SAME_PLACE_PX, SAME_SIZE_RADII, MIN_STILL_SHOTS = 2.0, 0.03, 3
+SAME_PLACE_PX, SAME_SIZE_RADII, MIN_STILL_SHOTS, MIN_WITNESSED_SHOTS = 2.0, 0.03, 3, 2
 """Pixels within which a thing is at the same place, and the part of its radius within which it has the same size (a
-ball that comes nearer along a line of sight grows); and it must be there in so many shots at least to be left out."""
+ball that comes nearer along a line of sight grows); and it must be there in so many shots at least to be left out, the
+second number where other cameras tell whether the ball rested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,11 +245,14 @@ class Ball(DetectorBase):
             One point or none, with the ball's edge as an outline.
         """
         looked = 1 - picture if self.bright else picture
-        found = self._find_balls(looked, _brightest(looked))
+        frame = _Frame.of(looked)
+        found = self._find_balls(looked, frame)
         if not found:
-            return nothing("no ball: nowhere is there a dark disc with a whole edge before something light")
-        made = [_detection_of(edge, view) for edge in found]
-        return _choose(made)
+            return nothing(
+                "no ball: nowhere is there a dark disc with a whole edge before something light",
+                notes={"white": frame.bright},
+            )
+        return _choose([_detection_of(edge, view, frame) for edge in found])
 
     def detect_near(self, picture: Grey, view: View, last: Detected) -> Detected | None:
         """Look for a ball only around where it was in the picture before, by the same tests as in the whole picture.
@@ -270,11 +279,13 @@ class Ball(DetectorBase):
             smallest=max(self.smallest, radius / FOLLOWED_RADIUS_RATIO),
             largest=min(self.largest, radius * FOLLOWED_RADIUS_RATIO),
         )
-        found = sized._find_balls(part, _brightest(looked), float(last.notes["blur_px"]))
+        frame = _Frame.of(looked, low)
+        found = sized._find_balls(part, frame, float(last.notes["blur_px"]))
         if len(found) != 1 or not _is_like(found[0], last):
             return None
         edge = found[0]
-        return _detection_of(edge._replace(ellipse=edge.ellipse._replace(centre=edge.ellipse.centre + low)), view)
+        moved = edge._replace(ellipse=edge.ellipse._replace(centre=edge.ellipse.centre + low))
+        return _detection_of(moved, view, frame)
 
     def was_there(self, earlier: NDArray[Any], picture: Grey, found: Detected) -> bool:
         """Whether an earlier picture shows the same thing at the place where a ball was found, brighter or darker.
@@ -292,16 +303,19 @@ class Ball(DetectorBase):
         return float(np.mean(before * now)) > ALIKE_CORRELATION * size
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
-        """Drop what is at the same place in shot after shot of a camera, or far fainter than usual, and choose again.
+        """Drop what is before nothing white, stays at its place in shot after shot, or is far fainter than usual.
 
         Args:
             found: What `detect` gave of each picture.
         """
         cameras = dict.fromkeys(view.camera for view in found)
         views = {camera: [view for view in found if view.camera == camera] for camera in cameras}
+        white = {camera: _usual_white([found[view] for view in own]) for camera, own in views.items()}
+        found = {view: _drop_if_dim(one, white[view.camera]) for view, one in found.items()}
+        tracks = {camera: _Track.of(own, found) for camera, own in views.items()}
         moving: dict[View, Detected] = {}
-        for own in views.values():
-            still = _find_still_objects([_all_candidates(found[view]) for view in own])
+        for camera, own in views.items():
+            still = _find_still_objects(tracks[camera], [t for other, t in tracks.items() if other != camera])
             moving |= {view: _drop_still_objects(found[view], still) for view in own}
         steps = {camera: [moving[v].notes["step"] for v in own if len(moving[v])] for camera, own in views.items()}
         every = [step for own in steps.values() for step in own]
@@ -328,23 +342,23 @@ class Ball(DetectorBase):
             f"give its radius with --radius, in {data.length_unit}, and it is corrected"
         ]
 
-    def _find_balls(self, picture: Grey, bright: float, blur: float = 1.0) -> list[Edge]:
+    def _find_balls(self, picture: Grey, frame: _Frame, blur: float = 1.0) -> list[Edge]:
         """Different balls, the likeliest first; only where there is none, those that their shadow has displaced. blur:
         of their edges, pixels, where it is known: the fit begins there."""
         places = self._find_places(picture)
         for steep_first in (False, True):
-            found = self._fit_balls(picture, places, bright, blur, steep_first=steep_first)
+            found = self._fit_balls(picture, places, frame, blur, steep_first=steep_first)
             if found:
                 break
         return found
 
     def _fit_balls(
-        self, picture: Grey, places: list[tuple[Floats, float]], bright: float, blur: float, *, steep_first: bool
+        self, picture: Grey, places: list[tuple[Floats, float]], frame: _Frame, blur: float, *, steep_first: bool
     ) -> list[Edge]:
         rough: list[Rough] = []
         for centre, radius in places:
             if not any(_overlaps(centre, one) for one in rough):
-                step = MIN_STEP_BRIGHTNESS * bright
+                step = MIN_STEP_BRIGHTNESS * frame.bright
                 one = find_rough_edge(picture, centre, radius, step=step, steep_first=steep_first)
                 if one is not None and not any(_overlaps(one.ellipse.centre, other) for other in rough):
                     rough.append(one)
@@ -354,17 +368,17 @@ class Ball(DetectorBase):
             if good and one.quality < MIN_RIVAL_QUALITY_RATIO * rough[0].quality:
                 break
             edge = _fit_ball(picture, one, blur)
-            if edge is not None and self._is_plausible(edge, bright):
+            if edge is not None and self._is_plausible(edge, frame):
                 good.append(edge)
         return sorted(good, key=_score, reverse=True)
 
-    def _is_plausible(self, edge: Edge, bright: float) -> bool:
-        """Whether a ball has a radius that was asked for, and its plate is white."""
-        size = self.smallest <= edge.ellipse.radius <= self.largest
+    def _is_plausible(self, edge: Edge, frame: _Frame) -> bool:
+        """Whether a ball has a radius that was asked for, is as round as it must be there, and its plate is white."""
+        long, short = edge.ellipse.axes
         return (
-            size
-            and edge.outer > MIN_PLATE_BRIGHTNESS * bright
-            and edge.outer - edge.inner > MIN_STEP_BRIGHTNESS * bright
+            self.smallest <= edge.ellipse.radius <= self.largest
+            and short >= frame.least_axis_ratio(edge.ellipse.centre) * long
+            and _is_before_white(edge.outer, edge.outer - edge.inner, frame.bright)
         )
 
     def _find_places(self, picture: Grey) -> list[tuple[Floats, float]]:
@@ -383,15 +397,35 @@ class Ball(DetectorBase):
         return [(centre, radius) for _, centre, radius in _keep_apart(places)]
 
 
-def _brightest(picture: Grey) -> float:
-    """What counts as white in a picture."""
-    return float(np.quantile(picture[::4, ::4], 0.999))
+class _Frame(NamedTuple):
+    """The whole picture: what counts as white in it, and its middle (2,) and diagonal, in pixels of the part that is
+    searched."""
+
+    bright: float
+    middle: Floats
+    diagonal: float
+
+    @classmethod
+    def of(cls, picture: Grey, low: NDArray[Any] | tuple[int, int] = (0, 0)) -> _Frame:
+        """Of a picture, of which the part from pixel `low` on is searched."""
+        sides = np.array(picture.shape[::-1])
+        bright = float(np.quantile(picture[::4, ::4], 0.999))
+        return cls(bright, (sides - 1) / 2 - np.asarray(low), float(np.linalg.norm(sides)))
+
+    def least_axis_ratio(self, place: Floats) -> float:
+        """Of the picture of a sphere there."""
+        off = min(float(np.linalg.norm(place - self.middle)) / (OFF_AXIS_DIAGONALS * self.diagonal), 1.0)
+        return MIN_MIDDLE_AXIS_RATIO + (MIN_AXIS_RATIO - MIN_MIDDLE_AXIS_RATIO) * off**2
 
 
 def _is_like(edge: Edge, last: Detected) -> bool:
     """Whether a ball has about the step at its edge that it had; its radius was asked for."""
     ratio = (edge.outer - edge.inner) / float(last.notes["step"])
     return 1 / FOLLOWED_STEP_RATIO < ratio < FOLLOWED_STEP_RATIO
+
+
+def _is_before_white(plate: float, step: float, white: float) -> bool:
+    return plate > MIN_PLATE_BRIGHTNESS * white and step > MIN_STEP_BRIGHTNESS * white
 
 
 def _overlaps(centre: Floats, other: Rough) -> bool:
@@ -408,6 +442,8 @@ def _fit_ball(picture: Grey, rough: Rough, blur: float = 1.0) -> Edge | None:
     good = (
         short >= MIN_AXIS_RATIO * long
         and edge.support >= MIN_EDGE_SHARE
+        and edge.broken <= MAX_BROKEN_SHARE
+        and edge.uneven < MAX_UNEVEN_STEPS
         and found > MIN_STEP_NOISES * edge.residual
         and edge.residual < MAX_RESIDUAL_STEPS * found
         and edge.inner < MAX_BALL_BRIGHTNESS * edge.outer
@@ -422,8 +458,10 @@ def _score(edge: Edge) -> float:
     return float((edge.outer - edge.inner) * edge.support**2 * np.sqrt(short / long))
 
 
-def _detection_of(edge: Edge, view: View) -> Detected:
+def _detection_of(edge: Edge, view: View, frame: _Frame) -> Detected:
     notes = {
+        "white": frame.bright,
+        "plate": edge.outer,
         "score": _score(edge),
         "step": edge.outer - edge.inner,
         "radius_px": edge.ellipse.radius,
@@ -440,7 +478,7 @@ def _choose(made: list[Detected]) -> Detected:
     if rest and rest[0].notes["score"] > MIN_RIVAL_SCORE_RATIO * best.notes["score"]:
         (u, v), (s, t) = best.uv[0], rest[0].uv[0]
         reason = f"two balls, at ({u:.0f}, {v:.0f}) and ({s:.0f}, {t:.0f}): cover one, or take it away"
-        return nothing(reason, others=(replace(best, others=()), *rest))
+        return nothing(reason, others=(replace(best, others=()), *rest), notes={"white": best.notes["white"]})
     return replace(best, others=rest)
 
 
@@ -448,21 +486,58 @@ def _all_candidates(found: Detected) -> list[Detected]:
     return [*([replace(found, others=())] if len(found) else []), *found.others]
 
 
-def _find_still_objects(shots: list[list[Detected]]) -> Floats:
-    """(k, 3) places and radii where something is found in many shots of a camera, while the ball is elsewhere."""
-    uvr = np.array([[*ball.uv[0], ball.notes["radius_px"]] for balls in shots for ball in balls]).reshape(-1, 3)
-    shot = np.array([s for s, balls in enumerate(shots) for _ in balls], dtype=np.int64)
+class _Track(NamedTuple):
+    """All that may be the ball in the pictures of one camera: (k, 3) places and radii, the shot (k,) of each; and the
+    shots that were taken."""
+
+    uvr: Floats
+    shot: NDArray[np.str_]
+    taken: frozenset[str]
+
+    @classmethod
+    def of(cls, views: list[View], found: Mapping[View, Detected]) -> _Track:
+        each = [(view.shot, ball) for view in views for ball in _all_candidates(found[view])]
+        uvr = np.array([[*ball.uv[0], ball.notes["radius_px"]] for _, ball in each]).reshape(-1, 3)
+        return cls(uvr, np.array([shot for shot, _ in each], dtype=np.str_), frozenset(view.shot for view in views))
+
+
+def _find_still_objects(track: _Track, others: list[_Track]) -> Floats:
+    """(k, 3) places and radii where something is found in many shots of a camera that is not the ball.
+
+    It is not where a ball is found elsewhere in most of those shots. And it is not where other cameras took those shots
+    and most cameras see no ball at rest in them: a ball that rests, to test how well it is measured, rests for all.
+    """
+    uvr, shot, _ = track
     looked_at = len(set(shot.tolist()))
     places = []
     while len(uvr):
         near = _match_place(uvr, uvr[0])
-        times = len(set(shot[near].tolist()))
-        # A ball that moves in no shot is a test of repeatability, and is kept.
-        ball_elsewhere = times < 0.8 * looked_at or _is_mostly_elsewhere(shot, near)
-        if times >= max(MIN_STILL_SHOTS, 0.1 * looked_at) and ball_elsewhere:
-            places.append(np.median(uvr[near], axis=0))
+        shots = set(shot[near].tolist())
+        witnesses = [other for other in others if len(shots & other.taken) >= MIN_WITNESSED_SHOTS]
+        least = MIN_WITNESSED_SHOTS if witnesses else max(MIN_STILL_SHOTS, 0.1 * looked_at)
+        if len(shots) >= least:
+            elsewhere = len(set(shot[~near].tolist()) & shots) > 0.5 * len(shots)
+            if witnesses:
+                resting = 1 + sum(_rests(other, shots) for other in witnesses)
+                elsewhere |= resting <= 0.5 * (1 + len(witnesses))
+            else:
+                elsewhere |= len(shots) < 0.8 * looked_at
+            if elsewhere:
+                places.append(np.median(uvr[near], axis=0))
         uvr, shot = uvr[~near], shot[~near]
     return np.array(places).reshape(-1, 3)
+
+
+def _rests(track: _Track, shots: set[str]) -> bool:
+    """Whether a camera finds one thing at one place in most of some shots."""
+    among = np.isin(track.shot, list(shots))
+    uvr, shot = track.uvr[among], track.shot[among]
+    while len(uvr):
+        near = _match_place(uvr, uvr[0])
+        if len(set(shot[near].tolist())) > 0.5 * len(shots & track.taken):
+            return True
+        uvr, shot = uvr[~near], shot[~near]
+    return False
 
 
 def _match_place(uvr: Floats, place: Floats) -> NDArray[np.bool_]:
@@ -471,20 +546,28 @@ def _match_place(uvr: Floats, place: Floats) -> NDArray[np.bool_]:
     return np.asarray(near & (np.abs(uvr[:, 2] / place[2] - 1) < SAME_SIZE_RADII), dtype=np.bool_)
 
 
-def _is_mostly_elsewhere(shot: NDArray[np.int64], near: NDArray[np.bool_]) -> bool:
-    """Whether most shots show a ball at another place too."""
-    return len(set(shot[~near].tolist())) > 0.5 * len(set(shot.tolist()))
+def _usual_white(found: list[Detected]) -> float:
+    """The median over a camera's pictures, of those that could be read; 0 where none could."""
+    each = [one.notes["white"] for one in found if "white" in one.notes]
+    return float(np.median(each)) if each else 0.0
+
+
+def _drop_if_dim(found: Detected, white: float) -> Detected:
+    """Without what no ball's plate is behind, by what is usually white in the camera's pictures: one that does not show
+    the plate may show nothing white."""
+    return _keep_only(
+        found,
+        lambda ball: _is_before_white(ball.notes["plate"], ball.notes["step"], white),
+        "is before nothing as white as the camera's other pictures show",
+    )
 
 
 def _drop_still_objects(found: Detected, still: Floats) -> Detected:
-    balls = _all_candidates(found)
-    moving = [b for b in balls if not _match_place(still, np.array([*b.uv[0], b.notes["radius_px"]])).any()]
-    if len(moving) == len(balls):
-        return found
-    if not moving:
-        u, v = balls[0].uv[0]
-        return nothing(f"no ball: what looks like one at ({u:.0f}, {v:.0f}) is there in shot after shot")
-    return _choose(moving)
+    return _keep_only(
+        found,
+        lambda ball: not _match_place(still, np.array([*ball.uv[0], ball.notes["radius_px"]])).any(),
+        "is there in shot after shot",
+    )
 
 
 def _drop_if_faint(found: Detected, usual: float) -> Detected:
@@ -492,6 +575,18 @@ def _drop_if_faint(found: Detected, usual: float) -> Detected:
         return found
     u, v = found.uv[0]
     return nothing(f"no ball: the disc at ({u:.0f}, {v:.0f}) is much fainter than it is elsewhere")
+
+
+def _keep_only(found: Detected, good: Callable[[Detected], bool], why: str) -> Detected:
+    """The ball among those that are good; without any, that what looks like one is none, and why."""
+    balls = _all_candidates(found)
+    kept = [ball for ball in balls if good(ball)]
+    if len(kept) == len(balls):
+        return found
+    if kept:
+        return _choose(kept)
+    u, v = balls[0].uv[0]
+    return nothing(f"no ball: what looks like one at ({u:.0f}, {v:.0f}) {why}")
 
 
 @lru_cache

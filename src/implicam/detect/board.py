@@ -4,9 +4,9 @@ Corner 1 touches the board's black outermost corner square that is at the top le
 `columns` running to the right; numbers run along the rows. The mirror image of a checkerboard is a checkerboard, too:
 corners are numbered as they lie on the printed side, and a picture that was mirrored afterwards is read wrongly.
 
-The seeds of `seeds.py` grow (`grid.py`) until nothing more of the board is seen; the paper's detector and OpenCV's at
-full size are asked where the saddle points alone did not give the whole board, and the grid with the most corners is
-kept. Then the grid is read (`numbering.py`). A grid that can be read in more than one way is refused, with all the
+The seeds of `seeds.py` grow (`grid.py`) until nothing more of the board is seen, and the grid with the most corners is
+read (`numbering.py`); OpenCV's detector and the paper's are asked where what grew from the saddle points alone cannot
+be read. A grid that can be read in more than one way is refused, with all the
 ways in `Detected.others`.
 """
 
@@ -124,54 +124,70 @@ class Board(DetectorBase):
         unfit = explain_unusable(picture)
         if unfit:
             return nothing(unfit)
-        grids = self._find_grids(picture)
-        if not grids:
-            return nothing(
-                f"no checkerboard was found (looked for {self.rows} x {self.columns} inner corners). Show the board "
-                "whole and sharp, well lit and without glare, with squares at least 5 pixels wide."
-            )
-        return self._read(picture, grids, view)
-
-    def _find_grids(self, picture: Grey) -> list[Grid]:
-        """All checkerboards in the picture, the one with the most corners first."""
         grids: list[Grid] = []
-        limit, grown = max(self.rows, self.columns) + 3, 0
-        for seed in self._find_seeds(picture, grids):
+        found = nothing(
+            f"no checkerboard was found (looked for {self.rows} x {self.columns} inner corners). Show the board "
+            "whole and sharp, well lit and without glare, with squares at least 5 pixels wide."
+        )
+        for seeds in (self._quick_seeds, self._slow_seeds):
+            exhausted = self._grow(picture, seeds(picture, grids), grids)
+            if grids:
+                found = self._read(picture, self._join_parts(picture, grids), view)
+            if len(found) or exhausted or self._is_settled(grids):
+                break
+        return found
+
+    def _grow(self, picture: Grey, seeds: Iterator[Floats], grids: list[Grid]) -> bool:
+        """Add the checkerboards that grow from seeds to a list; whether so many grew that no more are looked for."""
+        limit, grown = self._limit, 0
+        for seed in seeds:
             grid = grow_grid(picture, seed[:limit, :limit], limit)
             if grid is not None:
                 _add_grid(grids, grid)
                 grown += 1
             if grown == MAX_TIMES_FOUND:
-                break
-        return self._join_parts(picture, sorted(grids, key=lambda grid: -grid.count), limit)
+                return True
+        return False
 
-    def _join_parts(self, picture: Grey, grids: list[Grid], limit: int) -> list[Grid]:
-        """The parts of a board that something covers, joined where that is certain."""
-        if not grids or self._is_whole(grids[0]) or self._is_too_large(grids[0]):
+    @property
+    def _limit(self) -> int:
+        """Rows or columns beyond which a grid need not grow."""
+        return max(self.rows, self.columns) + 3
+
+    def _join_parts(self, picture: Grey, grids: list[Grid]) -> list[Grid]:
+        """All checkerboards in the picture, the one with the most corners first; the parts of a board that something
+        covers joined where that is certain."""
+        grids = sorted(grids, key=lambda grid: -grid.count)
+        if self._is_whole(grids[0]) or self._is_too_large(grids[0]):
             return grids
         first, rest = complete_grid(picture, grids[0], (self.rows, self.columns)), []
         for grid in grids[1:]:
             if _share_corners(first, grid):
                 continue
-            both = join_grids(picture, first, grid, (self.rows, self.columns), limit)
+            both = join_grids(picture, first, grid, (self.rows, self.columns), self._limit)
             if both is None or both.count <= first.count:
                 rest.append(grid)
             else:
                 first = both
         return [first, *rest]
 
-    def _find_seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
-        """Seeds for as long as the grids found so far (the list grows meanwhile) do not hold a whole board."""
-        scale = min(1.0, 0.5 ** np.ceil(np.log2(max(picture.size / MAX_SEARCH_PIXELS, 1)) / 2))
-        for seeds in (
-            lambda: _saddle_seeds(picture, scale, grids),
-            lambda: _saddle_seeds(picture, scale / 2, grids),
-            lambda: from_opencv(picture, scale),
-            lambda: from_libcbdetect(picture, scale),
-        ):
-            yield from seeds()
-            if any(self._is_whole(grid) or self._is_too_large(grid) for grid in grids):
-                return
+    def _quick_seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
+        """Seeds from saddle points while the grids found so far, a list that grows meanwhile, hold no whole board."""
+        scale = _search_scale(picture)
+        yield from _saddle_seeds(picture, scale, grids)
+        if not self._is_settled(grids):
+            yield from _saddle_seeds(picture, scale / 2, grids)
+
+    def _slow_seeds(self, picture: Grey, grids: list[Grid]) -> Iterator[Floats]:
+        """Seeds from OpenCV and the paper's detector, which take longer than all the rest together."""
+        scale = _search_scale(picture)
+        yield from from_opencv(picture, scale)
+        if not self._is_settled(grids):
+            yield from from_libcbdetect(picture, scale)
+
+    def _is_settled(self, grids: list[Grid]) -> bool:
+        """Whether another search can find nothing more of the board."""
+        return any(self._is_whole(grid) or self._is_too_large(grid) for grid in grids)
 
     def _is_too_large(self, grid: Grid) -> bool:
         shape, board = sorted((grid.rows, grid.columns)), sorted((self.rows, self.columns))
@@ -339,6 +355,11 @@ def explain_unusable(picture: Grey) -> str:
     return ""
 
 
+def _search_scale(picture: Grey) -> float:
+    """The factor by which a picture is shrunk before the board is looked for."""
+    return float(min(1.0, 0.5 ** np.ceil(np.log2(max(picture.size / MAX_SEARCH_PIXELS, 1)) / 2)))
+
+
 def _saddle_seeds(picture: Grey, scale: float, grids: list[Grid]) -> Iterator[Floats]:
     """Seeds from the saddle points that no grid has yet, as long as each lets a grid grow."""
     small = resize(picture, scale)
@@ -352,12 +373,8 @@ def _saddle_seeds(picture: Grey, scale: float, grids: list[Grid]) -> Iterator[Fl
 
 def _is_inside(grid: Grid, uv: Floats) -> bool:
     """Whether a pixel is within a square or so of the grid's corners."""
-    return float(np.nanmin(np.linalg.norm(grid.uv - uv, axis=2))) < 0.8 * _largest_step(grid)
-
-
-def _largest_step(grid: Grid) -> float:
-    steps = [np.linalg.norm(np.diff(grid.uv, axis=axis), axis=2).ravel() for axis in (0, 1)]
-    return float(np.nanmax(np.concatenate(steps)))
+    away = grid.found - uv
+    return float(np.einsum("nk,nk->n", away, away).min()) < (0.8 * grid.largest_step) ** 2
 
 
 def _add_grid(grids: list[Grid], grid: Grid) -> None:

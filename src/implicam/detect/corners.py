@@ -17,6 +17,7 @@ and what the model does not describe count. All corners of a board are fitted si
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,14 +108,18 @@ def fit_corners(picture: Grey, uv: Floats, right: Floats, down: Floats, *, bare:
 
 
 class _Windows:
-    """The pixels around n corners, and the fit of the model to them."""
+    """The pixels around n corners, and the fit of the model to them.
+
+    Boards spend most of their time here: pixels are the last axis, neighbours in memory, and those that are in no
+    corner's window are left out.
+    """
 
     def __init__(self, picture: Grey, uv: Floats, right: Floats, down: Floats, half: int, bare: float) -> None:
         corner = np.rint(uv).astype(int)
         step = np.arange(-half, half + 1)
         dv, du = (x.ravel() for x in np.meshgrid(step, step, indexing="ij"))
-        self.offset = np.column_stack([du, dv]).astype(np.float64)
-        self.grey = picture[corner[:, 1, None] + dv, corner[:, 0, None] + du].astype(np.float64)
+        self.around = np.stack([du, dv]).astype(np.float64)
+        self.picture = picture[corner[:, 1, None] + dv, corner[:, 0, None] + du].astype(np.float64)
         self.corner = corner.astype(np.float64)
         self.steps = np.stack([right, down], axis=2)  # (n, 2, 2): pixels from squares
         self.angle = np.arctan2(self.steps[:, 1], self.steps[:, 0])  # (n, 2): of the edges to the right and down
@@ -124,76 +129,78 @@ class _Windows:
     def fit(self) -> Corners:
         n = len(self.start)
         parameters = np.hstack([self.start, self.angle, np.full((n, 1), np.log(0.8))])
-        weight = self._choose_window(parameters)
-        error, parameters, linear, jacobian = self._evaluate(parameters, weight)
+        self._choose_window(parameters)
+        state = self._evaluate(parameters)
         damping = np.full(n, 1e-3)
         for turn in range(MAX_ROUNDS):
             if turn == 2:  # the window follows the corner once only: else the fit does not converge
-                weight = self._choose_window(parameters)
-                error, parameters, linear, jacobian = self._evaluate(parameters, weight)
-            trial = self._limit(parameters - self._solve_step(linear[1], jacobian, weight, damping))
-            tried = self._evaluate(trial, weight)
-            better = tried[0] < error
+                self._choose_window(state.parameters)
+                state = self._evaluate(state.parameters)
+            trial = self._limit(state.parameters - self._solve_step(state, damping))
+            change = np.abs(trial - state.parameters)[:, :2].max(axis=1)
+            tried = self._evaluate(trial)
+            better = tried.error < state.error
             damping = np.where(better, damping / 5, damping * 5)
-            pick = (better[:, None], better[:, None], better[:, None, None])
-            change = np.abs(trial - parameters)[:, :2].max(axis=1)
-            error = np.where(better, tried[0], error)
-            parameters = np.where(pick[0], trial, parameters)
-            jacobian = np.where(pick[2], tried[3], jacobian)
-            linear = (np.where(pick[0], tried[2][0], linear[0]), np.where(pick[1], tried[2][1], linear[1]))
+            state = tried if better.all() else state.replace_where(better, tried)
             if turn > 3 and np.all(change < 2e-4):
                 break
-        return self._collect(parameters, linear, jacobian, weight)
+        return self._collect(state)
 
-    def _choose_window(self, parameters: Floats) -> Floats:
-        """(n, pixels) 1 in the window, 0 outside; the window is point-symmetric about the corner, as the model is."""
-        d = self.offset - parameters[:, None, :2]
-        inverse = np.linalg.pinv(self.steps)
-        squares = np.abs(d @ inverse.swapaxes(1, 2))
-        slope = np.linalg.norm(inverse, axis=2)[:, None]  # squares per pixel
+    def _choose_window(self, parameters: Floats) -> None:
+        """The pixels that are used, and their weight (n, pixels), 1 in the window and 0 outside; the window is
+        point-symmetric about the corner, as the model is."""
+        u, v = (self.around[k] - parameters[:, k, None] for k in range(2))
+        near = u * u + v * v < (self.half - 0.5) ** 2
+        used = near.any(axis=0)
+        u, v, inside = u[:, used], v[:, used], near[:, used]
+        inverse = _invert(self.steps)
+        slope = np.linalg.norm(inverse, axis=2)  # squares per pixel
         reach = np.maximum(1 - EDGE_CLEARANCE_PX * slope, 0.35)
-        inside = (squares < reach).all(axis=2) & (np.linalg.norm(d, axis=2) < self.half - 0.5)
+        squares = [np.abs(inverse[:, k, 0, None] * u + inverse[:, k, 1, None] * v) for k in range(2)]
+        inside &= (squares[0] < reach[:, 0, None]) & (squares[1] < reach[:, 1, None])
         if self.bare < 1:
             bare = np.maximum(self.bare - EDGE_CLEARANCE_PX * slope, 1.5 * slope)
-            inside &= (squares < bare).any(axis=2)
-        return np.asarray(inside, dtype=np.float64)
+            inside &= (squares[0] < bare[:, 0, None]) | (squares[1] < bare[:, 1, None])
+        some = inside.any(axis=0)
+        where = np.flatnonzero(used)[some]
+        self.offset, self.grey = self.around[:, where], self.picture[:, where]
+        self.weight = np.asarray(inside[:, some], dtype=np.float64)
 
-    def _evaluate(self, parameters: Floats, weight: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats], Floats]:
-        """Sum of squares (n,), the parameters, (mean and height (n, 2), residuals (n, pixels)), Jacobian.
-
-        Mean and height enter linearly and are solved for each time (variable projection, Golub & Pereyra 1973); the
-        Jacobian (n, pixels, 7) is that of the whole model: u, v, two angles, log blur, mean, height.
-        """
-        d = self.offset - parameters[:, None, :2]
-        cos, sin = np.cos(parameters[:, 2:4]), np.sin(parameters[:, 2:4])
+    def _evaluate(self, parameters: Floats) -> _State:
+        """Mean and height enter linearly and are solved for each time (variable projection, Golub & Pereyra 1973); the
+        Jacobian is that of the whole model: u, v, two angles, log blur, mean, height."""
+        u, v = (self.offset[k] - parameters[:, k, None] for k in range(2))
+        cos, sin = np.cos(parameters[:, 2:4])[..., None], np.sin(parameters[:, 2:4])[..., None]
         blur = np.exp(parameters[:, 4])[:, None]
-        distance, shape, slope = [], [], []
-        for k in range(2):  # k = 0: the edge that runs to the right, and how far below it
-            x = (d[..., 1] * cos[:, k, None] - d[..., 0] * sin[:, k, None]) / blur
-            distance.append(x)
-            shape.append(erf(x / np.sqrt(2)))
-            slope.append(np.exp(-0.5 * x * x) * np.sqrt(2 / np.pi))
+        # k = 0: the edge that runs to the right, and how far below it
+        distance = [(v * cos[:, k] - u * sin[:, k]) / blur for k in range(2)]
+        shape = [erf(x * np.sqrt(0.5)) for x in distance]
         product = -shape[0] * shape[1]  # below the one edge and left of the other is not between the two steps
-        mean, height = _fit_lines(product, self.grey, weight)
-        residual = (mean[:, None] + height[:, None] * product - self.grey) * weight
-        jacobian = np.empty((*product.shape, 7))
-        a, b = -slope[0] * shape[1], -slope[1] * shape[0]
-        jacobian[..., 0] = (a * sin[:, 0, None] + b * sin[:, 1, None]) / blur
-        jacobian[..., 1] = -(a * cos[:, 0, None] + b * cos[:, 1, None]) / blur
+        mean, height = _fit_lines(product, self.grey, self.weight)
+        residual = (mean[:, None] + height[:, None] * product - self.grey) * self.weight
+        scale = height[:, None] * np.sqrt(2 / np.pi)
+        a, b = (-scale * np.exp(-0.5 * distance[k] ** 2) * shape[1 - k] for k in range(2))
+        jacobian = np.empty((len(parameters), 7, product.shape[1]))
+        jacobian[:, 0] = (a * sin[:, 0] + b * sin[:, 1]) / blur
+        jacobian[:, 1] = -(a * cos[:, 0] + b * cos[:, 1]) / blur
         for k, part in enumerate((a, b)):
-            jacobian[..., 2 + k] = -part * (d[..., 0] * cos[:, k, None] + d[..., 1] * sin[:, k, None]) / blur
-        jacobian[..., 4] = -(a * distance[0] + b * distance[1])
-        jacobian[..., :5] *= height[:, None, None]
-        jacobian[..., 5], jacobian[..., 6] = 1, product
-        return np.sum(residual**2, axis=1), parameters, (np.column_stack([mean, height]), residual), jacobian
+            jacobian[:, 2 + k] = -part * (u * cos[:, k] + v * sin[:, k]) / blur
+        jacobian[:, 4] = -(a * distance[0] + b * distance[1])
+        jacobian[:, 5], jacobian[:, 6] = 1, product
+        error = np.einsum("np,np->n", residual, residual)
+        return _State(error, parameters, np.column_stack([mean, height]), residual, jacobian)
 
-    def _solve_step(self, residual: Floats, jacobian: Floats, weight: Floats, damping: Floats) -> Floats:
-        weighted = jacobian * weight[..., None]
-        normal = weighted.swapaxes(1, 2) @ jacobian
+    def _normal(self, jacobian: Floats) -> tuple[Floats, Floats]:
+        """The weighted Jacobian (n, 7, pixels), and the normal equations' matrix (n, 7, 7)."""
+        weighted = jacobian * self.weight[:, None]
+        return weighted, weighted @ jacobian.swapaxes(1, 2)
+
+    def _solve_step(self, state: _State, damping: Floats) -> Floats:
+        weighted, normal = self._normal(state.jacobian)
         diagonal = np.einsum("nii->ni", normal)
         diagonal += damping[:, None] * diagonal + 1e-9
-        gradient = np.einsum("npk,np->nk", weighted, residual)
-        step: Floats = np.linalg.solve(normal, gradient[..., None])[:, :5, 0]
+        gradient = weighted @ state.residual[..., None]
+        step = np.asarray(np.linalg.solve(normal, gradient)[:, :5, 0], dtype=np.float64)
         return np.clip(step, -0.7, 0.7)
 
     def _limit(self, parameters: Floats) -> Floats:
@@ -201,13 +208,12 @@ class _Windows:
         parameters[:, 4] = np.clip(parameters[:, 4], np.log(0.25), np.log(4.0))
         return parameters
 
-    def _collect(self, parameters: Floats, linear: tuple[Floats, Floats], jacobian: Floats, weight: Floats) -> Corners:
-        (mean, height), residual = linear[0].T, linear[1]
-        weighted = jacobian * weight[..., None]
-        normal = weighted.swapaxes(1, 2) @ jacobian
-        spare = weight.sum(axis=1) - 7
+    def _collect(self, state: _State) -> Corners:
+        parameters, (mean, height) = state.parameters, state.levels.T
+        weighted, normal = self._normal(state.jacobian)
+        spare = self.weight.sum(axis=1) - 7
         with np.errstate(invalid="ignore", divide="ignore"):
-            noise = np.where(spare > 5, np.sum(residual**2, axis=1) / spare, np.nan)
+            noise = np.where(spare > 5, state.error / spare, np.nan)
             misfit = np.sqrt(noise) / np.abs(height)
             scale = np.sqrt(np.einsum("nii->ni", normal)) + 1e-12
             inverse = np.linalg.pinv(normal / (scale[:, :, None] * scale[:, None, :]), hermitian=True)
@@ -216,8 +222,37 @@ class _Windows:
         sd = np.sqrt(np.where(good[:, None], variance, np.nan) + MIN_SD_PX**2)
         uv = np.where(good[:, None], self.corner + parameters[:, :2], np.nan)
         turned = np.abs(np.sin(parameters[:, 2:4] - self.angle)).max(axis=1)
-        shift = np.column_stack([_shift_of_edges(residual, jacobian[..., k] * weight, weight) for k in range(2)])
+        shift = np.column_stack([_shift_of_edges(state.residual, weighted[:, k], self.weight) for k in range(2)])
         return Corners(uv, sd, mean, height, misfit, np.exp(parameters[:, 4]), turned, shift)
+
+
+class _State(NamedTuple):
+    """Where n fits stand.
+
+    error: (n,) sums of squares. parameters: (n, 5) crossing, two angles, log blur. levels: (n, 2) mean and height.
+    residual: (n, pixels), weighted. jacobian: (n, 7, pixels).
+    """
+
+    error: Floats
+    parameters: Floats
+    levels: Floats
+    residual: Floats
+    jacobian: Floats
+
+    def replace_where(self, which: Bools, other: _State) -> _State:
+        """The other's rows where `which` (n,) says so."""
+        pairs = zip(self, other, strict=True)
+        return _State(*(np.where(which.reshape(-1, *[1] * (x.ndim - 1)), y, x) for x, y in pairs))
+
+
+def _invert(matrices: Floats) -> Floats:
+    """The inverses of (n, 2, 2); of those that have none, Moore and Penrose's."""
+    (a, b), (c, d) = matrices.transpose(1, 2, 0)
+    determinant = a * d - b * c
+    if (np.abs(determinant) <= 1e-12 * (a * a + b * b + c * c + d * d)).any():
+        return np.asarray(np.linalg.pinv(matrices), dtype=np.float64)
+    adjugate = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2)
+    return np.asarray(adjugate / determinant[:, None, None], dtype=np.float64)
 
 
 def _shift_of_edges(residual: Floats, slope: Floats, weight: Floats) -> Floats:

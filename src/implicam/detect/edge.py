@@ -29,6 +29,10 @@ SECTORS = 24
 ODD_SECTOR_RATIO = 2.5
 """A sector is left out where it fits so many times worse than usual."""
 
+MIN_BREAK_STEPS, MIN_BREAK_SDS, BREAK_REACH_PX = 0.1, 3.0, 2.0
+"""The edge is broken in a sector whose pixels on one side of it, so far beyond the blur, are together so far from the
+fit: in parts of the step, and in standard deviations of their mean."""
+
 GEOMETRY_NUMBERS = 6
 """Numbers of the edge: centre (2), shape (3), blur. Those of the light follow."""
 
@@ -104,7 +108,8 @@ def _change_ellipse(ellipse: Ellipse, change: Floats) -> Ellipse:
 
 class Edge(NamedTuple):
     """A fitted edge: covariance (2, 2) of its centre; levels inside and outside, and the rms left over, in grey values;
-    blur in pixels; and `support`, the part of the edge that looks like one."""
+    blur in pixels; `support`, the part of the edge that was fitted; `broken`, the part where it is no such step, though
+    the noise may hide that from `support`; and `uneven`, the largest wave of the light outside, in steps."""
 
     ellipse: Ellipse
     covariance: Floats
@@ -113,6 +118,8 @@ class Edge(NamedTuple):
     residual: float
     blur: float
     support: float
+    broken: float
+    uneven: float
 
 
 class Rough(NamedTuple):
@@ -260,9 +267,11 @@ def fit_edge(picture: Grey, start: Ellipse, blur: float = 1.0) -> Edge | None:
 
 def _judge(band: _Band, fit: _Fit, kept: Bools) -> Edge | None:
     """Levels and covariance of what was found."""
-    use = kept[_sector_of(band.uv, fit.ellipse)]
-    model, J, step = _evaluate_model(band.uv[use], fit)
-    residual = band.grey[use] - model
+    sector = _sector_of(band.uv, fit.ellipse)
+    use = kept[sector]
+    model, J, step = _evaluate_model(band.uv, fit)
+    left = band.grey - model
+    residual, J, step = left[use], J[use], step[use]
     if len(J) < 2 * J.shape[1]:
         return None
     JW = J / _noise_variance(fit.noise, step)[:, None]
@@ -272,9 +281,24 @@ def _judge(band: _Band, fit: _Fit, kept: Bools) -> Edge | None:
         return None
     rms = float(np.sqrt(np.mean(residual**2)))
     own = covariance[:2, :2] + (UNMODELLED_SD_BLURS * fit.blur) ** 2 * np.eye(2)
-    return Edge(
-        fit.ellipse, own, float(fit.light[0]), float(fit.light[LIGHT_NUMBERS]), rms, fit.blur, float(kept.mean())
-    )
+    inner, outer = float(fit.light[0]), float(fit.light[LIGHT_NUMBERS])
+    broken = _share_broken(left, _signed_distance(band.uv, fit.ellipse)[0], sector, fit.blur, outer - inner, rms)
+    waves = fit.light[LIGHT_NUMBERS + 1 :][: 2 * LIGHT_WAVES]
+    uneven = float(np.abs(waves).max()) / max(abs(outer - inner), 1e-9)
+    return Edge(fit.ellipse, own, inner, outer, rms, fit.blur, float(kept.mean()), broken, uneven)
+
+
+def _share_broken(
+    residual: Floats, distance: Floats, sector: NDArray[np.int64], blur: float, step: float, rms: float
+) -> float:
+    """The part of the sectors in which the pixels (n,) just inside or just outside are another grey than the fit."""
+    broken = np.zeros(SECTORS, dtype=np.bool_)
+    for side in (distance < 0, distance >= 0):
+        near = side & (np.abs(distance) < blur + BREAK_REACH_PX)
+        count = np.maximum(np.bincount(sector[near], minlength=SECTORS), 1)
+        off = np.abs(np.bincount(sector[near], weights=residual[near], minlength=SECTORS)) / count
+        broken |= off > np.maximum(MIN_BREAK_STEPS * abs(step), MIN_BREAK_SDS * rms / np.sqrt(count))
+    return float(broken.mean())
 
 
 def _cut_band(picture: Grey, ellipse: Ellipse, width: float) -> _Band | None:

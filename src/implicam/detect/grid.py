@@ -9,6 +9,7 @@ finds the corners that are not where their neighbours say.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -66,6 +67,17 @@ class Grid:
     def occupied(self) -> Bools:
         """(rows, columns) where a corner was found."""
         return np.isfinite(self.uv[..., 0])
+
+    @cached_property
+    def found(self) -> Floats:
+        """(count, 2) pixels of the corners that were found, row by row."""
+        return self.uv[self.occupied]
+
+    @cached_property
+    def largest_step(self) -> float:
+        """Pixels between neighbours at most; NaN where no two are neighbours."""
+        steps = [np.linalg.norm(np.diff(self.uv, axis=axis), axis=2).ravel() for axis in (0, 1)]
+        return float(np.nanmax(np.concatenate(steps)))
 
     @property
     def count(self) -> int:

@@ -28,6 +28,9 @@ ALONG_PRIOR_SD, ACROSS_PRIOR_SD = 0.2, 0.06
 """Prior sd of the perspective: how much the distance from the camera changes over the target, as a part of itself,
 along the line of sight; and across it, which is what an axis that does not meet the target does."""
 
+SETTLED = 1e-12
+"""Change of the map's numbers, in units of the target's size, below which a further step says nothing."""
+
 
 class Departure(NamedTuple):
     """What is smooth and not projective: its sd `bend` in the units of the pixels, its correlation length `reach` in
@@ -96,8 +99,11 @@ class ProjectiveProcess:
             L = cholesky(np.asfortranarray(J @ prior @ J.T + smooth))
             rest = (uv - image).ravel() + J @ theta
             alpha = solve(L, rest)
-            if turn < turns - 1:
-                theta = prior @ (J.T @ alpha)
+            if turn == turns - 1:
+                break
+            before, theta = theta, prior @ (J.T @ alpha)
+            if np.abs(theta - before).max() < SETTLED:
+                break
         evidence = -0.5 * rest @ alpha - np.log(np.diag(L)).sum()
         return cls(x, uv, theta, prior, departure, L, alpha, float(evidence))
 

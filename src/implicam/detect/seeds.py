@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
-from implicam.detect.corners import Bools
 from implicam.images import Grey, eight_bit, opencv
 
 MIN_ROWS = 4
@@ -36,6 +35,9 @@ MIN_ANGLE_SINE = 0.2
 
 MAX_SEEDS = 40
 """Seeds from saddle points that are handed on, at most."""
+
+TOGETHER = 32
+"""Saddle points whose neighbours are looked for at once."""
 
 PATIENCE_SECONDS = 60.0
 """Seconds that the paper's detector may take."""
@@ -161,12 +163,17 @@ def find_saddles(picture: Grey, blur: float = 1.5) -> Saddles:
     cv2 = opencv()
     smooth = cv2.GaussianBlur(picture, (0, 0), blur)
     uu, vv, uv = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
-    strength = np.sqrt(np.maximum(uv * uv - uu * vv, 0))
-    peak = (strength >= cv2.dilate(strength, np.ones((5, 5), np.uint8))) & (strength > 0)
+    strength = uv * uv
+    strength -= np.multiply(uu, vv, out=smooth)
+    np.sqrt(np.maximum(strength, 0, out=strength), out=strength)
+    peak = (strength >= cv2.dilate(strength, np.ones((5, 5), np.uint8), dst=smooth)) & (strength > 0)
     peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = False, False, False, False
-    v, u = np.nonzero(peak)
-    strongest = np.argsort(-strength[v, u], kind="stable")[:MAX_SADDLES]
-    v, u = v[strongest], u[strongest]
+    at = np.flatnonzero(peak)
+    height = strength.ravel()[at]
+    if len(at) > MAX_SADDLES:  # noise makes tens of thousands
+        enough = height >= np.partition(height, -MAX_SADDLES)[-MAX_SADDLES]
+        at, height = at[enough], height[enough]
+    v, u = np.unravel_index(at[np.argsort(-height, kind="stable")[:MAX_SADDLES]], strength.shape)
     if len(v):
         clear = strength[v, u] > MIN_STRENGTH_RATIO * strength[v, u][min(FAINT_RANK, len(v) - 1)]
         v, u = v[clear], u[clear]
@@ -193,8 +200,12 @@ def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[F
     if len(points.uv) < 9:
         return
     given = 0
+    arms: list[NDArray[np.intp] | None] = []
     for k in range(len(points.uv)):
-        seed = None if taken(points.uv[k]) else _find_square_about(points, k)
+        if k == len(arms):
+            arms += _find_arms(points, slice(k, k + TOGETHER))
+        four = arms[k]
+        seed = None if four is None or taken(points.uv[k]) else _make_square(points, k, four)
         if seed is not None:
             yield seed
             given += 1
@@ -202,16 +213,28 @@ def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[F
                 return
 
 
-def _find_square_about(points: Saddles, k: int) -> Floats | None:
-    away = points.uv - points.uv[k]
-    distance = np.linalg.norm(away, axis=1)
-    other = np.abs(points.bright @ points.bright[k]) < 0.75  # from corner to corner bright and dark squares change over
+def _find_arms(points: Saddles, some: slice) -> list[NDArray[np.intp] | None]:
+    """Of each of some points, the nearest points (4,) along its two edges, there and back, within 20 degrees; None
+    where one of them is missing."""
+    away = points.uv - points.uv[some, None]
+    distance = np.linalg.norm(away, axis=2)
+    other = np.abs(points.bright[some] @ points.bright.T) < 0.75  # from corner to corner bright and dark change over
     other &= distance > 0
-    a, b = points.edges[k]
-    arms = [_find_next_along(away, distance, other, direction) for direction in (a, -a, b, -b)]
-    if any(arm is None for arm in arms):
-        return None
-    ap, am, bp, bm = (points.uv[arm] for arm in arms if arm is not None)
+    distance[~other] = np.inf
+    along = away @ points.edges[some].swapaxes(1, 2)  # (some, n, 2)
+    least = 0.94 * distance
+    found, there = [], np.ones(len(away), dtype=np.bool_)
+    for edge in range(2):
+        for sign in (1, -1):
+            ahead = np.where(sign * along[..., edge] > least, distance, np.inf)
+            found.append(np.argmin(ahead, axis=1))
+            there &= np.isfinite(ahead.min(axis=1))
+    return [four if good else None for four, good in zip(np.stack(found, axis=1), there, strict=True)]
+
+
+def _make_square(points: Saddles, k: int, arms: NDArray[np.intp]) -> Floats | None:
+    """The seed about a point from its four neighbours; None where the corners of the square are missing."""
+    ap, am, bp, bm = points.uv[arms]
     middle = points.uv[k]
     seed = np.array([[middle, middle, middle]] * 3)
     seed[1, 2], seed[1, 0], seed[2, 1], seed[0, 1] = ap, am, bp, bm
@@ -228,9 +251,3 @@ def _find_square_about(points: Saddles, k: int) -> Floats | None:
                 return None
             seed[i, j] = points.uv[nearest]
     return seed
-
-
-def _find_next_along(away: Floats, distance: Floats, other: Bools, direction: Floats) -> int | None:
-    """The nearest point in a direction, within 20 degrees."""
-    ahead = np.flatnonzero(other & (away @ direction > 0.94 * distance))
-    return int(ahead[np.argmin(distance[ahead])]) if len(ahead) else None
