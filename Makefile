@@ -36,12 +36,7 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports --no-logo
 
 bench: $(VENV)/.dev
-	$(BIN)/python benchmarks/import_time.py
-	$(BIN)/python benchmarks/gp_fit.py
-	$(BIN)/python benchmarks/forward_speed.py
-	$(BIN)/python benchmarks/active_speed.py
-	$(BIN)/python benchmarks/reading.py
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/measuring.py
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python benchmarks/bench.py
 
 odd: $(VENV)/.dev
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/odd_rigs.py -o benchmarks/results/odd_rigs.md

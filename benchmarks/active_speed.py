@@ -1,4 +1,4 @@
-"""One step of active learning: choose among 1,500 candidates, measure, fit again with everything. `make bench` runs it.
+"""One step of active learning: choose among 1,500 candidates, measure, fit again with everything.
 
 Against the same step with GPyTorch: the paper's three GPs fitted again (the same settings as benchmarks/gp_fit.py: Adam
 0.1, 100 steps, float64), in the same process on the same data.
@@ -31,12 +31,12 @@ def main() -> None:
         rig = build_rig("bar6", seed=0, cameras=cameras)
         for noise in (0.0, 0.1):
             data = simulate(rig, random_positions(rig, POINTS, np.random.default_rng(0)), seed=0, robot_noise=noise)
-            theirs = _median(lambda data=data: _gpytorch(data))  # type: ignore[misc]
+            theirs = _median(lambda data=data: gpytorch(data))  # type: ignore[misc]
             for method, rule in ((InverseGP(), "variance"), (InverseGP(), "integrated"), (ForwardGP(), "integrated")):
                 if noise and isinstance(method, InverseGP):
                     continue
                 loop = Loop(method, Workspace.from_box(rig.volume), acquisition_from_name(rule), data=data)
-                choose, fit = _steps(loop, SimulatedOracle(rig, robot_noise=noise))
+                choose, fit = steps(loop, SimulatedOracle(rig, robot_noise=noise))
                 what = f"{method.method}, {rule}" + (", positions known to 0.1 mm" if noise else "")
                 step = choose + fit
                 print(
@@ -44,9 +44,10 @@ def main() -> None:
                 )
 
 
-def _steps(loop: Loop, oracle: SimulatedOracle) -> tuple[float, float]:
+def steps(loop: Loop, oracle: SimulatedOracle, repeats: int = REPEATS) -> tuple[float, float]:
+    """Median seconds of choosing a target, and of the fit with it."""
     choosing, fitting = [], []
-    for _ in range(REPEATS):
+    for _ in range(repeats):
         start = time.perf_counter()
         (target,) = loop.ask()
         choosing.append(time.perf_counter() - start)
@@ -66,7 +67,7 @@ def _median(work: Callable[[], Any]) -> float:
     return statistics.median(times)
 
 
-def _gpytorch(data: Any) -> None:
+def gpytorch(data: Any) -> None:
     """Fit the three GPs as the paper's software does."""
     from gp_fit import with_gpytorch
 

@@ -1,10 +1,10 @@
-"""Speed and memory of forward-gp: the second table of docs/speed.md.
+"""Speed of small fits of forward-gp beside GPyTorch, and where the time of a fit goes.
 
     python benchmarks/forward_speed.py [-o benchmarks/results/forward_speed.md]
     python benchmarks/forward_speed.py --stages       only where the processor time of a fit goes
 
 Simulated bar6 rig, six cameras. GPyTorch: the paper's three GPs on the same 157 points (Adam 0.1, 100 steps), as in
-gp_fit.py. Medians of 5 fits. Memory is the peak of the whole process, after the line's work, in a process of its own.
+gp_fit.py. Medians of 5 fits. Large rigs: large_rigs.py.
 """
 
 from __future__ import annotations
@@ -127,17 +127,6 @@ def small(_):
     return {n: fit_seconds(known(n)) for n in (17, 35, 157)}, fit_seconds(boards(), 3), gpytorch_seconds()
 
 
-def large(n):
-    data = known(n)
-    before = peak()
-    start = time.perf_counter()
-    calibration = ForwardGP().fit(data)
-    fitted = time.perf_counter() - start
-    start = time.perf_counter()
-    calibration.measure(data.observations)
-    return before, fitted, time.perf_counter() - start, peak()
-
-
 def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6  # GB on Linux
 
@@ -155,10 +144,6 @@ def report():
         yield f"| fit, {n} points, six cameras | {seconds:.2f} |"
     yield f"| GPyTorch, the paper's three GPs, 157 points | {gpytorch:.2f} ({gpytorch / fits[157]:.1f} times ours) |"
     yield f"| fit, 20 boards = 1760 corners, six cameras | {board:.2f} ({board / fits[157]:.1f} times 157 points) |"
-    before, fitted, measured, after = in_its_own_process(large, 100_000)
-    yield f"| fit, 100,000 points, six cameras | {fitted:.0f} |"
-    memory = f"peak memory {after:.2f} GB, {before:.2f} of it the data"
-    yield f"| measure the same 100,000 points | {measured:.0f} ({memory}) |"
     yield ""
     yield from stages()
 

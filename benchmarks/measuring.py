@@ -17,6 +17,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -96,30 +97,52 @@ def rig_and_known(name: str) -> tuple[Rig, Dataset]:
     return rig, replace(known, known=replace(known.positions, xyz=off, sd=np.full((157, 3), sd)))
 
 
-def row(
-    name: str, made: RigCalibration, tables: RigTable | None, uv: np.ndarray, truth: np.ndarray, peer: float
-) -> str:
+class Case(NamedTuple):
+    """Points a second of CPU time, and together by the clock; how far off the exact path, in sd and as a part of the
+    covariance; the share of points with the same views left out; coverage."""
+
+    rate: float
+    together: float
+    off_sd: float
+    off_covariance: float
+    same_views: float
+    coverage: float
+
+
+def measured(
+    made: RigCalibration, tables: RigTable | None, uv: np.ndarray, truth: np.ndarray, runs: int = RUNS
+) -> Case:
     locator = None if tables is None else tables.locate
     n = COMPARED if tables is None else len(uv) if tables.compiled else min(len(uv), 40_000)
     found = made.map.measure_pixels(uv[:n], None, locator)
-    least, clock = seconds(lambda: made.map.measure_pixels(uv[:n], None, locator), RUNS if locator else 1)
+    least, clock = seconds(lambda: made.map.measure_pixels(uv[:n], None, locator), runs if locator else 1)
     exact = made.map.measure_pixels(uv[:COMPARED])
     few = made.map.measure_pixels(uv[:COMPARED], None, locator)
     away, part = off(few, exact)
     alike = float((few.left_out == exact.left_out).all(axis=1).mean())
+    return Case(n / least, n / clock, away, part, alike, coverage(found, truth[:n]))
+
+
+def row(name: str, views: int, case: Case, peer: float) -> str:
     return (
-        f"| {name} | {uv.shape[1]} | {n / least:,.0f} | {n / clock:,.0f} | {peer * n / least:.2f} | {away:.4f} | "
-        f"{part:.4f} | {100 * alike:.2f} % | {100 * coverage(found, truth[:n]):.1f} % |"
+        f"| {name} | {views} | {case.rate:,.0f} | {case.together:,.0f} | {peer * case.rate:.2f} | {case.off_sd:.4f} | "
+        f"{case.off_covariance:.4f} | {100 * case.same_views:.2f} % | {100 * case.coverage:.1f} % |"
     )
 
 
-def live(made: RigCalibration, uv: np.ndarray) -> str:
+def live_seconds(made: RigCalibration, uv: np.ndarray) -> tuple[float, float]:
+    """Median and 99th percentile of one shot."""
     one, spent = made.live(), []
     for k in range(20000):
         start = time.perf_counter()
         one.measure(uv[k % len(uv)])
         spent.append(time.perf_counter() - start)
     middle, last = np.quantile(spent, [0.5, 0.99])
+    return float(middle), float(last)
+
+
+def live(made: RigCalibration, uv: np.ndarray) -> str:
+    middle, last = live_seconds(made, uv)
     return f"{1e6 * middle:.1f} us, 99th percentile {1e6 * last:.1f} us"
 
 
@@ -155,7 +178,7 @@ def main() -> None:
         for what, by, pixels in cases:
             again = seconds(peer, 5)[0] / 20_000
             usual = min(usual, again)
-            print(row(what, made, by, pixels, truth, usual), flush=True)
+            print(row(what, uv.shape[1], measured(made, by, pixels, truth), usual), flush=True)
     print("\n" + "\n".join(notes))
 
 
