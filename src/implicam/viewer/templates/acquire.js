@@ -88,7 +88,8 @@ function skip() {
 function key(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   if (event.key === "Escape" && about?.moves) { press("stop"); return; }
-  if (by("ask").open || ["INPUT", "SELECT"].includes(event.target.tagName)) return;
+  const typing = event.target.matches("select, input:not([type=checkbox], [type=range])");
+  if (by("ask").open || typing) return;
   if (event.key === "0") scene?.aim();
   const word = KEYS[event.key.toLowerCase()];
   if (word && !by(word).disabled) { event.preventDefault(); by(word).click(); }
