@@ -3,6 +3,7 @@
     python benchmarks/wand.py                          100 rigs: 200 frames, 10 % wrong and 30 % missing views
     python benchmarks/wand.py --clean                  all views there and right
     python benchmarks/wand.py --frames 50 --rigs 4     fewer frames, four rigs of each kind
+    python benchmarks/wand.py --real ../shared/real/caliscope-charuco   two corners of a board held by hand as a wand
     python benchmarks/wand.py -o benchmarks/results/wand.md   the tables that are kept: all of these
 
 Every rig is another one (lens errors of 0.5 px, 0.2 px noise); the wand is 0.6 of the volume's shortest edge, waved at
@@ -19,6 +20,7 @@ median and slowest.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from time import process_time
 
@@ -26,6 +28,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import implicam as ic
+from implicam.dataset.boards import CORNER, corner_positions
 from implicam.derived import distances
 from implicam.errors import ImplicamError
 from implicam.geometry import register
@@ -85,6 +88,38 @@ def length_errors(measured, true):
     pairs = [tuple(map(int, rng.choice(good, 2, replace=False))) for _ in range(PAIRS)]
     for (i, j), found in zip(pairs, distances(measured, pairs), strict=True):
         yield (found.value - np.linalg.norm(true[i] - true[j])) / found.sd
+
+
+def real(folder: Path, seed: int) -> str:
+    """Two corners of a board, three squares apart, are a wand; then all neighbouring corners are measured."""
+    data = ic.read_dataset(folder)
+    square, at = data.extra["target"]["square"], corner_positions(data.extra["target"])
+    found = [CORNER.fullmatch(str(point)) for point in data.points]
+    row = {(one["shot"], int(one["number"]) - 1): i for i, one in enumerate(found)}
+    rng, rows = np.random.default_rng(seed), list[tuple[int, str, str]]()
+    apart = np.linalg.norm(at[:, None] - at, axis=2)
+    for shot in dict.fromkeys(one["shot"] for one in found):
+        seen = [(i, j) for i, j in np.argwhere(np.isclose(apart, 3 * square)) if {(shot, i), (shot, j)} <= row.keys()]
+        if seen:
+            i, j = sorted(seen[rng.integers(len(seen))])
+            rows += [(row[shot, i], shot, "a"), (row[shot, j], shot, "b")]
+    frames, markers = (np.array([one[k] for one in rows]) for k in (1, 2))
+    seen = data.observations.select(np.array([one[0] for one in rows]))
+    seen = replace(seen, points=np.array([f"{frame} {marker}" for frame, marker in zip(frames, markers, strict=True)]))
+    waved = replace(data, observations=seen, columns={"frame": frames, "marker": markers}, extra={})
+    calibration = ic.ForwardGP(wand=3 * square).fit(waved)
+    measured = calibration.measure(data.observations)
+    pairs = [
+        (row[shot, i], row[shot, j]) for (shot, i) in row for j in np.flatnonzero(np.isclose(apart[i], square))
+        if j > i and (shot, j) in row and measured.measured[[row[shot, i], row[shot, j]]].all()
+    ]  # fmt: skip
+    lengths = distances(measured, pairs)
+    error = np.array([one.value for one in lengths]) - square
+    inside = np.mean(np.abs(error) < 1.96 * np.array([one.sd for one in lengths]))
+    return (
+        f"{len(rows) // 2} frames: {len(pairs)} neighbouring corners are off by {np.median(np.abs(error)):.2g} "
+        f"{data.length_unit} in the median, {np.sqrt(np.mean(error**2)):.2g} rms; {100 * inside:.0f} % in their 95 %"
+    )
 
 
 def told(rows: list[dict[str, float]], name: str, digits: int = 3) -> str:
@@ -148,7 +183,12 @@ def main() -> None:
     parser.add_argument("--lens-error", type=float, default=0.5)
     parser.add_argument("--clean", action="store_true")
     parser.add_argument("-o", type=Path)
+    parser.add_argument("--real", type=Path)
     args = parser.parse_args()
+    if args.real:
+        for seed in range(3):
+            print(real(args.real, seed), flush=True)
+        return
     if args.o:
         lines = ["# Calibrated from a wand", ""]
         for text in kept(args.seed0):
