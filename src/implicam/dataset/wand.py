@@ -96,10 +96,13 @@ def marker_rows(data: Dataset, ends: tuple[str, ...]) -> tuple[list[str], NDArra
     names = list(dict.fromkeys(markers))
     if not ends:
         if len(names) != 2:
+            plural = "s" * (len(names) != 1)
             raise DatasetError(
-                f"dataset {data.name!r} has {len(names)} markers ({', '.join(names[:5])}), and a wand two.",
-                why="which of them are its ends is not said",
-                fix="--wand-ends A,B (the others are single points)",
+                f"dataset {data.name!r} has {len(names)} marker{plural} ({', '.join(names[:5])}), and a wand two.",
+                why="which of them are its ends is not said" if len(names) > 2 else "",
+                fix="--wand-ends A,B (the others are single points)"
+                if len(names) > 2
+                else f"name both, each point's in the column {MARKER!r}",
             )
         ends = tuple(names)
     for end in ends:
