@@ -322,7 +322,7 @@ class BoardLoop:
         if not np.isfinite(unknown):
             return CameraProgress(0.4, boards, "sees nothing of the volume")
         part = 0.4 + 0.6 * min(1.0, MAX_EXCESS_PART / max(unknown, 1e-9))
-        return CameraProgress(part, boards, f"unknown: {decimal_number(unknown, 2)} times its noise")
+        return CameraProgress(part, boards, f"known to {decimal_number(unknown, 2)} of its noise")
 
     @property
     def _names(self) -> tuple[str, ...]:

@@ -375,7 +375,7 @@ class BoardController(SessionController):
             "asked": asked,
             "reasons": {look.camera: look.found.reason for look in looks if look.found.reason},
         }
-        with self._working("fitting", "keeping it"):
+        with self._working("fitting", "Keeping the pictures"):
             begun = time.monotonic()
             self.session.accept(shot, pictures=pictures, notes=notes)
             _LOG.info("%s accepted: on disk after %.3f s", target.name, time.monotonic() - begun)
