@@ -72,6 +72,13 @@ def test_what_goes_wrong_on_opening_is_in_the_log_and_the_folder_is_still_free(c
     open_session(tmp_path / "s", Setup(rig="stereo")).close()
 
 
+def test_an_address_that_is_none_leaves_no_folder(cli: Cli, tmp_path: Path) -> None:
+    told = cli("acquire", "s", "--no-browser", "--host", "192.0.2.7")
+    assert told.code == 1
+    assert "192.0.2.7 is no address or name of this computer" in told.err
+    assert not (tmp_path / "s").exists()
+
+
 def test_nothing_is_written_into_a_folder_of_something_else(cli: Cli, tmp_path: Path) -> None:
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "thesis.txt").write_text("three years")

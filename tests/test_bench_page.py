@@ -152,6 +152,16 @@ def test_a_simulated_robot_is_not_asked_about(controller: SessionController, pag
     until(lambda: controller.state.phase == "shown")
 
 
+def test_cameras_that_do_not_run_freely_say_when_a_picture_comes(controller: SessionController) -> None:
+    for source in controller.equipment.cameras:
+        source.live = False  # type: ignore[misc]  # as a folder's
+    page = BenchPage(SessionController(controller.session, controller.equipment, controller.loop))
+    page.start()
+    until(lambda: page._sent.get("phase") == "aim")
+    assert {one["reason"] for one in page._sent["cameras"]} == {"a picture comes with “Go”"}
+    page.close()
+
+
 def test_stop_takes_no_time(controller: SessionController, page: BenchPage) -> None:
     before = time.monotonic()
     page.stop({})
@@ -248,7 +258,9 @@ def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
                 assert page.input_value(f"#{axis}") == ""  # what nobody typed is not known
                 page.fill(f"#{axis}", text)
             page.keyboard.press("Enter")
-            page.get_by_role("button", name="It is", exact=True).click()  # outside of the workspace: asked about
+            page.wait_for_selector("#ask[open]")  # outside of the workspace: asked about
+            assert page.evaluate("document.activeElement.textContent") == "Correct"
+            page.get_by_role("button", name="It is", exact=True).click()
             page.wait_for_selector("#accept:enabled")
             page.click("#accept")
             until(lambda k=k: by_hand.session.data is not None and len(by_hand.session.data) == k + 1)
@@ -260,6 +272,10 @@ def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
         page.fill("#z", "1")
         page.click("#go")
         page.get_by_text("may mean 1.234 or 1234").wait_for()
+        page.fill("#x", "1.234")
+        page.click("#go")
+        page.get_by_text("may mean 1.234 or 1234").wait_for(state="detached")  # mended by a good one
+        page.get_by_role("button", name="Correct", exact=True).click()
         # the list: one is looked at, one is deleted
         page.click("#list summary")
         row = page.locator("#points tr", has_text="p001")
@@ -267,7 +283,7 @@ def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
         page.wait_for_function(
             "[...document.querySelectorAll('#ask-pictures img')].filter((i) => i.naturalWidth).length == 2"
         )
-        page.get_by_role("button", name="close", exact=True).click()
+        page.get_by_role("button", name="Close", exact=True).click()
         row.get_by_role("button", name="delete").click()
         page.get_by_role("button", name="Delete", exact=True).click()
         until(lambda: by_hand.session.data is not None and by_hand.session.data.points.tolist() == ["p002"])

@@ -141,10 +141,10 @@ def test_what_is_odd_before_pictures_is_said_with_the_numbers() -> None:
     assert ask(101, 0, 400) == ()  # at the edge
     assert ask(0, 0, 400, at=None) == ()
     (outside,) = ask(150, 0, 400, at=target(100, 0, 400))
-    assert "(150, 0, 400) is 50 mm outside of the workspace, a box of 200 x 200 x 200 mm" in outside
+    assert "(150, 0, 400) mm is 50 mm outside of the workspace, a box of 200 x 200 x 200 mm" in outside
     (far,) = ask(-90, 50, 400, at=target(90, 50, 400))
-    assert "is 180 mm from the target (90, 50, 400)" in far
-    assert far.endswith("if x had the other sign, it would be 0 away")
+    assert "is 180 mm from the target (90, 50, 400) mm" in far
+    assert far.endswith("if x had the other sign, it would be 0 mm from there")
     assert "if x and y were exchanged" in ask(10, 90, 400, at=target(90, 10, 400))[0]
     assert "if it were a thousandth" in ask(10e3, 20e3, 400e3, at=target(10, 20, 400))[1]
     assert "if it were ten times as much" in ask(1, 2, 40, at=target(10, 20, 400))[1]
@@ -168,7 +168,7 @@ def test_what_the_cameras_see_elsewhere_is_asked_about() -> None:
     assert ask([0, 0, 400], nothing, measured([np.nan] * 3, 1)) == ()
     assert ask([0, 0, 400], nothing, measured([1.5, 0, 400], 0.01)) == ()  # a ruler may be that far off
     (far,) = ask([0, 0, 400], nothing, measured([8, 0, 400], 0.05))
-    assert "(0, 0, 400) is 8 mm from where the cameras see the ball, (8, 0, 400)" in far
+    assert "(0, 0, 400) mm is 8 mm from where the cameras see the ball, (8, 0, 400) mm" in far
     assert "known to 0.05 mm" in far
     assert ask([0, 0, 400], nothing, measured([8, 0, 400], 2.0)) == ()  # they do not know it any better
     assert ask([0, 0, 400], [2.0] * 3, measured([8, 0, 400], 0.05)) == ()  # nor does the person

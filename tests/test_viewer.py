@@ -280,10 +280,10 @@ def test_how_far_every_rule_is_from_stopping() -> None:
     rule = (Below(1.2) & Within(1.3)) | Budget(60) | Never() | Below(0.5, "usual")
     state = State(history=(Step(9, 1.339, 0.5, 0.7, 1.456),))
     assert [text for text in snapped(state, [], rule=rule)["numbers"]["progress"] if text] == [
-        "1.34 of 1.20 mm everywhere",
-        "1.46 of 1.30 times what pixel noise leaves",
+        "1.34 mm everywhere; stop at 1.20 mm",
+        "1.46 times what pixel noise leaves; stop at 1.30",
         "9 of 60 points",
-        "0.700 of 0.500 mm in 95 % of the workspace",
+        "0.700 mm in 95 % of the workspace; stop at 0.500 mm",
     ]
     assert [text for text in snapped(State(), [], rule=rule)["numbers"]["progress"] if text] == ["0 of 60 points"]
 
@@ -292,6 +292,12 @@ def test_a_robot_goes_and_a_person_is_asked() -> None:
     state = aiming(look("left"))
     assert words.headline(state, True).title == "Point 3: press Go"
     assert words.headline(state, False).title == "Point 3: put the ball here"
+    planned = Target("p003", np.zeros(3), np.array([[300.0, 50.0]]))
+    assert words.headline(replace(state, target=planned), True).detail == "The robot takes the ball to the circle."
+    unplanned = replace(state, target=replace(planned, uv=np.full((1, 2), np.nan)))
+    assert "no circles yet" in words.headline(unplanned, True).detail
+    rough = replace(unplanned, rough=np.array([[300.0, 50, 20]]))
+    assert "dashed circles" in words.headline(rough, True).detail
     assert "enough" in words.headline(replace(state, stop="0.2 mm everywhere"), True).title
     for phase in ("starting", "aim", "moving", "shown", "fitting", "trouble", "done"):
         for moves in (True, False):
@@ -501,7 +507,7 @@ def test_a_whole_session_in_a_browser(tmp_path: Path, chromium: dict[str, Any]) 
                 visitor.reads("points · 1 skipped")
                 page.get_by_label("go on by itself").click()
                 visitor.reads("all 12 points of the budget are measured")
-                visitor.presses("Stop now")
+                visitor.presses("Finish")
                 visitor.reads("Done: the rig is calibrated")
                 here = command.url.partition("?")[0]
                 report = page.request.get(f"{here}report.html").text()

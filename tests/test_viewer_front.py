@@ -686,14 +686,18 @@ def test_a_port_in_use_is_said_and_how_to_help(front, behind):
     with pytest.raises(ImplicamError, match=f"port {front.port}") as caught:
         other.start()
     assert "in use" in caught.value.why
+    assert "Errno" not in caught.value.why
     assert "--port" in caught.value.fix
     other.close()
 
 
 @pytest.mark.parametrize(("host", "port"), [("192.0.2.7", 0), ("no-such-name.invalid", 0), ("127.0.0.1", 99_999)])
 def test_an_address_that_is_not_this_machine_is_said(behind, host, port):
-    with pytest.raises(ImplicamError, match="cannot be opened"):
+    with pytest.raises(ImplicamError, match="cannot be opened") as caught:
         Front(host=host, port=port, behind=behind.address, token=None, files={}).start()
+    if not port:
+        assert caught.value.why == f"{host} is no address or name of this computer"
+        assert "Close what" not in caught.value.fix
 
 
 def test_close_hangs_up_frees_the_port_and_ends_the_thread(behind, caplog):

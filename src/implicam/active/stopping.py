@@ -52,7 +52,7 @@ class Rule:
         raise NotImplementedError
 
     def progress(self, history: Sequence[Step], unit: str = "") -> str:
-        """How far it is from stopping, in words: "1.34 of 1.20 mm everywhere"; empty where there is nothing to say.
+        """How far it is from stopping, in words: "1.34 mm everywhere; stop at 1.20 mm"; or nothing.
 
         Args:
             history: The steps so far.
@@ -150,7 +150,8 @@ class Below(Rule):
         now = getattr(history[-1], self.of) if history else math.nan
         if not math.isfinite(now):
             return ""
-        return f"{decimal_number(now, 3)} of {decimal_number(self.value, 3)} {unit} {UNCERTAINTY_PLACES[self.of]}"
+        reached, wanted = (f"{decimal_number(value, 3)} {unit}".strip() for value in (now, self.value))
+        return f"{reached} {UNCERTAINTY_PLACES[self.of]}; stop at {wanted}"
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """Why to stop now: the uncertainty is small enough.
@@ -197,7 +198,7 @@ class Within(Rule):
             unit: Of lengths, for the words.
         """
         now = history[-1].excess if history else math.nan
-        return f"{now:.2f} of {self.times:.2f} times what pixel noise leaves" if math.isfinite(now) else ""
+        return f"{now:.2f} times what pixel noise leaves; stop at {self.times:.2f}" if math.isfinite(now) else ""
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """Why to stop now: pixel noise dominates.

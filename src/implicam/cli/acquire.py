@@ -161,12 +161,14 @@ def _acquire(
     """
     from implicam.session.folder import is_session, make_folder
     from implicam.session.setup import Setup, open_session, with_options
+    from implicam.viewer.front import check_address
 
     with_options(Setup(), **options)  # what is wrong with the words is said before anything is begun
     opencv()
     return_large_memory()
     if not unattended:
         import_extra("starlette", "viewer", "the page of implicam acquire")
+        check_address(host, port)  # before a folder is made
     if not is_session(folder):
         make_folder(folder)
     log = folder / LOG

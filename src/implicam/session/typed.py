@@ -166,14 +166,14 @@ def questions_before(xyz: Floats, unit: str, workspace: Workspace, target: Targe
     asked = []
     outside = float(np.max(workspace.normals @ xyz - workspace.offsets))
     if outside > OUTSIDE * workspace.size:
-        asked.append(f"{_words(xyz)} is {outside:.4g} {unit} outside of the workspace, {workspace.name} {unit}")
+        asked.append(f"{_words(xyz)} {unit} is {outside:.4g} {unit} outside of the workspace, {workspace.name} {unit}")
     if target is None:
         return tuple(asked)
     away = float(np.linalg.norm(xyz - target.xyz))
     if away > FAR_FROM_TARGET * workspace.size:
         asked.append(
-            f"{_words(xyz)} is {away:.4g} {unit} from the target {_words(target.xyz)}"
-            + _slip(xyz, target.xyz, 0.2 * away)
+            f"{_words(xyz)} {unit} is {away:.4g} {unit} from the target {_words(target.xyz)} {unit}"
+            + _slip(xyz, target.xyz, 0.2 * away, unit)
         )
     return tuple(asked)
 
@@ -202,8 +202,9 @@ def questions_after(
     if away <= max(FAR_SDS * own, FAR_FROM_MEASURED * workspace.size):
         return ()
     return (
-        f"{_words(xyz)} is {away:.3g} {unit} from where the cameras see the ball, {_words(measured.xyz[0])}, "
-        f"which is known to {own:.2g} {unit} in that direction" + _slip(xyz, measured.xyz[0], 0.2 * away),
+        f"{_words(xyz)} {unit} is {away:.3g} {unit} from where the cameras see the ball, "
+        f"{_words(measured.xyz[0])} {unit}, which is known to {own:.2g} {unit} in that direction"
+        + _slip(xyz, measured.xyz[0], 0.2 * away, unit),
     )
 
 
@@ -211,7 +212,7 @@ def _words(xyz: Floats) -> str:
     return "(" + ", ".join(f"{value:.6g}" for value in xyz) + ")"
 
 
-def _slip(xyz: Floats, where: Floats, near: float) -> str:
+def _slip(xyz: Floats, where: Floats, near: float, unit: str) -> str:
     """The one slip of a person that explains a position, in words; empty where none does, to within `near`."""
     tries = [(f"{axis} had the other sign", np.where(np.arange(3) == i, -xyz, xyz)) for i, axis in enumerate("xyz")]
     for i, j in combinations(range(3), 2):
@@ -221,7 +222,7 @@ def _slip(xyz: Floats, where: Floats, near: float) -> str:
     tries += [(f"it were {words}", xyz * factor) for factor, words in _SCALES.items()]
     best, moved = min(tries, key=lambda one: float(np.linalg.norm(one[1] - where)))
     left = float(np.linalg.norm(moved - where))
-    return f"; if {best}, it would be {left:.3g} away" if left <= near else ""
+    return f"; if {best}, it would be {left:.3g} {unit} from there" if left <= near else ""
 
 
 _SCALES = {0.1: "a tenth", 10.0: "ten times as much", 0.001: "a thousandth", 1000.0: "a thousand times as much"}

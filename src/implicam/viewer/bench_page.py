@@ -78,6 +78,9 @@ class BenchPage:
         self._asks = robot.alone and not controller.equipment.dry_run and not getattr(robot, "simulated", False)
         if self._asks:
             robot.ask_before_moving(self._may_move)
+        pulsed = controller.equipment.trigger is not None and controller.equipment.pulse_every > 0
+        free = controller.equipment.trigger is None and all(s.live for s in controller.equipment.cameras)
+        self._live_pictures = pulsed or free
         self._names = [source.name for source in controller.equipment.cameras]
         self._worker = Worker(controller, self._complain)
         self._running = True
@@ -240,7 +243,7 @@ class BenchPage:
             text = "\n".join((*error.questions, "", error.fix))
             asked = {
                 "number": secrets.token_urlsafe(8),
-                "title": error.what,
+                "title": f"{error.what[:1].upper()}{error.what[1:]}",
                 "text": text,
                 "yes": "It is",
                 "no": "Correct",
@@ -286,6 +289,8 @@ class BenchPage:
         for row in found["cameras"]:
             look = looks.get(row["name"])
             if look is None or look.frame is None:
+                if not self._live_pictures and state.phase == "aim" and row["kind"] != "bad":
+                    row["reason"] = f"a picture comes with “{found['buttons']['go']['label']}”"
                 continue
             number, picture = self._pictures.get(row["name"], (0, None))
             if look.frame.picture is not picture:

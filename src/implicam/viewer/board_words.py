@@ -92,7 +92,7 @@ def board_snapshot(state: BoardState, cameras: Sequence[str], rule: Rule, *, uni
     following = "finish" if state.stop or state.phase == "done" else "go" if state.phase != "fitting" else ""
     go = {"trouble": "Try again", "done": "Take more"}.get(state.phase, "Take it now")
     worst = state.history[-1].worst if state.history else np.nan
-    finish = "Close the session" if state.phase == "done" else "Stop now"
+    finish = "Close the session" if state.phase == "done" else "Finish"
     if np.isfinite(worst) and state.phase != "done":
         finish += f": {number(worst, 2)} {unit} everywhere"
     labels = {"go": go, "finish": finish, "skip": "Another pose"}

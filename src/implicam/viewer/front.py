@@ -18,6 +18,7 @@ The rules are those of RFC 9112 (HTTP/1.1), RFC 6455 (WebSocket), RFC 6265 (cook
 from __future__ import annotations
 
 import asyncio
+import errno
 import hashlib
 import ipaddress
 import mimetypes
@@ -551,6 +552,21 @@ def _own_address() -> str:
     return socket.gethostname()
 
 
+def check_address(host: str, port: int) -> None:
+    """Refuse an address on which no page can be opened, before anything is made for it.
+
+    Args:
+        host: What to listen on.
+        port: 0 for any free one.
+
+    Raises:
+        ImplicamError: The port is taken, or the host is not this machine.
+
+    >>> check_address("127.0.0.1", 0)
+    """
+    _listen(host, port).close()
+
+
 def _listen(host: str, port: int) -> socket.socket:
     """A listening socket. ImplicamError where there cannot be one."""
     where = "127.0.0.1" if host == "localhost" else host
@@ -562,9 +578,22 @@ def _listen(host: str, port: int) -> socket.socket:
         family = socket.getaddrinfo(where or "0.0.0.0", port, type=socket.SOCK_STREAM)[0][0]
         return socket.create_server((where, port), family=family, backlog=MAX_CLIENTS)
     except OSError as error:
+        why, fix = _why_not(error, host)
         raise ImplicamError(
             f"The page cannot be opened on {host or 'all addresses'}, port {port}.",
-            why=str(error),
-            fix="Close what uses the port (perhaps another session), or choose another with --port"
-            + ("." if _is_this_machine(host) else "; the host must be an address or a name of this machine."),
+            why=why,
+            fix=fix,
         ) from error
+
+
+def _why_not(error: OSError, host: str) -> tuple[str, str]:
+    """Why an address cannot be listened on, and how to help."""
+    if error.errno == errno.EADDRINUSE:
+        return "the port is in use", "Close what uses it (perhaps another session), or choose another with --port."
+    if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+        return f"{host} is no address or name of this computer", (
+            "Give one that it has, 0.0.0.0 for all of them, or leave --host out: then it opens on this computer only."
+        )
+    if error.errno == errno.EACCES:
+        return "the system does not let you use this port", "Choose one from 1024 on with --port."
+    return error.strerror or str(error), "Choose another port with --port, or another address with --host."

@@ -54,7 +54,7 @@ def _aim(state: State, point: str, moves: bool) -> Headline:
     if state.auto:
         return Headline(f"{point}: by itself", "The next target is gone to without asking.", "busy")
     if moves:
-        return Headline(f"{point}: press Go", "The robot takes the ball to the circle.", "ask")
+        return Headline(f"{point}: press Go", f"The robot takes the ball {_where_it_goes(state)}.", "ask")
     if not np.isfinite(state.target.uv).any() and np.isfinite(state.rough).any():
         return Headline(
             f"{point}: put the ball here",
@@ -66,6 +66,13 @@ def _aim(state: State, point: str, moves: bool) -> Headline:
             f"{point}: put the ball here", "Measure its way there, and say where it is. No circles yet.", "ask"
         )
     return Headline(f"{point}: put the ball here", "Into the circle in every picture; then say where it is.", "ask")
+
+
+def _where_it_goes(state: State) -> str:
+    """Of a robot: what there is to see of the target in the pictures."""
+    if state.target is not None and np.isfinite(state.target.uv).any():
+        return "to the circle"
+    return "into the dashed circles" if np.isfinite(state.rough).any() else "there; no circles yet"
 
 
 def way(here: Floats, there: Floats, unit: str) -> dict[str, Any]:
@@ -136,7 +143,7 @@ def labels(state: State, moves: bool, unit: str) -> dict[str, str]:
         return {"go": go, "finish": "Close the session"}
     worst = state.history[-1].worst if state.history else np.nan
     reached = f": {number(worst, 2)} {unit} everywhere" if np.isfinite(worst) else ""
-    return {"go": go, "finish": f"Stop now{reached}"}
+    return {"go": go, "finish": f"Finish{reached}"}
 
 
 def trouble_of(state: State, camera: str) -> str:

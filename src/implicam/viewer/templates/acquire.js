@@ -6,7 +6,7 @@ import {drawReach} from "./reach.js";
 const by = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 const KEYS = {g: "go", a: "accept", r: "redo", s: "skip", u: "undo", f: "finish"};
-const LABELS = {go: "Go", accept: "Accept", redo: "Redo", skip: "Skip", undo: "Undo", finish: "Stop now"};
+const LABELS = {go: "Go", accept: "Accept", redo: "Redo", skip: "Skip", undo: "Undo", finish: "Finish"};
 const LOST_MS = 6000, LOUPE_RADII = 4, ON_TARGET_PX = 12, GAP_PX = 8;
 
 let about = null, state = null, scene = null, world = null, heard = Date.now(), dismissed = new Set();
@@ -37,9 +37,15 @@ async function ask(path, body) {
 // ------------------------------------------------------------------------------------------------- what people do
 
 const own = [];  // complaints of this page, beside those of the session
-function complain(problem) {
-  own.push({number: `own${own.length}`, ...problem});
+let complained = 0;
+function complain(problem, word = "") {
+  own.push({number: `own${complained++}`, word, ...problem});
   while (own.length > 3) own.shift();
+  drawComplaints();
+}
+
+function takeBack(word) {  // what was wrong with the last try is mended by a good one
+  own.splice(0, own.length, ...own.filter((one) => one.word !== word));
   drawComplaints();
 }
 
@@ -51,11 +57,13 @@ async function press(word, more = {}) {
   if (word === "go" && !about.moves && state.phase === "aim") more = {xyz: ["x", "y", "z"].map((axis) => by(axis).value), ...more};
   try {
     const answer = await ask("api/do", {word, ...more});
+    takeBack(word);
     if (answer.ask) question(answer.ask, (yes) => press(word, {...more, ...yes}));
-  } catch (problem) { complain(problem); }
+  } catch (problem) { takeBack(word); complain(problem, word); }
   drawButtons();
 }
 
+// buttons: label, what it does, and "next" for the one that has the focus: Enter must not do what cannot be undone.
 function dialog(title, text, buttons, pictures = []) {
   by("ask-pictures").replaceChildren(...pictures.map(([name, url]) => {
     const figure = document.createElement("figure"), image = document.createElement("img");
@@ -74,15 +82,16 @@ function dialog(title, text, buttons, pictures = []) {
     return button;
   }));
   by("ask").showModal();
+  by("ask-buttons").querySelector(".next")?.focus();
 }
 
 const question = (asked, go) => dialog(asked.title, asked.text, [
-  [asked.yes, () => go({yes: asked.number}), "next"], [asked.no ?? "Do not", null]]);
+  [asked.yes, () => go({yes: asked.number})], [asked.no ?? "Do not", null, "next"]]);
 
 function skip() {
   if (about.boards) { press("skip"); return; }
   dialog("Skip this target: why?", "It is not proposed again.",
-    [...about.reasons.map((reason) => [reason, () => press("skip", {reason})]), ["do not skip", null, "next"]]);
+    [...about.reasons.map((reason) => [sentence(reason), () => press("skip", {reason})]), ["Do not skip", null, "next"]]);
 }
 
 function key(event) {
@@ -129,6 +138,7 @@ function draw() {
   }
 }
 
+const sentence = (words) => words.slice(0, 1).toUpperCase() + words.slice(1);
 const place = (xyz) => `${["x", "y", "z"].map((axis, i) => `${axis} ${number(xyz[i], 4)}`).join(", ")} ${about.unit}`;
 
 function drawButtons() {
@@ -358,7 +368,7 @@ function drawNumbers() {
       : [about.boards ? " · no calibration yet: each camera is shown what it has not seen" : " · no calibration yet: the first places are spread evenly"]));
   by("meaning").hidden = !usual;
   by("rules").replaceChildren(...progress.filter(Boolean).map((words) =>
-    Object.assign(document.createElement("li"), {textContent: `stop at: ${words}`})));
+    Object.assign(document.createElement("li"), {textContent: words})));
   if (state.phase !== "done") return;
   const link = (href, text, attributes) => Object.assign(document.createElement("a"), {href, textContent: text, ...attributes});
   by("files").replaceChildren(link("calibration.implicam", "Download the calibration", {download: ""}),
@@ -407,12 +417,12 @@ function listBoards(rows) {
   by("points").replaceChildren(table);
 }
 
-const lookAt = (row) => dialog(row.name, row.words ?? place(row.xyz), [["close", null, "next"]], about.cameras.map(({name}) =>
+const lookAt = (row) => dialog(row.name, row.words ?? place(row.xyz), [["Close", null, "next"]], about.cameras.map(({name}) =>
   [name, `kept.jpg?camera=${encodeURIComponent(name)}&point=${encodeURIComponent(row.name)}`]));
 const remove = (row) => dialog(`Delete ${row.name}?`, "It is kept in the session as undone, and its pictures in undone/.",
-  [["Delete", () => press("delete", {point: row.name})], ["keep it", null, "next"]]);
+  [["Delete", () => press("delete", {point: row.name})], ["Keep it", null, "next"]]);
 const again = (row) => dialog(`Measure ${row.name} again?`, "It is taken back, and its place is the next target.",
-  [["Measure it again", () => press("again", {point: row.name})], ["keep it", null, "next"]]);
+  [["Measure it again", () => press("again", {point: row.name})], ["Keep it", null, "next"]]);
 
 async function refreshCurve() {
   curveNumber = state.curve;
