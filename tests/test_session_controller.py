@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+import implicam as ic
 from implicam import load_calibration, read_dataset
 from implicam.active import Step
 from implicam.detect import Ball, Detected
 from implicam.errors import FitError, HardwareError, ImplicamError, UsageError
 from implicam.hardware import Person
 from implicam.session import Session
-from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, Equipment, SessionController
+from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, Equipment, SessionController, find_suspects
 from implicam.session.setup import Setup, open_session, with_options
 
 pytestmark = pytest.mark.usefixtures("looks_kept")
@@ -263,6 +264,38 @@ def test_nothing_moves_after_stop_until_somebody_says_go(controller: SessionCont
     controller.retry()
     controller.go()
     assert controller.state.phase == "shown"
+
+
+def test_a_stop_while_pictures_are_taken_leaves_the_point_to_a_person(
+    controller: SessionController, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take = controller._take_pictures
+
+    def stopped_meanwhile(where: Any, **more: Any) -> None:
+        controller.stop_robot()
+        assert controller.state.stopped
+        take(where, **more)
+
+    monkeypatch.setattr(controller, "_take_pictures", stopped_meanwhile)
+    controller.set_auto(True)
+    controller.step()
+    assert (controller.state.phase, controller.state.auto, controller.loop.points) == ("shown", False, 0)
+    controller.accept()
+    assert (controller.loop.points, controller.state.stopped) == (1, True)
+    monkeypatch.undo()
+    controller.go()
+    assert not controller.state.stopped
+
+
+def test_a_known_point_that_is_elsewhere_is_named_with_how_far() -> None:
+    right = ic.simulated("stereo", points=14, seed=3)
+    assert find_suspects(ic.ForwardGP().fit(right), right) == ()
+    xyz = right.xyz.copy()
+    xyz[2] += [0, 0, 60.0]  # a block too many under it
+    wrong = replace(right, known=replace(right.positions, xyz=xyz))
+    ((name, far),) = find_suspects(ic.ForwardGP().fit(wrong), wrong)
+    assert (name, round(far)) == (right.points[2], 60)
+    assert find_suspects(None, wrong) == ()
 
 
 def test_a_stop_that_fails_still_ends_what_goes_by_itself(

@@ -288,6 +288,26 @@ def test_how_far_every_rule_is_from_stopping() -> None:
     assert [text for text in snapped(State(), [], rule=rule)["numbers"]["progress"] if text] == ["0 of 60 points"]
 
 
+def test_done_says_what_the_report_says() -> None:
+    done = State(
+        phase="done", verdict=("Off by 17 mm rms. The error bars are too small.", "bad"), suspects=(("p003", 60.0),)
+    )
+    said = words.headline(done, False)
+    assert (said.kind, said.title) == ("bad", "Calibrated, but do not rely on it yet")
+    assert "17 mm rms" in said.detail
+    assert "p003 (60 mm off)" in said.detail
+    assert words.headline(replace(done, verdict=("Fine.", "good"), suspects=()), False).kind == "good"
+    assert words.headline(State(phase="done"), False).kind == "ask"
+
+
+def test_a_point_that_is_elsewhere_and_a_stop_stand_in_the_headline() -> None:
+    state = aiming(look("left"), suspects=tuple((f"p{i:03d}", 60.0 - i) for i in range(5)))
+    assert "p002 (58 mm off) and 2 more" in words.headline(state, False).detail
+    assert "p001" not in words.headline(replace(state, phase="fitting"), False).detail
+    assert "nothing moves until Go" in words.headline(replace(state, stopped=True), True).detail
+    assert words.headline(replace(state, stopped=True, phase="moving"), True).title == "Stopped"
+
+
 def test_a_robot_goes_and_a_person_is_asked() -> None:
     state = aiming(look("left"))
     assert words.headline(state, True).title == "Point 3: press Go"

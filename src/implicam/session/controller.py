@@ -82,6 +82,10 @@ all of it in "history"."""
 MAX_ROUGH_POINTS = 12
 """Known points from which a camera that is not calibrated yet is looked at roughly: the last ones."""
 
+SUSPECT_SQUARED_ERROR, SUSPECT_MEDIANS = 40.0, 5.0
+"""A known point is looked at again where its squared error in standard deviations is larger, which chance leaves of one
+in 10^8, and its distance so many times that of the others."""
+
 MIN_REPORTED_POINTS = 12
 """Known points from which a report by cross-validation says anything."""
 
@@ -124,7 +128,9 @@ class State:
 
     message: what to do now, or what went wrong. position: (3,) where the robot says the ball is, or what the person
     typed; NaN where unknown. typed: what the person typed, as it was understood. looks: the pictures that are being
-    judged (phase shown) or live. stop: why to stop now.
+    judged (phase shown) or live. stop: why to stop now. stopped: a person has stopped the robot, and nothing moves
+    until `go`. suspects: accepted points that are not where the calibration measures them, with how far they are off.
+    verdict: the report in one sentence, and its tone: "good", "bad", "careful" or "unknown".
     """
 
     phase: str = "starting"
@@ -141,6 +147,9 @@ class State:
     data: Dataset | None = None
     problem: ImplicamError | None = None
     auto: bool = False
+    stopped: bool = False
+    suspects: tuple[tuple[str, float], ...] = ()
+    verdict: tuple[str, str] = ("", "")
     report: Path | None = None
     version: int = 0
 
@@ -197,6 +206,7 @@ class SessionController:
     def go(self) -> None:
         """Send the robot to the target, and take pictures. UsageError where a person moves the ball."""
         self._halted.clear()
+        self._show(stopped=False)
         self._move()
 
     def _move(self) -> None:
@@ -334,7 +344,7 @@ class SessionController:
     def stop_robot(self) -> None:
         """Stop the robot at once, from any thread; automatic mode ends, and nothing moves until `go`."""
         self._halted.set()
-        self._show(auto=False)
+        self._show(auto=False, stopped=self.equipment.robot.moves)
         end = time.monotonic() + STOP_REPEAT_SECONDS
         try:
             self.equipment.robot.stop()
@@ -374,11 +384,13 @@ class SessionController:
             )
         if auto:
             self._halted.clear()
-        self._show(auto=auto)
+        self._show(auto=auto, stopped=self.state.stopped and not auto)
 
     def finish(self) -> Path:
         """Calibrate with everything, save and report; the calibration's file, which is not there after trouble."""
         from implicam.report import report_of, write_report
+        from implicam.report.words import headline
+        from implicam.report.words import verdict as judgement
 
         path = self.session.folder / CALIBRATION_FILE
         with self._working("fitting", "calibrating, and writing the report"):
@@ -392,16 +404,22 @@ class SessionController:
             calibration.save(path)
             report = self.session.folder / REPORT_FILE
             report.unlink(missing_ok=True)  # it may be of an earlier calibration
-            words = f"{self.loop.points} points. Saved: {path}"
+            words, verdict = f"{self.loop.points} points. Saved: {path}", ("", "unknown")
             try:
                 if len(calibration.data) >= MIN_REPORTED_POINTS:
                     title = f"{self.session.name}: a guided calibration"
-                    write_report(report, report_of(_evaluate(calibration), title, calibration_file.checksum(path)))
+                    data = report_of(_evaluate(calibration), title, calibration_file.checksum(path))
+                    write_report(report, data)
+                    about_bars, _, tone = judgement(data)
+                    verdict = f"{headline(data)} {about_bars}", tone
                     words += f" and {report}"
             except ImplicamError as error:
                 words += f". No report: {error.what}"
             self.session.log("finished", points=self.loop.points)
-            self._show(phase="done", message=words, report=report if report.exists() else None, target=None, auto=False)
+            self._show(
+                phase="done", message=words, report=report if report.exists() else None, target=None, auto=False,
+                verdict=verdict, suspects=find_suspects(calibration, calibration.data),
+            )  # fmt: skip
         return path
 
     def run(self, progress: Progress = silent) -> Path | None:
@@ -429,8 +447,8 @@ class SessionController:
         ball it stops: something is wrong."""
         if self.state.phase == "aim":
             self._move()
-        if self.state.phase != "shown":
-            return
+        if self.state.phase != "shown" or self._halted.is_set():
+            return  # stopped while the pictures were taken: a person judges them
         if self.state.cameras_with_ball:
             self.accept()
             return
@@ -587,6 +605,7 @@ class SessionController:
         self._show(
             data=data, calibration=self.loop.calibration, predicted=self.loop.predicted,
             history=tuple(self.loop.history), stop=self.loop.stop,
+            suspects=find_suspects(self.loop.calibration, data),
         )  # fmt: skip
 
     def _correct_outlines(self, data: Dataset) -> Dataset:
@@ -757,6 +776,31 @@ def _read_history(session: Session) -> list[Step]:
         return [steps[points] for points in sorted(steps) if points <= kept]
     except (TypeError, KeyError, AttributeError):  # another version's: the curve begins anew
         return []
+
+
+def find_suspects(calibration: Calibration | None, data: Dataset | None) -> tuple[tuple[str, float], ...]:
+    """Known points that cannot be where they are said to be: far from where the calibration measures them.
+
+    Args:
+        calibration: Fitted to them; None: there is none yet.
+        data: The known points.
+
+    Returns:
+        Name and distance in the length unit of each, the farthest first.
+    """
+    if calibration is None or data is None:
+        return ()
+    measured = calibration.measure(data.observations)
+    there = np.flatnonzero(measured.measured)
+    off = measured.xyz[there] - data.xyz[there]
+    stated = np.nan_to_num(data.positions.sd[there])
+    square = np.einsum(
+        "ni,nij,nj->n", off, np.linalg.inv(measured.cov[there] + stated[:, :, None] ** 2 * np.eye(3)), off
+    )
+    far = np.linalg.norm(off, axis=1)
+    wrong = (square > SUSPECT_SQUARED_ERROR) & (far > SUSPECT_MEDIANS * np.median(far)) if len(far) else square > 0
+    found = [(str(data.points[i]), float(d)) for i, d in zip(there[wrong], far[wrong], strict=True)]
+    return tuple(sorted(found, key=lambda one: -one[1]))
 
 
 def _evaluate(calibration: Calibration) -> Any:

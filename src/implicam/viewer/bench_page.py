@@ -156,8 +156,8 @@ class BenchPage:
             self._yes.clear()
             self._allowed = None
             return controller.retry
-        if word == "go" and not self._moves:
-            return self._report_position(given)
+        if not self._moves and (word == "go" or (word == "redo" and given.get("xyz", given.get("yes")) is not None)):
+            return self._report_position(given)  # a typing mistake that is seen in the pictures is corrected by `redo`
         if word == "go" and self._asks:
             return self._ask_for_move(given)
         if word in ("delete", "again"):

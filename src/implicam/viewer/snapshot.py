@@ -35,7 +35,7 @@ def snapshot(
         skipped: How many targets were left out.
     """
     state = words.current(state)
-    head = words.headline(state, moves)
+    head = words.headline(state, moves, unit)
     problem = state.problem if state.phase == "trouble" else None
     looks = {look.camera: look for look in state.looks}
     target = state.target

@@ -26,8 +26,44 @@ class Headline:
     kind: str
 
 
-def headline(state: State, moves: bool) -> Headline:
-    """What to do now. moves: whether a robot moves the ball, or a person."""
+MAX_SUSPECTS_NAMED = 3
+
+
+def headline(state: State, moves: bool, unit: str = "mm") -> Headline:
+    """What to do now.
+
+    Args:
+        state: Of the controller.
+        moves: Whether a robot moves the ball, or a person.
+        unit: Of lengths.
+    """
+    said = _headline(state, moves)
+    doubts = _suspects(state, unit) if state.phase in ("aim", "shown", "done") else ""
+    stopped = "Stopped by hand: nothing moves until Go." if state.stopped and state.phase in ("aim", "shown") else ""
+    detail = " ".join(filter(None, (stopped, said.detail, doubts)))
+    return replace(said, detail=detail, kind="bad" if doubts and said.kind == "good" else said.kind)
+
+
+def _suspects(state: State, unit: str) -> str:
+    """Points that are not where they are said to be, in a sentence."""
+    named = state.suspects[:MAX_SUSPECTS_NAMED]
+    if not named:
+        return ""
+    more = f" and {len(state.suspects) - len(named)} more" if len(state.suspects) > len(named) else ""
+    points = ", ".join(f"{name} ({number(far, 2)} {unit} off)" for name, far in named)
+    return f"Not where the cameras measure it: {points}{more}. Measure it again, or delete it, in the list of points."
+
+
+def _done(state: State) -> Headline:
+    told, tone = state.verdict
+    if tone == "bad":
+        return Headline("Calibrated, but do not rely on it yet", told, "bad")
+    if told:
+        return Headline("Done: the rig is calibrated", told, "good" if tone == "good" else "ask")
+    return Headline("Calibrated, and not checked", "Too few known points to hold some of them out.", "ask")
+
+
+def _headline(state: State, moves: bool) -> Headline:
     found = f"Found in {len(state.cameras_with_ball)} of {len(state.looks)} cameras"
     point = f"Point {state.target.name.lstrip('p0') or '?'}" if state.target is not None else "No target"
     if state.phase == "aim":
@@ -37,12 +73,15 @@ def headline(state: State, moves: bool) -> Headline:
     if state.phase == "trouble":
         problem = state.problem
         return Headline("Something needs you", problem.what if problem is not None else state.message, "bad")
+    if state.phase == "moving" and state.stopped:
+        return Headline("Stopped", "The robot was stopped by hand; what was begun comes to its end.", "bad")
+    if state.phase == "done":
+        return _done(state)
     if state.phase == "moving":
         return Headline(f"{point}: the robot moves …" if moves else f"{point}: looking …", "", "busy")
     return {
         "shown": Headline(f"{found}: accept?", "Accept keeps the point; redo looks again.", "good"),
         "fitting": Headline("Calculating …", state.message, "busy"),
-        "done": Headline("Done: the rig is calibrated", "", "good"),
     }.get(state.phase, Headline("Connecting …", state.message, "busy"))
 
 

@@ -10,7 +10,7 @@ const LABELS = {go: "Go", accept: "Accept", redo: "Redo", skip: "Skip", undo: "U
 const LOST_MS = 6000, LOUPE_RADII = 4, ON_TARGET_PX = 12, GAP_PX = 8;
 
 let about = null, state = null, scene = null, world = null, heard = Date.now(), dismissed = new Set();
-let sceneNumber = -1, curveNumber = -1, chosen = 0, typed = null, questioned = null, listed = null, closed = false, fetching = false;
+let sceneNumber = -1, curveNumber = -1, chosen = 0, typed = null, questioned = null, listed = null, closed = false, fetching = false, lastTexts = "";
 window.implicam = {get state() { return state; }, get scene() { return scene; }, get world() { return world; }};
 
 const number = (value, digits = 3) => Number.isFinite(value) ? String(Number(value.toPrecision(digits))) : "–";
@@ -54,7 +54,12 @@ async function press(word, more = {}) {
     try { await ask("api/stop", {}); } catch (problem) { complain(problem); }
     return;
   }
-  if (word === "go" && !about.moves && state.phase === "aim") more = {xyz: ["x", "y", "z"].map((axis) => by(axis).value), ...more};
+  const texts = ["x", "y", "z"].map((axis) => by(axis).value);
+  const corrected = word === "redo" && texts.every(Boolean) && texts.join("|") !== lastTexts;  // a typing mistake, seen late
+  if (!about.moves && (corrected || (word === "go" && state.phase === "aim"))) {
+    more = {xyz: texts, ...more};
+    lastTexts = texts.join("|");
+  }
   try {
     const answer = await ask("api/do", {word, ...more});
     takeBack(word);
@@ -134,7 +139,7 @@ function draw() {
   if (state.curve !== curveNumber) refreshCurve();
   if (state.question && state.question.number !== questioned && !by("ask").open) {
     questioned = state.question.number;
-    question(state.question, (yes) => press("go", yes));
+    question(state.question, (yes) => press(state.phase === "shown" ? "redo" : "go", yes));
   }
 }
 
