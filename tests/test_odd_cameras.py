@@ -36,7 +36,7 @@ from implicam.simulate import (
     write_rig,
 )
 from implicam.simulate.camera import random_error
-from implicam.simulate.photographs import PADDING_PX, lines_of_sight
+from implicam.simulate.photographs import PADDING_PX, LinesOfSight
 
 NO_ERROR = random_error(np.random.default_rng(0), 1280, 1024, 0.0)
 ALL_ODD = Unusual(tilt=8.0, mirror="cam1", aspect=1.3, window=12.0)
@@ -330,7 +330,7 @@ def test_wrong_usage_is_told(make: object, message: str) -> None:
 
 def test_lines_of_sight_are_those_of_the_camera() -> None:
     view = build_rig("bar6", seed=2, unusual=Unusual(tilt=10.0, mirror="all", aspect=0.8)).cameras[1]
-    directions = lines_of_sight(view)
+    directions = LinesOfSight(view).at(0, view.height + 2 * PADDING_PX, 0, view.width + 2 * PADDING_PX)
     rng = np.random.default_rng(0)
     u, v = rng.integers(0, view.width, 500), rng.integers(0, view.height, 500)
     along = directions[v + PADDING_PX, u + PADDING_PX].astype(float)
