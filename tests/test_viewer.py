@@ -306,6 +306,7 @@ def test_a_point_that_is_elsewhere_and_a_stop_stand_in_the_headline() -> None:
     assert "p001" not in words.headline(replace(state, phase="fitting"), False).detail
     assert "nothing moves until Go" in words.headline(replace(state, stopped=True), True).detail
     assert words.headline(replace(state, stopped=True, phase="moving"), True).title == "Stopped"
+    assert "yet: 7 views agree." in words.headline(replace(state, uncalibrated="7 views agree."), False).detail
 
 
 def test_a_robot_goes_and_a_person_is_asked() -> None:

@@ -130,7 +130,8 @@ class State:
     typed; NaN where unknown. typed: what the person typed, as it was understood. looks: the pictures that are being
     judged (phase shown) or live. stop: why to stop now. stopped: a person has stopped the robot, and nothing moves
     until `go`. suspects: accepted points that are not where the calibration measures them, with how far they are off.
-    verdict: the report in one sentence, and its tone: "good", "bad", "careful" or "unknown".
+    verdict: the report in one sentence, and its tone: "good", "bad", "careful" or "unknown". uncalibrated: why there is
+    no calibration, though there are points enough to try.
     """
 
     phase: str = "starting"
@@ -150,6 +151,7 @@ class State:
     stopped: bool = False
     suspects: tuple[tuple[str, float], ...] = ()
     verdict: tuple[str, str] = ("", "")
+    uncalibrated: str = ""
     report: Path | None = None
     version: int = 0
 
@@ -606,6 +608,7 @@ class SessionController:
             data=data, calibration=self.loop.calibration, predicted=self.loop.predicted,
             history=tuple(self.loop.history), stop=self.loop.stop,
             suspects=find_suspects(self.loop.calibration, data),
+            uncalibrated=self.loop.problem.what if self.loop.problem is not None and self.loop.calibration is None else "",
         )  # fmt: skip
 
     def _correct_outlines(self, data: Dataset) -> Dataset:

@@ -40,7 +40,11 @@ def headline(state: State, moves: bool, unit: str = "mm") -> Headline:
     said = _headline(state, moves)
     doubts = _suspects(state, unit) if state.phase in ("aim", "shown", "done") else ""
     stopped = "Stopped by hand: nothing moves until Go." if state.stopped and state.phase in ("aim", "shown") else ""
-    detail = " ".join(filter(None, (stopped, said.detail, doubts)))
+    why = state.uncalibrated if state.phase in ("aim", "shown") else ""
+    uncalibrated = (
+        f"No calibration yet: {why} Another point may help; a wrong one is deleted in the list." if why else ""
+    )
+    detail = " ".join(filter(None, (stopped, said.detail, doubts, uncalibrated)))
     return replace(said, detail=detail, kind="bad" if doubts and said.kind == "good" else said.kind)
 
 
