@@ -604,11 +604,12 @@ class SessionController:
                 unit = self.equipment.unit
                 _LOG.info("%d points: %.3g %s in 95 %% of the workspace", step.points, step.usual, unit)
             self.session.set(f"{HISTORY_KEY} {step.points}", json_safe(asdict(step)))
+        why = self.loop.problem.what if self.loop.problem is not None and self.loop.calibration is None else ""
         self._show(
             data=data, calibration=self.loop.calibration, predicted=self.loop.predicted,
             history=tuple(self.loop.history), stop=self.loop.stop,
             suspects=find_suspects(self.loop.calibration, data),
-            uncalibrated=self.loop.problem.what if self.loop.problem is not None and self.loop.calibration is None else "",
+            uncalibrated=why,
         )  # fmt: skip
 
     def _correct_outlines(self, data: Dataset) -> Dataset:
