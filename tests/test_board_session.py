@@ -17,18 +17,19 @@ from implicam.active.board_coverage import framing_of, is_new, unseen_framing, u
 from implicam.active.board_design import BoardDesign, BoardShape, board_pose
 from implicam.active.board_loop import BoardLoop, BoardTarget, Pictures
 from implicam.active.board_poses import POSE_COLUMN, KnownPose, KnownPosesLoop, described, poses_from, poses_of
-from implicam.active.stopping import Step
+from implicam.active.stopping import Step, Within
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
 from implicam.dataset.boards import corner_positions
 from implicam.detect import Charuco, View
 from implicam.detect.sharpness import edge_width
-from implicam.errors import DatasetError, UsageError
+from implicam.errors import DatasetError, HardwareError, UsageError
 from implicam.geometry import Pose, look_at, rotation_from_vector, vector_from_rotation
 from implicam.hardware.simulated_hand import board_target, match_pose, simulated_hand
-from implicam.session.board_session import BoardController
+from implicam.session.board_session import BoardController, BoardState
 from implicam.session.journal import TARGET_KEY, Session
-from implicam.session.setup import Setup, open_session
+from implicam.session.setup import Setup, changes_to, open_session
 from implicam.simulate import build_rig, simulate, simulate_boards
+from implicam.viewer.board_words import CURE, headline
 
 BOARD = {"kind": "board", "rows": 5, "columns": 8, "square": 20.0}
 CHARUCO = Charuco(9, 12, 13.29, 10.0)
@@ -165,7 +166,9 @@ def test_the_loop_says_where_why_and_how_far(loop):
     assert target.pose is not None
     assert target.score > 0
     assert target.words.endswith("mm from it")
-    assert " would become " in target.why
+    assert "the typical uncertainty of a position (sd in 3D) would " in target.why
+    (first,) = BoardLoop(loop.calibrator, loop.shape, loop.cameras).ask()
+    assert first.why == "cam1 has seen no board at this place and tilt yet"
     for c, outline in enumerate(target.outlines):
         assert (outline is None) == np.isnan(target.corners[c]).all()
     progress = loop.camera_progress()
@@ -198,6 +201,37 @@ def test_a_board_more_is_predicted_before_it_is_fitted(loop, rig, eight):
     more.tell(boards_of_rig(rig, 9))
     assert [step.points for step in more.history] == [8, 9]
     assert more.history[-1].usual < before.usual
+    assert more.forecast
+
+
+def test_good_enough_is_said_from_a_fit_and_not_of_cameras_that_contradict_each_other(loop, rig, eight, monkeypatch):
+    found = loop.history[-1].excess
+    more = BoardLoop(loop.calibrator, loop.shape, loop.cameras, rule=Within(found - 1e-6) | Pictures(10))
+    more.data = eight
+    more.adopt(eight, loop.calibration)
+    more.tell(boards_of_rig(rig, 9))
+    assert more.history[-1].excess < found - 1e-6  # as expected of the ninth
+    assert not more.stop
+    more.rule = Within(found + 1e-6) | Pictures(9)
+    assert "times what pixel noise" in more.stop  # by the fit of eight
+    said = "cam1 and cam2 contradict each other on the 8 boards"
+    monkeypatch.setattr(type(loop.calibration), "contradictions", [said])
+    assert more.contradictions == (said,)
+    assert more.stop == "all 9 boards of the budget are taken"
+
+
+def test_the_page_says_at_once_that_cameras_contradict_each_other():
+    said = "cam1 and cam2 contradict each other on the 14 boards that both saw."
+    state = BoardState(phase="aim", stop="all 9 boards of the budget are taken", contradictions=(said,))
+    for one in (state, replace(state, phase="done")):
+        head = headline(one)
+        assert head.kind == "bad"
+        assert "contradict each other" in head.title
+        assert said in head.detail
+        assert CURE in head.detail
+        assert "ood enough" not in head.title + head.detail
+    failed = headline(replace(state, stop="", contradictions=(), unfitted="the cameras contradict each other."))
+    assert "The last fit failed: the cameras contradict" in failed.detail
 
 
 def test_pictures_are_counted_in_words():
@@ -240,6 +274,22 @@ def test_a_hand_follows_an_outline_and_its_board_is_read(rig):
     assert np.abs(seen.uv - true).max() < 0.1
 
 
+def test_a_set_of_pictures_is_of_one_place_however_long_it_takes(rig):
+    cameras, hand = simulated_hand(rig, CHARUCO.describe(), seed=1, seconds=0.2)
+    hand.put(Pose(np.eye(3), hand.pose().translation + np.array([30.0, 0.0, 0.0])))
+    first = hand.held(0)
+    time.sleep(0.05)
+    assert hand.held(1) is first  # though the hand is on its way
+    assert hand.held(1) is not first
+    time.sleep(0.2)
+    cameras[0].fail_for(1)
+    with pytest.raises(HardwareError):
+        cameras[0].frame()
+    later = hand.held(0)  # one that has failed has had its turn
+    assert not np.array_equal(later[0].translation, first[0].translation)
+    assert np.array_equal(later[0].translation, later[1].translation)
+
+
 # --- what a session keeps, and what it refuses ----------------------------------------------------------------------
 
 
@@ -275,6 +325,7 @@ def test_boards_at_unknown_places_are_kept_and_come_back(tmp_path, eight):
     ("options", "says"),
     [
         ({"target": "charcuo"}, "did you mean 'charuco'"),
+        ({"target": "checkerboard"}, "a plain checkerboard is board"),
         ({"target": "board", "board": "8x11"}, "size of the squares"),
         ({"target": "board", "board": "8x11", "square": 13290.0}, "no size for a board"),
         ({"target": "charuco", "tag": 3.0}, "no option --tag"),
@@ -288,6 +339,15 @@ def test_what_a_session_with_a_board_cannot_be(tmp_path, options, says):
         open_session(tmp_path / "s", Setup(rig="stereo", **options)).close()
     assert says in str(caught.value)
     assert caught.value.fix
+
+
+def test_a_session_knows_its_board_when_it_goes_on(tmp_path):
+    before = Setup(rig="stereo", target="charuco")
+    assert changes_to(tmp_path, before, {"square": 13.29, "budget": 9})["square"] is None
+    with pytest.raises(UsageError, match=r"was begun with square 13\.29"):
+        changes_to(tmp_path, before, {"square": 30.0})
+    with pytest.raises(UsageError, match="was begun with target charuco"):
+        changes_to(tmp_path, before, {"target": "board"})
 
 
 # --- known poses ------------------------------------------------------------------------------------------------------
@@ -495,6 +555,18 @@ def test_a_moving_or_a_blurred_board_is_refused_with_the_reason(tmp_path):
         judged = controller._judge(())
         assert not judged.ready
         assert judged.reason == "hold it still: it moves by 20 px"
+        controller.state = replace(controller.state, target=controller.loop.ask()[0], phase="aim")
+        places = [here["cam1"][1] + 2, here["cam1"][1]]  # by 2.8 px, which live pictures did not show
+        numbers = here["cam1"][0]
+        controller._take_frames = lambda trigger: []  # type: ignore[method-assign]
+        controller._detect_all = lambda frames, **_: ()  # type: ignore[method-assign]
+        controller._refusal = lambda looks, views: ""  # type: ignore[method-assign]
+        for asked in (False, True):
+            left = iter(places)
+            controller._views = lambda looks, left=left: {"cam1": (numbers, next(left))}  # type: ignore[method-assign]
+            controller._last = {"cam1": (numbers, here["cam1"][1])}
+            with pytest.raises(UsageError, match="it moved while the pictures were taken"):
+                controller._take(asked=asked)
         assert threading.active_count() < 50
     finally:
         controller.close()

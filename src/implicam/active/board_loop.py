@@ -22,7 +22,7 @@ from implicam.active.design_model import Bools, PredictedCovariance
 from implicam.active.loop import Target, summarise_step
 from implicam.active.stopping import Budget, Never, Rule, Step
 from implicam.active.workspace import Workspace
-from implicam.calibrators import Calibration, Calibrator, PredictsPixels
+from implicam.calibrators import Calibration, Calibrator, PredictsPixels, TellsContradictions
 from implicam.dataset import Camera, Dataset, Floats
 from implicam.dataset.boards import CORNER
 from implicam.errors import FitError, ImplicamError, UsageError
@@ -154,6 +154,7 @@ class BoardLoop:
         self._refused: list[tuple[Floats, str]] = []
         self._asked = 0
         self._framings: dict[tuple[str, str], Framing | None] = {}
+        self._fitted = 0  # boards of the last fit; what there is beyond is a forecast
         if self.data is not None:
             self.reset(self.data)
 
@@ -164,8 +165,27 @@ class BoardLoop:
         """Why to stop, in words; empty where not yet, or where a camera is not calibrated."""
         if self.data is None:
             return ""
-        spent = isinstance(self.rule, Never) or not self._cold()
-        return self.rule.met(self.history, self.data.length_unit) if spent else ""
+        return self._met() if isinstance(self.rule, Never) or not self._cold() else ""
+
+    def _met(self) -> str:
+        """Why to stop by the rule, in words: by what a fit has found, and not by what a board is expected to bring, nor
+        by uncertainties of cameras that contradict each other. Boards are counted, whatever they say."""
+        unit = "" if self.data is None else self.data.length_unit
+        fitted = [step for step in self.history if step.points <= self._fitted]
+        found = "" if self.contradictions else self.rule.met(fitted, unit)
+        counted = [Step(step.points, seconds=step.seconds) for step in self.history[-1:]]
+        return found or self.rule.met([*self.history[:-1], *counted], unit)
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """What the last fit says of cameras that contradict each other, in words; empty where they do not."""
+        found = self.calibration
+        return tuple(found.contradictions) if isinstance(found, TellsContradictions) else ()
+
+    @property
+    def forecast(self) -> bool:
+        """Whether the last step of the history is expected of a board that no fit has seen yet."""
+        return self._fitted < self.points
 
     @property
     def points(self) -> int:
@@ -235,6 +255,7 @@ class BoardLoop:
             data: The corners that it was fitted to; others may have come meanwhile.
             found: What it gave.
         """
+        self._fitted = len(_shots(data))
         self.problem = found if isinstance(found, ImplicamError) else None
         self.calibration = None if isinstance(found, ImplicamError) else found
         self.design = self._designed()
@@ -426,11 +447,13 @@ class BoardLoop:
         corners[c] = usual_pixels(pose.apply(self.shape.some()), size)
         rim = usual_pixels(pose.apply(_densified(self.shape.outline)), size)
         boards = self._boards(c)
-        why = f"{name} has seen {boards} of {MIN_BOARDS} boards, and none so"
+        why = f"{name} has seen no board at this place and tilt yet"
+        if 0 < boards < MIN_BOARDS:
+            why += f", and {boards} of the {MIN_BOARDS} boards that it needs"
         if boards >= MIN_BOARDS and self.calibration is not None:
             why = f"{name} shares no board with the others: hold it where another camera sees it too"
         elif boards >= MIN_BOARDS:
-            why = f"{name} has seen {boards} boards, and none so; the best are those that other cameras see too"
+            why += "; the best are boards that other cameras see too"
         words = ", ".join(
             part for part in (_third(framing.place, name), _tilted(framing.tilt), _near(framing.span)) if part
         )
@@ -468,7 +491,11 @@ class BoardLoop:
         with np.errstate(invalid="ignore", divide="ignore"):
             better = np.nan_to_num(known / later)
         helped = self._names[int(np.argmax(better))]
-        why = f"Of {CANDIDATES} poses it tells most, mostly about {helped}: {sd:.2g} {unit} would become {sd_then:.2g}"
+        before, then_too = f"{sd:.2g} {unit}", f"{sd_then:.2g} {unit}"
+        what = "the typical uncertainty of a position (sd in 3D)"
+        why = f"Of {CANDIDATES} poses it tells most, mostly about {helped}: {what} would go from {before} to {then_too}"
+        if before == then_too:
+            why = f"No board would tell much more: {what} would stay {before}"
         middle, none = pose.apply(self.shape.middle), np.zeros((0, 2))
         target = BoardTarget(f"p{self.points + 1:03d}", middle, none, gain, why=why, pose=pose)
         target = self._with_pixels(target, pose, seen)

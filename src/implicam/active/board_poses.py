@@ -154,7 +154,7 @@ class KnownPosesLoop(BoardLoop):
         spent = f"all {len(self.poses)} poses are taken" if not left else ""
         if left and self._skipped and all(one.name in self._skipped for one in left):
             spent = f"{len(self.poses) - len(left)} of {len(self.poses)} poses are taken, and the others left out"
-        return spent or self.rule.met(self.history, self.data.length_unit)
+        return spent or self._met()
 
     @property
     def predicted(self) -> PredictedCovariance | None:

@@ -16,6 +16,7 @@ from implicam.calibrators.protocol import (
     PredictsPixels,
     RigCalibration,
     TakesPoints,
+    TellsContradictions,
     Updatable,
 )
 from implicam.calibrators.registry import (
@@ -61,6 +62,7 @@ __all__ = [
     "Rejected",
     "RigCalibration",
     "TakesPoints",
+    "TellsContradictions",
     "Unused",
     "Updatable",
     "calibrator",

@@ -306,6 +306,16 @@ class TakesPoints(Calibration, Protocol):
         """
 
 
+@runtime_checkable
+class TellsContradictions(Calibration, Protocol):
+    """A calibration that knows of cameras that fit alone and not together: their pictures are not of the same instants,
+    or something moved."""
+
+    @property
+    def contradictions(self) -> list[str]:
+        """Which cameras, and by how much, in words; empty where all agree."""
+
+
 def option(help: str, metavar: str = "NAME", *, is_dataset: bool = False) -> dict[str, Any]:  # noqa: A002
     """The metadata of a calibrator's field that is an option of the command line.
 

@@ -160,10 +160,11 @@ def _acquire(
     Without cameras it shows the simulated rig. Every accepted point is on disk; run it again to go on.
     """
     from implicam.session.folder import is_session, make_folder
-    from implicam.session.setup import Setup, open_session, with_options
+    from implicam.session.setup import Setup, changes_to, open_session, with_options
     from implicam.viewer.front import check_address
 
-    with_options(Setup(), **options)  # what is wrong with the words is said before anything is begun
+    if not is_session(folder):
+        with_options(Setup(), **options)  # what is wrong with the words is said before anything is begun
     opencv()
     return_large_memory()
     if not unattended:
@@ -175,7 +176,8 @@ def _acquire(
     try:
         with _ended_by_sigterm(log), log_to_file(log, command_line()):
             before = _stored(folder)
-            setup = with_options(before or Setup(), **options)
+            changed = options if before is None else changes_to(folder, before, options)
+            setup = with_options(before or Setup(), **changed)
             if unattended and not setup.simulated:
                 raise UsageError(
                     "nothing is moved, and nobody is asked, while nobody looks.",

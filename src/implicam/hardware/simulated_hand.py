@@ -32,6 +32,9 @@ EXPOSURE_SECONDS = 0.01
 TREMOR_MM = 0.1
 """Sd of where a board is, along each axis, that a hand holds still."""
 
+MAX_SET_SECONDS = 2.0
+"""From the first camera that is asked for a picture to the last: later ones begin another set of pictures."""
+
 FOLLOWING_SHARE, FOLLOWING_DEG = 0.03, 3.0
 """Sds by which a hand misses an outline: of the distance from the camera, and turned."""
 
@@ -61,6 +64,9 @@ class SimulatedHand:
         self._from = self._to = first
         self._begun = -np.inf
         self._lock = threading.Lock()
+        self._held = (first, first)  # in the set of pictures that is being taken
+        self._set_begun = -np.inf
+        self._in_set: set[int] = set(range(len(rig.cameras)))  # the cameras that have been asked for theirs
 
     @property
     def _middle(self) -> Floats:
@@ -114,12 +120,26 @@ class SimulatedHand:
         middle = here + part * (there - here)
         return Pose(rotation, middle - rotation @ self._middle)
 
-    def held(self) -> tuple[Pose, Pose]:
-        """Where the board is when a picture begins, and when it ends."""
-        now = time.monotonic()
-        tremor = TREMOR_MM * self.rig.units_per_mm * self._rng.normal(size=3) if self.seconds > 0 else np.zeros(3)
-        first, last = self.pose(now), self.pose(now + EXPOSURE_SECONDS)
-        return Pose(first.rotation, first.translation + tremor), Pose(last.rotation, last.translation + tremor)
+    def held(self, camera: int) -> tuple[Pose, Pose]:
+        """Where the board is when a picture begins, and when it ends: one instant for one set of pictures, as if all
+        cameras were exposed together, however long this computer takes from one to the next.
+
+        Args:
+            camera: That takes the picture; one that has its picture of the set begins another.
+        """
+        with self._lock:
+            now = time.monotonic()
+            whole = len(self._in_set) == len(self.rig.cameras)
+            if whole or camera in self._in_set or now - self._set_begun > MAX_SET_SECONDS:
+                shake = TREMOR_MM * self.rig.units_per_mm if self.seconds > 0 else 0.0
+                tremor = shake * self._rng.normal(size=3)
+                self._held = tuple(  # type: ignore[assignment]
+                    Pose(pose.rotation, pose.translation + tremor)
+                    for pose in (self.pose(now), self.pose(now + EXPOSURE_SECONDS))
+                )
+                self._set_begun, self._in_set = now, set()
+            self._in_set.add(camera)
+            return self._held
 
 
 class BoardCamera:
@@ -155,6 +175,7 @@ class BoardCamera:
         Raises:
             HardwareError: The camera was told to fail.
         """
+        first, last = self.hand.held(self._camera)  # one that fails has had its turn, too
         if self._fails > 0:
             self._fails -= 1
             raise HardwareError(
@@ -162,7 +183,6 @@ class BoardCamera:
             )
         self._number += 1
         taken = time.time()
-        first, last = self.hand.held()
         picture = self._photograph(first)
         if np.abs(self._pixels(first) - self._pixels(last)).max(initial=0.0) > 0.3:
             middle = Pose(first.rotation, (first.translation + last.translation) / 2)

@@ -97,13 +97,18 @@ class Judgement(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class BoardState(State):
     """As `State`. judgement: of the board in the live pictures. cameras: how far each is. busy: whether the cameras are
-    being fitted meanwhile. off: pixels from the corners to the outline, NaN where that is not known."""
+    being fitted meanwhile. off: pixels from the corners to the outline, NaN where that is not known.
+    contradictions: what the last fit says of cameras that contradict each other. unfitted: why the last fit failed.
+    forecast: whether the last numbers are expected of boards that no fit has seen yet."""
 
     judgement: Judgement = field(default_factory=lambda: Judgement(False, ""))
     cameras: tuple[CameraProgress, ...] = ()
     busy: bool = False
     off: float = float("nan")
     taken: int = 0
+    contradictions: tuple[str, ...] = ()
+    unfitted: str = ""
+    forecast: bool = False
 
 
 class BoardController(SessionController):
@@ -345,25 +350,30 @@ class BoardController(SessionController):
             self.session.set(f"{HISTORY_KEY} {step.points}", json_safe(asdict(step)))
         self._show(
             data=loop.data, calibration=loop.calibration, predicted=loop.predicted, history=tuple(loop.history),
-            stop=loop.stop, cameras=tuple(loop.camera_progress()),
+            stop=loop.stop, cameras=tuple(loop.camera_progress()), contradictions=loop.contradictions,
+            unfitted="" if loop.problem is None else f"{loop.problem.what} To do: {loop.problem.fix}.",
+            forecast=loop.forecast,
         )  # fmt: skip
 
     def _take(self, *, asked: bool) -> None:
         """Take a set of pictures and keep it; UsageError with the reason where it is of no use."""
         target = self._require_target()
         assert isinstance(target, BoardTarget)
+        before = self._last
         with self._camera_lock:
+            if asked and self._each_when_it_likes:  # it may be elsewhere than at the last look
+                before = self._views(self._detect_all(self._take_frames(None)))
             frames = self._take_frames(self.equipment.trigger)
         looks = self._detect_all(frames)
         views = self._views(looks)
-        moved = _moved(self._last, views)
+        moved = _moved(before, views)
         why = self._refusal(looks, views)
         if not why and asked and target.known:
             worth = self.loop.worth(views, target)
             if np.isfinite(worth.share) and not worth.enough:
                 why = worth.reason
-        if not why and not asked and not moved <= 3 * STILL_PX:  # at the key it may be another place than the last look
-            why = "the board moved"
+        if not why and (self._each_when_it_likes or not asked) and not moved <= STILL_PX:
+            why = "it moved while the pictures were taken"
         if why:
             _LOG.info("%s not taken: %s", target.name, why)
             self._show(looks=looks, judgement=Judgement(False, why))
@@ -387,6 +397,12 @@ class BoardController(SessionController):
             self._show_loop()
             self._fit_behind()
             self._aim()
+
+    @property
+    def _each_when_it_likes(self) -> bool:
+        """Whether cameras take pictures by themselves, triggered by nothing: only of a board held still do these
+        show one place."""
+        return self._live and self.equipment.trigger is None
 
     def _judge(self, looks: Sequence[Look]) -> Judgement:
         """Of live pictures: whether to take one now."""

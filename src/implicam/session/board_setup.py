@@ -57,18 +57,12 @@ def board_detector(setup: Setup) -> Detector:
     if setup.target not in BOARD_KINDS:
         raise UsageError(
             f"a session cannot show a target {setup.target!r}{did_you_mean(setup.target, (BALL, *BOARD_KINDS))}.",
-            fix=f"--target {'|'.join((BALL, *BOARD_KINDS))}",
+            fix=f"--target {'|'.join((BALL, *BOARD_KINDS))}; a plain checkerboard is board",
         )
-    known = options_of(setup.target)
-    given = {name: getattr(setup, name) for name in SIZES}
-    given = {name: value for name, value in given.items() if value is not None and value is not False}
+    known, given = options_of(setup.target), sizes_of(setup)
     for name in given:
         if name not in known:
             raise UsageError(f"the target {setup.target!r} has no option --{name}.", fix="leave it out")
-    if setup.simulated and setup.target in EXAMPLE_BOARDS and not given:
-        scale = {"mm": 1.0, "m": 1e-3}.get(setup.unit, 1.0)
-        example = EXAMPLE_BOARDS[setup.target]
-        given = {name: value if isinstance(value, str) else scale * value for name, value in example.items()}
     detector: Detector = TARGETS[setup.target].from_options(Path(), {}, **given)
     table = detector.describe()
     if "square" not in table and setup.target == "board":
@@ -76,6 +70,21 @@ def board_detector(setup: Setup) -> Detector:
     check_size(table, setup.unit)
     corner_positions(table)
     return detector
+
+
+def sizes_of(setup: Setup) -> dict[str, Any]:
+    """What a session says of the size of its board, by option; of a simulated one that says nothing, the example's.
+
+    Args:
+        setup: Of any session.
+    """
+    given = {name: getattr(setup, name) for name in SIZES}
+    given = {name: value for name, value in given.items() if value is not None and value is not False}
+    if given or not setup.simulated:
+        return given
+    scale = {"mm": 1.0, "m": 1e-3}.get(setup.unit, 1.0)
+    example = EXAMPLE_BOARDS.get(setup.target, {})
+    return {name: value if isinstance(value, str) else scale * value for name, value in example.items()}
 
 
 def board_settings(setup: Setup) -> dict[str, Any]:

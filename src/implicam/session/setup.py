@@ -64,6 +64,7 @@ from implicam.session.board_setup import (
     board_hardware,
     board_settings,
     made_board_session,
+    sizes_of,
 )
 from implicam.session.controller import Equipment, SessionController
 from implicam.session.folder import is_session
@@ -409,16 +410,42 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
     before = Setup.from_settings(session.settings)
     if setup is None:
         return before
-    same = ["unit", "target", "poses", *SIZES, *(("rig", "rig_cameras", "seed") if before.simulated else ())]
-    for key in same:
-        if getattr(setup, key) != getattr(before, key):
-            raise UsageError(
-                f"the session in {session.folder} was begun with {key} {getattr(before, key)}.",
-                fix="leave the option out, or begin another session in another folder",
-            )
+    changes_to(session.folder, before, {key: getattr(setup, key) for key in _lasting(before)}, all_given=True)
     if setup.simulated != before.simulated:
         raise UsageError(f"the session in {session.folder} has other cameras.", fix="begin another in another folder")
     return setup
+
+
+def _lasting(before: Setup) -> list[str]:
+    """What a session keeps to its end."""
+    return ["unit", "target", "poses", *SIZES, *(("rig", "rig_cameras", "seed") if before.simulated else ())]
+
+
+def changes_to(folder: Path, before: Setup, given: Mapping[str, Any], *, all_given: bool = False) -> dict[str, Any]:
+    """What is given anew for a session that is there, without what it has anyway.
+
+    Args:
+        folder: Of the session.
+        before: What it was begun with.
+        given: Options by name; None for those that were not given.
+        all_given: None is a value too.
+
+    Raises:
+        UsageError: Something is to be another that stays to the end: what is shown, its size, the unit.
+    """
+    found = dict(given)
+    has = {**{key: getattr(before, key) for key in _lasting(before)}, **sizes_of(before)}
+    for key in has:
+        if key not in given or given[key] == getattr(before, key) or (given[key] is None and not all_given):
+            continue
+        if given[key] != has[key]:
+            shown = f"{key.replace('_', '-')} {has[key]}" if has[key] not in (None, "") else f"no {key}"
+            raise UsageError(
+                f"the session in {folder} was begun with {shown}.",
+                fix="leave the option out, or begin another session in another folder",
+            )
+        found[key] = getattr(before, key)
+    return found
 
 
 def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> SessionController:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,12 @@ from implicam.session.board_session import BoardState
 from implicam.session.detections import Look
 from implicam.viewer.snapshot import numbers_of
 from implicam.viewer.words import Headline, trouble_of
+
+CURE = (
+    "To do: hold the board still, lean it on something, or let a trigger expose all cameras at one instant; then take "
+    "back the boards that were moving (under Boards), and show others."
+)
+"""Of cameras that contradict each other."""
 
 
 def headline(state: BoardState) -> Headline:
@@ -30,11 +37,29 @@ def headline(state: BoardState) -> Headline:
         return Headline("Something needs you", problem.what if problem is not None else state.message, "bad")
     return {
         "fitting": Headline("Calculating …", f"{_sentence(state.message)}.", "busy"),
-        "done": Headline("Done: the rig is calibrated", "", "good"),
+        "done": _done(state),
     }.get(state.phase, Headline("Connecting …", state.message, "busy"))
 
 
+def _done(state: BoardState) -> Headline:
+    if state.contradictions:
+        return Headline("Done, but the cameras contradict each other", " ".join((*state.contradictions, CURE)), "bad")
+    return Headline("Done: the rig is calibrated", "", "good")
+
+
 def _aim(state: BoardState) -> Headline:
+    head = _guidance(state)
+    if state.contradictions:
+        following = f"{head.title}." if not state.stop else f"{_sentence(state.stop)}."
+        return Headline(
+            "The cameras contradict each other", " ".join((*state.contradictions, CURE, "Now:", following)), "bad"
+        )
+    if state.unfitted and not state.stop:
+        return replace(head, detail=" ".join(filter(None, (head.detail, f"The last fit failed: {state.unfitted}"))))
+    return head
+
+
+def _guidance(state: BoardState) -> Headline:
     target, judged = state.target, state.judgement
     if state.stop:
         return Headline(f"Good enough: {state.stop}", "Finish now, or go on for even better.", "good")
@@ -51,6 +76,15 @@ def _aim(state: BoardState) -> Headline:
 
 def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
+
+
+def _meanwhile(state: BoardState) -> str:
+    if not state.busy:
+        return ""
+    forecast = (
+        "; until then the numbers are a forecast" if state.forecast and np.isfinite(state.history[-1].worst) else ""
+    )
+    return f"The cameras are being fitted meanwhile{forecast}."
 
 
 def allowed(state: BoardState) -> dict[str, bool]:
@@ -102,9 +136,7 @@ def board_snapshot(state: BoardState, cameras: Sequence[str], rule: Rule, *, uni
         "phase": state.phase,
         "kind": head.kind,
         "title": head.title,
-        "detail": " ".join(
-            filter(None, (head.detail, "The cameras are being fitted meanwhile." if state.busy else ""))
-        ),
+        "detail": " ".join(filter(None, (head.detail, _meanwhile(state)))),
         "why": "" if problem is None else problem.why,
         "fix": "" if problem is None else problem.fix,
         "message": state.message,

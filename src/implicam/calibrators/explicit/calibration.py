@@ -19,7 +19,7 @@ from implicam.calibrators.explicit import saved
 from implicam.calibrators.explicit.align import ICP, MATCHING
 from implicam.calibrators.explicit.boards import Boards, boards_of, has_boards
 from implicam.calibrators.explicit.camera_groups import CameraGroups, calibrate_groups
-from implicam.calibrators.explicit.fitted import Fitted, by_cameras_of, fit_to_boards_alone, fit_to_points
+from implicam.calibrators.explicit.fitted import CONTRADICT, Fitted, by_cameras_of, fit_to_boards_alone, fit_to_points
 from implicam.calibrators.explicit.from_boards import fit_to_boards
 from implicam.calibrators.explicit.lenses import AUTO, dropped_notes
 from implicam.calibrators.explicit.opencv_pipeline import FAMILIES, OpenCVRig, calibrate_with_opencv
@@ -334,6 +334,11 @@ class ExplicitCalibration(RigCalibration):
     def notes(self) -> list[str]:
         """What the user should know before trusting this calibration; empty where all is well."""
         return [*self._repair_notes(), *self.fitted.notes, *self.calibrator.idle_settings_note()]
+
+    @property
+    def contradictions(self) -> list[str]:
+        """Which cameras contradict each other on the boards, and by how much, in words; empty where all agree."""
+        return [note for note in self.fitted.notes if CONTRADICT in note]
 
     def summary(self) -> FitSummary:
         """Leave-one-out errors of the known points; of each camera the lens model and the noise."""

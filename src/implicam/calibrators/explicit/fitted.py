@@ -36,6 +36,9 @@ from implicam.rig_model import (
 
 METHOD = "explicit"
 
+CONTRADICT = "contradict each other on"
+"""In the note of two cameras that fit alone and not together."""
+
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
@@ -270,7 +273,7 @@ def group_notes(group: CameraGroup, trained: Observations, boards: Dataset) -> l
     notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in group.uncalibrated]
     moved = np.sqrt(6) * group.bundle.slack  # along three axes, in either picture
     notes += [
-        f"{names[one.pair[0]]} and {names[one.pair[1]]} contradict each other on the {one.boards} boards that both saw"
+        f"{names[one.pair[0]]} and {names[one.pair[1]]} {CONTRADICT} the {one.boards} boards that both saw"
         f": alone {one.alone:.2g} px, together {one.together:.2g} px, as if boards had moved by about {moved:.1g} "
         f"{boards.length_unit} from one picture to the other. The pictures are not of the same instants, or a camera "
         "or the rig moved between them. The error bars allow for it; what moves while it is measured is off by more."
