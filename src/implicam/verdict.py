@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc, chdtri, fdtrc
 
 from implicam.calibrators import Calibration, PredictsPixels
-from implicam.calibrators.protocol import CheckPlan
+from implicam.calibrators.protocol import CheckPlan, FindsFaults
 from implicam.dataset import Dataset, Floats, describe_copies, find_copies
 from implicam.dataset.marks import remove_marks
 from implicam.errors import ImplicamError, UsageError
@@ -152,6 +152,8 @@ def judge(calibration: Calibration, progress: Progress = silent) -> Verdict:
     cure = _SDS if _declared(calibration.data) and not sds else _LOOK
     findings = [*failed, *_of_held_out(held_out, calibration, cure), *sds, *_of_data(calibration.data)]
     findings += _of_surface(calibration)
+    if isinstance(calibration, FindsFaults):
+        findings += calibration.find_faults(progress)
     findings += _of_cameras(calibration, {name for finding in findings for name in finding.cameras})
     reasons = tuple(finding.reason for finding in sorted(findings, key=lambda finding: not finding.grave))
     word = NOT_USABLE if any(finding.grave for finding in findings) else DOUBTFUL if findings else USABLE

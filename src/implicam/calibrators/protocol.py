@@ -27,6 +27,7 @@ from implicam.dataset.unused import Rejected, Unused
 from implicam.errors import FitError, UsageError
 from implicam.formatting import decimal_number
 from implicam.measurement import Measurement
+from implicam.mistakes import Finding
 from implicam.plotted import Plotted
 from implicam.progress import Progress, silent
 from implicam.rig_model import (
@@ -202,6 +203,18 @@ class Calibration(Protocol):
     @property
     def check_plan(self) -> CheckPlan | None:
         """How `judge` fits it again; None for the usual way, of a method that is fast."""
+
+
+@runtime_checkable
+class FindsFaults(Calibration, Protocol):
+    """A calibration that can hold out more than known points, and then knows what speaks against it."""
+
+    def find_faults(self, progress: Progress = silent) -> list[Finding]:
+        """What speaks against this calibration beside what its known points say.
+
+        Args:
+            progress: Is told how far it is.
+        """
 
 
 @runtime_checkable

@@ -19,7 +19,7 @@ from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
 from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings, Training
-from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, fit_to_wand
+from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, find_faults, fit_to_wand
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -39,7 +39,7 @@ from implicam.dataset.wand import Wand, wand_of
 from implicam.errors import UsageError, did_you_mean
 from implicam.geometry import Floats
 from implicam.lenses import LENSES
-from implicam.mistakes import explain_fit_error
+from implicam.mistakes import Finding, explain_fit_error
 from implicam.progress import Progress, silent
 from implicam.rig_model.diagnostics import Diagnosis
 from implicam.rig_model.fit_result import FitResult
@@ -254,6 +254,14 @@ class ForwardGPCalibration(RigCalibration):
         """
         self._refuse_wand()
         return self.calibrator.fit(data, progress)
+
+    def find_faults(self, progress: Progress = silent) -> list[Finding]:
+        """Of a calibration from a wand: how its length comes out in frames that a fit does not know.
+
+        Args:
+            progress: Is told how far it is.
+        """
+        return [] if self.waved is None else list(find_faults(self, progress))
 
     def _refuse_wand(self) -> None:
         if self.waved is not None:
