@@ -259,8 +259,8 @@ def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
                 page.fill(f"#{axis}", text)
             page.keyboard.press("Enter")
             page.wait_for_selector("#ask[open]")  # outside of the workspace: asked about
-            assert page.evaluate("document.activeElement.textContent") == "Correct"
-            page.get_by_role("button", name="It is", exact=True).click()
+            assert page.evaluate("document.activeElement.textContent") == "Correct the numbers"
+            page.get_by_role("button", name="It is there", exact=True).click()
             page.wait_for_selector("#accept:enabled")
             page.click("#accept")
             until(lambda k=k: by_hand.session.data is not None and len(by_hand.session.data) == k + 1)
@@ -275,10 +275,10 @@ def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
         page.fill("#x", "1.234")
         page.click("#go")
         page.get_by_text("may mean 1.234 or 1234").wait_for(state="detached")  # mended by a good one
-        page.get_by_role("button", name="Correct", exact=True).click()
+        page.get_by_role("button", name="Correct the numbers", exact=True).click()
         # the list: one is looked at, one is deleted
         page.click("#list summary")
-        row = page.locator("#points tr", has_text="p001")
+        row = page.locator("#points tbody", has_text="p001")
         row.get_by_role("button", name="look").click()
         page.wait_for_function(
             "[...document.querySelectorAll('#ask-pictures img')].filter((i) => i.naturalWidth).length == 2"
@@ -287,8 +287,8 @@ def test_positions_are_kept_as_they_are_typed_and_what_is_odd_is_asked(
         row.get_by_role("button", name="delete").click()
         page.get_by_role("button", name="Delete", exact=True).click()
         until(lambda: by_hand.session.data is not None and by_hand.session.data.points.tolist() == ["p002"])
-        page.locator("#points tr", has_text="p001").wait_for(state="detached")
-        page.locator("#points tr", has_text="p002").get_by_role("button", name="again").click()
+        page.locator("#points tbody", has_text="p001").wait_for(state="detached")
+        page.locator("#points tbody", has_text="p002").get_by_role("button", name="again").click()
         page.get_by_role("button", name="Measure it again").click()
         until(lambda: by_hand.session.data is None or not len(by_hand.session.data))
         there = [1e-3, -125.0, 100.0]
@@ -316,6 +316,8 @@ def test_a_phone_and_two_desktops_each_have_their_layout_and_show_the_same(
         desktop, tablet, phone = pages
         for page in pages:
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+            for name in ("#which", "#controls", "#progress", ".tile.chosen .top"):  # nothing is cut off at the right
+                assert page.evaluate("(n) => (e => e.scrollWidth <= e.clientWidth)(document.querySelector(n))", name)
         assert [page.locator(".tile:visible").count() for page in pages] == [2, 2, 1]
         paper = [page.evaluate("getComputedStyle(document.body).backgroundColor") for page in pages]
         assert paper[0] != paper[1] == paper[2]

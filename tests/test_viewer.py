@@ -496,7 +496,7 @@ def by_hand(visitor: Visitor, hand: Path) -> None:
     visitor.reads("3 points")
     visitor.reads("Point 4: press Go")
     visitor.presses("Skip")
-    visitor.presses("something is in the way")
+    visitor.presses("Something is in the way")
     visitor.reads("3 points · 1 skipped")
     visitor.reads("Point 4: press Go")
     visitor.page.keyboard.press("u")

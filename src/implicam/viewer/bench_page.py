@@ -240,13 +240,13 @@ class BenchPage:
 
     def _complain(self, error: ImplicamError) -> None:
         if isinstance(error, PositionQuestion):
-            text = "\n".join((*error.questions, "", error.fix))
+            text = ".\n\n".join(error.questions) + "."
             asked = {
                 "number": secrets.token_urlsafe(8),
                 "title": f"{error.what[:1].upper()}{error.what[1:]}",
                 "text": text,
-                "yes": "It is",
-                "no": "Correct",
+                "yes": "It is there",
+                "no": "Correct the numbers",
             }
             self._questioned = {**asked, "position": self._position}
             with self._lock:

@@ -7,7 +7,7 @@ const by = (id) => document.getElementById(id);
 const SVG = "http://www.w3.org/2000/svg";
 const KEYS = {g: "go", a: "accept", r: "redo", s: "skip", u: "undo", f: "finish"};
 const LABELS = {go: "Go", accept: "Accept", redo: "Redo", skip: "Skip", undo: "Undo", finish: "Finish"};
-const LOST_MS = 6000, LOUPE_RADII = 4, ON_TARGET_PX = 12, GAP_PX = 8;
+const LOST_MS = 6000, LOUPE_RADII = 4, ON_TARGET_PX = 12, GAP_PX = 8, SIDE_PX = 370, BELOW_PX = 310;
 
 let about = null, state = null, scene = null, world = null, heard = Date.now(), dismissed = new Set();
 let sceneNumber = -1, curveNumber = -1, chosen = 0, typed = null, questioned = null, listed = null, closed = false, fetching = false, lastTexts = "";
@@ -233,16 +233,36 @@ function makeTiles() {
 }
 
 // The columns that make tiles largest.
-function layOut() {
-  const {clientWidth: width, clientHeight: height} = by("cameras");
-  const single = matchMedia("(max-width: 700px)").matches, count = single ? 1 : about.cameras.length;
-  const aspect = Math.max(...(state?.cameras ?? []).map((one) => one.shown ? one.width / one.height : 0)) || 4 / 3;
+function columnsFor(width, height, count, aspect) {
   let best = {across: 0, columns: 1};
   for (let columns = 1; columns <= count; columns++) {
     const rows = Math.ceil(count / columns);
     const across = Math.min((width - GAP_PX * (columns - 1)) / columns, (height - GAP_PX * (rows - 1)) / rows * aspect);
     if (across > best.across) best = {across, columns};
   }
+  return best;
+}
+
+// On a desktop, where all else stands: below the pictures where that makes them larger, or beside them, as wide as they
+// leave it. By the window alone, so that nothing jumps while somebody works.
+function arrange(count, aspect) {
+  const main = document.querySelector("main"), wide = innerWidth - 20, high = innerHeight - 120;
+  const byHand = !about.moves && !about.boards;
+  const beside = columnsFor(wide - SIDE_PX - 10, high - (about.moves ? 190 : 120), count, aspect);
+  const below = columnsFor(wide, high - BELOW_PX, count, aspect);
+  main.classList.toggle("below", innerWidth >= (byHand ? 1400 : 1024) && below.across > 1.08 * beside.across);
+  const left = wide - 10 - beside.across * beside.columns - GAP_PX * (beside.columns - 1);
+  main.style.setProperty("--side", `${Math.floor(Math.min(Math.max(left, SIDE_PX), 0.5 * wide))}px`);
+}
+
+function layOut() {
+  const single = matchMedia("(max-width: 700px)").matches, count = single ? 1 : about.cameras.length;
+  const aspect = Math.max(...(state?.cameras ?? []).map((one) => one.shown ? one.width / one.height : 0)) || 4 / 3;
+  arrange(count, aspect);
+  const {clientWidth: width, clientHeight} = by("cameras"), stacked = innerWidth < 1024;
+  const height = stacked ? (single ? 0.38 : 0.48) * innerHeight : clientHeight;
+  const best = columnsFor(width, height, count, aspect), rows = Math.ceil(count / best.columns);
+  if (stacked) document.body.style.setProperty("--pictures", `${Math.ceil(rows * (best.across / aspect + GAP_PX))}px`);
   by("cameras").style.gridTemplateColumns = `repeat(${best.columns}, ${Math.floor(best.across)}px)`;
   for (const tile of by("cameras").children) tile.style.height = `${Math.floor(best.across / aspect)}px`;
 }
@@ -377,8 +397,7 @@ function drawNumbers() {
   if (state.phase !== "done") return;
   const link = (href, text, attributes) => Object.assign(document.createElement("a"), {href, textContent: text, ...attributes});
   by("files").replaceChildren(link("calibration.implicam", "Download the calibration", {download: ""}),
-    ...(state.report ? [link("report.html", "Open the report", {target: "_blank", rel: "noopener"})] : []),
-    `everything is in ${about.folder}`);
+    ...(state.report ? [link("report.html", "Open the report", {target: "_blank", rel: "noopener"})] : []));
 }
 
 async function refreshPoints() {
@@ -390,12 +409,14 @@ async function refreshPoints() {
   try { rows = (await ask("api/points")).points; } catch { listed = null; return; }
   if (about.boards) { listBoards(rows); return; }
   const table = document.createElement("table"), cell = (kind, text) => Object.assign(document.createElement(kind), {textContent: text});
-  table.insertRow().append(...["", "x", "y", "z", "cameras", `off, ${about.unit}`, ""].map((text) => cell("th", text)));
+  table.insertRow().append(...["", "x", "y", "z", "cameras", `off, ${about.unit}`].map((text) => cell("th", text)));
   for (const row of rows.reverse()) {
-    const line = table.insertRow(), acts = cell("td", "");
+    const rows = table.appendChild(document.createElement("tbody")), line = rows.insertRow(), acts = Object.assign(cell("td", ""), {colSpan: 6, className: "acts"});
+    line.className = "one";
     const off = cell("td", row.off === null ? "–" : number(row.off, 2));
     if (row.off > 4 * row.sd) off.className = "far";
-    line.append(cell("td", row.name), ...row.xyz.map((v) => cell("td", number(v, 5))), cell("td", row.cameras), off, acts);
+    line.append(cell("td", row.name), ...row.xyz.map((v) => cell("td", number(v, 5))), cell("td", row.cameras), off);
+    rows.insertRow().append(acts);
     for (const [label, act] of [["look", () => lookAt(row)], ["again", () => again(row)], ["delete", () => remove(row)]]) {
       const button = cell("button", label);
       button.disabled = label !== "look" && !state.buttons.delete.enabled;
@@ -436,7 +457,7 @@ async function refreshCurve() {
   const svg = by("curve"), known = data.points.length > 0;
   svg.toggleAttribute("hidden", !known);
   if (!known) return;
-  const wide = svg.clientWidth || 380, high = 185, [left, right, top, bottom] = [52, 14, 14, 34];
+  const wide = svg.clientWidth || 380, high = svg.clientHeight || 185, [left, right, top, bottom] = [52, 14, 14, 34];
   svg.setAttribute("viewBox", `0 0 ${wide} ${high}`);
   svg.replaceChildren();
   const stops = data.stops.map((one) => one.value), values = [...data.worst, ...data.usual, ...stops].filter((v) => v > 0);
@@ -469,7 +490,7 @@ async function refreshCurve() {
       if (value > 0) element("circle", {cx: x(data.points[i]), cy: y(value), r: 3, class: `${name} dot`}, svg);
     });
     const end = data[name].at(-1);
-    if (end > 0) element("text", {x: Math.min(x(last) + 6, wide - right - 60), y: y(end) + (name === "worst" ? -6 : 14),
+    if (end > 0) element("text", {x: Math.min(x(last) + 6, wide - 74), y: y(end) + (name === "worst" ? -6 : 14),
       class: `${name}-word`}, svg, words);
   }
 }
@@ -487,6 +508,7 @@ async function refreshScene() {
   try {
     if (!scene) {
       scene = new Scene3D(by("scene"), world.placing);
+      scene.above = [by("whole")];
       matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { scene.theme(); refreshScene(); });
     }
   } catch (error) {
@@ -573,8 +595,8 @@ async function begin() {
     for (const word of ["accept", "redo"]) by(word).hidden = true;
     by("auto").nextSibling.textContent = " take pictures by itself, when the board is held still"
       + (about.simulated ? " (cameras, board and the hand that holds it are simulated)" : "");
-    for (const kind of ["wanted", "ball"]) { const dot = document.querySelector(`.dots .${kind}`); dot.nextSibling.remove(); dot.remove(); }
-    document.querySelector(".dots .known").nextSibling.textContent = "corners ";
+    for (const kind of ["wanted", "ball"]) document.querySelector(`.dots .${kind}`).parentNode.remove();
+    document.querySelector(".dots .known").nextSibling.textContent = "corners";
     by("list").querySelector("summary").textContent = "Boards";
     by("meaning").textContent = "These are predictions of the calibration, for a position measured anywhere in the volume, "
       + "in the frame that fits it best; the report at the end measures boards that were held out.";

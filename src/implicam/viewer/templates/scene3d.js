@@ -14,6 +14,9 @@ const CIVIDIS = [[0, 32, 76], [0, 49, 111], [57, 72, 107], [87, 92, 109], [112, 
 
 const GROUPS = ["box", "cameras", "pictures", "known", "volume", "measured", "ellipsoids", "cloud", "skipped", "target", "ball"];
 
+// Where a label may stand beside its place, the best first: which part of it is at the place, from its lower left corner.
+const LABEL_ANCHORS = [[0.5, 0.5], [0.5, -0.4], [0.5, 1.4], [-0.15, 0.5], [1.15, 0.5], [0, -0.4], [1, -0.4], [0, 1.4], [1, 1.4]];
+
 export const cividis = (part) => {
   const at = Math.min(Math.max(part, 0), 1) * (CIVIDIS.length - 1), k = Math.min(Math.floor(at), CIVIDIS.length - 2);
   return CIVIDIS[k].map((value, i) => (value + (at - k) * (CIVIDIS[k + 1][i] - value)) / 255);
@@ -104,6 +107,7 @@ export class Scene3D {
     this.asked = true;
     requestAnimationFrame(() => {
       this.asked = false;
+      this.spread();
       this.renderer.render(this.scene, this.camera);
       this.drawn = (this.drawn ?? 0) + 1;
     });
@@ -224,14 +228,38 @@ export class Scene3D {
     const sprite = new THREE.Sprite(new THREE.SpriteMaterial({sizeAttenuation: false, depthTest: false}));
     sprite.position.copy(at);
     sprite.renderOrder = 5;
-    const label = {sprite, text, colour, spare};
+    const label = {sprite, text, colour, spare, group};
     this.labels.push(label);
     this.write(label);
     group.add(sprite);
   }
 
-  write({sprite, text, colour, spare}) {
-    sprite.visible = !(spare && this.canvas.clientWidth < NARROW_PX);
+  // Labels beside one another and inside the window, those that matter most first; what finds no room is left out.
+  spread() {
+    const {clientWidth: wide, clientHeight: high} = this.canvas, {target, box} = this.groups;
+    const corner = this.canvas.getBoundingClientRect();
+    const taken = (this.above ?? []).map((one) => one.getBoundingClientRect())
+      .map(({left, top, right, bottom}) => [left - corner.left, top - corner.top, right - corner.left, bottom - corner.top]);
+    const rank = ({group, spare}) => spare ? 3 : group === target ? 0 : group === box ? 1 : 2;
+    for (const label of [...this.labels].sort((a, b) => rank(a) - rank(b))) {
+      const {sprite, spare, group} = label;
+      sprite.visible = false;
+      const at = sprite.position.clone().project(this.camera);
+      if (!group.visible || Math.abs(at.z) > 1 || (spare && wide < NARROW_PX)) continue;
+      const [across, up] = sprite.userData.pixels, x = (at.x + 1) / 2 * wide, y = (1 - at.y) / 2 * high;
+      for (const [right, above] of LABEL_ANCHORS) {
+        const [left, top] = [x - right * across, y - (1 - above) * up];
+        if (left < 0 || top < 0 || left + across > wide || top + up > high) continue;
+        if (taken.some(([l, t, r, b]) => left < r && l < left + across && top + 3 < b && t < top + up - 3)) continue;
+        taken.push([left, top, left + across, top + up]);
+        sprite.center.set(right, above);
+        sprite.visible = true;
+        break;
+      }
+    }
+  }
+
+  write({sprite, text, colour}) {
     const ratio = 2, canvas = document.createElement("canvas"), pen = canvas.getContext("2d");
     const font = `600 ${LABEL_PX * ratio}px system-ui, sans-serif`;
     pen.font = font;
