@@ -25,6 +25,8 @@ from implicam.detect.sharpness import edge_width
 from implicam.errors import DatasetError, HardwareError, UsageError
 from implicam.geometry import Pose, look_at, rotation_from_vector, vector_from_rotation
 from implicam.hardware.simulated_hand import board_target, match_pose, simulated_hand
+from implicam.report import words
+from implicam.session import board_report
 from implicam.session.board_session import BoardController, BoardState
 from implicam.session.journal import TARGET_KEY, Session
 from implicam.session.setup import Setup, changes_to, open_session
@@ -232,6 +234,27 @@ def test_the_page_says_at_once_that_cameras_contradict_each_other():
         assert "ood enough" not in head.title + head.detail
     failed = headline(replace(state, stop="", contradictions=(), unfitted="the cameras contradict each other."))
     assert "The last fit failed: the cameras contradict" in failed.detail
+
+
+def test_the_report_says_how_far_distances_on_boards_held_out_are_off(tmp_path, rig, monkeypatch):
+    data = boards_of_rig(rig, 9)
+    calibrator = ic.Explicit(lens="brown-conrady")
+    fitted = calibrator.fit(data)
+    monkeypatch.setattr(type(calibrator), "fit", lambda self, some: fitted)  # of all: it is quick, and nearly the same
+    monkeypatch.setattr(board_report, "write_report", lambda path, found: None)
+    found = board_report.write_board_report(tmp_path / "r.html", "b", calibrator, fitted, data)
+    lengths = found.lengths
+    assert lengths.rms == pytest.approx(lengths.stated_rms, rel=0.4)
+    assert 0.8 < lengths.inside <= 1
+    assert words.headline(found).startswith("Distances between far corners of 3 boards held out are off by 0.")
+    title, why, tone = words.verdict(found)
+    assert (title, tone) == ("The error bars hold for distances.", "good")
+    assert "times that" in why
+    wrong = replace(found, lengths=replace(lengths, errors=4 * lengths.errors))
+    assert words.verdict(wrong)[2] == "bad"
+    assert any("rms error of distances" in label for label, _, _ in words.tiles(found))
+    done = BoardState(phase="done", verdict=(words.headline(found), tone))
+    assert "held out are off by" in headline(done).detail
 
 
 def test_pictures_are_counted_in_words():

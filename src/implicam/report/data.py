@@ -16,6 +16,39 @@ from implicam.evaluation import Evaluation
 from implicam.measurement import Measurement
 from implicam.report.instrument import Instrument
 
+NORMAL_95 = 1.96
+"""Standard deviations to either side that contain 95 % of a normal distribution."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownLengths:
+    """Distances between measured points whose true length is known, though not where the points were.
+
+    Attributes:
+        what: They are between, in words: "corners of 4 boards that were held out".
+        errors: (n,) measured minus true, in the length unit.
+        sd: (n,) stated standard uncertainty of each distance.
+    """
+
+    what: str
+    errors: Floats
+    sd: Floats
+
+    @property
+    def rms(self) -> float:
+        """Of the errors."""
+        return float(np.sqrt(np.mean(self.errors**2)))
+
+    @property
+    def stated_rms(self) -> float:
+        """What the error bars say that `rms` should be."""
+        return float(np.sqrt(np.mean(self.sd**2)))
+
+    @property
+    def inside(self) -> float:
+        """Share of the distances that their 95 % interval contains, from 0 to 1."""
+        return float(np.mean(np.abs(self.errors) <= NORMAL_95 * self.sd))
+
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
@@ -26,7 +59,8 @@ class ReportData:
     true_xyz: (n, 3) where its points really were, NaN where unknown. coverage: `implicam.coverage.assess` of the same
     points, the base of the headline and of the verdict. known_xyz: (m, 3) points the rig was calibrated from.
     cameras: name -> (3,) centre. facts: label and value pairs for the head (rig, method, date, ...). notes: sentences
-    for "how it was computed". instrument: the cameras themselves.
+    for "how it was computed". instrument: the cameras themselves. lengths: what headline and verdict are about, where
+    no truth is known but distances between points.
     """
 
     title: str
@@ -39,6 +73,7 @@ class ReportData:
     cameras: Mapping[str, ArrayLike] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     instrument: Instrument | None = None
+    lengths: KnownLengths | None = None
 
     def __post_init__(self) -> None:
         n = len(self.measurement)

@@ -9,7 +9,7 @@ import numpy as np
 from implicam.coverage import Estimate, Summary
 from implicam.dataset import Floats
 from implicam.formatting import number, percent
-from implicam.report.data import ReportData
+from implicam.report.data import KnownLengths, ReportData
 
 VERDICTS = {
     "right": ("The error bars tell the truth.", "good"),
@@ -42,6 +42,11 @@ def interval(value: Estimate) -> str:
     return f"{number(value.value)} ({number(value.low)}–{number(value.high)})"
 
 
+MAX_RIGHT_FACTOR, MAX_CAREFUL_FACTOR = 1.4, 2.0
+"""Rms of distances over what the error bars say: so much is chance with a few boards; beyond
+the second they are wrong."""
+
+
 def headline(data: ReportData) -> str:
     """The result in one sentence.
 
@@ -52,6 +57,12 @@ def headline(data: ReportData) -> str:
     if n == 0:
         return "No point could be measured."
     if data.coverage is None or data.coverage.overall.n == 0:
+        if data.lengths is not None:
+            known = data.lengths
+            return (
+                f"Distances between {known.what} are off by {number(known.rms)} {unit} rms; 95 % intervals contained "
+                f"the truth for {percent(known.inside)} of {len(known.errors):,}."
+            )
         typical = number(_median(data.spread))
         return f"{_points(n)} measured, with a typical stated uncertainty of {typical} {unit} in 3D."
     row = data.coverage.overall
@@ -71,6 +82,8 @@ def verdict(data: ReportData) -> tuple[str, str, str]:
     Returns:
         Title, explanation, and tone: "good", "bad", "careful" or "unknown".
     """
+    if data.lengths is not None:
+        return _verdict_of_lengths(data.lengths, data.unit)
     if data.coverage is None:
         return (
             "The error bars were not checked here.",
@@ -81,6 +94,21 @@ def verdict(data: ReportData) -> tuple[str, str, str]:
     row = data.coverage.overall
     title, tone = VERDICTS[row.verdict]
     return title, f"{_judgement(row)} {_independence(row)}".strip(), tone
+
+
+def _verdict_of_lengths(known: KnownLengths, unit: str) -> tuple[str, str, str]:
+    factor = known.rms / known.stated_rms
+    seen = f"Of these distances the error bars predict {number(known.stated_rms)} {unit} rms; it is "
+    seen += f"{number(known.rms)} {unit}, {number(factor, 2)} times that."
+    blind = (
+        "A distance shows noise, wrong scale and bent space, but no error that shifts or turns all of it. It has two "
+        "ends, so it compares with a position's uncertainty along one axis, times 1.4, and not with its 95 % ellipsoid."
+    )
+    if factor <= MAX_RIGHT_FACTOR:
+        return "The error bars hold for distances.", f"{seen} {blind}", "good"
+    if factor <= MAX_CAREFUL_FACTOR:
+        return "The error bars are somewhat too small for distances.", f"{seen} {blind}", "careful"
+    return "The error bars are too small.", f"{seen} Do not rely on them: look at the notes below. {blind}", "bad"
 
 
 def tiles(data: ReportData) -> list[tuple[str, str, str]]:
@@ -100,6 +128,15 @@ def tiles(data: ReportData) -> list[tuple[str, str, str]]:
     sources = _sources(data)
     if data.coverage is None or data.coverage.overall.n == 0:
         x, y, z = (number(_median(sd)) for sd in data.sd.T)
+        if data.lengths is not None:
+            known = data.lengths
+            error = f"the error bars predict {number(known.stated_rms)} {unit}"
+            inside = f"of {len(known.errors):,} distances; 95 % is right"
+            sources = [
+                ("rms error of distances", f"{number(known.rms)} {unit}", error),
+                ("inside their 95 % interval", percent(known.inside), inside),
+                *sources,
+            ]
         return [count, (f"stated sd, median ({unit})", f"{x} / {y} / {z}", "in x, y and z"), *sources]
     row = data.coverage.overall
     found = [

@@ -12,11 +12,13 @@ import numpy as np
 
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator
-from implicam.dataset import Dataset
+from implicam.dataset import Dataset, Floats
 from implicam.dataset.boards import CORNER, corner_positions, corner_shots
+from implicam.derived import distances
 from implicam.errors import FitError, UsageError
 from implicam.geometry import register
-from implicam.report import ReportData, write_report
+from implicam.measurement import Measurement
+from implicam.report import KnownLengths, ReportData, write_report
 
 HELD_OUT_EVERY = 3
 """One board in so many is held out."""
@@ -25,7 +27,9 @@ MIN_BOARDS = 9
 """From which boards can be held out."""
 
 
-def write_board_report(path: Path, name: str, calibrator: Calibrator, calibration: Calibration, data: Dataset) -> None:
+def write_board_report(
+    path: Path, name: str, calibrator: Calibrator, calibration: Calibration, data: Dataset
+) -> ReportData:
     """Write the page.
 
     Args:
@@ -34,6 +38,9 @@ def write_board_report(path: Path, name: str, calibrator: Calibrator, calibratio
         calibrator: That made it.
         calibration: From all boards.
         data: The corners of all boards, at places that nobody knows.
+
+    Returns:
+        What the page says.
 
     Raises:
         UsageError: There are too few boards to hold some out.
@@ -73,9 +80,36 @@ def write_board_report(path: Path, name: str, calibrator: Calibrator, calibratio
     )
     notes = (
         "Nobody knows where the boards were: each one held out is laid where its measured corners fit it best, and "
-        "errors are what is left. They show noise, wrong scale and bent space, and no error that shifts or turns a "
-        "board as a whole; error bars, which contain that too, are therefore not judged by them.",
+        "the errors of its points are what is left: no error that shifts or turns a board as a whole. The headline is "
+        "of distances, from each corner to the farthest one on its board, which need no such fit; their error bars are "
+        "those of both ends with what these share.",
         *calibration.notes,
     )
     title = f"{name}: calibrated with boards held by hand"
-    write_report(path, ReportData(title, measured, facts=facts, true_xyz=true, notes=notes))
+    lengths = _lengths(measured, held_out, flat[numbers])
+    found = ReportData(title, measured, facts=facts, true_xyz=true, notes=notes, lengths=lengths)
+    write_report(path, found)
+    return found
+
+
+def _lengths(measured: Measurement, held_out: Dataset, flat: Floats) -> KnownLengths | None:
+    """From each corner to the farthest on its board that was measured: the error of the distance is known, wherever the
+    board was. None where there is no such pair."""
+    shots, pairs, boards = corner_shots(held_out.points), [], 0
+    for shot in dict.fromkeys(shots.tolist()):
+        rows = np.flatnonzero((shots == shot) & measured.measured)
+        if len(rows) < 2:
+            continue
+        far = np.linalg.norm(flat[rows][:, None] - flat[rows], axis=2).argmax(axis=1)
+        pairs += sorted({(min(a, b), max(a, b)) for a, b in zip(rows.tolist(), rows[far].tolist(), strict=True)})
+        boards += 1
+    if not pairs:
+        return None
+    found = distances(measured, pairs)
+    first, second = np.array(pairs).T
+    true = np.linalg.norm(flat[first] - flat[second], axis=1)
+    return KnownLengths(
+        f"far corners of {boards} board{'s' * (boards != 1)} held out",
+        np.array([one.value for one in found]) - true,
+        np.array([one.sd for one in found]),
+    )

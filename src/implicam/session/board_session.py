@@ -35,6 +35,8 @@ from implicam.hardware import Frame
 from implicam.images import blank
 from implicam.progress import Progress, silent
 from implicam.report import report_of, write_report
+from implicam.report.words import headline
+from implicam.report.words import verdict as judgement
 from implicam.session.board_report import write_board_report
 from implicam.session.controller import (
     CALIBRATION_FILE,
@@ -260,18 +262,24 @@ class BoardController(SessionController):
             calibration.save(path)
             report = self.session.folder / REPORT_FILE
             report.unlink(missing_ok=True)  # it may be of an earlier calibration
-            words = f"{self.loop.points} boards. Saved: {path}"
+            words, verdict = f"{self.loop.points} boards. Saved: {path}", ("", "unknown")
             try:
                 if data.known is None:
-                    write_board_report(report, self.session.name, self.loop.calibrator, calibration, data)
+                    said = write_board_report(report, self.session.name, self.loop.calibrator, calibration, data)
                 else:
                     title = f"{self.session.name}: a board at known poses"
-                    write_report(report, report_of(leave_out_shots(self.loop.calibrator.fit, data), title))
+                    said = report_of(leave_out_shots(self.loop.calibrator.fit, data), title)
+                    write_report(report, said)
+                about_bars, _, tone = judgement(said)
+                verdict = f"{headline(said)} {about_bars}", tone
                 words += f" and {report}"
             except ImplicamError as error:
                 words += f". No report: {error.what}"
             self.session.log("finished", points=self.loop.points)
-            self._show(phase="done", message=words, report=report if report.exists() else None, target=None, auto=False)
+            self._show(
+                phase="done", message=words, report=report if report.exists() else None, target=None, auto=False,
+                verdict=verdict,
+            )  # fmt: skip
         return path
 
     def close(self) -> None:

@@ -41,19 +41,32 @@ def headline(state: BoardState) -> Headline:
     }.get(state.phase, Headline("Connecting …", state.message, "busy"))
 
 
+def _contradiction(state: BoardState) -> str:
+    """The first pair of cameras, how many more there are, and the cure."""
+    more = len(state.contradictions) - 1
+    others = f"So do {more} more pair{'s' * (more != 1)} of cameras." if more else ""
+    return " ".join(filter(None, (state.contradictions[0], others, CURE)))
+
+
 def _done(state: BoardState) -> Headline:
+    told, tone = state.verdict
     if state.contradictions:
-        return Headline("Done, but the cameras contradict each other", " ".join((*state.contradictions, CURE)), "bad")
-    return Headline("Done: the rig is calibrated", "", "good")
+        detail = " ".join(filter(None, (told, _contradiction(state))))
+        return Headline("Done, but the cameras contradict each other", detail, "bad")
+    if tone == "bad":
+        return Headline("Calibrated, but do not rely on it yet", told, "bad")
+    if told:
+        return Headline("Done: the rig is calibrated", told, "good" if tone == "good" else "ask")
+    return Headline(
+        "Calibrated, and not checked", "There is no report: too few boards to hold some of them out.", "ask"
+    )
 
 
 def _aim(state: BoardState) -> Headline:
     head = _guidance(state)
     if state.contradictions:
         following = f"{head.title}." if not state.stop else f"{_sentence(state.stop)}."
-        return Headline(
-            "The cameras contradict each other", " ".join((*state.contradictions, CURE, "Now:", following)), "bad"
-        )
+        return Headline("The cameras contradict each other", f"{_contradiction(state)} Now: {following}", "bad")
     if state.unfitted and not state.stop:
         return replace(head, detail=" ".join(filter(None, (head.detail, f"The last fit failed: {state.unfitted}"))))
     return head

@@ -599,7 +599,7 @@ async function begin() {
     document.querySelector(".dots .known").nextSibling.textContent = "corners";
     by("list").querySelector("summary").textContent = "Boards";
     by("meaning").textContent = "These are predictions of the calibration, for a position measured anywhere in the volume, "
-      + "in the frame that fits it best; the report at the end measures boards that were held out.";
+      + "in the frame that fits it best; the report at the end gives the rms error of distances between corners of boards that were held out.";
   }
   makeTiles();
   for (const word of Object.values(KEYS)) by(word).addEventListener("click", () => word === "skip" ? skip() : press(word));
