@@ -57,9 +57,7 @@ def _done(state: BoardState) -> Headline:
         return Headline("Calibrated, but do not rely on it yet", told, "bad")
     if told:
         return Headline("Done: the rig is calibrated", told, "good" if tone == "good" else "ask")
-    return Headline(
-        "Calibrated, and not checked", "There is no report: too few boards to hold some of them out.", "ask"
-    )
+    return Headline("Calibrated, and not checked", "No boards were held out to check it.", "ask")
 
 
 def _aim(state: BoardState) -> Headline:
