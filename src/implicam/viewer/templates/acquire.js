@@ -248,11 +248,11 @@ function columnsFor(width, height, count, aspect) {
 function arrange(count, aspect) {
   const main = document.querySelector("main"), wide = innerWidth - 20, high = innerHeight - 120;
   const byHand = !about.moves && !about.boards;
-  const beside = columnsFor(wide - SIDE_PX - 10, high - (about.moves ? 190 : 120), count, aspect);
+  const beside = columnsFor(wide - SIDE_PX - 10, high - (about.boards ? 120 : 190), count, aspect);
   const below = columnsFor(wide, high - BELOW_PX, count, aspect);
-  main.classList.toggle("below", innerWidth >= (byHand ? 1400 : 1024) && below.across > 1.08 * beside.across);
+  main.classList.toggle("below", innerWidth >= (byHand ? 1400 : 1024) && below.across > (byHand ? 1.15 : 1.08) * beside.across);
   const left = wide - 10 - beside.across * beside.columns - GAP_PX * (beside.columns - 1);
-  main.style.setProperty("--side", `${Math.floor(Math.min(Math.max(left, SIDE_PX), 0.5 * wide))}px`);
+  main.style.setProperty("--side", `${Math.floor(Math.min(Math.max(left, SIDE_PX), 0.38 * wide))}px`);
 }
 
 function layOut() {
