@@ -202,6 +202,19 @@ def test_a_resection_finds_the_shape_of_pixels() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("sd", "moved"), [(0.04, True), (0.005, False)])
+def test_what_is_to_blame_depends_on_how_good_the_corners_are(sd: float, moved: bool) -> None:
+    """Boards that moved leave each camera alone as good as its corners are; a lens that no model holds does not."""
+    data = read_dataset(CASES / "two-camera-noise")
+    seen = data.observations
+    stated = Observations(seen.points, seen.cameras, seen.uv, np.where(np.isfinite(seen.uv), sd, np.nan))
+    calibration = Explicit().fit(replace(data, observations=stated))
+    (note,) = [note for note in calibration.notes if "together 0.5 px" in note]
+    assert ("not of the same instants" in note, "no lens model here holds these lenses" in note) == (moved, not moved)
+    assert (len(calibration.contradictions) == 1) is moved
+
+
+@pytest.mark.slow
 def test_neither_camera_is_to_blame() -> None:
     """Truth: f 900, centre (639.5, 359.5), baseline 120: webcams without trigger, the board moved by N(0, 3 mm)."""
     data = read_dataset(CASES / "two-camera-noise")

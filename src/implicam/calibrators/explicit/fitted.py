@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from implicam.calibrators.explicit.agreement import Agreement
 from implicam.calibrators.explicit.boards import boards_of
 from implicam.calibrators.explicit.camera_groups import CameraGroup, calibrate_largest_group
 from implicam.calibrators.explicit.from_points import fit_points
@@ -38,6 +39,9 @@ METHOD = "explicit"
 
 CONTRADICT = "contradict each other on"
 """In the note of two cameras that fit alone and not together."""
+
+MAX_ALONE_NOISES = 3.0
+"""Residual of cameras alone, in the stated noise of their corners, above which it is the lenses that do not fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,14 +275,7 @@ def group_notes(group: CameraGroup, trained: Observations, boards: Dataset) -> l
     """
     names = trained.camera_names
     notes = [f"{names[c]} is not calibrated, and its views are not used: {why}" for c, why in group.uncalibrated]
-    moved = np.sqrt(6) * group.bundle.slack  # along three axes, in either picture
-    notes += [
-        f"{names[one.pair[0]]} and {names[one.pair[1]]} {CONTRADICT} the {one.boards} boards that both saw"
-        f": alone {one.alone:.2g} px, together {one.together:.2g} px, as if boards had moved by about {moved:.1g} "
-        f"{boards.length_unit} from one picture to the other. The pictures are not of the same instants, or a camera "
-        "or the rig moved between them. The error bars allow for it; what moves while it is measured is off by more."
-        for one in group.doubts
-    ]
+    notes += [_doubt_note(one, group, trained, boards) for one in group.doubts]
     if group.wrong:
         worst = wrong_corners(group, boards)[:MAX_NAMED_IN_NOTE]
         named = ", ".join(f"{view.point} in {view.camera} ({view.residual:.3g} px off)" for view in worst)
@@ -286,6 +283,30 @@ def group_notes(group: CameraGroup, trained: Observations, boards: Dataset) -> l
         count = f"{len(group.wrong)} corner{'s' * (len(group.wrong) != 1)}"
         notes.append(f"{count} not used, far from where the others predict them: {named}{more}.")
     return [*notes, *_lens_notes(group, trained)]
+
+
+def _doubt_note(one: Agreement, group: CameraGroup, trained: Observations, boards: Dataset) -> str:
+    """Of two cameras that do not fit together: that something moved, or that their lenses are not held.
+
+    Pictures of other instants leave each camera alone as good as its corners are. A lens that no model holds leaves
+    more than that in each, and most of it hides in the poses of the boards until two cameras must share these.
+    """
+    names, stated = trained.camera_names, stated_noise(trained)
+    pair = f"{names[one.pair[0]]} and {names[one.pair[1]]}"
+    which = f"the {one.boards} boards that both saw: alone {one.alone:.2g} px, together {one.together:.2g} px"
+    corners = float(np.sqrt(np.mean(stated[list(one.pair)] ** 2)))
+    if one.alone > MAX_ALONE_NOISES * corners:
+        return (
+            f"{pair} do not fit together on {which}, and alone already {one.alone / corners:.2g} times what their "
+            "corners are good to: no lens model here holds these lenses, or the board is not flat. The error bars "
+            "allow for it. Known points and forward-gp learn such a lens; more boards do not."
+        )
+    moved = np.sqrt(6) * group.bundle.slack  # along three axes, in either picture
+    return (
+        f"{pair} {CONTRADICT} {which}, as if boards had moved by about {moved:.1g} {boards.length_unit} from one "
+        "picture to the other. The pictures are not of the same instants, or a camera or the rig moved between them. "
+        "The error bars allow for it; what moves while it is measured is off by more."
+    )
 
 
 def _lens_notes(group: CameraGroup, trained: Observations) -> list[str]:
