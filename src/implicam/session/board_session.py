@@ -410,7 +410,7 @@ class BoardController(SessionController):
     def _each_when_it_likes(self) -> bool:
         """Whether cameras take pictures by themselves, triggered by nothing: only of a board held still do these
         show one place."""
-        return self._live and self.equipment.trigger is None
+        return self.equipment.shows_live and self.equipment.trigger is None
 
     def _judge(self, looks: Sequence[Look]) -> Judgement:
         """Of live pictures: whether to take one now."""

@@ -116,6 +116,13 @@ class Equipment:
     unit: str = "mm"
     pulse_every: float = 0.0
 
+    @property
+    def shows_live(self) -> bool:
+        """Whether pictures come between those that are taken: cameras run freely, or pulses are sent for that."""
+        if self.trigger is not None:
+            return self.pulse_every > 0
+        return all(source.live for source in self.cameras)
+
     def __post_init__(self) -> None:
         if not isinstance(self.robot, GuardedRobot) or (self.dry_run and not self.robot.dry_run):
             options = RobotOptions(unit=self.unit, dry_run=self.dry_run)
@@ -180,8 +187,6 @@ class SessionController:
         self._halted = threading.Event()  # stop was pressed: nothing moves until `go`
         self._ending = threading.Event()  # the session is being left: nothing moves, whoever says go
         self._targets_without_ball = 0
-        pulsed = equipment.trigger is not None and equipment.pulse_every > 0
-        self._live = pulsed or (equipment.trigger is None and all(source.live for source in equipment.cameras))
         self._followers = {name: Follower(equipment.detector, k) for k, name in enumerate(names)}
         self._next_pulse = 0.0  # time.monotonic() before which none is fired for live pictures
         loop.history = _read_history(session)
@@ -475,7 +480,7 @@ class SessionController:
         A pulse for live pictures is over when all cameras have given theirs, and a shot waits for that.
         """
         phase = self.state.phase
-        if not self._live or phase not in ("aim", "done") or time.monotonic() < self._next_pulse:
+        if not self.equipment.shows_live or phase not in ("aim", "done") or time.monotonic() < self._next_pulse:
             return
         if not self._camera_lock.acquire(blocking=False):
             return

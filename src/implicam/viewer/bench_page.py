@@ -78,9 +78,6 @@ class BenchPage:
         self._asks = robot.alone and not controller.equipment.dry_run and not getattr(robot, "simulated", False)
         if self._asks:
             robot.ask_before_moving(self._may_move)
-        pulsed = controller.equipment.trigger is not None and controller.equipment.pulse_every > 0
-        free = controller.equipment.trigger is None and all(s.live for s in controller.equipment.cameras)
-        self._live_pictures = pulsed or free
         self._names = [source.name for source in controller.equipment.cameras]
         self._worker = Worker(controller, self._complain)
         self._running = True
@@ -289,7 +286,7 @@ class BenchPage:
         for row in found["cameras"]:
             look = looks.get(row["name"])
             if look is None or look.frame is None:
-                if not self._live_pictures and state.phase == "aim" and row["kind"] != "bad":
+                if not self._controller.equipment.shows_live and state.phase == "aim" and row["kind"] != "bad":
                     row["reason"] = f"a picture comes with “{found['buttons']['go']['label']}”"
                 continue
             number, picture = self._pictures.get(row["name"], (0, None))

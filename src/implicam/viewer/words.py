@@ -27,6 +27,7 @@ class Headline:
 
 
 MAX_SUSPECTS_NAMED = 3
+"""Points that are not where they are said to be, and stand in the headline by name."""
 
 
 def headline(state: State, moves: bool, unit: str = "mm") -> Headline:
