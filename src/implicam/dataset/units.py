@@ -23,6 +23,22 @@ def refuse_length_unit(given: object) -> None:
         raise UsageError(f"length_unit={given!r} is no argument here.", fix=f"write unit={given!r}")
 
 
+def refuse_unknown_unit(unit: object) -> None:
+    """Refuse what is no length unit.
+
+    Args:
+        unit: As somebody wrote it.
+
+    Raises:
+        UsageError: It is none of `METRES_PER_UNIT`.
+    """
+    if unit not in METRES_PER_UNIT:
+        raise UsageError(
+            f"there is no length unit {unit!r}{did_you_mean(str(unit), METRES_PER_UNIT)}.",
+            fix=f"use {', '.join(METRES_PER_UNIT)}",
+        )
+
+
 def metres_per(unit: str) -> float:
     """The length of a unit in metres.
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from implicam.dataset.units import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT, refuse_unknown_unit
 from implicam.errors import HardwareError, UsageError, import_extra
 from implicam.hardware.protocol import (
     Box,
@@ -107,8 +107,7 @@ class URRobot:
         sd: Sequence[float] | None = None,
         say: Callable[[str], None] = print,
     ) -> None:
-        if unit not in METRES_PER_UNIT:
-            raise UsageError(f"there is no length unit {unit!r}.", fix=f"use {', '.join(METRES_PER_UNIT)}")
+        refuse_unknown_unit(unit)
         if not 0 < speed <= MAX_SPEED_M_S:
             raise UsageError(f"speed = {speed} m/s is out of range.", fix=f"0.1 is calm; {MAX_SPEED_M_S} is the most")
         self.host, self.unit, self._speed = host, unit, speed

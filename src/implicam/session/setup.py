@@ -31,9 +31,9 @@ from implicam.addresses import without_secrets
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset import Camera, Floats
 from implicam.dataset.boards import BOARD_KINDS
-from implicam.dataset.units import METRES_PER_UNIT
+from implicam.dataset.units import METRES_PER_UNIT, refuse_unknown_unit
 from implicam.detect import Ball
-from implicam.errors import DatasetError, HardwareError, UsageError, did_you_mean
+from implicam.errors import DatasetError, HardwareError, UsageError
 from implicam.hardware import (
     CAMERAS,
     ROBOTS,
@@ -162,11 +162,7 @@ class Setup:
         trigger: Any = self.trigger or ()  # older sessions have None, or one
         object.__setattr__(self, "trigger", (trigger,) if isinstance(trigger, str) else tuple(trigger))
         object.__setattr__(self, "tool", None if self.tool is None else _tool(self.tool))
-        if self.unit not in METRES_PER_UNIT:
-            raise UsageError(
-                f"there is no length unit {self.unit!r}{did_you_mean(self.unit, METRES_PER_UNIT)}.",
-                fix=f"use {', '.join(METRES_PER_UNIT)}",
-            )
+        refuse_unknown_unit(self.unit)
         method, _ = CALIBRATORS.find(self.method)
         if not can_design_experiments(method.calibration):
             raise design_error(method.calibration.method)
@@ -434,6 +430,8 @@ def changes_to(folder: Path, before: Setup, given: Mapping[str, Any], *, all_giv
         UsageError: Something is to be another that stays to the end: what is shown, its size, the unit.
     """
     found = dict(given)
+    if given.get("unit") is not None:  # a word that is none is a slip of the hand, whatever was begun
+        refuse_unknown_unit(given["unit"])
     has = {**{key: getattr(before, key) for key in _lasting(before)}, **sizes_of(before)}
     for key in has:
         if key not in given or given[key] == getattr(before, key) or (given[key] is None and not all_given):
