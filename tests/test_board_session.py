@@ -176,6 +176,9 @@ def test_the_loop_says_where_why_and_how_far(loop):
     progress = loop.camera_progress()
     assert [one.boards for one in progress] == [8, 8]
     assert all(0.4 < one.part <= 1 for one in progress)
+    known = loop.design.pixel_sd() * loop.design.pixel_noise()
+    assert loop.design.pixel_noise() == pytest.approx(0.2, rel=0.2)
+    assert [one.words.split(",")[0] for one in progress] == [f"calibrated to {px:.2g} px" for px in known]
     step = loop.history[-1]
     assert step.points == 8
     assert step.usual < step.worst < 50
@@ -348,7 +351,7 @@ def test_boards_at_unknown_places_are_kept_and_come_back(tmp_path, eight):
     ("options", "says"),
     [
         ({"target": "charcuo"}, "did you mean 'charuco'"),
-        ({"target": "checkerboard"}, "a plain checkerboard is board"),
+        ({"target": "checkerboard", "board": "8x11"}, "size of the squares"),
         ({"target": "board", "board": "8x11"}, "size of the squares"),
         ({"target": "board", "board": "8x11", "square": 13290.0}, "no size for a board"),
         ({"target": "charuco", "tag": 3.0}, "no option --tag"),
@@ -371,6 +374,9 @@ def test_a_session_knows_its_board_when_it_goes_on(tmp_path):
         changes_to(tmp_path, before, {"square": 30.0})
     with pytest.raises(UsageError, match="was begun with target charuco"):
         changes_to(tmp_path, before, {"target": "board"})
+    plain = Setup(rig="stereo", target="checkerboard")
+    assert plain.target == "board"
+    assert changes_to(tmp_path, plain, {"target": "checkerboard"})["target"] == "board"
 
 
 # --- known poses ------------------------------------------------------------------------------------------------------

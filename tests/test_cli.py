@@ -315,6 +315,15 @@ def test_acquire_goes_on_and_refuses_what_it_cannot(cli: Cli) -> None:
         assert "fix:" in ran.err
 
 
+def test_acquire_makes_no_folder_with_the_name_of_a_file(cli: Cli) -> None:
+    Path("NOTES").write_text("a file")
+    for name in ("README.md", "my-session.implicam", "NOTES"):
+        ran = cli("acquire", name, "--unattended")
+        assert (ran.code, ran.out) == (2, "")
+        assert "file" in ran.err
+        assert not Path(name).is_dir()
+
+
 def test_a_failure_with_json_leaves_stdout_empty(cli: Cli) -> None:
     ran = cli("info", "nothing.implicam", "--json")
     assert (ran.code, ran.out) == (1, "")

@@ -81,6 +81,7 @@ ENDINGS_OF_FILES = frozenset((
     ".csv", ".tsv", ".txt", ".xlsx", ".xls", ".xlsm", ".xlsb", ".ods", ".numbers", ".parquet", ".feather", ".npz",
     ".npy", ".json", ".toml", ".yaml", ".yml", ".xml", ".html", ".htm", ".pdf", ".png", ".svg", ".jpg", ".jpeg", ".tif",
     ".tiff", ".mat", ".h5", ".hdf5", ".pkl", ".zip", ".implicam", ".onnx",
+    ".md", ".rst", ".log", ".db", ".py", ".ipynb", ".avi", ".mp4", ".mov", ".mkv",
 ))  # fmt: skip
 """Endings that promise what is in a file; another form is not written under such a name."""
 

@@ -192,6 +192,20 @@ class BoardDesign:
         found[used] = np.sqrt(np.nanmean(variance[:, used], axis=(0, 2)))
         return found
 
+    def pixel_noise(self) -> Floats:
+        """The noise of each camera's pixels.
+
+        Returns:
+            (cameras,) rms over the judged places that it sees; NaN for a camera that is not calibrated.
+        """
+        there = self._at_judged
+        seen = there.seen.reshape(len(there.sd), -1, 2).any(axis=2)
+        variance = (there.sd**2).reshape(len(there.sd), -1, 2).mean(axis=2)
+        found = np.full(variance.shape[1], np.nan)
+        used = seen.any(axis=0)
+        found[used] = np.sqrt(np.nanmean(np.where(seen, variance, np.nan)[:, used], axis=0))
+        return found
+
     def gains(self, poses: Sequence[Pose], seen: Sequence[Bools] | None = None) -> Floats:
         """By how much a board at each pose would reduce the mean variance of a position in the volume.
 

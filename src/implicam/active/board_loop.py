@@ -343,7 +343,9 @@ class BoardLoop:
         if not np.isfinite(unknown):
             return CameraProgress(0.4, boards, "sees nothing of the volume")
         part = 0.4 + 0.6 * min(1.0, MAX_EXCESS_PART / max(unknown, 1e-9))
-        return CameraProgress(part, boards, f"known to {decimal_number(unknown, 2)} of its noise")
+        noise = float(self.design.pixel_noise()[c])
+        now, enough = decimal_number(unknown * noise, 2), decimal_number(MAX_EXCESS_PART * noise, 2)
+        return CameraProgress(part, boards, f"calibrated to {now} px" + (f", {enough} is enough" if part < 1 else ""))
 
     @property
     def _names(self) -> tuple[str, ...]:

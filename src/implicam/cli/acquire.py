@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from implicam.calibrators import load_calibration
 from implicam.cli import show
-from implicam.cli.app import Json, Seed, command, command_line, must_not_replace
+from implicam.cli.app import Json, Seed, command, command_line, must_be_folder, must_not_replace
 from implicam.cli.options import OptionsOfParts, options_of_setup
 from implicam.dataset import Floats
 from implicam.dataset.written_table import check_table_name, write_table
@@ -163,6 +163,7 @@ def _acquire(
     from implicam.session.setup import Setup, changes_to, open_session, with_options
     from implicam.viewer.front import check_address
 
+    must_be_folder(folder)
     if not is_session(folder):
         with_options(Setup(), **options)  # what is wrong with the words is said before anything is begun
     opencv()

@@ -143,7 +143,9 @@ def chosen(data: Dataset, cameras: str | None, without: str | None) -> Dataset:
 
 
 def must_be_folder(path: Path) -> None:
-    """UsageError where the name is that of a file."""
+    """UsageError where the name is that of a file: of one that is there, or by its ending."""
+    if path.is_file():
+        raise UsageError(f"{path} is a file, and this command writes a folder.", fix="give another name")
     if is_file_name(path) and not path.exists():
         raise UsageError(
             f"{path} is the name of a file, and this command writes a folder.",

@@ -10,7 +10,7 @@ import typer
 from implicam.cli import show
 from implicam.cli.app import Json, check_figure, command
 from implicam.dataset.boards import BOARD_KINDS
-from implicam.detect import TARGETS, options_of
+from implicam.detect import ALSO_CALLED, TARGETS, options_of
 from implicam.errors import UsageError, did_you_mean
 
 ACTIONS = ("print",)
@@ -39,6 +39,7 @@ def board_command(
     """Make a board to print in true size, with bars to check the printer."""
     if action not in ACTIONS:
         raise UsageError(f"board {action!r} is not known{did_you_mean(action, ACTIONS)}.", fix="implicam board print")
+    target = ALSO_CALLED.get(target, target)
     if target not in BOARD_KINDS:
         raise UsageError(f"{target!r} is no board{did_you_mean(target, BOARD_KINDS)}.", fix=f"use {list(BOARD_KINDS)}")
     check_figure(output)

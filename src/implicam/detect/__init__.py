@@ -16,11 +16,12 @@ from implicam.detect.dots import Dots
 from implicam.detect.film import detect_films, films_of
 from implicam.detect.folder import Correct, DetectionRun, detect_folder
 from implicam.detect.model import Detected, Detector, DetectorBase, View
-from implicam.detect.registry import TARGETS, detector_from_options, options_of
+from implicam.detect.registry import ALSO_CALLED, TARGETS, detector_from_options, options_of
 from implicam.detect.silhouette import correct_outlines, predict_outline_shift
 from implicam.registry import Option
 
 __all__ = [
+    "ALSO_CALLED",
     "TARGETS",
     "AprilGrid",
     "Ball",

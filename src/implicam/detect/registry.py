@@ -43,6 +43,10 @@ TARGETS: Registry[type[Any]] = Registry(
 """Target -> its detector."""
 
 
+ALSO_CALLED = {"checkerboard": "board", "chessboard": "board"}
+"""Other names that people give a target -> the name in `TARGETS`, which stands in files."""
+
+
 def options_of(target: str) -> dict[str, inspect.Parameter]:
     """The options that a target has on the command line: the keyword arguments of its detector's `from_options`.
 
@@ -71,7 +75,7 @@ def detector_from_options(target: str | None, dataset: Path, **options: Any) -> 
         UsageError: The target or an option is not known, or an option is missing or wrong.
     """
     described = _described_target(dataset)
-    name = target or str(described.get("kind", ""))
+    name = ALSO_CALLED.get(target or "", target or "") or str(described.get("kind", ""))
     if not name:
         raise UsageError(
             "which target is it?",

@@ -57,7 +57,7 @@ def board_detector(setup: Setup) -> Detector:
     if setup.target not in BOARD_KINDS:
         raise UsageError(
             f"a session cannot show a target {setup.target!r}{did_you_mean(setup.target, (BALL, *BOARD_KINDS))}.",
-            fix=f"--target {'|'.join((BALL, *BOARD_KINDS))}; a plain checkerboard is board",
+            fix=f"--target {'|'.join((BALL, *BOARD_KINDS))}",
         )
     known, given = options_of(setup.target), sizes_of(setup)
     for name in given:

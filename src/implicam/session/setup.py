@@ -32,7 +32,7 @@ from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_na
 from implicam.dataset import Camera, Floats
 from implicam.dataset.boards import BOARD_KINDS
 from implicam.dataset.units import METRES_PER_UNIT, refuse_unknown_unit
-from implicam.detect import Ball
+from implicam.detect import ALSO_CALLED, Ball
 from implicam.errors import DatasetError, HardwareError, UsageError
 from implicam.hardware import (
     CAMERAS,
@@ -161,6 +161,7 @@ class Setup:
         _refuse_twice([name for name, _ in self.cameras])
         trigger: Any = self.trigger or ()  # older sessions have None, or one
         object.__setattr__(self, "trigger", (trigger,) if isinstance(trigger, str) else tuple(trigger))
+        object.__setattr__(self, "target", ALSO_CALLED.get(self.target, self.target))
         object.__setattr__(self, "tool", None if self.tool is None else _tool(self.tool))
         refuse_unknown_unit(self.unit)
         method, _ = CALIBRATORS.find(self.method)
@@ -429,7 +430,7 @@ def changes_to(folder: Path, before: Setup, given: Mapping[str, Any], *, all_giv
     Raises:
         UsageError: Something is to be another that stays to the end: what is shown, its size, the unit.
     """
-    found = dict(given)
+    found = given = {**given, "target": ALSO_CALLED.get(given.get("target") or "", given.get("target"))}
     if given.get("unit") is not None:  # a word that is none is a slip of the hand, whatever was begun
         refuse_unknown_unit(given["unit"])
     has = {**{key: getattr(before, key) for key in _lasting(before)}, **sizes_of(before)}
