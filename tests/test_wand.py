@@ -22,7 +22,7 @@ from implicam.errors import DatasetError, FitError, UsageError
 from implicam.geometry import Pose, register, rotation_from_vector
 from implicam.progress import silent
 from implicam.rig_model import image_of
-from implicam.simulate import Optics, Rig, Target, as_wand, build_rig, random_positions, record, simulate, waved_wand
+from implicam.simulate import Rig, Target, as_wand, build_rig, random_positions, simulate, waved_wand
 from implicam.verdict import judge
 
 
@@ -215,9 +215,6 @@ def test_a_wand_that_does_not_fit_is_not_waved() -> None:
     rig = build_rig("bar3", seed=1)
     with pytest.raises(UsageError, match="does not fit"):
         waved_wand(rig, 3, np.random.default_rng(0), length=1000.0)
-    target = waved_wand(rig, 3, np.random.default_rng(0))
-    with pytest.raises(UsageError, match="photographed"):
-        record(rig, target, seed=1, optics=Optics())
 
 
 def test_eliminated_frames_give_the_answer_of_the_whole_system() -> None:

@@ -1,4 +1,4 @@
-"""From photographs to observations: a ball, a board, dots.
+"""From photographs to observations: a ball, a board, dots, a wand.
 
 run = detect_folder(Path("my-rig"), Ball())
 run.data, run.cameras, run.reasons
@@ -18,6 +18,7 @@ from implicam.detect.folder import Correct, DetectionRun, detect_folder
 from implicam.detect.model import Detected, Detector, DetectorBase, View
 from implicam.detect.registry import ALSO_CALLED, TARGETS, detector_from_options, options_of
 from implicam.detect.silhouette import correct_outlines, predict_outline_shift
+from implicam.detect.wand import WandMarkers
 from implicam.registry import Option
 
 __all__ = [
@@ -36,6 +37,7 @@ __all__ = [
     "Option",
     "Template",
     "View",
+    "WandMarkers",
     "correct_outlines",
     "detect_films",
     "detect_folder",

@@ -138,12 +138,13 @@ def _answer_noise(picture: Grey, sigma: Floats) -> Floats:
     return np.asarray(noise / (np.sqrt(2 * np.pi) * sigma), dtype=np.float64)
 
 
-def find_spots(picture: Grey, sigma: float) -> tuple[Floats, Floats]:
+def find_spots(picture: Grey, sigma: float, least: float | None = None) -> tuple[Floats, Floats]:
     """Find all bright spots of about one scale.
 
     Args:
         picture: (height, width) grey from 0 to 1.
         sigma: The scale in pixels.
+        least: Answer of the Laplacian that a spot has at least; None for what stands out of the noise.
 
     Returns:
         Pixels (n, 2), to about half a pixel; and answers (n,) of the Laplacian.
@@ -151,8 +152,11 @@ def find_spots(picture: Grey, sigma: float) -> tuple[Floats, Floats]:
     cv2 = opencv()
     answer = laplacian(picture, sigma)
     around = cv2.dilate(answer, np.ones((3, 3), np.uint8))
-    least = max(MIN_RESPONSE_NOISES * float(_answer_noise(picture, np.array([sigma]))[0]), 1e-4)
-    v, u = np.nonzero((answer == around) & (answer > least))
+    if least is None:
+        least = max(MIN_RESPONSE_NOISES * float(_answer_noise(picture, np.array([sigma]))[0]), 1e-4)
+    at = np.flatnonzero(answer.ravel() > least)  # few: what is compared with its surroundings
+    at = at[answer.ravel()[at] == around.ravel()[at]]
+    v, u = np.unravel_index(at, answer.shape)
     inside = (u > 1) & (v > 1) & (u < picture.shape[1] - 2) & (v < picture.shape[0] - 2)
     u, v = u[inside], v[inside]
     across, along = _principal_curvatures(answer, u, v)

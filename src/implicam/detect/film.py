@@ -68,8 +68,9 @@ REPEATED_SDS = 8.0
 MAX_DRAWN = 36
 """Pictures of a camera that are drawn."""
 
-BOARD_INSTANTS = 60
-"""Instants that are kept of a target with several points, unless another number is asked for."""
+BOARD_INSTANTS, WANTED_POINTS = 60, 800
+"""Instants that are kept of a target with several points, unless another number is asked for: the first, or, of a wand
+with its few, as many as give so many points."""
 
 MIN_DIFFERENCE_PX = 5.0
 """Instants that differ by less, on average over the points, are nearly equal."""
@@ -118,8 +119,8 @@ def detect_films(
         offsets: Seconds to add to the times in the films, as `given_clocks` reads them; None to find them from the
             movement of the target.
         every: Search every so many pictures.
-        frames: Keep so many instants, those that differ most; None for all of a single point, and for `BOARD_INSTANTS`
-            of a target with several.
+        frames: Keep so many instants, those that differ most; None for all of a single point, and of a target with
+            several for `BOARD_INSTANTS`, or more where they are few.
         overlays: Whether to draw pictures to check by eye.
         restart: Forget what an earlier run found.
         correct: What is done to the observations before they are written, instead of `detector.correct`.
@@ -538,7 +539,8 @@ def _observe(
                 why="their films show the target at different times",
                 fix="film the target with all cameras at the same time; or correct --times or --offsets",
             )
-        number = frames if frames is not None else BOARD_INSTANTS if len(points) > 1 else None
+        usual = max(BOARD_INSTANTS, WANTED_POINTS // len(points)) if len(points) > 1 else None
+        number = frames if frames is not None else usual
         kept = usable if number is None else usable[choose_different(uv[usable], sd[usable], number)]
         shots = [shot_name(int(tracks[0].numbers[row])) for row in kept]  # an instant is a picture of the first track
     data = _dataset(rig, points, shots, instants.times[kept], uv[kept], sd[kept], instants.known)

@@ -16,6 +16,7 @@ from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
 from implicam.detect.dots import Dots
 from implicam.detect.model import Detector
+from implicam.detect.wand import WandMarkers
 from implicam.errors import UsageError, did_you_mean
 from implicam.registry import Registry, offers
 
@@ -36,7 +37,7 @@ class DetectorClass(Detector, Protocol):
 
 TARGETS: Registry[type[Any]] = Registry(
     "target",
-    {"ball": Ball, "board": Board, "charuco": Charuco, "aprilgrid": AprilGrid, "dots": Dots},
+    {"ball": Ball, "board": Board, "charuco": Charuco, "aprilgrid": AprilGrid, "dots": Dots, "wand": WandMarkers},
     "implicam.detectors",
     offers(DetectorClass),
 )

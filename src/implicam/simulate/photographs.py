@@ -1,4 +1,4 @@
-"""Photographs of a simulated rig: what each camera sees of a ball or a board through its true lens.
+"""Photographs of a simulated rig: what each camera sees of a ball, a board or a wand through its true lens.
 
 Each camera has its lines of sight, pixel by pixel, and its background, both made once; a picture renders only the patch
 that the target covers, two by two rays a pixel, and then the optics and the sensor: blur, vignetting, noise, 8 bits.
@@ -23,7 +23,7 @@ from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.clutter import background
 from implicam.simulate.noise import Bools, simulate, views
 from implicam.simulate.rigs import Rig
-from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, ShownObject
+from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, ShownObject, Wand
 from implicam.simulate.targets import Target
 from implicam.threads import side_by_side
 
@@ -31,6 +31,9 @@ RAYS_PER_PIXEL_SIDE = 2
 """Rays per pixel in each direction."""
 
 BALL_RADIUS_MM = 8.0
+
+WAND_RADII_MM, WAND_BRIGHTNESS, WAND_ROD_MM = (9.0, 6.0), (0.9, 0.9), 2.0
+"""Of a wand's two balls, the larger of which is `a`, and of its rod."""
 
 
 @dataclass(frozen=True)
@@ -216,6 +219,8 @@ class Studio:
 
     def description(self) -> dict[str, Any]:
         """The target as dataset.toml describes it; lengths in the rig's unit."""
+        if self.target.wand is not None:
+            return {}  # `as_wand` says it
         if self.target.board is None:
             return {"kind": "ball", "radius": self.ball_radius_mm * self.rig.units_per_mm}
         rows, columns = self.target.board
@@ -230,6 +235,9 @@ class Studio:
             shot: The number of the shot.
         """
         xyz = self.target.xyz[self.target.shots == self.shots[shot]]
+        if self.target.wand is not None:
+            mm = self.rig.units_per_mm
+            return Wand(xyz, mm * np.array(WAND_RADII_MM), np.array(WAND_BRIGHTNESS), mm * WAND_ROD_MM)
         if self.target.board is None:
             return Ball(xyz[0], self._towards_cameras, self.ball_radius_mm * self.rig.units_per_mm, self._light)
         rows, columns = self.target.board
@@ -265,7 +273,7 @@ class Studio:
 
     def _from_the_front(self) -> Bools:
         """(n, cameras) where a ball is not behind its plate."""
-        if self.target.facing is not None:
+        if self.target.facing is not None or self.target.wand is not None:
             return np.ones((len(self.target.xyz), len(self.rig.cameras)), dtype=np.bool_)
         columns = []
         for camera in self.rig.cameras:
@@ -405,15 +413,13 @@ def record(
     """
     if optics is None:
         return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, missing=missing, outliers=outliers))
-    if target.wand is not None:
-        raise UsageError("a wand cannot be photographed yet.", fix="leave out --images")
     if outliers > 0:
         raise UsageError(
             "wrong detections cannot be photographed.", why="they come from the detector", fix="leave out --outliers"
         )
     studio = Studio(rig, target, optics, seed, missing)
     _, visible = studio.true_pixels
-    described = {"target": studio.description()}
+    described = {"target": told} if (told := studio.description()) else {}
     return Recorded(simulate(rig, target, seed=seed, robot_noise=robot_noise, visible=visible, extra=described), studio)
 
 

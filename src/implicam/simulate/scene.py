@@ -1,4 +1,4 @@
-"""What stands in front of the cameras: a ball on a tool before its white plate, or a printed checkerboard.
+"""What stands in front of the cameras: a ball on a tool before its white plate, a printed checkerboard, or a wand.
 
 An object paints itself into a patch of rays: its albedo where it covers them, and how much of each it covers. The edge
 of a thing is where a smooth function of the ray is zero; the function over its own slope is the distance from the edge
@@ -90,9 +90,9 @@ class Ball:
         plate_at = self.centre - self.GAP * self.radius * self.facing
         back = plate_at - self.TOOL_LENGTH * self.radius * self.facing
         layers: list[tuple[Patch, Any]] = [
-            (self._rod(rays, back, plate_at, self.TOOL * self.radius), np.float32(0.22)),
+            (_rod(rays, back, plate_at, self.TOOL * self.radius), np.float32(0.22)),
             self._plate(rays, plate_at),
-            (self._rod(rays, plate_at, self.centre, self.STEM * self.radius), np.float32(0.4)),
+            (_rod(rays, plate_at, self.centre, self.STEM * self.radius), np.float32(0.4)),
             self._sphere(rays),
         ]
         if (rays.centre - plate_at) @ self.facing < 0:  # seen from behind, the plate hides the ball
@@ -113,10 +113,7 @@ class Ball:
     def _sphere(self, rays: Rays) -> tuple[Patch, Patch]:
         towards = self.centre - rays.centre
         distance = float(np.linalg.norm(towards))
-        axis = (towards / distance).astype(np.float32)
-        along = rays.directions @ axis
-        aside = _length(rays.directions - along[..., None] * axis)
-        cover = _cover(aside - np.float32(self.radius / distance))
+        cover, along, aside = _sphere_cover(rays, self.centre, self.radius)
         depth = distance * along - np.sqrt(np.maximum(self.radius**2 - (distance * aside) ** 2, 0))
         normal = (depth[..., None] * rays.directions - towards.astype(np.float32)) / np.float32(self.radius)
         lamp = self.light.towards.astype(np.float32)
@@ -138,19 +135,6 @@ class Ball:
         from_shadow = _length(hit - shadow_at.astype(np.float32)) / np.float32(self.radius)
         shade = 1 - 0.25 / (1 + np.exp(6 * (np.minimum(from_shadow, 9) - 1.1)))  # the ball's, soft: the lamp is large
         return cover, np.nan_to_num(np.asarray(0.75 * shade * self.light.at(hit), np.float32))
-
-    def _rod(self, rays: Rays, start: Floats, end: Floats, radius: float) -> Patch:
-        """How much of each ray a rod with rounded ends covers."""
-        axis = (end - start).astype(np.float32)
-        towards = (start - rays.centre).astype(np.float32)
-        # The point of the rod nearest to a ray, as a part of its length: both lines' mutual perpendicular, clipped.
-        da, aa = rays.directions @ axis, np.float32(axis @ axis)
-        dt, at = rays.directions @ towards, np.float32(axis @ towards)
-        part = np.clip((da * dt - at) / np.maximum(aa - da * da, 1e-6 * aa), 0, 1)
-        nearest = np.asarray(towards + part[..., None] * axis, np.float32)
-        along = _dot(nearest, rays.directions)
-        aside = _length(nearest - along[..., None] * rays.directions)
-        return _cover(np.asarray((aside - radius) / np.maximum(along, radius), np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +205,73 @@ class Checkerboard:
         return np.array([self.corner + i * self.right + j * self.down for i, j in ends])
 
 
-ShownObject = Ball | Checkerboard
+@dataclass(frozen=True, eq=False)
+class Wand:
+    """A dark rod with a bright ball at each end, and perhaps another between them: they shine by themselves.
+
+    Attributes:
+        ends: (n, 3) middles of the balls in the world; the rod goes from the first to the last.
+        radii: (n,) of the balls, in the length unit.
+        brightness: (n,) from 0 to 1.
+        rod: Radius of the rod.
+    """
+
+    ends: Floats
+    radii: Floats
+    brightness: Floats
+    rod: float
+
+    def paint(self, rays: Rays, ground: Patch) -> Patch:
+        """Paint it over what is behind it.
+
+        Args:
+            rays: One for each sample.
+            ground: (rows, columns) brightness of what is behind it.
+
+        Returns:
+            (rows, columns) brightness.
+        """
+        order = np.argsort(-np.linalg.norm(self.ends - rays.centre, axis=1))  # the nearest last
+        along = (self.ends[-1] - self.ends[0]) / np.linalg.norm(self.ends[-1] - self.ends[0])
+        rod = _rod(rays, self.ends[0] + self.radii[0] * along, self.ends[-1] - self.radii[-1] * along, self.rod)
+        for rank, ball in enumerate(order):
+            cover, _, _ = _sphere_cover(rays, self.ends[ball], float(self.radii[ball]))
+            ground = ground + cover * (np.float32(self.brightness[ball]) - ground)
+            if rank == 0:  # the rod may hide the far ball in part, and the near one the rod
+                ground = ground + rod * (np.float32(0.1) - ground)
+        return np.asarray(ground, np.float32)
+
+    def reach(self) -> Floats:
+        """(n, 3) points in the world whose pixels enclose its picture."""
+        corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+        return np.concatenate([end + radius * corners for end, radius in zip(self.ends, self.radii, strict=True)])
+
+
+ShownObject = Ball | Checkerboard | Wand
+
+
+def _rod(rays: Rays, start: Floats, end: Floats, radius: float) -> Patch:
+    """How much of each ray a rod with rounded ends covers."""
+    axis = (end - start).astype(np.float32)
+    towards = (start - rays.centre).astype(np.float32)
+    # The point of the rod nearest to a ray, as a part of its length: both lines' mutual perpendicular, clipped.
+    da, aa = rays.directions @ axis, np.float32(axis @ axis)
+    dt, at = rays.directions @ towards, np.float32(axis @ towards)
+    part = np.clip((da * dt - at) / np.maximum(aa - da * da, 1e-6 * aa), 0, 1)
+    nearest = np.asarray(towards + part[..., None] * axis, np.float32)
+    along = _dot(nearest, rays.directions)
+    aside = _length(nearest - along[..., None] * rays.directions)
+    return _cover(np.asarray((aside - radius) / np.maximum(along, radius), np.float32))
+
+
+def _sphere_cover(rays: Rays, centre: Floats, radius: float) -> tuple[Patch, Patch, Patch]:
+    """How much of each ray a ball covers; and the parts of the direction along the line to its middle and across."""
+    towards = centre - rays.centre
+    distance = float(np.linalg.norm(towards))
+    axis = (towards / distance).astype(np.float32)
+    along = rays.directions @ axis
+    aside = _length(rays.directions - along[..., None] * axis)
+    return _cover(aside - np.float32(radius / distance)), along, aside
 
 
 def _across(normal: Floats) -> tuple[Floats, Floats]:
