@@ -71,8 +71,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulated = "simulate rig --cameras 2R --positions random --points 40 --check 30 --seed 1"
     photos = "simulate photos --images --cameras 2R --positions random --points 3"
     cameras = "export rig.implicam --to aniposelib -o cameras.toml"
+    waved = "simulate wand --cameras 2R --target wand --frames 50 --check 8 --seed 1"
     with contextlib.chdir(folder):
-        for words in (simulated, "calibrate rig -o rig.implicam", photos, cameras):
+        fits = ("calibrate rig -o rig.implicam", "calibrate wand -o wand.implicam --force")
+        for words in (simulated, fits[0], photos, cameras, waved, fits[1]):
             with pytest.raises(SystemExit) as end:
                 main(words.split())
             assert not end.value.code

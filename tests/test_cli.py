@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -48,6 +49,7 @@ MAKES = {
     "detect": set(),
     "label": set(),
     "calibrate": {"my-rig.implicam"},
+    "world": {"my-world.implicam"},
     "measure": {"measured.csv"},
     "evaluate": {"report.html"},
     "check": {"checks.csv"},
@@ -140,6 +142,9 @@ def test_every_example_runs_and_leaves_what_it_names(tmp_path: Path, cli: Cli) -
     for module in ("plotly", "matplotlib"):
         pytest.importorskip(module)
     cli("simulate", "my-photos", "--images", "--cameras", "2R", "--grid", "3x2x2")
+    cli("simulate", "my-wand", "--cameras", "2R", "--target", "wand", "--frames", "60", "--check", "8")
+    cli("calibrate", "my-wand", "-o", "wand.implicam")
+    shutil.copytree(tmp_path / "my-wand" / "check", tmp_path / "l-frame")
     for command in EXAMPLES:
         if command not in (*HEAVY_EXAMPLES, *ASKS_A_PERSON):  # in this process: to start one costs a second
             example(command, tmp_path, lambda words, folder: cli(*shlex.split(words)))
@@ -207,6 +212,7 @@ def json_commands(made: Path) -> dict[str, list[str]]:
         "shoot": ["shoot", "shots", "--cameras", "2R", "--count", "2"],
         "detect": ["detect", str(made / "photos"), "--no-overlays"],
         "calibrate": ["calibrate", rig, "-o", "out.implicam"],
+        "world": ["world", str(made / "wand.implicam"), str(made / "wand" / "check"), "-o", "world.implicam"],
         "measure": ["measure", file, check],
         "evaluate": ["evaluate", file, check],
         "check": ["check", file, check],

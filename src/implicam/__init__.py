@@ -77,6 +77,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; `_NAMES` says the same 
     from implicam.verification import Verification as Verification
     from implicam.verification import verify as verify
     from implicam.viewer.calibration_page import LiveView as LiveView
+    from implicam.world import set_world as set_world
 
     __version__: str
 
@@ -105,6 +106,7 @@ _NAMES = {
     "implicam.verdict": ("Verdict", "judge"),
     "implicam.verification": ("CalibratedLength", "Verification", "verify"),
     "implicam.viewer.calibration_page": ("LiveView",),
+    "implicam.world": ("set_world",),
 }  # fmt: skip
 """Module -> the public names it has."""
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}

@@ -42,6 +42,7 @@ from implicam.rig_model import (
     all_repaired,
     white_unknowns,
 )
+from implicam.rig_model.placement import Placement
 from implicam.settings import Settings
 from implicam.tabulated import Live, RigTable, why_not_tabulated
 
@@ -316,6 +317,40 @@ class TakesPoints(Calibration, Protocol):
 
         Returns:
             The new calibration.
+        """
+
+
+@runtime_checkable
+class PlacesItsWorld(Calibration, Protocol):
+    """A calibration that can be made without known positions; then something else may say where the world is."""
+
+    @property
+    def free_world(self) -> bool:
+        """Whether its data do not say where the world is."""
+
+    @property
+    def world(self) -> tuple[str, ...]:
+        """What has said since where the world is, in sentences; empty where nothing has."""
+
+    def centres(self) -> dict[str, Floats]:
+        """Where the calibrated cameras are: name -> (3,) in the world."""
+
+    def in_world(self, placement: Placement, told: tuple[str, ...]) -> PlacesItsWorld:
+        """The same calibration, which measures in another world.
+
+        Args:
+            placement: Where it is.
+            told: What says so, in sentences.
+        """
+
+    def in_world_of_camera(self, name: str) -> PlacesItsWorld:
+        """The same calibration, in the world of one of its cameras: its centre, x right, y down, z forward.
+
+        Args:
+            name: Of the camera.
+
+        Raises:
+            UsageError: It is not calibrated.
         """
 
 

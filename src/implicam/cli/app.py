@@ -37,6 +37,7 @@ EXAMPLES = {
     "detect": "implicam detect my-photos --target ball --radius 8",
     "label": "implicam label my-tank",
     "calibrate": "implicam calibrate my-rig -o my-rig.implicam",
+    "world": "implicam world wand.implicam l-frame -o my-world.implicam",
     "measure": "implicam measure my-rig.implicam my-rig/check -o measured.csv",
     "evaluate": "implicam evaluate my-rig.implicam my-rig/check --report report.html",
     "check": "implicam check my-rig.implicam my-rig/check --log checks.csv",

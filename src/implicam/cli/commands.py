@@ -29,7 +29,8 @@ import implicam.cli.paper
 import implicam.cli.shoot
 import implicam.cli.simulate
 import implicam.cli.verify
-import implicam.cli.view  # noqa: F401  these register their commands
+import implicam.cli.view
+import implicam.cli.world  # noqa: F401  these register their commands
 from implicam import calibration_file
 from implicam.calibrators import Calibration, Calibrator, Explicit, load_calibration
 from implicam.calibrators.elsewhere import fit_on_cluster

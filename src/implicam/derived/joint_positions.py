@@ -104,12 +104,13 @@ def find_measured_point(measurement: Measurement, point: str | int) -> int:
     return number
 
 
-def joint_of_rows(measurement: Measurement, rows: NDArray[np.int64]) -> JointPositions:
+def joint_of_rows(measurement: Measurement, rows: NDArray[np.int64], *, short: bool = True) -> JointPositions:
     """The joint distribution of measured points by their numbers.
 
     Args:
         measurement: As a calibration gave it.
         rows: (k,) numbers of points that were measured.
+        short: The shared numbers z may be others than those of the calibration, and then fewer.
 
     Raises:
         UsageError: The method does not say what errors share.
@@ -123,7 +124,7 @@ def joint_of_rows(measurement: Measurement, rows: NDArray[np.int64]) -> JointPos
     shared = measurement.shared.of(rows)
     k, _, q = shared.shape
     own = _nearest_covariances(measurement.cov[rows] - shared @ shared.swapaxes(1, 2), measurement.cov[rows])
-    if q > 3 * k:
+    if short and q > 3 * k:
         flat = shared.reshape(-1, q)
         shared = covariance_root(flat @ flat.T).reshape(k, 3, -1)
     names = tuple(map(str, measurement.points[rows]))

@@ -20,6 +20,7 @@ from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
 from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings, Training
 from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, find_faults, fit_to_wand
+from implicam.calibrators.forward_gp.wand.gauge import cameras_move_with_the_world
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -33,17 +34,20 @@ from implicam.calibrators.protocol import (
     solvable,
 )
 from implicam.dataset import Dataset, remove_copies
+from implicam.dataset.frames import rigid_parts
 from implicam.dataset.requirements import require_dataset
 from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
 from implicam.dataset.wand import Wand, wand_of
 from implicam.errors import UsageError, did_you_mean
-from implicam.geometry import Floats
+from implicam.geometry import Floats, Pose
 from implicam.lenses import LENSES
 from implicam.mistakes import Finding, explain_fit_error
 from implicam.progress import Progress, silent
+from implicam.rig_model import CentralCamera, GeneralCamera
 from implicam.rig_model.diagnostics import Diagnosis
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.level_errors import find_uncertain_planes
+from implicam.rig_model.placement import Placement, placed, placement_at_camera
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.repair import Repair
 from implicam.rig_model.rig import FittedRig
@@ -181,6 +185,7 @@ class ForwardGPCalibration(RigCalibration):
     fitted: FitResult
     repairs: tuple[Repair, ...] = ()
     waved: Waved | None = None
+    world: tuple[str, ...] = ()
 
     method: ClassVar[str] = "forward-gp"
 
@@ -225,7 +230,7 @@ class ForwardGPCalibration(RigCalibration):
     def diagnosis(self) -> Diagnosis:
         """How it agrees with its own data."""
         if self.waved is not None:
-            return WandDiagnosis(self.used, self.frame, self.fitted, self.waved)
+            return WandDiagnosis(self.used, self.frame, self.fitted, self.waved, self.world)
         return Diagnosis(self.used, self.frame, self.fitted)
 
     @property
@@ -270,6 +275,79 @@ class ForwardGPCalibration(RigCalibration):
                 fix="calibrate the whole dataset of the wand again, or evaluate with a dataset of known points: "
                 "implicam evaluate FILE DATASET",
             )
+
+    @property
+    def free_world(self) -> bool:
+        """Whether its data do not say where the world is."""
+        return self.waved is not None
+
+    def in_world(self, placement: Placement, told: tuple[str, ...] = ()) -> ForwardGPCalibration:
+        """The same calibration, which measures in another world. `set_world` finds where it is.
+
+        Args:
+            placement: Where it is.
+            told: What says so, in sentences.
+
+        Raises:
+            UsageError: A camera has moved since the calibration.
+        """
+        if self.repairs:
+            raise UsageError(
+                "this calibration cannot be moved: a camera moved after the wand had been seen.",
+                why="its places would no longer be where the cameras see them",
+                fix="set the world of the calibration as it was before, then check and repair that one",
+            )
+        moves = cameras_move_with_the_world(self.posterior.models, self.frame.to_working(placement.middle))
+        posterior, frame = placed(self.posterior, self.frame, placement, moves)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = placement.new_from_old.rotation, placement.new_from_old.translation
+        fitted = replace(self.fitted, posterior=posterior)
+        return replace(self, data=self.data.transformed(pose), frame=frame, fitted=fitted, world=told)
+
+    def in_world_of_camera(self, name: str) -> ForwardGPCalibration:
+        """The same calibration, in the world of one of its cameras: its centre, x right, y down, z forward.
+
+        Args:
+            name: Of the camera.
+
+        Raises:
+            UsageError: It is not calibrated.
+        """
+        if name not in self.camera_names:
+            raise UsageError(
+                f"camera {name!r} is not calibrated{did_you_mean(name, self.camera_names)}.",
+                fix=f"the calibrated cameras are {', '.join(self.camera_names)}",
+            )
+        middle = self.data.xyz.mean(axis=0)
+        number = self.camera_names.index(name)
+        told = f"The world is that of {name}: its centre is the origin, x points right, y down, z forward."
+        here = self.cameras[name].camera_from_world
+        if here is None or not isinstance(self.posterior.models[number].camera, CentralCamera | GeneralCamera):
+            raise UsageError(
+                f"camera {name!r} has no place of its own.",
+                why="what it sees is described by a linear projection, or it looks into a mirror",
+                fix="name another camera",
+            )
+        return self.in_world(placement_at_camera(self.posterior, self.frame, number, here, middle), (told,))
+
+    def transformed(self, pose: Any) -> ForwardGPCalibration:
+        """The calibration that measures in another frame of the world: fitted again to the known points in that frame;
+        of one from a wand, moved as it is.
+
+        Args:
+            pose: What takes a position to the other frame: SciPy's Rotation, or a rigid 4 x 4 matrix (a translation in
+                the length unit).
+
+        Raises:
+            UsageError: It is no rotation and no rigid matrix.
+        """
+        if not self.free_world:
+            return super().transformed(pose)  # type: ignore[no-any-return]
+        rotation, shift = rigid_parts(pose)
+        root = self.posterior.joint
+        assert root is not None
+        still = Placement(Pose(rotation, shift), np.zeros(3), np.zeros((6, len(root))), np.zeros((6, 6)))
+        return self.in_world(still, ("The world was turned and shifted as stated, exactly.",))
 
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> ForwardGPCalibration:
         """As `refit`, starting from what is known: for a few points more, in half of the time.
@@ -389,6 +467,7 @@ class ForwardGPCalibration(RigCalibration):
         table, arrays = saved.state(self.fitted, self.data.observations.camera_names)
         moved, moved_arrays = repairs_state(self.repairs)
         waved, waved_arrays = ({}, {}) if self.waved is None else self.waved.state()
+        waved |= {"world": list(self.world)} if self.world else {}
         arrays = arrays | moved_arrays | waved_arrays | {"frame": self.frame.as_array()}
         return self.calibrator.as_table() | table | moved | waved, arrays
 
@@ -413,4 +492,5 @@ class ForwardGPCalibration(RigCalibration):
         used = remove_copies(data)
         fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, calibrator.settings)
         repairs = repairs_from_state(table, arrays, fitted.posterior)
-        return cls(calibrator, data, working, fitted, repairs, Waved.from_state(table, arrays))
+        world = tuple(str(one) for one in table.get("world", ()))
+        return cls(calibrator, data, working, fitted, repairs, Waved.from_state(table, arrays), world)

@@ -175,6 +175,7 @@ class WandDiagnosis(Diagnosis):
     """How a rig agrees with the wand it was fitted to: of points nothing was known before."""
 
     waved: Waved
+    world: tuple[str, ...] = ()
 
     @cached_property
     def rejected(self) -> tuple[Rejected, ...]:
@@ -199,11 +200,12 @@ class WandDiagnosis(Diagnosis):
     def notes(self) -> list[str]:
         """Where the world is; cameras that could not be calibrated; views and lengths that contradict the others."""
         first = self.data.observations.camera_names[self.fitted.cameras[0]]
-        world = (
+        own = (
             "The world is the wand's: its origin is the middle of all places where the wand was, its axes are those "
-            f"of {first} (x right, y down, z forward). Error bars are of positions relative to these places."
+            f"of {first} (x right, y down, z forward). Error bars are of positions relative to these places. "
+            "implicam world says where it is instead, from an L-frame, known points, a floor or a plumb line."
         )
-        return [world, *super().notes(), *self._length_notes()]
+        return [*(self.world or (own,)), *super().notes(), *self._length_notes()]
 
     def _length_notes(self) -> list[str]:
         notes = []
