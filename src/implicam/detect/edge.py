@@ -441,9 +441,10 @@ def _begin_fit(band: _Band, outside: Bools, start: Ellipse, blur: float) -> _Fit
 
 
 def _apply_change(fit: _Fit, change: Floats, start: Ellipse) -> _Fit:
-    damp = min(1.0, 0.3 * start.radius / max(float(np.linalg.norm(change[:2])), 1e-9))
-    blur = float(np.clip(fit.blur + damp * change[5], 0.6 * fit.blur, 1.6 * fit.blur))
-    blur = float(np.clip(blur, 0.3, 0.5 * start.radius))
+    radius = start.radius
+    damp = min(1.0, 0.3 * radius / max(math.hypot(*change[:2]), 1e-9))
+    blur = min(max(fit.blur + damp * float(change[5]), 0.6 * fit.blur), 1.6 * fit.blur)
+    blur = min(max(blur, 0.3), 0.5 * radius)
     light = fit.light + damp * change[GEOMETRY_NUMBERS:]
     return _Fit(_change_ellipse(fit.ellipse, damp * change[:5]), blur, light, fit.noise)
 
@@ -461,15 +462,16 @@ def _is_sane(ellipse: Ellipse, start: Ellipse) -> bool:
     """Still an ellipse, near where it started."""
     if not ellipse.is_one:
         return False
-    near = float(np.linalg.norm(ellipse.centre - start.centre)) < 0.6 * start.radius
-    return near and 0.5 < ellipse.radius / start.radius < 2
+    radius = start.radius
+    near = math.hypot(*(ellipse.centre - start.centre)) < 0.6 * radius
+    return near and 0.5 < ellipse.radius / radius < 2
 
 
 def _median(values: Floats) -> float:
     """As `np.median`, which takes four times as long for the few values of an edge."""
-    middle = len(values) // 2
-    sides = [middle - 1, middle] if len(values) % 2 == 0 else [middle]
-    return float(np.mean(np.partition(values, sides)[sides]))
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(values, (low, high))
+    return float(ordered[low] + ordered[high]) / 2
 
 
 def _sector_of(uv: Floats, ellipse: Ellipse) -> NDArray[np.int64]:
