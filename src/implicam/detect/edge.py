@@ -385,7 +385,7 @@ def _prior_precision(fit: _Fit) -> Floats:
     """(GEOMETRY_NUMBERS + 2 LIGHT_NUMBERS,) of the prior: the light is nearly even inside, less so outside, and
     never jumps."""
     jump = abs(fit.light[LIGHT_NUMBERS] - fit.light[0]) + 1e-3
-    return _PRIOR_PRECISION / jump**2
+    return np.asarray(_PRIOR_PRECISION / jump**2, dtype=np.float64)
 
 
 def _prior_precision_of_a_step() -> Floats:
@@ -422,7 +422,7 @@ def _gauss_newton(band: _Band, start: Ellipse, blur: float, last: _Fit | None) -
         normal.ravel()[:: len(normal) + 1] += precision
         pull[GEOMETRY_NUMBERS:] -= precision[GEOMETRY_NUMBERS:] * fit.light
         try:
-            change = np.linalg.solve(normal, pull)
+            change: Floats = np.linalg.solve(normal, pull).astype(np.float64, copy=False)
         except np.linalg.LinAlgError:
             return None
         fit = _apply_change(fit, change, start)
@@ -453,9 +453,7 @@ def _estimate_noise(residual: Floats, step: Floats) -> Floats:
     """(2,) standard deviation inside and outside, bearing outliers; never less than the sensor's steps."""
     sides = (residual[step < 0.5], residual[step >= 0.5])
     taken = LIGHT_NUMBERS + GEOMETRY_NUMBERS / 2  # what the fit has explained away
-    return np.array(
-        [max(1.48 * _median(np.abs(r)) * np.sqrt(len(r) / max(len(r) - taken, 1)), 1e-3) for r in sides]
-    )
+    return np.array([max(1.48 * _median(np.abs(r)) * np.sqrt(len(r) / max(len(r) - taken, 1)), 1e-3) for r in sides])
 
 
 def _is_sane(ellipse: Ellipse, start: Ellipse) -> bool:
