@@ -1,4 +1,4 @@
-# make demo   the main job on a simulated rig          make test   every test that takes a second or two; make test-slow the others
+# make demo   the main job on a simulated rig          make test   every test that takes a second or so; make test-slow the others
 # make check  all that CI checks                        make bench  speed against the limits
 # make real   the table of docs/real-data.md            make rigs   the tables of docs/choose.md on forward-gp
 # make methods   all methods side by side, the first table of docs/choose.md

@@ -717,6 +717,7 @@ def test_a_recorded_pool_is_used_once_each(known: Dataset) -> None:
 # what it is for
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", [pytest.param("bar6", marks=pytest.mark.slow), "stereo"])
 def test_choosing_beats_chance_clearly(spec: str) -> None:
     """16 chosen points are better than 20 random ones, in 95 % of the volume; the benchmark has 10 seeds."""

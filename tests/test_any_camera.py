@@ -39,6 +39,7 @@ def stretched(ratio: float) -> Dataset:
     return with_pixels(read_dataset(CASES / "nonsquare-points"), change)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [pytest.param(0.75, marks=pytest.mark.slow), 1.0, 1.333])
 def test_pixels_need_not_be_square(ratio: float) -> None:
     found = cross_validate(ForwardGP().fit, stretched(ratio), 5).coverage.overall
@@ -74,6 +75,7 @@ def test_a_wild_pixel_is_rejected_and_named_though_no_image_size_is_stated(pixel
     assert measured >= 198
 
 
+@pytest.mark.slow
 def test_v_from_below_is_a_mirror_image_and_said_to_be_one() -> None:
     def upside_down(uv: np.ndarray) -> np.ndarray:
         uv[..., 1] = 1081 - uv[..., 1]

@@ -161,6 +161,7 @@ def loop(rig: Any, eight: Dataset) -> BoardLoop:
     return found
 
 
+@pytest.mark.slow
 def test_the_loop_says_where_why_and_how_far(loop):
     assert loop.points == 8
     assert loop.stop == "all 8 boards of the budget are taken"

@@ -702,6 +702,7 @@ for path in sys.argv[1:]:
 # --- forged at random ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_random_forgeries(saved: Path, tmp_path: Path) -> None:
     """Random changes behind a right checksum reach the inner checks: refused, or a calibration; nothing else."""
     table, members = contents(saved)

@@ -99,6 +99,7 @@ def test_a_camera_that_moved_is_named_with_how_far(step: Floats) -> None:
     assert "cam4 has moved" in found.sentences()[0]
 
 
+@pytest.mark.slow
 def test_wrong_detections_do_not_hide_it() -> None:
     rig, calibration = rig_and_calibration()
     data = views(moved(rig, 3, step_of(pan=0.1)), 8, points=60)
@@ -111,6 +112,7 @@ def test_wrong_detections_do_not_hide_it() -> None:
     assert found.cameras[0].sd[1] < 0.04  # only the wrong views are left out: all others were, once
 
 
+@pytest.mark.slow
 def test_two_cameras_that_moved_are_no_single_one() -> None:
     rig, calibration = rig_and_calibration()
     both = moved(moved(rig, 3, step_of(pan=0.1)), 1, step_of(tilt=0.1))
@@ -351,6 +353,7 @@ def test_cameras_that_errors_of_known_positions_tie_are_repaired_too() -> None:
     assert nees.mean() == pytest.approx(3, abs=1.2)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_repaired_is_refused() -> None:
     rig, calibration = rig_and_calibration()
     with pytest.raises(UsageError, match="no camera to put right: the verdict is 'stands'"):

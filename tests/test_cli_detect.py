@@ -45,6 +45,7 @@ def photos(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "photos"))
 
 
+@pytest.mark.slow
 def test_photographs_are_there_and_dataset_toml_says_what_they_show(photos: Path) -> None:
     data = read_dataset(photos)
     assert data.extra["target"] == {"kind": "ball", "radius": 8.0}
@@ -54,6 +55,7 @@ def test_photographs_are_there_and_dataset_toml_says_what_they_show(photos: Path
         assert cv2.imread(str(photos / "images" / camera.name / "ball001.png")).shape == (1024, 1280, 3)
 
 
+@pytest.mark.slow
 def test_detect_finds_the_ball_where_the_truth_is_and_nowhere_else(photos: Path, cli: Cli) -> None:
     truth = read_dataset(photos)
     code, out, _ = cli("detect", photos)  # target and radius from dataset.toml
@@ -71,6 +73,7 @@ def test_detect_finds_the_ball_where_the_truth_is_and_nowhere_else(photos: Path,
     assert len(list((photos / "detections" / "overlays").rglob("*.jpg"))) == 24
 
 
+@pytest.mark.slow
 def test_the_middle_of_the_outline_is_corrected(photos: Path, cli: Cli) -> None:
     code, _, err = cli("detect", photos, "--no-overlays")
     assert code == 0
@@ -80,6 +83,7 @@ def test_the_middle_of_the_outline_is_corrected(photos: Path, cli: Cli) -> None:
     assert 0 < np.abs(moved.uv[moved.seen] - outline.astype(float)).max() < 1
 
 
+@pytest.mark.slow
 def test_without_a_radius_the_outline_is_what_is_given_and_it_says_so(photos: Path, cli: Cli) -> None:
     toml = photos / "dataset.toml"
     toml.write_text(toml.read_text().replace("radius = 8.0", ""))
@@ -111,6 +115,7 @@ def test_one_click_teaches_what_the_ball_looks_like(photos: Path, cli: Cli) -> N
     assert np.nanmax(np.abs(found.uv - data.observations.uv)) < 2
 
 
+@pytest.mark.slow
 def test_a_pattern_finds_pictures_in_one_folder(photos: Path, cli: Cli) -> None:
     flat = photos / "flat"
     flat.mkdir()
@@ -121,6 +126,7 @@ def test_a_pattern_finds_pictures_in_one_folder(photos: Path, cli: Cli) -> None:
     assert len(read_dataset(photos)) == 12
 
 
+@pytest.mark.slow
 def test_a_folder_of_pictures_alone_becomes_a_dataset(photos: Path, cli: Cli) -> None:
     for name in ("dataset.toml", "points.csv", "observations.csv", "truth.toml"):
         (photos / name).unlink()
@@ -134,6 +140,7 @@ def test_a_folder_of_pictures_alone_becomes_a_dataset(photos: Path, cli: Cli) ->
     assert (data.length_unit, data.known, len(data.cameras)) == ("mm", None, 2)
 
 
+@pytest.mark.slow
 def test_bad_pictures_are_named_and_the_rest_goes_on(photos: Path, cli: Cli) -> None:
     images = photos / "images"
     cut = images / "cam1" / "ball001.png"

@@ -174,6 +174,7 @@ def test_calibrate_says_which_views_it_rejected(cli: Cli) -> None:
     assert cli("calibrate", "rig", "-o", "x.implicam", "--method", "inverse-gp", "--json").json["rejected"] == []
 
 
+@pytest.mark.slow
 def test_a_point_measured_without_a_contradicting_view_counts_as_measured(cli: Cli) -> None:
     four_cameras(cli)
     cli("calibrate", "rig", "-o", "x.implicam")
@@ -202,6 +203,7 @@ def test_a_point_measured_without_a_contradicting_view_counts_as_measured(cli: C
     assert len(told["views_left_out"]) == 3
 
 
+@pytest.mark.slow
 def test_measure_does_without_a_camera_that_is_not_there(cli: Cli) -> None:
     four_cameras(cli)
     check = read_dataset("check")
@@ -278,6 +280,7 @@ def test_measure_from_every_form_gives_the_same(made: Path, cli: Cli) -> None:
         assert Path("again.csv").read_bytes() == expected
 
 
+@pytest.mark.slow
 def test_a_wide_csv_of_a_stranger(made: Path, cli: Cli) -> None:
     """No description beside it: measuring needs none, learning must know the unit."""
     cli("convert", made / "rig", "rig.csv")
@@ -329,6 +332,7 @@ def test_what_was_measured_is_written_as_its_name_says(ending: str, made: Path, 
     pandas.testing.assert_frame_equal(found, pandas.read_csv("measured.csv"), check_dtype=False)
 
 
+@pytest.mark.slow
 def test_a_unit_without_a_known_size_measures_and_is_not_converted(made: Path, cli: Cli) -> None:
     cli("convert", made / "rig", "rig.csv")
     Path("rig.csv.toml").unlink()

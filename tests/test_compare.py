@@ -461,6 +461,7 @@ def test_where_there_is_no_inner_plane_there_is_nothing_to_leave_out() -> None:
         plane_splits(lattice(), [141])
 
 
+@pytest.mark.slow
 def test_a_random_split_flatters_what_learns_planes_and_the_planes_show_it() -> None:
     """Without its bound of lengthscales inverse-gp learns the planes themselves (docs/decisions/0004)."""
     methods = {"forward-gp": ForwardGP(), "unbounded": InverseGP(preset="plain", shortest_lengthscale=0.05)}

@@ -46,6 +46,7 @@ def test_rows_joined_twice_are_one_and_said() -> None:
     assert note.startswith("48 of 60 known points are copies of others")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ic.ForwardGP(), ic.Explicit(), ic.InverseGP()])
 def test_a_fit_uses_each_row_once(method: ic.ForwardGP | ic.Explicit | ic.InverseGP, tmp_path: Path) -> None:
     once = rig()

@@ -142,6 +142,7 @@ def compare(made: RigCalibration, driver: Path, folder: Path, threads: int = 0) 
     return state
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_it_projects_and_measures_as_python_does(driver: Path, tmp_path: Path) -> None:
     state = compare(plain(), driver, tmp_path / "table", threads=3)

@@ -127,6 +127,7 @@ def refused_for(data: Dataset, form: str) -> str:
     return "could be mistaken" if form in ("csv", "parquet") and clash else ""
 
 
+@pytest.mark.slow
 def test_every_form_keeps_everything(tmp_path_factory: pytest.TempPathFactory) -> None:
     """One draw serves all forms: to draw a dataset costs more than to write and read it."""
 

@@ -68,6 +68,7 @@ def test_the_joint_covariance_is_that_of_what_was_drawn() -> None:
     np.testing.assert_allclose(np.diagonal(stated.cov)[:3], np.diagonal(drawn.measure().cov[0]), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_distances_and_angles_have_the_spread_that_they_state() -> None:
     true = np.array([[0.0, 0, 0], [80, 10, 5], [20, 70, -10]])
     drawn = Drawn(true, 2, shared=1.0)

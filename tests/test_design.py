@@ -160,6 +160,7 @@ def test_smooth_errors_are_as_large_as_the_process_says() -> None:
     np.testing.assert_allclose(np.sqrt(np.trace(left @ K @ left) / len(q)), 0.5, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_predicted_is_realised_within_twelve_per_cent_over_six_rigs() -> None:
     """The tolerance is three standard errors of six rigs; `benchmarks/design.py check` has 20 of each placement."""
     (design,) = compare_designs(["2R"], Assumptions(), 36, places=200, check=6)

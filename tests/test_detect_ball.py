@@ -217,6 +217,7 @@ def errors_of(made, detector):
     return np.array(errors), np.array(sd), visible
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("noise", "blur", "bias", "rms", "least"), [(0.01, 0.7, 0.02, 0.08, 0.95), (0.05, 1.5, 0.06, 0.2, 0.85)]
 )
@@ -279,6 +280,7 @@ def test_no_ball_is_a_reason(picture, bright):
     assert found.uv.shape == found.sd.shape == (0, 2)
 
 
+@pytest.mark.slow
 def test_nothing_is_found_among_clutter():
     """Half of the balls are covered; each camera's background holds 14 look-alikes."""
     rig = build_rig("bar6", seed=4, cameras="cam1,cam2")

@@ -476,6 +476,7 @@ detect_folder(Path({folder!r}), Spot(), overlays=False)
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_stopped(tmp_path):
     shots = 60
     make(tmp_path, cameras=2, shots=shots, points=False)

@@ -62,6 +62,7 @@ def points(rig: Rig, n: int, seed: int, **options: Any) -> Dataset:
     return simulate(rig, random_positions(rig, n, np.random.default_rng(seed)), seed=seed, **options)
 
 
+@pytest.mark.slow
 def test_the_group_knows_where_the_cameras_are() -> None:
     rig, _ = fisheyes()
     first = rig.cameras[0].camera_from_world
@@ -111,6 +112,7 @@ def test_pairs_agree_with_opencvs_multiview_calibration() -> None:
     np.testing.assert_allclose(pose.translation, T, atol=0.15)
 
 
+@pytest.mark.slow
 def test_a_camera_that_cannot_be_joined_is_left_out_with_the_reason() -> None:
     rig, data = pair()
     uv = data.observations.uv.copy()
@@ -130,6 +132,7 @@ def rig_names(rig: Rig) -> list[str]:
     return [camera.name for camera in rig.cameras]
 
 
+@pytest.mark.slow
 def test_pictures_of_other_instants_name_the_camera() -> None:
     _, data = pair()
     uv = data.observations.uv.copy()
@@ -236,6 +239,7 @@ def test_icp_is_the_closed_form_where_the_names_are_right() -> None:
     np.testing.assert_allclose(found.translation, pose.translation, atol=0.02)
 
 
+@pytest.mark.slow
 def test_icp_needs_no_names() -> None:
     rig, _ = pair()
     known = points(rig, 30, 5)
@@ -383,6 +387,7 @@ def test_a_wrong_known_point_does_not_turn_the_world() -> None:
     assert np.abs(shift).max() < 0.2
 
 
+@pytest.mark.slow
 def test_boards_alone_are_measured_in_the_frame_of_the_first_camera() -> None:
     rig, _ = fisheyes()
     calibration = from_boards_alone()
@@ -419,6 +424,7 @@ def test_the_layout_may_come_from_known_positions() -> None:
 # from known points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "ratio"), [(35, 1.17), (157, 1.07)])
 def test_from_points_it_reaches_the_limit(count: int, ratio: float) -> None:
     """The goals are 1.15 and 1.05 over many rigs (benchmarks/explicit.py); three rigs scatter by two percent."""
@@ -597,6 +603,7 @@ def test_too_few_known_points_cannot_align() -> None:
         on_boards().fit(points(pair()[0], 2, 1))
 
 
+@pytest.mark.slow
 def test_nothing_in_common_is_a_clear_error_without_known_points() -> None:
     rig = build_rig("bar6", seed=2, cameras="2R")
     alone = simulate_boards(rig, [("cam2",)] * 6 + [("cam3",)] * 6, seed=1)

@@ -113,6 +113,7 @@ def with_square_pixels() -> float:
     return rms_held_out(stretched(1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ratio", [pytest.param(0.75, marks=pytest.mark.slow), pytest.param(1.067, marks=pytest.mark.slow), 1.5]
 )
@@ -166,6 +167,7 @@ def test_boards_find_pixels_of_any_shape_as_opencv_does() -> None:
     assert turn == pytest.approx(4.0, abs=0.2)
 
 
+@pytest.mark.slow
 def test_one_camera_stretched_to_the_size_of_the_other() -> None:
     """Mrcal #24: an infrared camera of 512 x 424 scaled to 1920 x 1080, fair alone, useless in the pair."""
     data = held(3)
@@ -238,6 +240,7 @@ def test_neither_camera_is_to_blame() -> None:
     assert baselines[0] == pytest.approx(120, abs=6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("moved", "doubted", "seeds"), [
     (0.1, False, range(3)),
     pytest.param(0.1, False, range(3, 6), marks=pytest.mark.slow),

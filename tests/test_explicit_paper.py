@@ -56,6 +56,7 @@ def by_opencv(joint: bool = False) -> OpenCVRig:
 both = pytest.mark.parametrize("variant", ["paper", "paper-bundle"])
 
 
+@pytest.mark.slow
 @both
 def test_it_measures_near_the_limit_with_error_bars_that_are_of_the_right_size(variant: str) -> None:
     others = points(300, 6)
@@ -110,6 +111,7 @@ def test_two_cameras_triangulate_as_opencv_does() -> None:
     np.testing.assert_allclose(xyz, a.pose.inverse().apply((theirs[:3] / theirs[3]).T), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_joint_adjustment_ends_where_scipy_ends() -> None:
     """A few pictures of two cameras; every corner counts the same."""
     small = build_rig("bar6", seed=4, cameras="2R")
@@ -192,6 +194,7 @@ def test_the_unit_of_the_known_points_is_that_of_the_answer() -> None:
     np.testing.assert_allclose(1e6 * in_m.cov, in_mm.cov, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_it_is_compared_with_the_others_and_given_to_other_programs() -> None:
     fit = calibration("paper")
     train, held_out = points(60, 5).split(40, seed=0)

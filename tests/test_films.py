@@ -138,6 +138,7 @@ def test_a_table_of_times_says_it_all(tmp_path: Path) -> None:
         detect_films(folder, Ball(), films_of(folder), times=table, offsets="0")
 
 
+@pytest.mark.slow
 def test_known_positions_have_times(two_films: Path, tmp_path: Path) -> None:
     folder = copied(two_films, tmp_path / "rig")
     at = np.linspace(0.5, 4.0, 12)
@@ -310,6 +311,7 @@ def error_of(found: Offset, offset: float, drift: float = 0.0) -> float:
     return found.seconds - (true_time - found.around)
 
 
+@pytest.mark.slow
 def test_the_offset_and_the_drift_of_a_clock() -> None:
     first = track(0, wander(1), seed=1, rate=60)
     second = track(1, wander(1), seed=1, offset=-0.81, drift=3e-4)
@@ -351,6 +353,7 @@ def test_a_target_at_rest_and_one_that_repeats_itself_are_refused() -> None:
         assert "--offsets" in told.value.fix
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", [1, 3])
 def test_pictures_that_were_lost_without_a_trace_are_noticed(lost: int) -> None:
     first, whole = track(0, wander(4), seed=4, rate=60), track(1, wander(4), seed=4, offset=0.1, lost=0.0)

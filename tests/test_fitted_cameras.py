@@ -33,6 +33,7 @@ def lens_of(made: RigCalibration, camera: str) -> Lens:
     return lens
 
 
+@pytest.mark.slow
 def test_a_camera_has_its_lens_and_its_pose_in_the_world(made: RigCalibration, data: Dataset) -> None:
     """Within what the note says that a lens loses of forward-gp's field."""
     assert list(made.cameras) == ["cam1", "cam2"]

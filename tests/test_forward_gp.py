@@ -137,6 +137,7 @@ def test_one_grossly_wrong_view_is_left_out_and_named(bad: int) -> None:
     np.testing.assert_allclose(spoilt.consistency[told], without.consistency[told], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_two_wrong_views_among_six_are_left_out() -> None:
     six = rig("2R4W")
     calibration = ForwardGP().fit(simulate(six, random_positions(six, 50, np.random.default_rng(11)), seed=12))
@@ -227,6 +228,7 @@ def test_a_fifth_of_wrong_detections_is_found_out() -> None:
     assert np.median(measured.sd / clean.sd) < 1.3
 
 
+@pytest.mark.slow
 def test_a_fifth_of_wrong_detections_does_not_break_a_fit_without_a_lens() -> None:
     for seed in range(3):
         target = random_positions(rig(), 60, np.random.default_rng(seed))
@@ -384,6 +386,7 @@ def test_a_known_view_stated_as_worse_weighs_less_in_the_fit() -> None:
     assert all(0.14 < value < 0.28 for value in noise_px.values())  # 0.2 px, of a usual view
 
 
+@pytest.mark.slow
 def test_declared_noise_of_the_known_positions_widens_the_error_bars() -> None:
     exact = fitted().measure(others().observations)
     unsure = ForwardGP().fit(with_positions(known(), sd=0.5))

@@ -36,6 +36,7 @@ def test_the_rigs_are_those_of_the_stored_numbers(rig: str) -> None:
     np.testing.assert_allclose(np.array(pixels(RIGS[rig].pair())), stored(rig)["pixels"], rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rig", "name"), CASES)
 def test_a_method_measures_what_it_measured(rig: str, name: str) -> None:
     if not has_library(name):

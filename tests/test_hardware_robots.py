@@ -333,6 +333,7 @@ def test_a_person_is_only_asked() -> None:
 # ---- the simulated rig ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_simulated_cameras_photograph_where_the_robot_is() -> None:
     cameras, robot = simulated_rig(RIG, seed=5, sd=2.0)
     rng, seen = np.random.default_rng(6), 0

@@ -246,6 +246,7 @@ def test_normal_noise_is_left_alone(spec: str, monkeypatch: pytest.MonkeyPatch) 
         np.testing.assert_array_equal(calibration.measure(some).xyz, same.measure(some).xyz)
 
 
+@pytest.mark.slow
 def test_known_positions_that_are_off_are_no_heavy_tails() -> None:
     """A few by half a millimetre, or all by a tenth, undeclared."""
     data = known("bar6", 60)
@@ -271,6 +272,7 @@ def test_a_gross_error_is_still_found() -> None:
     assert (np.abs(measured.xyz - some.truth.xyz)[ok] / measured.sd[ok]).max() < 5
 
 
+@pytest.mark.slow
 def test_two_views_are_no_worse(monkeypatch: pytest.MonkeyPatch) -> None:
     """A calibration that knows of the tails, from six cameras, measures with two of them."""
     data = with_noise(others("bar6"), 70)

@@ -47,6 +47,7 @@ def declared() -> Dataset:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["forward-gp", "explicit", "tied"])
 def test_the_budget_adds_up_to_what_a_measurement_states(kind: str) -> None:
     if kind == "tied":
@@ -89,6 +90,7 @@ def test_what_new_points_would_do_is_what_they_do() -> None:
     assert instrument.sd_with_new_points < 0.7 * instrument.sd[instrument.worst]
 
 
+@pytest.mark.slow
 def test_a_smudge_is_named_with_camera_and_part_of_the_picture() -> None:
     data = known(120)
     uv = data.observations.uv.copy()
@@ -108,12 +110,14 @@ def test_good_data_get_no_advice_that_is_not_true() -> None:
     assert "More known points would hardly help" in said
 
 
+@pytest.mark.slow
 def test_errors_of_known_positions_are_told_and_not_taken_for_a_smudge() -> None:
     said = " ".join(Instrument(ic.ForwardGP().fit(declared())).advice())
     assert "errors of the known positions themselves" in said
     assert "smudge" not in said
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_put_right_is_not_taken_for_a_dirty_one() -> None:
     """What it saw when it was calibrated is held against where it stood then."""
     calibration = calibrated(120)
@@ -126,6 +130,7 @@ def test_a_camera_that_was_put_right_is_not_taken_for_a_dirty_one() -> None:
     assert "smudge" not in " ".join(Instrument(repaired).advice())
 
 
+@pytest.mark.slow
 def test_cameras_without_known_points_of_their_own_are_reported_on_too() -> None:
     """Of another program, or from boards alone: there is no box of known points to look at."""
     fitted = ic.Explicit().fit(known(40))

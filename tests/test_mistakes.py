@@ -90,6 +90,7 @@ def test_one_camera_late_is_named() -> None:
     assert found.reason.startswith("cam2: its pixels are 1 row late: put right they fit to")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ic.ForwardGP, ic.Explicit])
 def test_a_fit_that_fails_says_why(method: type[ic.ForwardGP] | type[ic.Explicit]) -> None:
     data = known()

@@ -405,6 +405,7 @@ def of_kept(calibration: MLPCalibration) -> tuple[np.ndarray, np.ndarray]:
     return measured.xyz - kept.xyz, measured.sd
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [5, 60, 157])
 def test_the_coverage_it_states_is_what_it_says(n: int) -> None:
     calibration = fitted(n)
@@ -435,6 +436,7 @@ def test_its_covariance_is_the_spread_in_the_datasets_unit() -> None:
     assert np.abs(measured.cov[:, 0, 1]).min() > 0  # a full covariance
 
 
+@pytest.mark.slow
 def test_without_dropout_the_bars_are_the_errors_of_the_points_kept() -> None:
     calibration = fitted(157, dropout=0.0)
     errors, sds = of_kept(calibration)

@@ -372,6 +372,7 @@ def odd_rigs() -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 def test_every_kind_of_odd_rig_can_be_drawn_and_measured(odd_rigs: ModuleType) -> None:
     for kind in odd_rigs.RANGES:
         drawn = odd_rigs.draw(kind, 1)
@@ -389,6 +390,7 @@ def test_the_same_seed_draws_the_same_rig(odd_rigs: ModuleType) -> None:
     np.testing.assert_array_equal(one.known.observations.uv, same.known.observations.uv)
 
 
+@pytest.mark.slow
 def test_a_rig_is_judged(odd_rigs: ModuleType) -> None:
     row = odd_rigs.judged(("ordinary", 0, "forward-gp", 60.0, False))
     assert not row["refused"]

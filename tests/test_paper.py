@@ -260,6 +260,7 @@ def test_between_two_fits_a_gaussian_process_keeps_its_hyperparameters() -> None
     assert after.max() < sd.max()  # more data, same hyperparameters: never less certain
 
 
+@pytest.mark.slow
 def test_other_methods_have_rows_where_they_are_fitted_only() -> None:
     rows = active.grow(Source(0).options, "2R", FORWARD, [0], 20, 5, 2)["rows"]
     assert [row["added"] for row in rows] == [0, 2, 4, 5]
@@ -489,6 +490,7 @@ def test_explicit_is_a_line_that_the_most_points_must_cross() -> None:
     assert judged(rows_of_the_ball({GP: 0.5}), "explicit_wins_2R", GP).verdict == FAILS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", LINES)
 def test_each_line_is_computed_by_its_own_pipeline(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = list[Explicit]()

@@ -590,6 +590,7 @@ def test_the_page_is_whole_and_loads_nothing() -> None:
     assert interactive3d.html_page(again, title=HOSTILE, caption=HOSTILE) == text
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_the_page_draws_in_a_browser(tmp_path: Path, chromium: dict[str, Any]) -> None:
     sync_api = pytest.importorskip("playwright.sync_api")

@@ -60,6 +60,7 @@ def measured(controller: SessionController, points: int) -> SessionController:
     return controller
 
 
+@pytest.mark.slow
 def test_a_session_from_start_to_report(controller: SessionController) -> None:
     phases = [controller.state.phase]
     for i in range(1, 13):
@@ -189,6 +190,7 @@ def test_undo_takes_back_the_last_point_only(controller: SessionController) -> N
     assert controller.state.phase == "aim"
 
 
+@pytest.mark.slow
 def test_any_point_can_be_taken_back_or_measured_again(after_ten: SessionController) -> None:
     before = after_ten.session.data
     assert before is not None

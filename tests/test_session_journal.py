@@ -362,6 +362,7 @@ def assert_whole(session: Session) -> None:
     assert {p.name for p in folder.iterdir()} <= tops
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kills", [6, pytest.param(60, marks=pytest.mark.slow)])
 def test_every_point_that_was_accepted_survives_kill_9(tmp_path, kills):
     folder, rng = tmp_path / "s", np.random.default_rng(7)

@@ -99,6 +99,7 @@ CHANGES: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("data", "changed"), CHANGES, ids=[" ".join([of, *changed]) for of, changed in CHANGES])
 def test_a_changed_setting_changes_the_fit_or_its_error_bars(data: str, changed: dict[str, Any]) -> None:
     usual = default_fit(data)
@@ -111,6 +112,7 @@ def test_a_changed_setting_changes_the_fit_or_its_error_bars(data: str, changed:
     )
 
 
+@pytest.mark.slow
 def test_settings_of_measuring_are_those_of_the_calibration() -> None:
     """Which views disagree, when there is no position, and when that is an alarm."""
     data = with_wrong_views()

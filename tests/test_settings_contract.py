@@ -304,6 +304,7 @@ def usual_from_boards() -> Any:
     return from_boards()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changed",
     [

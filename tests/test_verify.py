@@ -459,6 +459,7 @@ def test_the_command_writes_protocol_and_table_and_ends_with_the_decision(made: 
     assert ratio == pytest.approx(1 + 5 * 11.5e-6, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_lengths_are_in_the_unit_that_is_said_whatever_the_data_are_in(made: Path, cli: Cli) -> None:
     lengths = made / "rig" / "lengths"
     assert cli("import", made / "cameras.toml", "-o", "in-m.implicam", "--unit", "m").code == 0
