@@ -18,9 +18,10 @@ from implicam.dataset import Dataset, write_dataset
 from implicam.derived import distances, joint
 from implicam.errors import DatasetError, FitError, UsageError
 from implicam.geometry import Floats, Pose, rotation_from_vector
+from implicam.measurement import Measurement, SharedErrors
 from implicam.rig_model.placement import placed, placement_at_camera, step_between
 from implicam.simulate import Rig, Target, as_wand, build_rig, random_positions, simulate, waved_wand
-from implicam.world import set_world, with_known_positions
+from implicam.world import lay_over, set_world, with_known_positions
 
 FRAME = {"o": (0, 0, 0), "x1": (0.5, 0, 0), "x2": (1, 0, 0), "y": (0, 1, 0)}
 """An L-frame, its long arm being one."""
@@ -335,3 +336,64 @@ def test_the_command(waving: Waving, frame: Dataset, tmp_path: Path, cli: Cli) -
     assert "no known positions" in ran.err
     ran = cli("world", file, "--camera", "cam1", "-o", file)
     assert ran.code == 2
+
+
+def test_what_is_left_after_laying_over_has_the_covariance_that_is_stated() -> None:
+    rng, n, q, repeats = np.random.default_rng(5), 12, 9, 400
+    xyz = rng.normal(size=(n, 3)) * [100, 80, 60]
+    E = 0.3 * rng.normal(size=(n, 3, q))
+    roots = 0.2 * rng.normal(size=(n, 3, 3))
+    own = roots @ roots.swapaxes(1, 2) + 0.01 * np.eye(3)
+    sd = np.full((n, 3), 0.1)
+    away = Pose(rotation_from_vector([0.4, -1.0, 0.3]), np.array([500.0, 20.0, -300.0]))
+    whitened = []
+    for _ in range(repeats):
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(own), rng.normal(size=(n, 3)))
+        known = xyz + sd * rng.normal(size=(n, 3))
+        measured = _measured(xyz + E @ rng.normal(size=q) + noise, own, E)
+        laid = lay_over(measured, away.apply(known), sd)
+        off = laid.measurement.xyz - away.apply(known)
+        cov = laid.measurement.cov + away.rotation @ (sd[:, :, None] ** 2 * np.eye(3)) @ away.rotation.T
+        whitened.append(np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off).mean())
+    # the mean of a squared distance is 3, whatever six numbers were taken out
+    assert np.mean(whitened) == pytest.approx(3.0, abs=4 * np.std(whitened) / np.sqrt(repeats))
+    assert np.std(whitened) / np.sqrt(repeats) < 0.08
+
+
+def _measured(xyz: Floats, own: Floats, E: Floats) -> Measurement:
+    n = len(xyz)
+    shared = SharedErrors(lambda rows: E[rows], np.arange(n), np.eye(3))
+    names = np.array([f"p{i}" for i in range(n)])
+    cov = own + E @ E.swapaxes(1, 2)
+    return Measurement(
+        names, xyz, cov, np.full(n, 2), np.full(n, 0.5), np.full(n, ""), "mm", shared=shared
+    )  # fmt: skip
+
+
+def test_a_world_of_its_own_is_laid_over_the_points_that_judge_it(waving: Waving, frame: Dataset) -> None:
+    held = held_out(waving)
+    judged = ic.evaluate(waving.calibration, held)
+    assert "laid over the known ones by a rigid motion" in judged.how
+    assert judged.coverage.overall.rmse < 1.5
+    assert 1.0 < judged.coverage.overall.nees.value < 7.0
+    elsewhere = ic.evaluate(set_world(waving.calibration, frame), held)
+    assert "in another frame than the calibration" in elsewhere.notes[0]
+    assert "laid over" not in elsewhere.how
+    with pytest.raises(DatasetError, match="5 of the known points"):
+        ic.evaluate(waving.calibration, held.select(range(5)))
+
+
+def test_without_known_points_a_report_is_of_lengths(waving: Waving, tmp_path: Path, cli: Cli) -> None:
+    pytest.importorskip("plotly")
+    waving.calibration.save(tmp_path / "wand.implicam")
+    ran = cli("report", str(tmp_path / "wand.implicam"))
+    assert ran.code == 0
+    assert "Distances between both ends of the wand in 20 frames held out" in ran.out
+    assert "No position is known." in (tmp_path / "report.html").read_text()
+
+
+def test_a_wand_is_not_compared(tmp_path: Path, cli: Cli) -> None:
+    cli("simulate", "wand", "--target", "wand", "--frames", "30", "--cameras", "2R")
+    ran = cli("compare", "wand", "--methods", "forward-gp")
+    assert ran.code == 2
+    assert "is of a wand, and compare needs known points" in ran.err

@@ -6,13 +6,14 @@ A point that the calibration was fitted from says nothing about its accuracy, so
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators import Calibration
+from implicam.calibrators.protocol import PlacesItsWorld
 from implicam.coverage import Coverage, assess, tercile_labels
 from implicam.dataset import Dataset, Floats, Names, Observations, find_copies
 from implicam.dataset.model import fingerprint_rows
@@ -20,6 +21,7 @@ from implicam.errors import DatasetError
 from implicam.geometry import depth_of_points
 from implicam.measurement import Measurement
 from implicam.progress import Progress, silent
+from implicam.world import in_another_frame, lay_over
 
 
 class Fits(Protocol):
@@ -131,8 +133,17 @@ def evaluate(calibration: Calibration, data: Dataset, *, regions: bool = True) -
     if used.any():
         how += f"; {used.sum()} of this dataset were, and are left out"
     measurement = calibration.measure(held_out.observations)
-    labels = _label_covariance(calibration, held_out)
-    return _judge(calibration, held_out, measurement, labels, calibration.data.xyz, how, regions=regions)
+    labels, known_xyz = _label_covariance(calibration, held_out), calibration.data.xyz
+    xyz = held_out.xyz if held_out.truth is None else held_out.truth.xyz
+    more: tuple[str, ...] = ()
+    if isinstance(calibration, PlacesItsWorld) and calibration.free_world and not calibration.world:
+        laid = lay_over(measurement, xyz, np.sqrt(np.diagonal(labels, axis1=1, axis2=2)))
+        measurement, how = laid.measurement, f"{how}, {laid.told}"
+        known_xyz = laid.new_from_old.apply(known_xyz)
+    else:
+        more = tuple(in_another_frame(measurement, xyz))
+    found = _judge(calibration, held_out, measurement, labels, known_xyz, how, regions=regions)
+    return replace(found, notes=(*more, *found.notes))
 
 
 def cross_validate(fit: Fits, data: Dataset, k: int, *, seed: int = 0, progress: Progress = silent) -> Evaluation:

@@ -218,6 +218,38 @@ class FindsFaults(Calibration, Protocol):
         """
 
 
+class LengthsHeldOut(NamedTuple):
+    """Lengths as measured by a fit that did not know them.
+
+    Attributes:
+        what: They are, in words: "both ends of the wand in 66 frames held out".
+        errors: (k,) measured less true, in the length unit.
+        sds: (k,) stated for these.
+    """
+
+    what: str
+    errors: Floats
+    sds: Floats
+
+
+@runtime_checkable
+class HoldsLengthsOut(Calibration, Protocol):
+    """A calibration that can be judged by lengths, where no position is known."""
+
+    def hold_lengths_out(self, progress: Progress = silent) -> LengthsHeldOut | None:
+        """Fit again without a part of the frames, and measure the lengths there.
+
+        Args:
+            progress: Is told how far it is.
+
+        Returns:
+            What came out; None where it was made from known points.
+
+        Raises:
+            FitError: Without these there is no calibration.
+        """
+
+
 @runtime_checkable
 class PredictsPixels(Calibration, Protocol):
     """A calibration that knows each camera: where it sees a position, and how uncertain that is.

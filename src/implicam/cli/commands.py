@@ -467,15 +467,17 @@ def report_command(
     must_be_page(output)
     fitted = load_calibration(calibration)
     from implicam.report.call import report
+    from implicam.report.words import headline
 
     with show.progress(json) as progress:
         data = None if dataset is None else read(dataset, table, calibration=fitted)
         sha256 = calibration_file.checksum(calibration)
-        evaluation = report(fitted, output, data=data, checksum=sha256, by=by, progress=progress)
+        found = report(fitted, output, data=data, checksum=sha256, by=by, progress=progress)
+    how = found.how if isinstance(found, Evaluation) else headline(found)
     if json:
-        show.emit_json({"report": str(output), "how": evaluation.how})
+        show.emit_json({"report": str(output), "how": how})
     else:
-        show.line(f"{output}: {evaluation.how}")
+        show.line(f"{output}: {how}")
 
 
 @command("convert")

@@ -29,6 +29,7 @@ from implicam.compare import (
 )
 from implicam.dataset import Dataset, TableOptions
 from implicam.dataset.table_options import DOCUMENTED
+from implicam.dataset.wand import FRAME, MARKER, wand_of
 from implicam.errors import UsageError
 
 
@@ -97,6 +98,13 @@ def _splits(
     data: Dataset, train: str | None, seeds: int | None, check: Dataset | None, leave_out: str | None, lattice: bool
 ) -> list[Split]:
     must_be_shot(leave_out)
+    if data.known is None and (wand_of(data) is not None or {FRAME, MARKER} <= data.further_columns().keys()):
+        raise UsageError(
+            f"dataset {data.name!r} is of a wand, and compare needs known points.",
+            why="points are held out and compared with where they are known to be; of a wand nothing is known but its "
+            "length, and one method uses it",
+            fix="calibrate it, and judge it by lengths (implicam verify) or known points (implicam evaluate)",
+        )
     if (check is not None) + (leave_out is not None) + lattice > 1:
         raise UsageError("--check, --leave-out and --lattice exclude each other.", fix="give one of them")
     if leave_out is not None:

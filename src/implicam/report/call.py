@@ -6,11 +6,12 @@ from pathlib import Path
 
 from implicam import calibration_file
 from implicam.calibrators import Calibration
+from implicam.calibrators.protocol import HoldsLengthsOut
 from implicam.dataset import Dataset
 from implicam.evaluation import Evaluation, cross_validate, evaluate
 from implicam.files import refuse_folder
 from implicam.progress import Progress, silent
-from implicam.report.data import report_of
+from implicam.report.data import ReportData, report_of, report_of_lengths
 from implicam.report.html_page import write_report
 
 FOLDS = 10
@@ -27,7 +28,7 @@ def report(
     by: str = "",
     seed: int = 0,
     progress: Progress = silent,
-) -> Evaluation:
+) -> Evaluation | ReportData:
     """Write one page that a stranger understands: how good the measurement is, and whether its error bars are true.
 
     ic.report(calibration, "report.html", data=others)
@@ -35,7 +36,8 @@ def report(
     Args:
         what: An evaluation; or a calibration, which is evaluated.
         path: The page to write; it is replaced.
-        data: Known points to judge a calibration by; None for its own, by 10-fold cross-validation.
+        data: Known points to judge a calibration by; None for its own, by 10-fold cross-validation, or of one from a
+            wand by the wand's length in frames that a fit did not know.
         title: Of the page.
         checksum: The SHA-256 of the calibration file, for the page; of a calibration it is found out.
         by: Who reports, for the page.
@@ -43,7 +45,7 @@ def report(
         progress: Told how far it is.
 
     Returns:
-        The evaluation that the page shows.
+        The evaluation that the page shows; where no position is known, what it says of lengths.
 
     Raises:
         MissingExtraError: Plotly or Jinja2 is not installed.
@@ -54,6 +56,11 @@ def report(
         evaluation = what
     elif data is not None:
         evaluation = evaluate(what, data)
+    elif isinstance(what, HoldsLengthsOut) and (held_out := what.hold_lengths_out(progress)) is not None:
+        title = title or f"{what.data.name}, calibrated from lengths"
+        found = report_of_lengths(what, held_out, title, checksum or calibration_file.checksum(what), by=by)
+        write_report(path, found)
+        return found
     else:
         evaluation = cross_validate(what.refit, what.data, min(FOLDS, len(what.data)), seed=seed, progress=progress)
     if not (checksum or isinstance(what, Evaluation)):

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from implicam.calibrators import Calibration, RigCalibration
+from implicam.calibrators.protocol import LengthsHeldOut
 from implicam.coverage import Coverage
 from implicam.dataset import Floats
-from implicam.errors import UsageError
+from implicam.errors import FitError, UsageError
 from implicam.evaluation import Evaluation
 from implicam.measurement import Measurement
 from implicam.report.instrument import Instrument
@@ -164,4 +165,51 @@ def report_of(
         notes=(f"Errors are taken against {evaluation.against}.", *evaluation.notes, *own_notes),
         cameras={} if instrument is None else instrument.calibration.centres(),
         instrument=instrument,
+    )
+
+
+def report_of_lengths(
+    calibration: Calibration, held_out: LengthsHeldOut, title: str, checksum: str, *, by: str = ""
+) -> ReportData:
+    """What a report says of a calibration where no position is known, but lengths are.
+
+    Args:
+        calibration: What is reported on.
+        held_out: Lengths that a fit did not know.
+        title: Of the page.
+        checksum: The SHA-256 of the calibration file.
+        by: Who reports; empty for nobody.
+
+    Raises:
+        FitError: No length could be measured.
+    """
+    if not len(held_out.errors):
+        raise FitError(
+            "no length that was held out could be measured.",
+            fix="wave the wand longer where two cameras see both its markers",
+        )
+    data = calibration.data
+    facts = (
+        ("Dataset", data.name),
+        ("Method", calibration.method),
+        ("Cameras", f"{len(data.cameras)}: {', '.join(camera.name for camera in data.cameras)}"),
+        ("Judged on", f"distances between {held_out.what}"),
+        ("Length unit", data.length_unit),
+        ("Calibration file, SHA-256", checksum),
+        *([("By", by)] if by else []),
+    )
+    instrument = Instrument(calibration) if isinstance(calibration, RigCalibration) else None
+    return ReportData(
+        title,
+        calibration.measure(data.observations),
+        facts=facts,
+        known_xyz=data.xyz,
+        notes=(
+            "No position is known. The headline is of lengths in frames that a fit did not know; the points and the "
+            "places shown are where the wand was, as the calibration from all frames has them.",
+            *calibration.notes,
+        ),
+        cameras={} if instrument is None else instrument.calibration.centres(),
+        instrument=instrument,
+        lengths=KnownLengths(held_out.what, held_out.errors, held_out.sds),
     )

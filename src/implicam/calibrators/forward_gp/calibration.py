@@ -21,10 +21,12 @@ from implicam.calibrators.forward_gp.position_error_fit import separate_position
 from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings, Training
 from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, find_faults, fit_to_wand
 from implicam.calibrators.forward_gp.wand.gauge import cameras_move_with_the_world
+from implicam.calibrators.forward_gp.wand.held_out import hold_lengths_out
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
     FitSummary,
+    LengthsHeldOut,
     RigCalibration,
     finite_column,
     option,
@@ -267,6 +269,20 @@ class ForwardGPCalibration(RigCalibration):
             progress: Is told how far it is.
         """
         return [] if self.waved is None else list(find_faults(self, progress))
+
+    def hold_lengths_out(self, progress: Progress = silent) -> LengthsHeldOut | None:
+        """Fit again without a third of the frames of a wand, and measure its length there.
+
+        Args:
+            progress: Is told how far it is.
+
+        Returns:
+            What came out; None where it was made from known points.
+
+        Raises:
+            FitError: Without these frames there is no calibration.
+        """
+        return None if self.waved is None else hold_lengths_out(self, progress)
 
     def _refuse_wand(self) -> None:
         if self.waved is not None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from implicam.calibrators.protocol import LengthsHeldOut
 from implicam.dataset.wand import FRAME, MARKER, marker_rows
 from implicam.derived import distances
 from implicam.errors import FitError
-from implicam.geometry import Floats
 from implicam.mistakes import Finding
 from implicam.progress import Progress
 
@@ -30,18 +30,6 @@ MAX_MEAN_SQUARE, UNUSABLE_MEAN_SQUARE = 2.5, 20.0
 are doubtful, above the second they are nothing."""
 
 TRIMMED_SHARE = 0.05
-
-
-class LengthsHeldOut(NamedTuple):
-    """What the wand measured in frames that were left out.
-
-    Attributes:
-        errors: (k,) the length there, less that of the wand; in the length unit.
-        sds: (k,) of these, with the jitter of the wand.
-    """
-
-    errors: Floats
-    sds: Floats
 
 
 def hold_lengths_out(calibration: ForwardGPCalibration, progress: Progress) -> LengthsHeldOut:
@@ -69,6 +57,7 @@ def hold_lengths_out(calibration: ForwardGPCalibration, progress: Progress) -> L
     found = distances(measured, pairs) if pairs else []
     progress("checking", 1, 1)
     return LengthsHeldOut(
+        f"both ends of the wand in {len(pairs)} frame{'s' * (len(pairs) != 1)} held out",
         np.array([one.value - wand.length for one in found]),
         np.array([np.hypot(one.sd, wand.jitter) for one in found]),
     )
