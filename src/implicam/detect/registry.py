@@ -6,6 +6,7 @@ CONTRIBUTING.md has the recipe for one more.
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -83,7 +84,7 @@ def detector_from_options(target: str | None, dataset: Path, **options: Any) -> 
             why=f"neither --target nor {dataset / DESCRIPTION} says so",
             fix=f"--target {'|'.join(TARGETS)}",
         )
-    detector, variant = TARGETS.find(name)
+    _, variant = TARGETS.find(name)
     if variant:
         raise UsageError(f"target {name!r} has no variants.", fix=f"--target {name.partition(':')[0]}")
     known = options_of(name)
@@ -95,7 +96,21 @@ def detector_from_options(target: str | None, dataset: Path, **options: Any) -> 
                 fix=f"leave it out; {name} has {', '.join(f'--{one}' for one in known) or 'none'}",
             )
     own = described if described.get("kind") == name else {}
-    made: Detector = detector.from_options(dataset, own, **{**{k: own[k] for k in known if k in own}, **given})
+    return _made(name, dataset, own, given)
+
+
+def detector_of(described: Mapping[str, Any]) -> Detector:
+    """The detector of a target that a dataset describes.
+
+    Args:
+        described: The table [target], with its kind.
+    """
+    return _made(str(described["kind"]), Path(), described, {})
+
+
+def _made(name: str, dataset: Path, described: Mapping[str, Any], given: Mapping[str, Any]) -> Detector:
+    stated = {key: described[key] for key in options_of(name) if key in described}
+    made: Detector = TARGETS[name].from_options(dataset, described, **{**stated, **given})
     return made
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +9,10 @@ import numpy as np
 
 from implicam.dataset import Floats
 from implicam.detect import AprilGrid, Board, Charuco
-from implicam.detect.dictionaries import dictionary_of
+from implicam.detect.prints import Print, moved, printed
 from implicam.errors import UsageError
 from implicam.figures.printed import new_figure
 from implicam.files import replacing
-from implicam.images import opencv
 
 PAPERS_MM = {
     "a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "a1": (594.0, 841.0), "a0": (841.0, 1189.0),
@@ -25,9 +23,6 @@ PAPERS_MM = {
 RIM_MM = 8.0
 """At the paper's edge, where printers leave out what is there."""
 
-WHITE_SQUARES = 0.5
-"""White about a board, in squares: a detector needs it to see where the board ends."""
-
 FOOT_MM, SIDE_MM = 24.0, 9.0
 """Below the board for the bar and the words, and left of it for the upright bar."""
 
@@ -35,19 +30,6 @@ BARS_MM = (200.0, 150.0, 100.0, 50.0, 20.0)
 """Lengths of bars: the longest that has room is drawn."""
 
 MM_PER_INCH = 25.4
-
-
-@dataclass(frozen=True, eq=False)
-class Print:
-    """What is black on a board, in millimetres from its top left: rectangles (k, 4) of left, top, width, height.
-
-    size: (2,) width and height. white: about it. words: what it is, and the options that detect it.
-    """
-
-    black: Floats
-    size: Floats
-    white: float
-    words: tuple[str, str]
 
 
 def draw_board(board: Board | Charuco | AprilGrid, paper: str, path: Path) -> tuple[float, float]:
@@ -67,7 +49,7 @@ def draw_board(board: Board | Charuco | AprilGrid, paper: str, path: Path) -> tu
     """
     if paper.lower() not in PAPERS_MM:
         raise UsageError(f"there is no paper {paper!r}.", fix=f"use one of {', '.join(PAPERS_MM)}")
-    sheet = _printed(board)
+    sheet = printed(board)
     upright = np.array(PAPERS_MM[paper.lower()])
     needed = sheet.size + 2 * sheet.white + 2 * RIM_MM + [SIDE_MM, FOOT_MM]
     fitting = [page for page in (upright, upright[::-1]) if (needed <= page).all()]
@@ -82,90 +64,6 @@ def draw_board(board: Board | Charuco | AprilGrid, paper: str, path: Path) -> tu
     return _draw(sheet, fitting[0], path)
 
 
-def _printed(board: Board | Charuco | AprilGrid) -> Print:
-    if isinstance(board, Board):
-        return _checkerboard(board)
-    return _charuco(board) if isinstance(board, Charuco) else _aprilgrid(board)
-
-
-def _checkerboard(board: Board) -> Print:
-    if board.square is None:
-        raise UsageError("the size of the squares is not known.", fix="--square 20, in mm")
-    rows, columns, square = board.rows + 1, board.columns + 1, board.square
-    i, j = np.nonzero(np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0)
-    words = f"Checkerboard, {board.rows} x {board.columns} inner corners, squares of {square:g} mm"
-    told = f"--target board --board {board.rows}x{board.columns} --square {square:g}"
-    black = np.column_stack([j, i, np.ones(len(i)), np.ones(len(i))]) * square
-    return Print(
-        np.asarray(black, dtype=np.float64), np.array([columns, rows]) * square, WHITE_SQUARES * square, (words, told)
-    )
-
-
-def _charuco(board: Charuco) -> Print:
-    aruco = opencv().aruco
-    dictionary = dictionary_of(board.dictionary)
-    plan = aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
-    plan.setLegacyPattern(board.legacy)
-    bits = int(dictionary.markerSize) + 2
-    marks = [np.asarray(points, dtype=np.float64)[0, :2] for points in plan.getObjPoints()]
-    marked = {tuple(np.floor(corner / board.square).astype(int)) for corner in marks}
-    black = [
-        np.array([[j, i, 1, 1]]) * board.square
-        for i in range(board.rows)
-        for j in range(board.columns)
-        if (j, i) not in marked
-    ]
-    for number, corner in zip(plan.getIds().ravel(), marks, strict=True):
-        image = aruco.generateImageMarker(dictionary, int(number), bits)
-        black.append(_moved(_cells(image, board.marker / bits), corner))
-    words = (
-        f"ChArUco board, {board.rows} x {board.columns} squares of {board.square:g} mm, markers of {board.marker:g} mm "
-        f"({board.dictionary})"
-    )
-    told = (
-        f"--target charuco --board {board.rows}x{board.columns} --square {board.square:g} --marker {board.marker:g} "
-        f"--dictionary {board.dictionary}{' --legacy' if board.legacy else ''}"
-    )
-    size = np.array([board.columns, board.rows]) * board.square
-    return Print(np.concatenate(black), size, WHITE_SQUARES * board.square, (words, told))
-
-
-def _aprilgrid(board: AprilGrid) -> Print:
-    aruco, dictionary, border = opencv().aruco, dictionary_of(board.dictionary), board.border or 2
-    bits = int(dictionary.markerSize) + 2 * border
-    pitch, gap = board.tag + board.spacing, board.spacing
-    i, j = np.indices((board.rows + 1, board.columns + 1)).reshape(2, -1)
-    black = [np.column_stack([j * pitch, i * pitch, np.full(len(i), gap), np.full(len(i), gap)])]
-    for number in range(board.rows * board.columns):
-        row, column = divmod(number, board.columns)
-        image = aruco.generateImageMarker(dictionary, board.first + number, bits, borderBits=border)
-        corner = np.array([gap + column * pitch, gap + (board.rows - 1 - row) * pitch])
-        black.append(_moved(_cells(image, board.tag / bits), corner))
-    words = (
-        f"AprilGrid, {board.rows} x {board.columns} tags of {board.tag:g} mm, {gap:g} mm apart ({board.dictionary}, "
-        f"borders of {border} bits)"
-    )
-    told = f"--target aprilgrid --board {board.rows}x{board.columns} --tag {board.tag:g} --spacing {gap:g}"
-    if board.dictionary != AprilGrid.dictionary:
-        told += f" --dictionary {board.dictionary}"
-    told += f" --first {board.first}" if board.first else ""
-    size = np.array([board.columns, board.rows]) * pitch + gap
-    return Print(np.concatenate(black), size, gap / 2, (words, told))
-
-
-def _cells(image: Any, edge: float) -> Floats:
-    """The black runs of a marker drawn with a pixel a bit, as rectangles."""
-    found = []
-    for i, row in enumerate(image):
-        change = np.flatnonzero(np.diff(np.concatenate([[0], row < 128, [0]]).astype(int)))
-        found += [(start, i, end - start, 1) for start, end in change.reshape(-1, 2)]
-    return np.array(found, dtype=np.float64) * edge
-
-
-def _moved(black: Floats, by: Floats) -> Floats:
-    return np.asarray(black + np.concatenate([by, [0, 0]]), dtype=np.float64)
-
-
 def _draw(sheet: Print, page: Floats, path: Path) -> tuple[float, float]:
     from matplotlib import rc_context
     from matplotlib.patches import PathPatch
@@ -178,7 +76,7 @@ def _draw(sheet: Print, page: Floats, path: Path) -> tuple[float, float]:
     room = page - [SIDE_MM, FOOT_MM]
     corner = [SIDE_MM, 0] + (room - sheet.size) / 2
     # one outline for all that is black: between shapes of their own, viewers draw hairlines
-    axes.add_patch(PathPatch(_outline(_moved(sheet.black, corner)), facecolor="black", edgecolor="none", lw=0))
+    axes.add_patch(PathPatch(_outline(moved(sheet.black, corner)), facecolor="black", edgecolor="none", lw=0))
     across = _longest(page[0] - 2 * RIM_MM - 4)
     along = _longest(page[1] - FOOT_MM - 2 * RIM_MM)
     below = page[1] - FOOT_MM + 7

@@ -19,12 +19,15 @@ from scipy.optimize import least_squares
 
 from implicam.dataset.boards import corner_positions
 from implicam.detect.dictionaries import dictionary_of
-from implicam.errors import HardwareError, UsageError
+from implicam.detect.prints import printed
+from implicam.detect.registry import detector_of
+from implicam.errors import HardwareError
 from implicam.geometry import Pose, look_at, rotation_from_vector, vector_from_rotation
 from implicam.hardware.protocol import Floats, Frame
 from implicam.hardware.simulated import SEED_STEP
 from implicam.images import opencv
 from implicam.simulate import Optics, Rig, SimulatedCamera, Studio, Target
+from implicam.simulate.scene import Print
 
 EXPOSURE_SECONDS = 0.01
 """For which a picture is exposed: a board that moves meanwhile is blurred."""
@@ -59,7 +62,7 @@ class SimulatedHand:
         self._rng = np.random.default_rng([seed, 31])
         flat = corner_positions(target)
         self.corners = np.column_stack([flat, np.zeros(len(flat))])
-        self.marks = markers_of(target)
+        self.marks = print_of(target)
         first = _facing(rig.cameras[0], self._middle, np.array([0.5, 0.5]), 0.5, self._diagonal, (0.3, 0.2))
         self._from = self._to = first
         self._begun = -np.inf
@@ -201,45 +204,64 @@ class BoardCamera:
         return uv[np.isfinite(uv).all(axis=1)] if np.isfinite(uv).all() else np.zeros((0, 2))
 
 
-def markers_of(target: Mapping[str, Any]) -> NDArray[np.float32] | None:
-    """What is printed in the white squares of a board; None for a plain checkerboard.
+def print_of(target: Mapping[str, Any]) -> NDArray[np.float32] | Print | None:
+    """What is printed on a board, beside the squares of a checkerboard.
 
     Args:
         target: The table [target] of dataset.toml.
 
     Returns:
-        As `scene.Checkerboard` takes it.
+        In the white squares of a ChArUco board, as `scene.Checkerboard` takes it; of another board all of it; None for
+        a plain checkerboard.
+
+    Raises:
+        UsageError: Nothing is known of how such a target is printed.
     """
-    if target["kind"] != "charuco":
+    kind = target.get("kind")
+    if kind == "board":
         return None
+    if kind == "charuco":
+        return _markers_of(target)
+    detector = detector_of(target)
+    shown = printed(detector)
+    samples = SAMPLES_PER_SQUARE / float(np.median(np.linalg.norm(np.diff(corner_positions(target), axis=0), axis=1)))
+    black = shown.picture(samples)
+    return Print(black, -shown.origin - shown.white, np.array(black.shape[::-1]) / samples)  # whole samples
+
+
+def _markers_of(target: Mapping[str, Any]) -> NDArray[np.float32]:
     aruco = opencv().aruco
     rows, columns, size = int(target["rows"]), int(target["columns"]), SAMPLES_PER_SQUARE
     dictionary = dictionary_of(str(target["dictionary"]))
     board = aruco.CharucoBoard((columns, rows), float(target["square"]), float(target["marker"]), dictionary)
     board.setLegacyPattern(bool(target.get("legacy", False)))
-    printed = board.generateImage((columns * size, rows * size), marginSize=0)
-    squares = np.indices(printed.shape) // size
-    marks = np.where(squares.sum(axis=0) % 2, 1 - printed.astype(np.float32) / 255, 0)
+    drawn = board.generateImage((columns * size, rows * size), marginSize=0)
+    squares = np.indices(drawn.shape) // size
+    marks = np.where(squares.sum(axis=0) % 2, 1 - drawn.astype(np.float32) / 255, 0)
     return np.asarray(marks, dtype=np.float32)
 
 
-def board_target(target: Mapping[str, Any], pose: Pose, marks: NDArray[np.float32] | None = None) -> Target:
+def board_target(
+    target: Mapping[str, Any], pose: Pose, marks: NDArray[np.float32] | Print | None = None
+) -> Target:
     """A board at a pose, as simulated cameras look at it.
 
     Args:
-        target: The table [target] of dataset.toml, of a checkerboard or a ChArUco board.
+        target: The table [target] of dataset.toml.
         pose: world_from_board.
-        marks: Of `markers_of`; None where nobody takes a picture of it.
+        marks: Of `print_of`; None where nobody takes a picture of it.
     """
     shot = "held"
     flat = corner_positions(target)
     names = np.array([f"{shot}-c{i + 1:03d}" for i in range(len(flat))])
     shots = np.full(len(flat), shot)
+    xyz = pose.apply(np.column_stack([flat, np.zeros(len(flat))]))
+    facing = np.asarray(-pose.rotation[:, 2], dtype=np.float64)
+    if isinstance(marks, Print):
+        return Target("boards", names, shots, xyz, facing, sheet=(pose, marks))
     rows, columns = int(target["rows"]), int(target["columns"])
     if target["kind"] == "charuco":
         rows, columns = rows - 1, columns - 1
-    xyz = pose.apply(np.column_stack([flat, np.zeros(len(flat))]))
-    facing = np.asarray(-pose.rotation[:, 2], dtype=np.float64)
     return Target("boards", names, shots, xyz, facing, (rows, columns), marks=marks)
 
 
@@ -321,11 +343,6 @@ def simulated_hand(
     Raises:
         UsageError: There is no picture of such a board.
     """
-    if target.get("kind") not in ("board", "charuco"):
-        raise UsageError(
-            f"simulated cameras cannot show a target of the kind {target.get('kind')!r}.",
-            fix="use --target board or --target charuco, or real cameras (--camera NAME=WHAT)",
-        )
     hand = SimulatedHand(rig, target, seed=seed, seconds=seconds)
     shown = board_target(target, hand.pose(), hand.marks)
     studio = Studio(rig, shown, optics or Optics(), seed).showing(shown, seed=seed)

@@ -35,6 +35,7 @@ HAND_SECONDS = 1.5
 EXAMPLE_BOARDS: dict[str, dict[str, Any]] = {
     "board": {"board": "8x11", "square": 13.29},
     "charuco": {"board": "9x12", "square": 13.29, "marker": 10.0},
+    "aprilgrid": {"board": "5x7", "tag": 16.0, "spacing": 4.8},
 }
 """Of a simulated session that says no size: in mm, that of the paper."""
 

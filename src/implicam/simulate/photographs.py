@@ -23,7 +23,7 @@ from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.clutter import background
 from implicam.simulate.noise import Bools, simulate, views
 from implicam.simulate.rigs import Rig
-from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, ShownObject, Wand
+from implicam.simulate.scene import Ball, Checkerboard, Light, Rays, Sheet, ShownObject, Wand
 from implicam.simulate.targets import Target
 from implicam.threads import side_by_side
 
@@ -238,6 +238,9 @@ class Studio:
         if self.target.wand is not None:
             mm = self.rig.units_per_mm
             return Wand(xyz, mm * np.array(WAND_RADII_MM), np.array(WAND_BRIGHTNESS), mm * WAND_ROD_MM)
+        if self.target.sheet is not None:
+            pose, shown = self.target.sheet
+            return Sheet(pose.translation, pose.rotation[:, 0], pose.rotation[:, 1], shown, self._light)
         if self.target.board is None:
             return Ball(xyz[0], self._towards_cameras, self.ball_radius_mm * self.rig.units_per_mm, self._light)
         rows, columns = self.target.board

@@ -179,25 +179,12 @@ class Checkerboard:
         printed = _inside(x, -1, self.columns) * _inside(y, -1, self.rows)
         black = 0.5 + 0.5 * _stripes(x) * _stripes(y)
         if self.marks is not None:
-            black = np.maximum(black, self._marks_at(self.marks, x, y))
+            black = np.maximum(black, _read_print(self.marks, x + 1, y + 1, self.columns + 1, self.rows + 1))
         albedo = 0.78 - 0.70 * black * printed
         value = np.nan_to_num(np.asarray(albedo * self.light.at(hit), np.float32))
         if (rays.centre - self.corner) @ facing < 0:
             value = np.full_like(value, 0.3)  # its back
         return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
-
-    def _marks_at(self, marks: Patch, x: Patch, y: Patch) -> Patch:
-        """The marks where rays meet the board, averaged over about what a sample covers."""
-        cv2 = opencv()
-        with np.errstate(invalid="ignore"):
-            step = float(np.nanmedian(np.hypot(*np.gradient(x)))) if min(x.shape) > 1 else 1.0
-        samples = marks.shape[1] / (self.columns + 1)
-        part = float(np.clip(1 / max(step * samples, 1e-3), 0.02, 1.0))
-        small = cv2.resize(marks, None, fx=part, fy=part, interpolation=cv2.INTER_AREA)
-        across, along = small.shape[1] / (self.columns + 1), small.shape[0] / (self.rows + 1)
-        u, v = ((x + 1) * across - 0.5).astype(np.float32), ((y + 1) * along - 0.5).astype(np.float32)
-        found = cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return np.asarray(found, np.float32)
 
     def reach(self) -> Floats:
         """(4, 3) the corners of the sheet, in the world."""
@@ -247,7 +234,80 @@ class Wand:
         return np.concatenate([end + radius * corners for end, radius in zip(self.ends, self.radii, strict=True)])
 
 
-ShownObject = Ball | Checkerboard | Wand
+class Print(NamedTuple):
+    """What is printed on a sheet.
+
+    Attributes:
+        black: (k, l) how black it is, from 0 to 1.
+        low: (2,) its top left corner, on the board: x to the right, y down.
+        size: (2,) its width and height.
+    """
+
+    black: Patch
+    low: Floats
+    size: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """A sheet with any print: tags, dots.
+
+    Attributes:
+        corner: (3,) the origin of the board, in the world.
+        right: (3,) a unit vector along its x.
+        down: (3,) along its y.
+        print: What is on it, in the unit of the world.
+        light: The lamp.
+    """
+
+    corner: Floats
+    right: Floats
+    down: Floats
+    print: Print
+    light: Light
+
+    def paint(self, rays: Rays, ground: Patch) -> Patch:
+        """Paint it over what is behind it; seen from behind it is plain grey.
+
+        Args:
+            rays: One for each sample.
+            ground: (rows, columns) brightness of what is behind it.
+
+        Returns:
+            (rows, columns) brightness.
+        """
+        facing = np.cross(self.down, self.right)
+        hit = _on_plane(rays, self.corner, facing)
+        offset = hit - self.corner.astype(np.float32)
+        (width, height), low = self.print.size, self.print.low.astype(np.float32)
+        x, y = offset @ self.right.astype(np.float32) - low[0], offset @ self.down.astype(np.float32) - low[1]
+        cover = _inside(x, 0, width) * _inside(y, 0, height)
+        albedo = 0.78 - 0.70 * _read_print(self.print.black, x, y, width, height)
+        value = np.nan_to_num(np.asarray(albedo * self.light.at(hit), np.float32))
+        if (rays.centre - self.corner) @ facing < 0:
+            value = np.full_like(value, 0.3)  # its back
+        return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
+
+    def reach(self) -> Floats:
+        """(4, 3) its corners, in the world."""
+        ends = [self.print.low + self.print.size * [i, j] for i in (0, 1) for j in (0, 1)]
+        return np.array([self.corner + x * self.right + y * self.down for x, y in ends])
+
+
+ShownObject = Ball | Checkerboard | Sheet | Wand
+
+
+def _read_print(black: Patch, x: Patch, y: Patch, width: float, height: float) -> Patch:
+    """A print where rays meet it, x and y from its top left corner, averaged over about what a sample covers."""
+    cv2 = opencv()
+    with np.errstate(invalid="ignore"):
+        step = float(np.nanmedian(np.hypot(*np.gradient(x)))) if min(x.shape) > 1 else width
+    part = float(np.clip(width / max(step * black.shape[1], 1e-3 * width), 0.02, 1.0))
+    small = cv2.resize(black, None, fx=part, fy=part, interpolation=cv2.INTER_AREA)
+    across, along = small.shape[1] / width, small.shape[0] / height
+    u, v = (x * across - 0.5).astype(np.float32), (y * along - 0.5).astype(np.float32)
+    found = cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(found, np.float32)
 
 
 def _rod(rays: Rays, start: Floats, end: Floats, radius: float) -> Patch:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from implicam.dataset import Floats, Names
 from implicam.errors import UsageError
-from implicam.geometry import look_at, rotation_from_vector
+from implicam.geometry import Pose, look_at, rotation_from_vector
 from implicam.simulate.camera import SimulatedCamera
 from implicam.simulate.rigs import Rig
+from implicam.simulate.scene import Print
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,7 @@ class Target:
         takes: (n, cameras) which cameras take a picture; None for all of them.
         marks: What is printed in the white squares of a board, as `scene.Checkerboard` has it; None for nothing.
         wand: Length of a wand, whose two ends the points are in turn; None for no wand.
+        sheet: Of a board that is no checkerboard: world_from_board, and what is printed on it; None for nothing.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Target:
     takes: NDArray[np.bool_] | None = None
     marks: NDArray[np.float32] | None = None
     wand: float | None = None
+    sheet: tuple[Pose, Print] | None = None
 
 
 def ball_grid(rig: Rig, shape: tuple[int, int, int] = (5, 5, 7)) -> Target:
