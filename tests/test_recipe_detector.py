@@ -136,13 +136,13 @@ def test_help_has_its_options(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize(("words", "what", "cure"), [
-    ("--target lmap", "did you mean 'lamp'", "use one of ball, board, charuco, aprilgrid, dots, wand, lamp"),
+    ("--target lmap", "did you mean 'lamp'", "use one of ball, board, charuco, aprilgrid, dotgrid, dots, wand, lamp"),
     ("--target lamp --above 2", "nothing is brighter than 2.", "--above 0.5"),
     ("--target lamp --above -1", "", ""),
     ("--target lamp --marker 3", "the target 'lamp' has no option --marker", "lamp has --above, --dark, --radius"),
     ("--target ball --above 0.5", "the target 'ball' has no option --above", "leave it out"),
     ("--target lamp:bright", "has no variants", "--target lamp"),
-    ("", "which target is it?", "--target ball|board|charuco|aprilgrid|dots|wand|lamp"),
+    ("", "which target is it?", "--target ball|board|charuco|aprilgrid|dotgrid|dots|wand|lamp"),
 ])  # fmt: skip
 def test_what_is_wrong_is_said_with_its_cure(words: str, what: str, cure: str, photos: Path, cli: Cli) -> None:
     ran = cli("detect", photos, "--unit", "mm", *words.split())

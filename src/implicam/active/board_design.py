@@ -54,11 +54,13 @@ class BoardShape(NamedTuple):
         corners: (n, 3) on the board, x right and y down on its printed side, z = 0, in the dataset's length unit.
         square: About from one corner to the next.
         whole: Whether a picture counts only where it shows all of them: a board without markers.
+        edges: Whether lines between neighbours are edges, by which blur is seen; not of dots, whose middles stay.
     """
 
     corners: Floats
     square: float
     whole: bool
+    edges: bool = True
 
     @property
     def outline(self) -> Floats:

@@ -21,13 +21,16 @@ def board_command(
     action: Annotated[str, typer.Argument(metavar="print", help="What to do.")],
     target: Annotated[str, typer.Option(metavar="NAME", help=f"{', '.join(BOARD_KINDS)}.")] = "board",
     board: Annotated[
-        str | None, typer.Option(metavar="RxC", help="Inner corners of a checkerboard, squares, or tags: 8x11.")
+        str | None, typer.Option(metavar="RxC", help="Inner corners of a checkerboard, squares, tags or dots: 8x11.")
     ] = None,
     square: Annotated[float | None, typer.Option(metavar="MM", min=0, help="Edge of a square.")] = None,
     marker: Annotated[float | None, typer.Option(metavar="MM", min=0, help="charuco: edge of a marker.")] = None,
     tag: Annotated[float | None, typer.Option(metavar="MM", min=0, help="aprilgrid: edge of a tag.")] = None,
     spacing: Annotated[
-        float | None, typer.Option(metavar="MM", min=0, help="aprilgrid: between two tags (default 0.3 of a tag).")
+        float | None,
+        typer.Option(
+            metavar="MM", min=0, help="aprilgrid: between two tags (default 0.3 of a tag); dotgrid: from row to row."
+        ),
     ] = None,
     dictionary: Annotated[
         str | None, typer.Option(metavar="NAME", help="charuco, aprilgrid: OpenCV's name of the markers.")

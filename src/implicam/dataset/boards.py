@@ -4,6 +4,7 @@
     board       rows, columns, square                   rows x columns inner corners of a checkerboard
     charuco     rows, columns, square, marker, ...      (rows - 1) x (columns - 1): rows and columns count squares
     aprilgrid   rows, columns, tag, spacing, ...        2 rows x 2 columns: rows and columns count tags
+    dotgrid     rows, columns, spacing                  rows x columns dots in staggered rows, for corners
 
 Lengths are in the dataset's unit; other keys (dictionary, border) matter to the detector alone. A corner is named
 <shot>-c001, counted along the rows: on a checkerboard from the top, on an AprilGrid, as in Kalibr, from the bottom.
@@ -91,7 +92,7 @@ def check_size(target: Mapping[str, Any], unit: str) -> None:
     Raises:
         UsageError: A length is impossible.
     """
-    for name in ("square", "marker", "tag"):
+    for name in ("square", "marker", "tag", "spacing"):
         length = target.get(name)
         if length is not None and unit in METRES_PER_UNIT:
             low, high = SIZE_RANGE_METRES
@@ -116,10 +117,30 @@ def _aprilgrid(target: Mapping[str, Any]) -> Floats:
     return aprilgrid_corners(rows, columns, _length(target, "tag"), _length(target, "spacing"))
 
 
+def _dotgrid(target: Mapping[str, Any]) -> Floats:
+    return staggered_dots(_count(target, "rows", 3), _count(target, "columns", 3), _length(target, "spacing"))
+
+
+def staggered_dots(rows: int, columns: int, spacing: float) -> Floats:
+    """The dots of OpenCV's asymmetric circles grid, along the rows from the top left.
+
+    Args:
+        rows: Of dots.
+        columns: Dots in a row.
+        spacing: From one row to the next, and half the way from a dot to the next in its row.
+
+    Returns:
+        (rows columns, 2) to the right and down; every second row begins a spacing further right.
+    """
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    return np.asarray(np.column_stack([2 * column + row % 2, row]) * spacing, dtype=np.float64)
+
+
 BOARD_KINDS: Mapping[str, Callable[[Mapping[str, Any]], Floats]] = {
     "board": _checkerboard,
     "charuco": _charuco,
     "aprilgrid": _aprilgrid,
+    "dotgrid": _dotgrid,
 }
 """Kind -> where the corners are."""
 
@@ -170,6 +191,7 @@ def _error(target: Mapping[str, Any], why: str) -> DatasetError:
     needed = {
         "board": "rows, columns (of inner corners) and square",
         "charuco": "rows, columns (of squares) and square",
+        "dotgrid": "rows, columns (dots in a row) and spacing (from one row to the next)",
     }
     needs = needed.get(target["kind"], "rows, columns (of tags), tag and spacing")
     return DatasetError(

@@ -12,6 +12,7 @@ from implicam.detect.aprilgrid import AprilGrid
 from implicam.detect.ball import Ball, Template
 from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
+from implicam.detect.dotgrid import DotGrid
 from implicam.detect.dots import Dots
 from implicam.detect.film import detect_films, films_of
 from implicam.detect.folder import Correct, DetectionRun, detect_folder
@@ -33,6 +34,7 @@ __all__ = [
     "DetectionRun",
     "Detector",
     "DetectorBase",
+    "DotGrid",
     "Dots",
     "Option",
     "Template",

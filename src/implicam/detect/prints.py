@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from implicam.dataset import Floats
+from implicam.dataset.boards import staggered_dots
 from implicam.detect.aprilgrid import AprilGrid
 from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
 from implicam.detect.dictionaries import dictionary_of
+from implicam.detect.dotgrid import DotGrid
 from implicam.errors import UsageError
 from implicam.images import Grey, opencv
 
@@ -19,9 +21,14 @@ WHITE_SQUARES = 0.5
 """White about a board, in squares: a detector needs it to see where the board ends."""
 
 
+DOT_SPACINGS = 0.4
+"""Radius of a dot, in spacings."""
+
+
 @dataclass(frozen=True, eq=False)
 class Print:
-    """What is black on a board, in millimetres from its top left: rectangles (k, 4) of left, top, width, height.
+    """What is black on a board, in millimetres from its top left: rectangles (k, 4) of left, top, width, height; and
+    discs (m, 3) of their middles and radii.
 
     size: (2,) width and height. white: about it. words: what it is, and the options that detect it. origin: (2,) the
     place from which `corner_positions` counts.
@@ -32,6 +39,7 @@ class Print:
     white: float
     words: tuple[str, str]
     origin: Floats
+    discs: Floats = field(default_factory=lambda: np.zeros((0, 3)))
 
     def picture(self, samples: float) -> Grey:
         """How black it is, with the white about it.
@@ -48,10 +56,19 @@ class Print:
             (left, across), (top, down) = _covered(x, x + w), _covered(y, y + h)
             part = drawn[top : top + len(down), left : left + len(across)]
             part += np.outer(down, across)[: part.shape[0], : part.shape[1]].astype(np.float32)
+        y, x = np.indices((height, width), sparse=True)
+        for u, v, r in np.add(self.discs, [self.white, self.white, 0]) * samples:
+            top, left = max(int(v - r) - 2, 0), max(int(u - r) - 2, 0)
+            spot = slice(top, int(v + r) + 3), slice(left, int(u + r) + 3)
+            far = np.hypot(x[:, spot[1]] + 0.5 - u, y[spot[0]] + 0.5 - v)
+            drawn[spot] = np.maximum(drawn[spot], np.clip(r - far + 0.5, 0, 1))
         return np.minimum(drawn, 1)
 
 
-def printed(board: Board | Charuco | AprilGrid) -> Print:
+Printable = Board | Charuco | AprilGrid | DotGrid
+
+
+def printed(board: Printable) -> Print:
     """What is printed on a board.
 
     Args:
@@ -63,6 +80,8 @@ def printed(board: Board | Charuco | AprilGrid) -> Print:
     """
     if isinstance(board, Board):
         return _checkerboard(board)
+    if isinstance(board, DotGrid):
+        return _dots(board)
     return _charuco(board) if isinstance(board, Charuco) else _aprilgrid(board)
 
 
@@ -75,7 +94,10 @@ def _checkerboard(board: Board) -> Print:
     told = f"--target board --board {board.rows}x{board.columns} --square {square:g}"
     black = np.column_stack([j, i, np.ones(len(i)), np.ones(len(i))]) * square
     return Print(
-        np.asarray(black, dtype=np.float64), np.array([columns, rows]) * square, WHITE_SQUARES * square, (words, told),
+        np.asarray(black, dtype=np.float64),
+        np.array([columns, rows]) * square,
+        WHITE_SQUARES * square,
+        (words, told),
         np.array([square, square]),
     )
 
@@ -132,6 +154,16 @@ def _aprilgrid(board: AprilGrid) -> Print:
     return Print(np.concatenate(black), size, gap / 2, (words, told), np.full(2, gap))
 
 
+def _dots(board: DotGrid) -> Print:
+    spacing, radius = board.spacing, DOT_SPACINGS * board.spacing
+    middles = staggered_dots(board.rows, board.columns, spacing)
+    words = f"Dots in staggered rows, {board.rows} x {board.columns}, {spacing:g} mm from one row to the next"
+    told = f"--target dotgrid --board {board.rows}x{board.columns} --spacing {spacing:g}"
+    discs = np.column_stack([middles + radius, np.full(len(middles), radius)])
+    size, none = np.ptp(middles, axis=0) + 2 * radius, np.zeros((0, 4))
+    return Print(none, size, spacing, (words, told), np.full(2, radius), discs)
+
+
 def _covered(start: float, end: float) -> tuple[int, Floats]:
     """The first sample that a line covers, and how much of each from there on."""
     first, after = int(np.floor(start + 1e-9)), int(np.ceil(end - 1e-9))
@@ -156,5 +188,3 @@ def moved(black: Floats, by: Floats) -> Floats:
         by: (2,) how far, right and down.
     """
     return np.asarray(black + np.concatenate([by, [0, 0]]), dtype=np.float64)
-
-

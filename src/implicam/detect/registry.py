@@ -15,6 +15,7 @@ from implicam.detect.aprilgrid import AprilGrid
 from implicam.detect.ball import Ball
 from implicam.detect.board import Board
 from implicam.detect.charuco import Charuco
+from implicam.detect.dotgrid import DotGrid
 from implicam.detect.dots import Dots
 from implicam.detect.model import Detector
 from implicam.detect.wand import WandMarkers
@@ -38,7 +39,15 @@ class DetectorClass(Detector, Protocol):
 
 TARGETS: Registry[type[Any]] = Registry(
     "target",
-    {"ball": Ball, "board": Board, "charuco": Charuco, "aprilgrid": AprilGrid, "dots": Dots, "wand": WandMarkers},
+    {
+        "ball": Ball,
+        "board": Board,
+        "charuco": Charuco,
+        "aprilgrid": AprilGrid,
+        "dotgrid": DotGrid,
+        "dots": Dots,
+        "wand": WandMarkers,
+    },
     "implicam.detectors",
     offers(DetectorClass),
 )

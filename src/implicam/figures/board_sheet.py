@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from implicam.dataset import Floats
-from implicam.detect import AprilGrid, Board, Charuco
-from implicam.detect.prints import Print, moved, printed
+from implicam.detect.prints import Print, Printable, moved, printed
 from implicam.errors import UsageError
 from implicam.figures.printed import new_figure
 from implicam.files import replacing
@@ -32,7 +31,7 @@ BARS_MM = (200.0, 150.0, 100.0, 50.0, 20.0)
 MM_PER_INCH = 25.4
 
 
-def draw_board(board: Board | Charuco | AprilGrid, paper: str, path: Path) -> tuple[float, float]:
+def draw_board(board: Printable, paper: str, path: Path) -> tuple[float, float]:
     """Draw a board whose lengths are millimetres.
 
     Args:
@@ -66,7 +65,7 @@ def draw_board(board: Board | Charuco | AprilGrid, paper: str, path: Path) -> tu
 
 def _draw(sheet: Print, page: Floats, path: Path) -> tuple[float, float]:
     from matplotlib import rc_context
-    from matplotlib.patches import PathPatch
+    from matplotlib.patches import Circle, PathPatch
 
     figure = new_figure(*(page / MM_PER_INCH))
     figure.set_layout_engine("none")
@@ -77,6 +76,8 @@ def _draw(sheet: Print, page: Floats, path: Path) -> tuple[float, float]:
     corner = [SIDE_MM, 0] + (room - sheet.size) / 2
     # one outline for all that is black: between shapes of their own, viewers draw hairlines
     axes.add_patch(PathPatch(_outline(moved(sheet.black, corner)), facecolor="black", edgecolor="none", lw=0))
+    for u, v, radius in sheet.discs:
+        axes.add_patch(Circle((u + corner[0], v + corner[1]), radius, facecolor="black", edgecolor="none", lw=0))
     across = _longest(page[0] - 2 * RIM_MM - 4)
     along = _longest(page[1] - FOOT_MM - 2 * RIM_MM)
     below = page[1] - FOOT_MM + 7

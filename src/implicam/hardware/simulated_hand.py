@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from implicam.dataset.boards import corner_positions
 from implicam.detect.dictionaries import dictionary_of
-from implicam.detect.prints import printed
+from implicam.detect.prints import Printable, printed
 from implicam.detect.registry import detector_of
 from implicam.errors import HardwareError
 from implicam.geometry import Pose, look_at, rotation_from_vector, vector_from_rotation
@@ -223,8 +223,9 @@ def print_of(target: Mapping[str, Any]) -> NDArray[np.float32] | Print | None:
     if kind == "charuco":
         return _markers_of(target)
     detector = detector_of(target)
+    assert isinstance(detector, Printable)  # as all boards are
     shown = printed(detector)
-    samples = SAMPLES_PER_SQUARE / float(np.median(np.linalg.norm(np.diff(corner_positions(target), axis=0), axis=1)))
+    samples = SAMPLES_PER_SQUARE / float(target.get("tag", target.get("spacing", 0.0)))
     black = shown.picture(samples)
     return Print(black, -shown.origin - shown.white, np.array(black.shape[::-1]) / samples)  # whole samples
 
@@ -241,9 +242,7 @@ def _markers_of(target: Mapping[str, Any]) -> NDArray[np.float32]:
     return np.asarray(marks, dtype=np.float32)
 
 
-def board_target(
-    target: Mapping[str, Any], pose: Pose, marks: NDArray[np.float32] | Print | None = None
-) -> Target:
+def board_target(target: Mapping[str, Any], pose: Pose, marks: NDArray[np.float32] | Print | None = None) -> Target:
     """A board at a pose, as simulated cameras look at it.
 
     Args:

@@ -438,6 +438,8 @@ class BoardController(SessionController):
         if not views:
             some = [look.found.reason for look in looks if len(look.found)]
             return "too few corners are seen: show more of the board" if some else "no camera sees the board"
+        if not self.loop.shape.edges:
+            return ""
         blurred = []
         for look in looks:
             if look.camera in views and look.frame is not None:

@@ -13,7 +13,7 @@ from implicam.active.board_loop import BoardLoop
 from implicam.active.board_poses import KnownPosesLoop, described, poses_from, poses_of
 from implicam.calibrators import DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset.boards import BOARD_KINDS, check_size, corner_positions
-from implicam.detect import TARGETS, Detector, options_of
+from implicam.detect import ALSO_CALLED, TARGETS, Detector, options_of
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import FrameSource, Person
 from implicam.hardware.simulated_hand import simulated_hand
@@ -36,6 +36,7 @@ EXAMPLE_BOARDS: dict[str, dict[str, Any]] = {
     "board": {"board": "8x11", "square": 13.29},
     "charuco": {"board": "9x12", "square": 13.29, "marker": 10.0},
     "aprilgrid": {"board": "5x7", "tag": 16.0, "spacing": 4.8},
+    "dotgrid": {"board": "11x4", "spacing": 12.0},
 }
 """Of a simulated session that says no size: in mm, that of the paper."""
 
@@ -44,6 +45,15 @@ POSES_KEY = "known_poses"
 
 SIZES = ("board", "square", "marker", "tag", "spacing", "dictionary", "legacy")
 """The options of a session that say what the board is."""
+
+
+def shown_target(name: str | None) -> Any:
+    """The target that a session shows by another name: a plate of dots that moves has no labels, and is `dotgrid`.
+
+    Args:
+        name: As a person says it; None where nothing is said.
+    """
+    return {**ALSO_CALLED, "dots": "dotgrid"}.get(name or "", name)
 
 
 def board_detector(setup: Setup) -> Detector:
@@ -109,8 +119,9 @@ def shape_of(detector: Detector) -> BoardShape:
     """
     table = detector.describe()
     flat = corner_positions(table)
-    square = float(table.get("square", table.get("tag", 0.0)))
-    return BoardShape(np.column_stack([flat, np.zeros(len(flat))]), square, table["kind"] == "board")
+    square = float(table.get("square", table.get("tag", table.get("spacing", 0.0))))
+    whole = table["kind"] in ("board", "dotgrid")
+    return BoardShape(np.column_stack([flat, np.zeros(len(flat))]), square, whole, edges=table["kind"] != "dotgrid")
 
 
 def board_hardware(

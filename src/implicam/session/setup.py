@@ -32,7 +32,7 @@ from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_na
 from implicam.dataset import Camera, Floats
 from implicam.dataset.boards import BOARD_KINDS
 from implicam.dataset.units import METRES_PER_UNIT, refuse_unknown_unit
-from implicam.detect import ALSO_CALLED, Ball
+from implicam.detect import Ball
 from implicam.errors import DatasetError, HardwareError, UsageError
 from implicam.hardware import (
     CAMERAS,
@@ -64,6 +64,7 @@ from implicam.session.board_setup import (
     board_hardware,
     board_settings,
     made_board_session,
+    shown_target,
     sizes_of,
 )
 from implicam.session.controller import Equipment, SessionController
@@ -118,11 +119,13 @@ class Setup:
     rig: Annotated[str, _rig("bar6, grid9, dome8 ..., or a drawing RIG.toml")] = "bar6"
     rig_cameras: Annotated[str | None, _rig("Some of its cameras: 2R, cam1,cam4", "LIST", flags="--cameras")] = None
     target: Annotated[str, _shown(lambda: f"{', '.join((BALL, *BOARD_KINDS))}")] = BALL
-    board: Annotated[str | None, _shown("Of a board: inner corners, squares or tags, 8x11", "RxC")] = None
+    board: Annotated[str | None, _shown("Of a board: inner corners, squares, tags or dots, 8x11", "RxC")] = None
     square: Annotated[float | None, _shown("Edge of its squares", "LENGTH", 0)] = None
     marker: Annotated[float | None, _shown("charuco: edge of its markers", "LENGTH", 0)] = None
     tag: Annotated[float | None, _shown("aprilgrid: edge of its tags", "LENGTH", 0)] = None
-    spacing: Annotated[float | None, _shown("aprilgrid: between two tags", "LENGTH", 0)] = None
+    spacing: Annotated[
+        float | None, _shown("aprilgrid: between two tags; dots: from one row to the next", "LENGTH", 0)
+    ] = None
     dictionary: Annotated[str | None, _shown("charuco, aprilgrid: OpenCV's name of the markers")] = None
     legacy: Annotated[bool, _shown("charuco: printed with OpenCV before 4.6", flags="--legacy/--no-legacy")] = False
     poses: Annotated[
@@ -161,7 +164,7 @@ class Setup:
         _refuse_twice([name for name, _ in self.cameras])
         trigger: Any = self.trigger or ()  # older sessions have None, or one
         object.__setattr__(self, "trigger", (trigger,) if isinstance(trigger, str) else tuple(trigger))
-        object.__setattr__(self, "target", ALSO_CALLED.get(self.target, self.target))
+        object.__setattr__(self, "target", shown_target(self.target))
         object.__setattr__(self, "tool", None if self.tool is None else _tool(self.tool))
         refuse_unknown_unit(self.unit)
         method, _ = CALIBRATORS.find(self.method)
@@ -430,7 +433,7 @@ def changes_to(folder: Path, before: Setup, given: Mapping[str, Any], *, all_giv
     Raises:
         UsageError: Something is to be another that stays to the end: what is shown, its size, the unit.
     """
-    found = given = {**given, "target": ALSO_CALLED.get(given.get("target") or "", given.get("target"))}
+    found = given = {**given, "target": shown_target(given.get("target"))}
     if given.get("unit") is not None:  # a word that is none is a slip of the hand, whatever was begun
         refuse_unknown_unit(given["unit"])
     has = {**{key: getattr(before, key) for key in _lasting(before)}, **sizes_of(before)}
