@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import Field, asdict, dataclass, field, fields, replace
 from functools import cached_property
+from inspect import getattr_static
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -120,7 +121,19 @@ class CheckPlan(NamedTuple):
     max_points: int
 
 
-class Calibration(Protocol):
+class _AskedByName(type(Protocol)):  # type: ignore[misc]
+    """Whether an object offers a protocol is seen from the names of what it has. Python does so from 3.12 on; before, it
+    reads every property to know, and such as `notes` are work."""
+
+    def __instancecheck__(cls, instance: Any) -> bool:
+        if cls in type(instance).__mro__ or not getattr(cls, "_is_protocol", False):
+            return bool(super().__instancecheck__(instance))
+        bases = [base for base in cls.__mro__ if getattr(base, "_is_protocol", False)]
+        names = {name for base in bases for name in (*vars(base), *vars(base).get("__annotations__", {}))}
+        return all(getattr_static(instance, name, None) is not None for name in names if name[0] != "_")
+
+
+class Calibration(Protocol, metaclass=_AskedByName):
     """A fitted map of a rig, and the data it was fitted from.
 
     >>> import implicam as ic
