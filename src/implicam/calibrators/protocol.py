@@ -122,8 +122,8 @@ class CheckPlan(NamedTuple):
 
 
 class _AskedByName(type(Protocol)):  # type: ignore[misc]
-    """Whether an object offers a protocol is seen from the names of what it has. Python does so from 3.12 on; before, it
-    reads every property to know, and such as `notes` are work."""
+    """Whether an object offers a protocol is seen from the names of what it has. Python does so from 3.12 on; before,
+    it reads every property to know, and such as `notes` are work."""
 
     def __instancecheck__(cls, instance: Any) -> bool:
         if cls in type(instance).__mro__ or not getattr(cls, "_is_protocol", False):
