@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from implicam.geometry import Bools, Floats
-from implicam.rig_model import CameraViews, CentralCamera, Prior
+from implicam.rig_model import CameraViews, CentralCamera, GeneralCamera, Prior
 from implicam.rig_model.normal_equations import stable_cholesky
 
 DEGREES = 3.0
@@ -125,7 +125,7 @@ class FrameEquations(NamedTuple):
 class Bundle:
     """Cameras, places (F, 2, 3) of the markers, priors of the cameras; nothing but lenses."""
 
-    cameras: tuple[CentralCamera, ...]
+    cameras: tuple[CentralCamera | GeneralCamera, ...]
     places: Floats
     priors: tuple[Prior, ...]
 

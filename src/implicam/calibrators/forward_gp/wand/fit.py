@@ -6,6 +6,7 @@ The order of docs/method.md, section "Wand".
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -13,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
-from implicam.calibrators.forward_gp.wand.bundle import FrameEquations, Lengths
+from implicam.calibrators.forward_gp.wand.bundle import Bundle, FrameEquations, Lengths
 from implicam.calibrators.forward_gp.wand.gauge import posterior_in_gauge
 from implicam.calibrators.forward_gp.wand.sizes import add_priors, estimate_sizes, size_fields, white_models
 from implicam.calibrators.forward_gp.wand.start import (
     MIN_LENGTH_SHARE,
     Started,
+    WandCamera,
     bundle_of,
     consensus,
     describe_stranger,
@@ -33,6 +35,7 @@ from implicam.rig_model import (
     CameraModel,
     CameraViews,
     CentralCamera,
+    GeneralCamera,
     Hyperparameters,
     InitialCamera,
     Posterior,
@@ -208,6 +211,8 @@ def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings) -> _S
         sigma = max(float(np.median(off)) / 1.1774 / np.sqrt(free), 0.02)
         near = max(5 * sigma, 1.0)
         _LOG.info("adjusted: sigma %.3f px of 1280", sigma)
+    cameras, bundle, sigma = _freed(waves, cameras, bundle, sigma, near, settings)
+    near = max(5 * sigma, 1.0)
     places, agree = consensus(waves, cameras, near)
     at = np.where(np.isfinite(bundle.places.reshape(-1, 3)) & known[:, None], bundle.places.reshape(-1, 3), places)
     known = np.isfinite(at[:, 0]) & (agree.sum(axis=1) >= 2)
@@ -220,16 +225,92 @@ def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings) -> _S
     working = np.where(known[:, None], (at - middle) @ turn.T / scale, 0.0).reshape(-1, 2, 3)
     models = []
     for c in numbers:
-        pose = cameras[c].pose @ Pose(turn.T, middle)
-        camera = CentralCamera(cameras[c].lens, Pose(pose.rotation, pose.translation / scale))
+        moved = cameras[c].in_frame(Pose(turn.T, middle))
+        camera = replace(moved, pose=Pose(moved.pose.rotation, moved.pose.translation / scale))
         prior = prior_of(camera, waves.images[c], waves.seen[c].uv[agree[waves.seen[c].rows, c]], settings)
         noise = LENIENT_RATIO * sigma * waves.images[c].half / 640
-        models.append(lens_only_model(InitialCamera(camera, prior, agree[:, c]), waves.images[c], noise))
-    none = np.zeros(waves.frames, dtype=np.bool_)
-    state = _State(waves, numbers, tuple(models), working, agree, none, scale)
+        family = "free" if isinstance(camera, GeneralCamera) else "ordinary"
+        models.append(lens_only_model(InitialCamera(camera, prior, agree[:, c], family), waves.images[c], noise))
+    # seen by cameras of any kind alone, the world may be stretched: there lengths are needed from the start
+    odd = any(isinstance(camera, GeneralCamera) for camera in cameras.values())
+    lengths = _likely_lengths(waves, at, known) if odd else np.zeros(waves.frames, dtype=np.bool_)
+    state = _State(waves, numbers, tuple(models), working, agree, lengths, scale)
     # a wrong marker and a stiff length would pull everything: lengths are first judged by the views alone
     state = _judged(_relocated(state), settings)
     return _judged(_solved(state, fields=False), settings)
+
+
+def _freed(
+    waves: Waves, cameras: Mapping[int, WandCamera], bundle: Bundle, sigma: float, near: float,
+    settings: ForwardGPSettings,
+) -> tuple[dict[int, WandCamera], Bundle, float]:  # fmt: skip
+    """Cameras of any kind, where ordinary ones leave much more: a tilted or cropped sensor, pixels that are not square.
+
+    Args:
+        waves: What was seen.
+        cameras: By number, adjusted.
+        bundle: They, and the places.
+        sigma: Noise in pixels of 1280.
+        near: How far views that agree are off, in pixels of 1280.
+        settings: Priors.
+
+    Returns:
+        The same, with cameras of any kind where that helps much.
+    """
+    numbers = tuple(sorted(cameras))
+    half = np.array([waves.images[c].half for c in numbers]) / 640
+    ordinary = [c for c in numbers if isinstance(cameras[c], CentralCamera)]
+    places, agree = consensus(waves, dict(cameras), near)
+    if not ordinary or not _enough_for_any_kind(agree[:, ordinary]):
+        return dict(cameras), bundle, sigma
+
+    def adjusted(own: dict[int, WandCamera], steps: int) -> tuple[dict[int, WandCamera], Bundle, Floats]:
+        seen = [waves.seen[c].select(agree[waves.seen[c].rows, c]) for c in numbers]
+        frames = np.flatnonzero(np.isfinite(places[:, 0]).reshape(-1, 2).all(axis=1) & waves.ends)
+        sd = np.full(len(frames), max(0.001 * waves.length, waves.jitter))
+        found = bundle_of(waves, own, places, settings).adjusted(
+            seen, sigma * half, Lengths(frames, waves.length, sd), robust=True, max_steps=steps, tolerance=1e-3
+        )
+        off = [float(np.median(e / h)) for e, h in zip(found.errors(seen), half, strict=True)]
+        return dict(zip(numbers, found.cameras, strict=True)), found, np.array(off)
+
+    again, _, before = adjusted(dict(cameras), 4)
+    any_kind: dict[int, WandCamera] = {
+        c: GeneralCamera.from_central(one) if isinstance(one, CentralCamera) else one for c, one in again.items()
+    }
+    free, _, after = adjusted(any_kind, 25)
+    better = {c for k, c in enumerate(numbers) if c in ordinary and after[k] < MAX_FREER_ERROR_RATIO * before[k]}
+    _LOG.info("as cameras of any kind: %s px instead of %s", np.round(after, 3), np.round(before, 3))
+    if not better:
+        return dict(cameras), bundle, sigma
+    if len(better) > len(numbers) / 2:  # places have bent to the cameras that were ordinary, and hide what these are
+        better = set(ordinary)
+    for _ in range(2):
+        mixed = {c: free[c] if c in better or c not in ordinary else again[c] for c in numbers}
+        mixed, found, off = adjusted(mixed, 25)
+        known = np.isfinite(places[:, 0])
+        left = max(1 - 3 * known.sum() / (2 * sum(agree[known, c].sum() for c in numbers)), 0.1)
+        sigma = max(float(np.median(off)) / 1.1774 / np.sqrt(left), 0.02)
+        places, agree = consensus(waves, mixed, max(5 * sigma, 1.0))
+        free = again = mixed
+    return mixed, found, sigma
+
+
+def _likely_lengths(waves: Waves, at: Floats, known: Bools) -> Bools:
+    """(F,) frames in which places (2 F, 3) are as far apart as in most."""
+    both = known.reshape(-1, 2).all(axis=1) & waves.ends
+    ends = at.reshape(-1, 2, 3)
+    off = np.abs(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / waves.length - 1)
+    usual = 1.4826 * float(np.median(off[both])) if both.any() else 0.0
+    return np.asarray(both & (off < max(4 * usual, 4 * waves.jitter / waves.length)), dtype=np.bool_)
+
+
+MAX_FREER_ERROR_RATIO = 0.7
+"""A camera of any kind that leaves less than this part of what an ordinary one does is of that kind."""
+
+
+def _enough_for_any_kind(agree: Bools) -> bool:
+    return bool((agree.sum(axis=0) >= 3 * MIN_VIEWS_PER_CAMERA).all())
 
 
 def _with_fields(state: _State, settings: ForwardGPSettings) -> _State:

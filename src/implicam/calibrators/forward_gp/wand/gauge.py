@@ -9,13 +9,15 @@ smallest where the wand was.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from implicam.calibrators.forward_gp.wand.bundle import FrameEquations
 from implicam.geometry import Bools, Floats, Pose, cross_matrices, rotation_from_vector, vector_from_rotation
-from implicam.rig_model import CameraModel, CentralCamera, Posterior, solve_normal
+from implicam.rig_model import CameraModel, CentralCamera, GeneralCamera, Posterior, solve_normal
+from implicam.rig_model.camera import ProjectiveCamera
 from implicam.rig_model.general_camera import AnyCamera
 from implicam.rig_model.normal_equations import name_failing_camera
 
@@ -89,7 +91,7 @@ def cameras_move_with_the_world(models: Sequence[CameraModel], middle: Floats) -
             turn = rotation_from_vector(sign * d[:3])
             # places x become turn (x - middle) + middle + shift; a camera that sees them as before looks back
             forth = Pose(turn, middle - turn @ middle + sign * d[3:])
-            both.append([_pose_step(model.camera, model.camera.in_frame(forth.inverse())) for model in models])
+            both.append([_step(model.camera, model.camera.in_frame(forth.inverse())) for model in models])
         slopes = [(one - two) / (2 * h) for one, two in zip(*both, strict=True)]
         columns.append(np.concatenate([_padded(slope, model) for slope, model in zip(slopes, models, strict=True)]))
     return np.array(columns).T
@@ -105,23 +107,30 @@ def cameras_grow_with_the_world(models: Sequence[CameraModel], middle: Floats) -
     Returns:
         (P,), by a relative growth.
     """
-    out = []
+    h, out = 1e-6, []
     for model in models:
-        assert isinstance(model.camera, CentralCamera)
-        slope = np.zeros(model.camera.size)
         # x grows to middle + s (x - middle): R x + T becomes s times itself where T' = s T + (s - 1) R middle
-        slope[-3:] = model.camera.pose.translation + model.camera.pose.rotation @ middle
-        out.append(_padded(slope, model))
+        camera = _posed(model.camera)
+        by = camera.pose.translation + camera.pose.rotation @ middle
+        both = [replace(camera, pose=Pose(camera.pose.rotation, camera.pose.translation + d * by)) for d in (h, -h)]
+        out.append(_padded((_step(camera, both[0]) - _step(camera, both[1])) / (2 * h), model))
     return np.concatenate(out)
 
 
-def _pose_step(before: AnyCamera, after: AnyCamera) -> Floats:
-    """(p,) the step from one to the other: of the pose alone."""
-    assert isinstance(before, CentralCamera)
-    assert isinstance(after, CentralCamera)
-    step = np.zeros(before.size)
-    step[-6:-3] = vector_from_rotation(after.pose.rotation @ before.pose.rotation.T)
-    step[-3:] = after.pose.translation - before.pose.translation
+def _posed(camera: AnyCamera) -> CentralCamera | GeneralCamera:
+    assert not isinstance(camera, ProjectiveCamera)  # a wand is never fitted with one
+    return camera
+
+
+def _step(before: AnyCamera, after: AnyCamera) -> Floats:
+    """(p,) the step from one camera to another of the same lens that is elsewhere."""
+    one, two = _posed(before), _posed(after)
+    step = two.parameters - one.parameters
+    turn = vector_from_rotation(two.pose.rotation @ one.pose.rotation.T)
+    if isinstance(one, GeneralCamera):
+        step[-3:] = turn
+    else:
+        step[-6:-3], step[-3:] = turn, two.pose.translation - one.pose.translation
     return step
 
 

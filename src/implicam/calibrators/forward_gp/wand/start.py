@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from implicam.calibrators.forward_gp.choose_camera import as_started, candidates, choose
+from implicam.calibrators.forward_gp.families import Scene, family_prior
+from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.calibrators.forward_gp.wand.bundle import Bundle, Lengths, rows_of
 from implicam.calibrators.forward_gp.wand.pairs import (
     MIN_SHARED_POINTS,
@@ -21,10 +24,13 @@ from implicam.calibrators.forward_gp.wand.pairs import (
 from implicam.calibrators.forward_gp.wand.waves import Waves
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose
-from implicam.rig_model import MIN_POINTS_PER_CAMERA, CentralCamera, Image, Prior, RigModelSettings
+from implicam.rig_model import MIN_POINTS_PER_CAMERA, CentralCamera, GeneralCamera, Image, Prior
 from implicam.rig_model.initialise import start_camera
 
 _LOG = logging.getLogger(__name__)
+
+WandCamera = CentralCamera | GeneralCamera
+"""An ordinary camera, or one of any kind."""
 
 MAX_PAIRS = 4
 """Pairs of cameras that are tried as the first."""
@@ -55,13 +61,13 @@ class Started:
     views agree; first, the two that all others were joined to."""
 
     first: tuple[int, ...]
-    cameras: dict[int, CentralCamera]
+    cameras: dict[int, WandCamera]
     places: Floats
     agree: Bools
 
 
-def prior_of(camera: CentralCamera, image: Image, uv: Floats, settings: RigModelSettings) -> Prior:
-    """The prior of an ordinary camera that is used where it saw something.
+def prior_of(camera: WandCamera, image: Image, uv: Floats, settings: ForwardGPSettings) -> Prior:
+    """The prior of a camera that is used where it saw something.
 
     Args:
         camera: As it is now.
@@ -69,13 +75,15 @@ def prior_of(camera: CentralCamera, image: Image, uv: Floats, settings: RigModel
         uv: (n, 2) what it saw.
         settings: The prior's sds.
     """
-    rays, good = camera.lens.ray_from_pixel(uv)
-    angle = np.arccos(np.clip(rays[good, 2], -1, 1))
-    widest = float(np.quantile(angle, 0.98)) if len(angle) else 1.0
-    return camera.prior(image, max(widest, 0.02), settings)
+    ahead = camera.lines(uv)[1] @ camera.pose.rotation[2]
+    angle = np.arccos(np.clip(ahead[np.isfinite(ahead)], -1, 1))
+    widest = max(float(np.quantile(angle, 0.98)) if len(angle) else 1.0, 0.02)
+    if isinstance(camera, GeneralCamera):
+        return family_prior(camera, "free", image, widest, settings)
+    return camera.prior(image, widest, settings)
 
 
-def start(waves: Waves, settings: RigModelSettings, tried: Collection[tuple[int, ...]] = ()) -> Started:
+def start(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int, ...]] = ()) -> Started:
     """Every camera that can be started.
 
     Args:
@@ -91,7 +99,9 @@ def start(waves: Waves, settings: RigModelSettings, tried: Collection[tuple[int,
     while True:
         places, agree = consensus(waves, cameras)
         left = [c for c in range(len(waves.seen)) if c not in cameras]
-        joined = {c: found for c in left if (found := _resected(waves, c, places, settings)) is not None}
+        odd = sum(isinstance(camera, GeneralCamera) for camera in cameras.values()) > len(cameras) / 2
+        each = {c: _resected(waves, c, places, settings, ordinary_first=not odd) for c in left}
+        joined = {c: found for c, found in each.items() if found is not None}
         if not joined:
             break
         cameras = _adjusted_together(waves, cameras | joined, settings)
@@ -99,24 +109,24 @@ def start(waves: Waves, settings: RigModelSettings, tried: Collection[tuple[int,
     return Started(first, cameras, places, agree)
 
 
-def _best_pair(
-    waves: Waves, settings: RigModelSettings, tried: Collection[tuple[int, ...]]
-) -> dict[int, CentralCamera]:
+def _best_pair(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int, ...]]) -> dict[int, WandCamera]:
     uv = waves.uv
     seen = np.isfinite(uv).all(axis=2).astype(np.int64)
     shared = np.einsum("ni,nj->ij", seen, seen)
     pairs = sorted(combinations(range(seen.shape[1]), 2), key=lambda pair: -shared[pair])
-    best: tuple[float, dict[int, CentralCamera]] | None = None
+    best: tuple[float, dict[int, WandCamera], bool] | None = None
     for pair in [pair for pair in pairs if pair not in tried][:MAX_PAIRS]:
         found = _pair(waves, pair, settings)
         if found is None:
             continue
-        score, cameras, good = found
+        score, _cameras, good = found
         _LOG.info("pair %s: score %.3g, %s", pair, score, "good" if good else "poor")
         if best is None or score < best[0]:
-            best = score, cameras
+            best = found
         if good:
             break
+    if best is None or not best[2]:
+        best = _best_of_odd(waves, [pair for pair in pairs if pair not in tried][:1], settings, best)
     if best is None:
         most = max((int(shared[pair]) for pair in pairs), default=0)
         raise FitError(
@@ -128,9 +138,59 @@ def _best_pair(
     return best[1]
 
 
+class Odd(NamedTuple):
+    """What a picture is before a camera is an ordinary one: p, half the log of how much wider than high a pixel is, and
+    whether it is mirrored."""
+
+    p: float = 0.0
+    mirrored: bool = False
+
+    def straightened(self, uv: Floats, image: Image) -> Floats:
+        """The pixels of the ordinary camera.
+
+        Args:
+            uv: (n, 2) as seen.
+            image: Where they are measured from.
+        """
+        by = np.exp([-self.p, self.p]) * [-1.0 if self.mirrored else 1.0, 1.0]
+        return np.asarray(image.centre + by * (uv - image.centre), dtype=np.float64)
+
+    def camera(self, ordinary: CentralCamera) -> WandCamera:
+        """The camera that sees so.
+
+        Args:
+            ordinary: The one that sees the straightened pixels, its axis at their middle.
+        """
+        if self == Odd():
+            return ordinary
+        found = GeneralCamera.from_central(ordinary)
+        return replace(found, shape=np.array([self.p, 0.0]), mirrored=self.mirrored)
+
+
+ODD_PAIRS = ((Odd(), Odd(mirrored=True)), *((Odd(p), Odd(p)) for p in (0.17, -0.17, 0.35, -0.35)))
+"""What two cameras are tried as that are not two ordinary ones: one before a mirror, or both with pixels 0.5, 0.7, 1.4
+or 2 times as wide as high; what is between is found by the adjustment."""
+
+
+def _best_of_odd(
+    waves: Waves,
+    pairs: Sequence[tuple[int, int]],
+    settings: ForwardGPSettings,
+    best: tuple[float, dict[int, WandCamera], bool] | None,
+) -> tuple[float, dict[int, WandCamera], bool] | None:
+    """Two cameras that are no ordinary ones, if they are good and better; else what there was."""
+    for pair in pairs:
+        for odd in ODD_PAIRS:
+            found = _pair(waves, pair, settings, odd)
+            if found is not None and (best is None or found[0] < best[0]):
+                _LOG.info("pair %s as %s: score %.3g, %s", pair, odd, found[0], "good" if found[2] else "poor")
+                best = found
+    return best
+
+
 def _pair(
-    waves: Waves, pair: tuple[int, int], settings: RigModelSettings
-) -> tuple[float, dict[int, CentralCamera], bool] | None:
+    waves: Waves, pair: tuple[int, int], settings: ForwardGPSettings, odd: tuple[Odd, Odd] = (Odd(), Odd())
+) -> tuple[float, dict[int, WandCamera], bool] | None:
     """The cost per view of two cameras, they, and whether they are good enough."""
     uv = waves.uv[:, pair]
     both = np.flatnonzero(np.isfinite(uv).all(axis=(1, 2)))
@@ -138,13 +198,14 @@ def _pair(
         return None
     marker = np.where(waves.ends[both // 2], both % 2, -1)
     images = [waves.images[c] for c in pair]
-    starts = pair_starts(uv[both], both // 2, marker, images, waves.length)[: BEST_STARTS[0]]
+    straight = np.stack([one.straightened(uv[both, k], images[k]) for k, one in enumerate(odd)], axis=1)
+    starts = pair_starts(straight, both // 2, marker, images, waves.length)[: BEST_STARTS[0]]
     if not starts:
         return None
     part = _part(waves, pair, both)
     every = _whole(part, np.isin(np.arange(2 * part.frames), both))
     found = [
-        _Trial(_bundle_of(one, part, both, uv[both], images, settings), _part(waves, pair, both[one.inliers]), 0.0)
+        _Trial(_bundle_of(one, part, both, straight, images, odd, settings), _part(waves, pair, both[one.inliers]), 0.0)
         for one in starts
     ]
     scale = np.array([image.half for image in images]) / 640
@@ -207,22 +268,22 @@ def _whole(waves: Waves, known: Bools) -> Lengths:
 
 
 def _bundle_of(
-    one: PairStart, part: Waves, both: np.ndarray, uv: Floats, images: Sequence[Image], settings: RigModelSettings
-) -> Bundle:
-    rays = np.stack([camera.lens.ray_from_pixel(uv[:, c])[0] for c, camera in enumerate(one.cameras)])
+    one: PairStart, part: Waves, both: np.ndarray, straight: Floats, images: Sequence[Image], odd: Sequence[Odd],
+    settings: ForwardGPSettings,
+) -> Bundle:  # fmt: skip
+    uv = part.uv[both]
+    rays = np.stack([camera.lens.ray_from_pixel(straight[:, c])[0] for c, camera in enumerate(one.cameras)])
     x, before = meet_two(rays, one.cameras[1].pose)
     middle = np.median(x[before & one.inliers], axis=0)
     places = np.tile(middle, (2 * part.frames, 1))
     places[both] = np.where((before & np.isfinite(x).all(axis=1))[:, None], x, middle)
-    priors = tuple(prior_of(c, i, uv[:, k], settings) for k, (c, i) in enumerate(zip(one.cameras, images, strict=True)))
     # about the middle of what was seen: a turn of a camera about a far origin would move everything
-    cameras = tuple(c.in_frame(Pose(np.eye(3), middle)) for c in one.cameras)
+    cameras = tuple(what.camera(c.in_frame(Pose(np.eye(3), middle))) for c, what in zip(one.cameras, odd, strict=True))
+    priors = tuple(prior_of(c, i, uv[:, k], settings) for k, (c, i) in enumerate(zip(cameras, images, strict=True)))
     return Bundle(cameras, (places - middle).reshape(-1, 2, 3), priors)
 
 
-def consensus(
-    waves: Waves, cameras: dict[int, CentralCamera], near_px: Floats | float = NEAR_PX
-) -> tuple[Floats, Bools]:
+def consensus(waves: Waves, cameras: dict[int, WandCamera], near_px: Floats | float = NEAR_PX) -> tuple[Floats, Bools]:
     """Where each place is, by those two of its views that most others agree with.
 
     Args:
@@ -259,10 +320,43 @@ def consensus(
 
 
 def _resected(
-    waves: Waves, c: int, places: Floats, settings: RigModelSettings, min_share: float = 0.0
+    waves: Waves, c: int, places: Floats, settings: ForwardGPSettings, *, ordinary_first: bool
+) -> WandCamera | None:
+    """A camera from the places that the others know: an ordinary one, or one of any kind that half of the views agree
+    with; None where these are too few, or do not fix it. Beside cameras that are not ordinary one that is is no
+    surprise, but the kind is asked for first."""
+    ordinary = _resected_ordinary(waves, c, places, settings)
+    if ordinary is not None and ordinary_first:
+        return ordinary
+    seen = waves.seen[c]
+    known = np.isfinite(places[seen.rows]).all(axis=1)
+    if known.sum() < MIN_VIEWS_OF_ODD_CAMERA:
+        return ordinary
+    scene = Scene(
+        places[seen.rows[known]], seen.uv[known], seen.relative[known], waves.images[c], float(waves.stated[c]),
+        settings,
+    )  # fmt: skip
+    try:
+        some = candidates(scene)
+        started = as_started(choose([some], settings)[0], scene, some)
+    except (FitError, np.linalg.LinAlgError):
+        return ordinary
+    error = scene.error(started.camera)  # type: ignore[arg-type]
+    near = error < NEAR_PX * waves.images[c].half / 640
+    if near.mean() < GOOD_SHARE or not isinstance(started.camera, GeneralCamera):
+        return ordinary
+    _LOG.info("camera %d is of another kind: %s%s", c, started.family, " mirrored" * started.camera.mirrored)
+    return started.camera
+
+
+MIN_VIEWS_OF_ODD_CAMERA = 20
+"""Of places that others know: a camera of seventeen numbers goes through fewer by chance."""
+
+
+def _resected_ordinary(
+    waves: Waves, c: int, places: Floats, settings: ForwardGPSettings, min_share: float = 0.0
 ) -> CentralCamera | None:
-    """A camera from the places that the others know; None where they are too few, or do not fix it, or fewer than a
-    share of them agree."""
+    """An ordinary camera; None where the views are too few, or do not fix it, or fewer than a share of them agree."""
     seen = waves.seen[c]
     known = np.isfinite(places[seen.rows]).all(axis=1)
     if known.sum() < MIN_POINTS_PER_CAMERA:
@@ -273,11 +367,15 @@ def _resected(
         return None
     error = np.linalg.norm(found.camera.pixel(places[seen.rows[known]]) - seen.uv[known], axis=1)[found.inliers]
     good = found.inliers.sum() >= MIN_POINTS_PER_CAMERA and np.median(error) < 5 * waves.images[c].half / 640
-    good = good and found.inliers.mean() >= min_share
+    good = good and found.inliers.mean() >= max(min_share, MIN_ORDINARY_SHARE)
     return found.camera if good and isinstance(found.camera, CentralCamera) else None
 
 
-def describe_stranger(waves: Waves, c: int, known: Floats, settings: RigModelSettings) -> str:
+MIN_ORDINARY_SHARE = 0.3
+"""Of the views of known places that agree with an ordinary camera: of a mirrored or a squeezed picture a few do."""
+
+
+def describe_stranger(waves: Waves, c: int, known: Floats, settings: ForwardGPSettings) -> str:
     """Why a camera does not belong to the others, as far as it can be told.
 
     Args:
@@ -299,14 +397,14 @@ def describe_stranger(waves: Waves, c: int, known: Floats, settings: RigModelSet
         "its frames are one behind the others'": np.roll(whole, 1, axis=0),
     }
     for why, places in shifted.items():
-        if _resected(waves, c, places.reshape(-1, 3), settings, min_share=0.5) is not None:
+        if _resected_ordinary(waves, c, places.reshape(-1, 3), settings, min_share=0.5) is not None:
             return f"{why}."
     return "too few of its views agree with the places that the other cameras know."
 
 
 def _adjusted_together(
-    waves: Waves, cameras: dict[int, CentralCamera], settings: RigModelSettings
-) -> dict[int, CentralCamera]:
+    waves: Waves, cameras: dict[int, WandCamera], settings: ForwardGPSettings
+) -> dict[int, WandCamera]:
     """A short robust adjustment of all cameras so far."""
     places, agree = consensus(waves, cameras)
     bundle = bundle_of(waves, cameras, places, settings)
@@ -319,7 +417,7 @@ def _adjusted_together(
     return dict(zip(used, bundle.cameras, strict=True))
 
 
-def bundle_of(waves: Waves, cameras: dict[int, CentralCamera], places: Floats, settings: RigModelSettings) -> Bundle:
+def bundle_of(waves: Waves, cameras: dict[int, WandCamera], places: Floats, settings: ForwardGPSettings) -> Bundle:
     """Cameras and places as one.
 
     Args:
