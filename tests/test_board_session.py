@@ -18,6 +18,7 @@ from implicam.active.board_design import BoardDesign, BoardShape, board_pose
 from implicam.active.board_loop import BoardLoop, BoardTarget, Pictures
 from implicam.active.board_poses import POSE_COLUMN, KnownPose, KnownPosesLoop, described, poses_from, poses_of
 from implicam.active.stopping import Step, Within
+from implicam.active.volume_design import linear_views
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
 from implicam.dataset.boards import corner_positions
 from implicam.detect import AprilGrid, Charuco, View
@@ -82,7 +83,7 @@ def test_the_pose_of_the_board_is_integrated_out(design, calibration, poses):
     pose = poses[int(np.argmax(design.gains(poses)))]
     (S,) = design._informations([pose], None)
     xyz = pose.apply(design.shape.some())
-    linear = design._linear(xyz, np.tile(design.visible([pose]), (len(xyz), 1)))
+    linear = linear_views(design.rig, xyz, np.tile(design.visible([pose]), (len(xyz), 1)))
     many = np.sqrt(len(design.shape.corners) / len(xyz))
     weight = np.where(linear.seen, many / linear.sd, 0)[..., None]
     H = (linear.half * weight).reshape(-1, linear.half.shape[2])

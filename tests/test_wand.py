@@ -13,14 +13,12 @@ from scipy.stats import chi2
 from implicam.calibrators import ForwardGP, ForwardGPCalibration, load_calibration
 from implicam.calibrators.forward_gp.wand.bundle import FrameEquations, Lengths, WhiteRows
 from implicam.calibrators.forward_gp.wand.gauge import cameras_grow_with_the_world, cameras_move_with_the_world
-from implicam.calibrators.forward_gp.wand.held_out import hold_lengths_out
 from implicam.calibrators.forward_gp.wand.pairs import meet_two, pair_starts
 from implicam.dataset import Dataset, read_dataset, write_dataset
 from implicam.dataset.wand import Wand, marker_rows, wand_of
 from implicam.derived import distances
 from implicam.errors import DatasetError, FitError, UsageError
 from implicam.geometry import Pose, register, rotation_from_vector
-from implicam.progress import silent
 from implicam.rig_model import image_of
 from implicam.simulate import Rig, Target, as_wand, build_rig, random_positions, simulate, waved_wand
 from implicam.verdict import judge
@@ -151,7 +149,7 @@ def test_no_known_point_can_be_held_out(waving: Waving) -> None:
 
 
 def test_lengths_of_frames_that_were_left_out_judge_it(waving: Waving) -> None:
-    held_out = hold_lengths_out(waving.calibration, silent)
+    held_out = waving.calibration.hold_lengths_out()
     assert len(held_out.errors) >= 15
     squares = (held_out.errors / held_out.sds) ** 2
     assert 0.2 < squares.mean() < 2.5  # the mean of fifteen squares: 1 +- 0.37

@@ -95,6 +95,19 @@ def _framing(shape: BoardShape, pose: Pose, size: tuple[int, int]) -> Framing:
     return Framing(np.asarray(uv / np.array(size), dtype=np.float64), span, -facing[:2, 2], pose)
 
 
+def third_of(place: Floats, camera: str) -> str:
+    """Where something is in a picture, in words: "left third, lower part of cam2".
+
+    Args:
+        place: (2,) as parts of width and height.
+        camera: Whose picture it is.
+    """
+    across = ("left third", "middle", "right third")[int(np.clip(3 * place[0], 0, 2))]
+    down = ("upper part", "", "lower part")[int(np.clip(3 * place[1], 0, 2))]
+    where = down if across == "middle" and down else across if not down else f"{across}, {down}"
+    return f"{where} of {camera}"
+
+
 def unseen_framing(shape: BoardShape, size: tuple[int, int], seen: Sequence[Framing]) -> Framing:
     """Of the places and tilts that a camera should be shown, that which differs most from what it has seen.
 

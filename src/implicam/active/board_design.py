@@ -15,17 +15,18 @@ is by how much the mean variance of positions falls (I-optimality: Atkinson, Don
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from implicam.active.design_model import Bools, Places, PredictedCovariance
+from implicam.active.design_model import Bools, Places
+from implicam.active.volume_design import VolumeDesign, linear_views
 from implicam.calibrators import PredictsPixels
 from implicam.dataset import Floats
 from implicam.dataset.image_bounds import are_on_image, image_bounds
-from implicam.errors import FitError, UsageError
+from implicam.errors import FitError
 from implicam.geometry import Pose, look_at, poses_from_rays, rotation_from_vector
 
 MIN_CORNERS = 12
@@ -98,101 +99,18 @@ class BoardShape(NamedTuple):
         return np.asarray(corners[chosen], dtype=np.float64)
 
 
-class _Linear(NamedTuple):
-    """Of n positions: slope (n, R, 3), half (n, R, q), sd (n, R) and seen (n, R), R = 2 cameras."""
-
-    slope: Floats
-    half: Floats
-    sd: Floats
-    seen: Bools
-
-
 @dataclass(frozen=True, eq=False)
-class BoardDesign:
-    """What a calibration knows, and what boards would add.
+class BoardDesign(VolumeDesign):
+    """What a calibration knows, and what boards would add; a rig from boards is only in the frame of its first camera.
 
     Attributes:
-        rig: A calibration that predicts pixels; in its frame is all that follows.
         shape: The board.
-        judged: Where positions have to be good, g places.
-        spread: (q, k) of what is unknown now: z = spread z', z' standard normal.
-
-    Raises:
-        UsageError: Fewer than four of the judged places are seen by two cameras or more.
     """
 
-    rig: PredictsPixels
-    shape: BoardShape
-    judged: Places
-    spread: Floats | None = None
+    shape: BoardShape = field(kw_only=True)
 
-    def __post_init__(self) -> None:
-        if self._counted.sum() < 4:
-            raise UsageError(
-                "the volume is hardly seen by two cameras.",
-                why=f"{int(self._counted.sum())} of {len(self.judged)} places of it are",
-                fix="give another --workspace, in the frame of the first camera; or aim the cameras at one volume",
-            )
-
-    @cached_property
-    def _at_judged(self) -> _Linear:
-        return self._linear(self.judged.xyz, self.judged.seen)
-
-    @cached_property
-    def _counted(self) -> Bools:
-        """(g,) which places two cameras or more see."""
-        return np.asarray(self._at_judged.seen.sum(axis=1) >= 4)
-
-    @cached_property
-    def _noise_alone(self) -> Floats:
-        """(g, 3, 3) the covariance that pixel noise leaves."""
-        there = self._at_judged
-        whitened = there.slope / there.sd[..., None] * there.seen[..., None]
-        found = np.full((len(self.judged), 3, 3), np.nan)
-        good = self._counted
-        found[good] = np.linalg.inv(whitened[good].swapaxes(1, 2) @ whitened[good])
-        return found
-
-    @cached_property
-    def _moved(self) -> tuple[Floats, Floats]:
-        """(k, 3, q) by what the counted places are off, rigid motion taken out; and (k, 3, q) that motion."""
-        there, good = self._at_judged, self._counted
-        weighted = there.slope / there.sd[..., None] ** 2 * there.seen[..., None]
-        A = self._noise_alone[good] @ weighted[good].swapaxes(1, 2)
-        moved = A @ np.where(there.seen[good][..., None], there.half[good], 0.0)
-        motion = np.linalg.qr(_rigid_motions(self.judged.xyz[good]))[0]
-        flat = moved.reshape(-1, moved.shape[2])
-        rigid = motion @ (motion.T @ flat)
-        return (flat - rigid).reshape(moved.shape), rigid.reshape(moved.shape)
-
-    @property
-    def _spread(self) -> Floats:
-        if self.spread is not None:
-            return self.spread
-        return np.eye(self._at_judged.half.shape[2])
-
-    @cached_property
-    def at_judged(self) -> PredictedCovariance:
-        """The covariance of measuring at the judged places, in the frame that fits them best."""
-        total = np.full((len(self.judged), 3, 3), np.nan)
-        off = self._moved[0] @ self._spread
-        total[self._counted] = self._noise_alone[self._counted] + off @ off.swapaxes(1, 2)
-        return PredictedCovariance(total, lambda: self._noise_alone)
-
-    def pixel_sd(self) -> Floats:
-        """What is unknown of each camera, in its pixels, over its noise: what calibration adds to what it sees.
-
-        Returns:
-            (cameras,) rms over the judged places that it sees; NaN for a camera that is not calibrated.
-        """
-        there, good = self._at_judged, self._counted
-        off = there.half[good] - there.slope[good] @ self._moved[1]  # in the frame that fits the volume best
-        variance = np.sum((off @ self._spread) ** 2, axis=2) / there.sd[good] ** 2
-        variance = np.where(there.seen[good], variance, np.nan).reshape(len(off), -1, 2)
-        found = np.full(variance.shape[1], np.nan)
-        used = np.isfinite(variance).any(axis=(0, 2))
-        found[used] = np.sqrt(np.nanmean(variance[:, used], axis=(0, 2)))
-        return found
+    frame_is_free: ClassVar[bool] = True
+    weighs_cameras: ClassVar[bool] = False
 
     def pixel_noise(self) -> Floats:
         """The noise of each camera's pixels.
@@ -253,7 +171,7 @@ class BoardDesign:
             xyz = pose.apply(corners)
             uv = self.rig.predict(xyz)
             there = are_on_image(self.rig.trained, uv) & by
-            part = self._linear(xyz, there)
+            part = linear_views(self.rig, xyz, there)
             weight = np.where(part.seen, 1 / part.sd, 0.0) * np.sqrt(len(self.shape.corners) / len(corners))
             turned = xyz - pose.translation
             K = np.concatenate([_cross(turned[:, None], part.slope), part.slope], axis=2) * weight[..., None]
@@ -337,9 +255,6 @@ class BoardDesign:
     def _eyes(self) -> dict[str, _Eye]:
         return {}
 
-    def _linear(self, xyz: Floats, seen: Bools) -> _Linear:
-        return _linear(self.rig, xyz, seen)
-
     @classmethod
     def of(cls, rig: PredictsPixels, shape: BoardShape, xyz: Floats | None = None, seed: int = 0) -> BoardDesign:
         """What a calibration knows.
@@ -356,7 +271,7 @@ class BoardDesign:
         """
         if xyz is None:
             xyz = seen_by_two(rig, shape, seed)
-        return cls(rig, shape, Places.predicted(rig, xyz))
+        return cls(rig, Places.predicted(rig, xyz), shape=shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,7 +371,7 @@ def _refined(rig: PredictsPixels, corners: Floats, uv: Floats, pose: Pose) -> tu
     for _ in range(POSE_ROUNDS):
         xyz = pose.apply(corners)
         r = uv - rig.predict(xyz)
-        part = _linear(rig, xyz, np.asarray(seen & np.isfinite(r).all(axis=2)))
+        part = linear_views(rig, xyz, np.asarray(seen & np.isfinite(r).all(axis=2)))
         if part.seen.sum() < 6:
             break
         weight = np.where(part.seen, 1 / part.sd, 0.0)
@@ -469,32 +384,6 @@ def _refined(rig: PredictsPixels, corners: Floats, uv: Floats, pose: Pose) -> tu
         if np.abs(flat @ step).max() < 1e-3:
             break
     return pose, left
-
-
-def _linear(rig: PredictsPixels, xyz: Floats, seen: Bools) -> _Linear:
-    """All calibrated cameras at once, in the order of the dataset's; nothing seen by those that are not."""
-    parts = rig.sensitivities(xyz)
-    R, unknowns = 2 * len(rig.trained.cameras), [part.half.shape[2] for part in parts]
-    slope, half = np.zeros((len(xyz), R, 3)), np.zeros((len(xyz), R, sum(unknowns)))
-    variance, there = np.ones((len(xyz), R)), np.zeros((len(xyz), R), dtype=np.bool_)
-    start = 0
-    for part, q in zip(parts, unknowns, strict=True):
-        rows = np.array([[2 * c, 2 * c + 1] for c in part.cameras]).ravel()
-        good: Bools = np.asarray(np.isfinite(part.slope).all(axis=2) & np.isfinite(part.half).all(axis=2))
-        slope[:, rows] = np.where(good[..., None], part.slope, 0)
-        half[:, rows, start : start + q] = np.where(good[..., None], part.half, 0)
-        variance[:, rows] = np.where(good, part.noise + part.rest, 1.0)  # NaN where a lens has no answer
-        there[:, rows] = good & seen[:, list(part.cameras)].repeat(2, axis=1)
-        start += q
-    return _Linear(slope, half, np.sqrt(variance), there)
-
-
-def _rigid_motions(xyz: Floats) -> Floats:
-    """(3 n, 6) by what points move with a small turn and shift of all of them."""
-    centred = xyz - xyz.mean(axis=0)
-    turns = np.stack([np.cross(axis, centred) for axis in np.eye(3)], axis=2)
-    shifts = np.broadcast_to(np.eye(3), (len(xyz), 3, 3))
-    return np.concatenate([turns, shifts], axis=2).reshape(-1, 6)
 
 
 def _cross(a: Floats, b: Floats) -> Floats:

@@ -16,11 +16,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from implicam.active.board_coverage import Framing, framing_of, is_new, unseen_framing, usual_pixels
+from implicam.active.board_coverage import Framing, framing_of, is_new, third_of, unseen_framing, usual_pixels
 from implicam.active.board_design import BoardDesign, BoardShape, board_pose
 from implicam.active.design_model import Bools, PredictedCovariance
 from implicam.active.loop import Target, summarise_step
 from implicam.active.stopping import Budget, Never, Rule, Step
+from implicam.active.volume_design import MAX_EXCESS_PART
 from implicam.active.workspace import Workspace
 from implicam.calibrators import Calibration, Calibrator, PredictsPixels, TellsContradictions
 from implicam.dataset import Camera, Dataset, Floats
@@ -42,13 +43,16 @@ CANDIDATES = 200
 WORTH_SHARE = 0.3
 """Of what the suggested pose would tell: a pose that tells as much is worth a picture."""
 
-MAX_EXCESS_PART = 0.66
-"""Of a camera's noise: what may be unknown of its pixels where calibration leaves positions within 1.2 of the noise."""
-
 
 @dataclass(frozen=True)
 class Pictures(Budget):
-    """When all pictures of the budget are taken."""
+    """When all pictures of the budget are taken.
+
+    Attributes:
+        what: They show: boards, frames of a wand.
+    """
+
+    what: str = "boards"
 
     def progress(self, history: Sequence[Step], unit: str = "") -> str:
         """How far it is from stopping.
@@ -57,7 +61,7 @@ class Pictures(Budget):
             history: The steps so far.
             unit: Of lengths, for the words.
         """
-        return super().progress(history, unit).replace("points", "boards")
+        return super().progress(history, unit).replace("points", self.what)
 
     def met(self, history: Sequence[Step], unit: str = "") -> str:
         """Why to stop now: the budget is spent.
@@ -69,7 +73,7 @@ class Pictures(Budget):
         Returns:
             The number in words; empty where it is smaller than `points`.
         """
-        return f"all {self.points} boards of the budget are taken" if super().met(history, unit) else ""
+        return f"all {self.points} {self.what} of the budget are taken" if super().met(history, unit) else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -457,7 +461,7 @@ class BoardLoop:
         elif boards >= MIN_BOARDS:
             why += "; the best are boards that other cameras see too"
         words = ", ".join(
-            part for part in (_third(framing.place, name), _tilted(framing.tilt), _near(framing.span)) if part
+            part for part in (third_of(framing.place, name), _tilted(framing.tilt), _near(framing.span)) if part
         )
         nowhere = np.full(3, np.nan)
         uv = np.full((len(self._names), 2), np.nan)
@@ -531,7 +535,7 @@ class BoardLoop:
         facing = frame @ pose.rotation
         place = uv[nearest] / np.array(self._size(nearest))
         turned = "upright" if abs(facing[1, 0]) > 0.7 else ""
-        parts = (_third(place, self._names[nearest]), _tilted(-facing[:2, 2]), turned)
+        parts = (third_of(place, self._names[nearest]), _tilted(-facing[:2, 2]), turned)
         told = ", ".join(part for part in parts if part)
         return f"{told}, {decimal_number(far, 2)} {self.data.length_unit} from it"
 
@@ -564,13 +568,6 @@ def _densified(rim: Floats, steps: int = 8) -> Floats:
     """(4 steps, 3) a closed line with points between its corners: lenses bend it."""
     part = np.arange(steps)[:, None] / steps
     return np.concatenate([a + part * (b - a) for a, b in zip(rim, np.roll(rim, -1, axis=0), strict=True)])
-
-
-def _third(place: Floats, camera: str) -> str:
-    across = ("left third", "middle", "right third")[int(np.clip(3 * place[0], 0, 2))]
-    down = ("upper part", "", "lower part")[int(np.clip(3 * place[1], 0, 2))]
-    where = down if across == "middle" and down else across if not down else f"{across}, {down}"
-    return f"{where} of {camera}"
 
 
 def _tilted(tilt: Floats) -> str:

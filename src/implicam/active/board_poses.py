@@ -22,7 +22,7 @@ import numpy as np
 
 from implicam.active.board_design import BoardDesign
 from implicam.active.board_loop import BoardLoop, BoardTarget, CameraProgress, Ints, Worth
-from implicam.active.design_model import Places, PredictedCovariance, can_design_experiments, design_model_of
+from implicam.active.design_model import PredictedCovariance, can_design_experiments, design_model_of
 from implicam.active.loop import summarise_step
 from implicam.active.stopping import Step
 from implicam.active.workspace import Workspace, lattice_places
@@ -314,7 +314,7 @@ class KnownPosesLoop(BoardLoop):
         """With where the cameras see it, as soon as a calibration says so."""
         if not isinstance(self.calibration, PredictsPixels):
             return target
-        design = BoardDesign(self.calibration, self.shape, Places.predicted(self.calibration, self.judged_at))
+        design = BoardDesign.of(self.calibration, self.shape, self.judged_at)
         seen = design.visible([pose])[0]
         made = self._with_pixels(target, pose, np.asarray(seen))
         return replace(made, why="a picture is taken by itself where the cameras see it there, held still")

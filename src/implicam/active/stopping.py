@@ -108,6 +108,17 @@ class Either(Rule):
         return self.first.met(history, unit) or self.second.met(history, unit)
 
 
+def parts_of(rule: Rule) -> list[Rule]:
+    """The rules of which one consists.
+
+    Args:
+        rule: Of any kind.
+    """
+    if isinstance(rule, Both | Either):
+        return [*parts_of(rule.first), *parts_of(rule.second)]
+    return [rule]
+
+
 def _where(step: Step) -> str:
     """Nothing, or which part of the workspace this is about."""
     return "" if step.measured > 0.995 else f" that enough cameras see ({percent(step.measured)} of the workspace)"

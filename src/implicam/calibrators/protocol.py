@@ -25,6 +25,7 @@ from implicam.calibrators.position_processes import PositionProcesses
 from implicam.dataset import Dataset, Floats, Observations
 from implicam.dataset.requirements import observations_of
 from implicam.dataset.unused import Rejected, Unused
+from implicam.dataset.wand import Wand
 from implicam.errors import FitError, UsageError
 from implicam.formatting import decimal_number
 from implicam.measurement import Measurement
@@ -261,6 +262,15 @@ class HoldsLengthsOut(Calibration, Protocol):
         Raises:
             FitError: Without these there is no calibration.
         """
+
+
+@runtime_checkable
+class FromWand(HoldsLengthsOut, FindsFaults, Protocol):
+    """A calibration that may be from a wand."""
+
+    @property
+    def wand(self) -> Wand | None:
+        """The wand as it was used; None for a calibration from known points."""
 
 
 @runtime_checkable

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from implicam.active import Below, Rule, Step
-from implicam.active.stopping import AtLeast, Both, Either
+from implicam.active.stopping import AtLeast, parts_of
 from implicam.dataset import Floats
 from implicam.drawing import finite_points
 from implicam.formatting import number
@@ -72,16 +72,9 @@ def curve(history: Sequence[Step], rule: Rule) -> dict[str, Any]:
         "points": [step.points for step in steps],
         "worst": [step.worst for step in steps],
         "usual": [step.usual for step in steps],
-        "stops": [{"value": one.value, "of": one.of} for one in _parts(rule) if isinstance(one, Below)],
-        "budgets": [one.points for one in _parts(rule) if isinstance(one, AtLeast)],
+        "stops": [{"value": one.value, "of": one.of} for one in parts_of(rule) if isinstance(one, Below)],
+        "budgets": [one.points for one in parts_of(rule) if isinstance(one, AtLeast)],
     }
-
-
-def _parts(rule: Rule) -> list[Rule]:
-    """The rules of which one consists."""
-    if isinstance(rule, Both | Either):
-        return [*_parts(rule.first), *_parts(rule.second)]
-    return [rule]
 
 
 def _buttons(state: State, moves: bool, unit: str) -> dict[str, dict[str, Any]]:
@@ -140,7 +133,7 @@ def numbers_of(history: Sequence[Step], rule: Rule, unit: str, skipped: int) -> 
         "skipped": skipped,
         "usual": f"{number(step.usual, 2)} {unit}" if known else "",
         "worst": f"{number(step.worst, 2)} {unit}" if known else "",
-        "progress": [one.progress(history, unit) for one in _parts(rule)],
+        "progress": [one.progress(history, unit) for one in parts_of(rule)],
     }
 
 

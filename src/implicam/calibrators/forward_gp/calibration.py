@@ -170,6 +170,9 @@ class ForwardGP(CalibratorBase):
         return ForwardGPCalibration(self, data, frame, replace(fitted, uncalibrated=uncalibrated))
 
 
+_HELD_OUT = "_lengths_held_out"
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ForwardGPCalibration(RigCalibration):
     """A fitted rig.
@@ -282,7 +285,17 @@ class ForwardGPCalibration(RigCalibration):
         Raises:
             FitError: Without these frames there is no calibration.
         """
-        return None if self.waved is None else hold_lengths_out(self, progress)
+        if self.waved is None:
+            return None
+        kept: LengthsHeldOut | None = self.__dict__.get(_HELD_OUT)
+        if kept is None:
+            kept = self.__dict__[_HELD_OUT] = hold_lengths_out(self, progress)  # a fit: once is enough
+        return kept
+
+    @property
+    def wand(self) -> Wand | None:
+        """The wand as it was used; None for a calibration from known points."""
+        return None if self.waved is None else self.waved.wand
 
     def _refuse_wand(self) -> None:
         if self.waved is not None:

@@ -80,7 +80,8 @@ def find_faults(calibration: ForwardGPCalibration, progress: Progress) -> Iterat
         )
         return
     try:
-        held_out = hold_lengths_out(calibration, progress)
+        held_out = calibration.hold_lengths_out(progress)
+        assert held_out is not None
     except FitError as error:
         yield Finding(False, f"Without a third of the frames there is no calibration ({error.what}): wave it longer.")
         return
