@@ -268,6 +268,14 @@ class BoardLoop:
         for shot in self._shots()[len(shots) :]:
             self._learn(shot)
 
+    def wants_fit(self, data: Dataset) -> bool:
+        """Whether a fit to these corners is worth its time: any board more is.
+
+        Args:
+            data: All corners.
+        """
+        return True
+
     def tell(self, data: Dataset) -> None:
         """One board more, without a fit: what it adds is predicted.
 

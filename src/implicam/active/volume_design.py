@@ -17,7 +17,6 @@ from implicam.calibrators import PredictsPixels
 from implicam.dataset import Floats
 from implicam.errors import UsageError
 
-
 MAX_EXCESS_PART = 0.66
 """Of a camera's noise: what may be unknown of its pixels where calibration leaves positions within 1.2 of the noise."""
 

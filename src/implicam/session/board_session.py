@@ -10,42 +10,29 @@ what the board must have told, while the cameras are fitted again in the backgro
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from implicam.active.board_loop import BoardLoop, BoardTarget, CameraProgress, Ints
+from implicam.active.board_loop import BoardLoop, BoardTarget, Ints
 from implicam.active.board_poses import POSE_COLUMN
+from implicam.calibrators import Calibration
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.dataset.boards import corner_name
-from implicam.detect import Detected, View
 from implicam.detect.sharpness import edge_width
-from implicam.errors import FitError, ImplicamError, UsageError
+from implicam.errors import UsageError
 from implicam.evaluation import leave_out_shots
-from implicam.formatting import json_safe
 from implicam.geometry import Pose
-from implicam.hardware import Frame
-from implicam.images import blank
 from implicam.progress import Progress, silent
-from implicam.report import report_of, write_report
-from implicam.report.words import headline
-from implicam.report.words import verdict as judgement
+from implicam.report import ReportData, report_of, write_report
 from implicam.session.board_report import write_board_report
-from implicam.session.controller import (
-    CALIBRATION_FILE,
-    HISTORY_KEY,
-    REPORT_FILE,
-    Equipment,
-    SessionController,
-    State,
-)
+from implicam.session.by_hand import ByHandController, ByHandState, Judgement
+from implicam.session.controller import Equipment
 from implicam.session.detections import Look
 from implicam.session.journal import Session
 
@@ -89,35 +76,20 @@ class Hand(Protocol):
         """
 
 
-class Judgement(NamedTuple):
-    """What is to be said of the board as it is held now: whether a picture is taken, and if not, why."""
-
-    ready: bool
-    reason: str
-
-
 @dataclass(frozen=True, eq=False)
-class BoardState(State):
-    """As `State`. judgement: of the board in the live pictures. cameras: how far each is. busy: whether the cameras are
-    being fitted meanwhile. off: pixels from the corners to the outline, NaN where that is not known.
-    contradictions: what the last fit says of cameras that contradict each other. unfitted: why the last fit failed.
-    forecast: whether the last numbers are expected of boards that no fit has seen yet."""
+class BoardState(ByHandState):
+    """As `ByHandState`. off: pixels from the corners to the outline, NaN where that is not known."""
 
-    judgement: Judgement = field(default_factory=lambda: Judgement(False, ""))
-    cameras: tuple[CameraProgress, ...] = ()
-    busy: bool = False
     off: float = float("nan")
-    taken: int = 0
-    contradictions: tuple[str, ...] = ()
-    unfitted: str = ""
-    forecast: bool = False
 
 
-class BoardController(SessionController):
+class BoardController(ByHandController):
     """One session with a board, its equipment, and the loop that says where to hold it next."""
 
-    loop: BoardLoop  # type: ignore[assignment]
+    loop: BoardLoop
     state: BoardState
+
+    thing, things, where = "board", "boards", "hold it into the outline"
 
     def __init__(
         self,
@@ -129,12 +101,8 @@ class BoardController(SessionController):
         hand: Hand | None = None,
         background: bool = True,
     ) -> None:
-        super().__init__(session, equipment, loop, auto=auto)  # type: ignore[arg-type]
-        self.state = BoardState(auto=auto)
-        self._hand, self._background = hand, background
-        self._fitter = ThreadPoolExecutor(1, thread_name_prefix="implicam-fit")
-        self._fitting: Future[None] | None = None
-        self._loop_lock = threading.RLock()
+        super().__init__(session, equipment, loop, BoardState(auto=auto), background=background)
+        self._hand = hand
         self._last: dict[str, tuple[Ints, Floats]] = {}  # the look before
         self._still_since = 0.0
 
@@ -143,22 +111,6 @@ class BoardController(SessionController):
     def go(self) -> None:
         """Take a picture now, as the board is held; UsageError with the reason where it would be of no use."""
         self._take(asked=True)
-
-    def redo(self) -> None:
-        """Nothing is shown to be judged here: a picture is kept or refused at once."""
-        raise UsageError("there is nothing to look at again.", fix="take a picture")
-
-    def report_position(self, position: Any, *, confirmed: bool = False) -> None:
-        """Refuse: nobody has to know where the board is.
-
-        Args:
-            position: Not used.
-            confirmed: Not used.
-
-        Raises:
-            UsageError: Always.
-        """
-        raise UsageError("a board held by hand needs no position.", fix="hold it into the outline")
 
     def skip(self, reason: str = "skipped by hand") -> None:
         """Show another pose instead of this one.
@@ -175,29 +127,6 @@ class BoardController(SessionController):
                 self.session.skip(target.xyz, reason)
                 self.loop.refuse(target.xyz, reason)
             self._aim()
-
-    def remove(self, name: str, *, again: bool = False) -> None:
-        """Take any picture back.
-
-        Args:
-            name: Of the board.
-            again: Not used: the same pose is hard to find again.
-
-        Raises:
-            UsageError: There is no such board.
-        """
-        with self._working("fitting", f"taking {name} back"):
-            self.session.remove(name)
-            self._fit()
-            self._aim(f"{name} is taken back. ")
-
-    def set_auto(self, auto: bool) -> None:
-        """Turn on or off that a picture is taken by itself.
-
-        Args:
-            auto: Whether it is.
-        """
-        self._show(auto=auto)
 
     def step(self) -> None:
         """Take a picture, if the board is held so that it tells enough."""
@@ -246,53 +175,23 @@ class BoardController(SessionController):
             if self.state.phase == "aim":
                 self._show(judgement=judged, off=self._off(self.state.looks))
 
-    def finish(self) -> Path:
-        """Calibrate with everything, save and report; the calibration's file, which is not there after trouble."""
-        path = self.session.folder / CALIBRATION_FILE
-        with self._working("fitting", "calibrating, and writing the report"):
-            self._wait_for_fit()
-            data = self.session.data
-            if self.loop.calibration is None or data is None:
-                raise UsageError(
-                    f"{self.loop.points} boards are too few to calibrate.",
-                    why=str(self.loop.problem.what) if self.loop.problem else "",
-                    fix=f"show each camera {self.loop.start} boards or more, in half of them two cameras at once",
-                )
-            calibration = self.loop.calibrator.fit(data)
-            calibration.save(path)
-            report = self.session.folder / REPORT_FILE
-            report.unlink(missing_ok=True)  # it may be of an earlier calibration
-            words, verdict = f"{self.loop.points} boards. Saved: {path}", ("", "unknown")
-            try:
-                if data.known is None:
-                    said = write_board_report(report, self.session.name, self.loop.calibrator, calibration, data)
-                else:
-                    title = f"{self.session.name}: a board at known poses"
-                    said = report_of(leave_out_shots(self.loop.calibrator.fit, data), title)
-                    write_report(report, said)
-                about_bars, _, tone = judgement(said)
-                verdict = f"{headline(said)} {about_bars}", tone
-                words += f" and {report}"
-            except ImplicamError as error:
-                words += f". No report: {error.what}"
-            self.session.log("finished", points=self.loop.points)
-            self._show(
-                phase="done", message=words, report=report if report.exists() else None, target=None, auto=False,
-                verdict=verdict,
-            )  # fmt: skip
-        return path
-
-    def close(self) -> None:
-        """Close the equipment and the session, after a fit in the background; closing twice is harmless."""
-        self._fitter.shutdown(wait=True, cancel_futures=True)
-        super().close()
-
-    @property
-    def measured_live(self) -> Floats:
-        """Nothing: a board is no point."""
-        return np.full(3, np.nan)
-
     # private
+
+    def _too_few(self) -> UsageError:
+        return UsageError(
+            f"{self.loop.points} boards are too few to calibrate.",
+            why=str(self.loop.problem.what) if self.loop.problem else "",
+            fix=f"show each camera {self.loop.start} boards or more, in half of them two cameras at once",
+        )
+
+    def _report(self, path: Path, calibration: Calibration, data: Dataset) -> ReportData:
+        if data.known is None:
+            return write_board_report(path, self.session.name, self.loop.calibrator, calibration, data)
+        said = report_of(
+            leave_out_shots(self.loop.calibrator.fit, data), f"{self.session.name}: a board at known poses"
+        )
+        write_report(path, said)
+        return said
 
     def _aim(self, before: str = "") -> None:
         try:
@@ -311,57 +210,6 @@ class BoardController(SessionController):
             self._hand.put(target.pose)
         elif self._hand is not None:
             self._hand.follow(self.loop.shape.some(), target.corners)
-
-    def _fit(self) -> None:
-        """With everything, now."""
-        self._wait_for_fit()
-        with self._loop_lock:
-            self.loop.reset(self.session.data)
-        self._show_loop()
-
-    def _fit_behind(self) -> None:
-        """In the background, unless that is being done: then what comes meanwhile is predicted."""
-        if not self._background:
-            self._fit()
-            return
-        if self._fitting is None or self._fitting.done():
-            self._show(busy=True)
-            self._fitting = self._fitter.submit(self._fitted_behind)
-
-    def _fitted_behind(self) -> None:
-        data = None
-        while data is not self.session.data:  # others came meanwhile
-            data = self.session.data
-            begun = time.monotonic()
-            try:
-                found = self.loop.fit(data)
-            except Exception as error:  # of a library: what was accepted is on disk, and the next fit may do
-                _LOG.exception("the fit in the background failed")
-                found = FitError(f"the fit failed: {type(error).__name__}: {error}.", fix="take another board")
-            first = self.loop.calibration is None
-            with self._loop_lock:
-                self.loop.adopt(data, found)
-            _LOG.info("fitted %d boards in %.1f s", self.loop.points, time.monotonic() - begun)
-            self._show_loop()
-            if first and self.loop.calibration is not None and self.state.phase == "aim":
-                self._aim()  # an outline for a camera alone is a poor one now
-        self._show(busy=False)
-
-    def _wait_for_fit(self) -> None:
-        if self._fitting is not None:
-            self._fitting.result()
-            self._fitting = None
-
-    def _show_loop(self) -> None:
-        loop = self.loop
-        for step in loop.history[-1:]:
-            self.session.set(f"{HISTORY_KEY} {step.points}", json_safe(asdict(step)))
-        self._show(
-            data=loop.data, calibration=loop.calibration, predicted=loop.predicted, history=tuple(loop.history),
-            stop=loop.stop, cameras=tuple(loop.camera_progress()), contradictions=loop.contradictions,
-            unfitted="" if loop.problem is None else f"{loop.problem.what} To do: {loop.problem.fix}.",
-            forecast=loop.forecast,
-        )  # fmt: skip
 
     def _take(self, *, asked: bool) -> None:
         """Take a set of pictures and keep it; UsageError with the reason where it is of no use."""
@@ -405,12 +253,6 @@ class BoardController(SessionController):
             self._show_loop()
             self._fit_behind()
             self._aim()
-
-    @property
-    def _each_when_it_likes(self) -> bool:
-        """Whether cameras take pictures by themselves, triggered by nothing: only of a board held still do these
-        show one place."""
-        return self.equipment.shows_live and self.equipment.trigger is None
 
     def _judge(self, looks: Sequence[Look]) -> Judgement:
         """Of live pictures: whether to take one now."""
@@ -471,18 +313,6 @@ class BoardController(SessionController):
                 if k is not None and np.isfinite(target.corners[c, k]).all():
                     off.append(float(np.linalg.norm(uv - target.corners[c, k])))
         return float(np.mean(off)) if off else float("nan")
-
-    def _detect_all(self, frames: Sequence[Frame], *, live: bool = False) -> tuple[Look, ...]:
-        names = [source.name for source in self.equipment.cameras]
-        found = list(self._pool.map(self._detect, names, frames))
-        nowhere = np.full(2, np.nan)
-        return tuple(Look(n, f, d, nowhere) for n, f, d in zip(names, frames, found, strict=True))
-
-    def _detect(self, camera: str, frame: Frame) -> Detected:
-        why = blank(frame.picture)
-        if why:
-            return Detected(reason=f"the picture is {why}")
-        return self.equipment.detector.detect(frame.picture, View(camera, "live"))
 
     def _make_shot(self, target: BoardTarget, looks: Sequence[Look]) -> Dataset:
         """What the cameras see, as corners of one board; with their positions, where those are known."""

@@ -6,7 +6,7 @@
     shots      number (the order of accepting), name, state, time, notes (JSON)
                state: accepted; undone (taken back, kept); begun (its pictures are being written, it is no point yet)
     points     one row a point: shot, number (its place in the shot), point, x, y, z, sd_x, sd_y, sd_z, more;
-               the corners of boards at places that nobody knows have no numbers
+               the corners of boards, and the ends of a wand, at places that nobody knows have no numbers
     views      one row a view: shot, point, camera, u, v, sd_u, sd_v, more
     skipped    number, x, y, z, reason, time
     events     number, time, what, more (JSON)
@@ -37,6 +37,7 @@ from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Names, Obs
 from implicam.dataset.boards import corner_shots
 from implicam.dataset.folder import POINTS, VIEWS
 from implicam.dataset.model import MAX_CELL_CHARACTERS
+from implicam.dataset.wand import FRAME
 from implicam.errors import DatasetError, ImplicamError, UsageError
 from implicam.files import toml_text
 from implicam.formatting import json_default
@@ -436,16 +437,17 @@ def insert_shot(database: Database, data: Dataset, notes: str) -> None:
     Args:
         database: An open one.
         data: The points of one shot, in the session's unit and with its cameras; with known positions, or corners of a
-            board at a place that nobody knows.
+            board, or markers of a wand, at a place that nobody knows.
         notes: JSON text.
     """
     shot = str(shots_of(data)[0])
     database.run("DELETE FROM shots WHERE name = ? AND state = 'begun'", shot)
     database.run("INSERT INTO shots (name, state, time, notes) VALUES (?, 'accepted', ?, ?)", shot, now(), notes)
     known, seen = data.known, data.observations
+    columns = data.columns if known is None else known.extra
     nowhere: list[float | None] = [None] * 6
     for i, point in enumerate(data.points.tolist()):
-        more = json_text({} if known is None else {key: str(text[i]) for key, text in known.extra.items()}, "a column")
+        more = json_text({key: str(text[i]) for key, text in columns.items()}, "a column")
         numbers = nowhere if known is None else _nulls_for_nan(known.xyz[i], known.sd[i])
         database.run("INSERT INTO points VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", shot, i, point, *numbers, more)
     for i, k in np.argwhere(seen.seen):
@@ -487,11 +489,9 @@ def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
     if not shots:
         return None
     names, n, c = points.names, len(points.names), len(empty.cameras)
-    known = None
-    if not np.isnan(points.numbers).all():  # else corners of boards at places that nobody knows
-        known = KnownPositions(
-            _text(points.shots), points.numbers[:, :3], points.numbers[:, 3:], _read_extra_columns(points.more, (n,))
-        )
+    known, columns = None, _read_extra_columns(points.more, (n,))
+    if not np.isnan(points.numbers).all():  # else corners of boards, or markers, at places that nobody knows
+        known = KnownPositions(_text(points.shots), points.numbers[:, :3], points.numbers[:, 3:], columns)
     row_of = {name: i for i, name in enumerate(names)}
     camera_of = {name: k for k, name in enumerate(empty.observations.camera_names)}
     i = np.array([row_of[name] for name in views.names], dtype=np.intp)
@@ -503,19 +503,22 @@ def read_accepted(database: Database, empty: Dataset) -> Dataset | None:
     observations = Observations(
         _text(names), empty.cameras, table[..., :2], table[..., 2:], _read_extra_columns(views.more, (n, c), (i, k))
     )
-    data = Dataset(empty.name, empty.length_unit, observations, known, empty.extra)
+    own = columns if known is None else {}
+    data = Dataset(empty.name, empty.length_unit, observations, known, empty.extra, columns=own)
     if known is None and shots_of(data).tolist() != points.shots:
-        raise ValueError("a point without a position is no corner of its shot")
+        raise ValueError("a point without a position is no corner of its shot, and no marker of its frame")
     return data
 
 
 def shots_of(data: Dataset) -> Names:
-    """The shot of each point: as the known positions say it, or the names of corners.
+    """The shot of each point: as the known positions say it, the frame of a wand, or the names of corners.
 
     Args:
         data: Of a session.
     """
-    return corner_shots(data.points) if data.known is None else data.known.shots
+    if data.known is not None:
+        return data.known.shots
+    return data.columns[FRAME] if FRAME in data.columns else corner_shots(data.points)
 
 
 @dataclass

@@ -187,8 +187,8 @@ class Session:
         """Add one shot; it is on disk when this returns, and where it raises, nothing was added.
 
         Args:
-            point: The views of all cameras, one point of a ball or several of a board, of one shot whose name is new;
-                with known positions, or all shots of the session without. Its numbers are kept bit by bit, its columns
+            point: The views of all cameras, one point of a ball or several of a board or wand, of one shot whose name
+                is new; with known positions, or all shots of the session without. Its numbers are kept bit by bit, its columns
                 too; its dataset name is not.
             pictures: Camera name -> grey (height, width) from 0 to 1; 16 bits are written where 8 would lose something.
             notes: Plain values, kept as JSON beside the shot.
@@ -359,7 +359,8 @@ class Session:
                 f"the shot {names[0]!r} was seen by no camera.", fix="take it again, or skip the target and say why"
             )
         observations = Observations(seen.points, self.cameras, seen.uv, seen.sd, seen.extra)
-        return Dataset(self.name, self.length_unit, observations, point.known, self._empty.extra)
+        own = {} if point.known else point.columns
+        return Dataset(self.name, self.length_unit, observations, point.known, self._empty.extra, columns=own)
 
     def _commit_begun(self, shot: str) -> None:
         """Commit that files of this name are about to appear, so that a kill leaves none unknown."""
