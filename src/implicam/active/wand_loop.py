@@ -48,6 +48,9 @@ from implicam.threads import blas_threads
 MIN_WHOLE_FRAMES = 30
 """In which two cameras have seen both ends, before a fit is worth its time."""
 
+MIN_GROWTH, MIN_MORE_FRAMES = 1.1, 5
+"""From one fit to the next there are so many times as many frames, and so many more."""
+
 COLD_FRAMES = 8
 """After so many, a camera that is not calibrated is shown another part of its picture."""
 
@@ -116,6 +119,8 @@ class WandLoop:
         self.start = MIN_WHOLE_FRAMES
         self._started = time.monotonic()
         self._refused: list[Floats] = []
+        self._fitted = 0  # frames of the last fit
+        self._ends: tuple[Dataset, Floats] | None = None  # they are asked for often
         self._asked, self._waved = 0, 0  # how often; frames there were when the present place was asked for
         if self.data is not None:
             self.reset(self.data)
@@ -185,7 +190,13 @@ class WandLoop:
     @property
     def ends(self) -> Floats:
         """(F, 2, cameras, 2) pixels of both ends in all frames; NaN where not seen."""
-        return np.zeros((0, 2, len(self.cameras), 2)) if self.data is None else ends_of(self.data, self.wand)
+        return np.zeros((0, 2, len(self.cameras), 2)) if self.data is None else self._ends_in(self.data)
+
+    def _ends_in(self, data: Dataset) -> Floats:
+        kept = self._ends
+        if kept is None or kept[0] is not data:
+            kept = self._ends = data, ends_of(data, self.wand)
+        return kept[1]
 
     @property
     def lengths(self) -> LengthsHeldOut | None:
@@ -226,6 +237,15 @@ class WandLoop:
         """
         self.data = data
         self.adopt(data, self.fit(data, progress))
+
+    def wants_fit(self, data: Dataset) -> bool:
+        """Whether a fit to these frames is worth its time: there are enough, and a good part more than at the last.
+
+        Args:
+            data: All frames.
+        """
+        points = int(_whole(self._ends_in(data)).sum())
+        return points >= MIN_WHOLE_FRAMES and points >= MIN_GROWTH * self._fitted + MIN_MORE_FRAMES
 
     def tell(self, data: Dataset) -> None:
         """More frames, without a fit.
@@ -282,7 +302,7 @@ class WandLoop:
         self.problem = found if isinstance(found, ImplicamError) else None
         self.fitted = None if isinstance(found, ImplicamError) else found
         self._asked = 0
-        points = 0 if data is None else int(_whole(ends_of(data, self.wand)).sum())
+        points = self._fitted = 0 if data is None else int(_whole(self._ends_in(data)).sum())
         self.history = [step for step in self.history if step.points < points]
         if self.predicted is not None:
             self.history.append(summarise_step(self.predicted, points, time.monotonic() - self._started))
@@ -333,7 +353,8 @@ class WandLoop:
                     words = "sees the wand together with too few others"
                 part *= 0.5
             else:
-                words = f"known in {percent(float(np.nanmean(cells.known >= 1 - 1e-9)))} of what it sees of the volume"
+                enough = cells.known[np.isfinite(cells.known)] >= 1 - 1e-9
+                words = f"known in {percent(float(enough.mean()))} of what it sees" if len(enough) else "sees nothing"
                 part = 0.5 + 0.5 * part
             found.append(CameraProgress(part, seen, words))
         return found

@@ -48,22 +48,19 @@ TILTED_STARTS = ((0.0, 0.0), (0.6, 0.0), (-0.6, 0.0), (0.0, 0.6), (0.0, -0.6))
 """About the board's x and y, radians: from where the pose of an outline is looked for."""
 
 
-class SimulatedHand:
-    """Stands in for a person with a board.
+class MovingHand:
+    """Stands in for a person who holds something in front of cameras, and moves it from place to place.
 
     Attributes:
-        seconds: That it takes from one outline to the next; 0 for at once.
+        seconds: That it takes from one place to the next; 0 for at once.
+        corners: (n, 3) points of what it holds, in that thing's own frame.
     """
 
     simulated = True
 
-    def __init__(self, rig: Rig, target: Mapping[str, Any], *, seed: int, seconds: float = 0.0) -> None:
-        self.rig, self.target, self.seconds = rig, dict(target), seconds
+    def __init__(self, rig: Rig, corners: Floats, first: Pose, *, seed: int, seconds: float = 0.0) -> None:
+        self.rig, self.corners, self.seconds = rig, corners, seconds
         self._rng = np.random.default_rng([seed, 31])
-        flat = corner_positions(target)
-        self.corners = np.column_stack([flat, np.zeros(len(flat))])
-        self.marks = print_of(target)
-        first = _facing(rig.cameras[0], self._middle, np.array([0.5, 0.5]), 0.5, self._diagonal, (0.3, 0.2))
         self._from = self._to = first
         self._begun = -np.inf
         self._lock = threading.Lock()
@@ -71,9 +68,78 @@ class SimulatedHand:
         self._set_begun = -np.inf
         self._in_set: set[int] = set(range(len(rig.cameras)))  # the cameras that have been asked for theirs
 
+    def shown(self, pose: Pose) -> Target:
+        """What cameras look at when it is at a pose.
+
+        Args:
+            pose: world_from_board, or world_from_wand.
+        """
+        raise NotImplementedError
+
+    def _go_to(self, pose: Pose) -> None:
+        """Begin to move there."""
+        with self._lock:
+            self._from, self._begun = self._carried(time.monotonic()), time.monotonic()
+            self._to = pose
+
     @property
     def _middle(self) -> Floats:
         return np.asarray((self.corners.min(axis=0) + self.corners.max(axis=0)) / 2, dtype=np.float64)
+
+    def pose(self, when: float | None = None) -> Pose:
+        """world_from_board on its way, without the tremor.
+
+        Args:
+            when: As of time.monotonic(); None for now.
+        """
+        return self._carried(time.monotonic() if when is None else when)
+
+    def _carried(self, when: float) -> Pose:
+        """On its way from one place to the next."""
+        passed = when - self._begun
+        part = 1.0 if self.seconds <= 0 else float(np.clip(passed / self.seconds, 0, 1))
+        part = part * part * (3 - 2 * part)
+        turn = vector_from_rotation(self._to.rotation @ self._from.rotation.T)
+        rotation = rotation_from_vector(part * turn) @ self._from.rotation
+        here, there = self._from.apply(self._middle), self._to.apply(self._middle)
+        middle = here + part * (there - here)
+        return Pose(rotation, middle - rotation @ self._middle)
+
+    def held(self, camera: int) -> tuple[Pose, Pose]:
+        """Where the board is when a picture begins, and when it ends: one instant for one set of pictures, as if all
+        cameras were exposed together, however long this computer takes from one to the next.
+
+        Args:
+            camera: That takes the picture; one that has its picture of the set begins another.
+        """
+        with self._lock:
+            now = time.monotonic()
+            whole = len(self._in_set) == len(self.rig.cameras)
+            if whole or camera in self._in_set or now - self._set_begun > MAX_SET_SECONDS:
+                self._begin_set()
+                shake = TREMOR_MM * self.rig.units_per_mm if self.seconds > 0 else 0.0
+                tremor = shake * self._rng.normal(size=3)
+                self._held = tuple(  # type: ignore[assignment]
+                    Pose(pose.rotation, pose.translation + tremor)
+                    for pose in (self.pose(now), self.pose(now + EXPOSURE_SECONDS))
+                )
+                self._set_begun, self._in_set = now, set()
+            self._in_set.add(camera)
+            return self._held
+
+    def _begin_set(self) -> None:
+        """Another set of pictures begins: a board is held still for it."""
+
+
+class SimulatedHand(MovingHand):
+    """Stands in for a person with a board: `seconds` from one outline to the next."""
+
+    def __init__(self, rig: Rig, target: Mapping[str, Any], *, seed: int, seconds: float = 0.0) -> None:
+        self.target, self.marks = dict(target), print_of(target)
+        flat = corner_positions(target)
+        self.corners = np.column_stack([flat, np.zeros(len(flat))])
+        first = _facing(rig.cameras[0], self._middle, np.array([0.5, 0.5]), 0.5, self._diagonal, (0.3, 0.2))
+        super().__init__(rig, self.corners, first, seed=seed, seconds=seconds)
 
     @property
     def _diagonal(self) -> float:
@@ -94,9 +160,7 @@ class SimulatedHand:
         turn = rotation_from_vector(np.radians(FOLLOWING_DEG) * self._rng.normal(size=3)) @ goal.rotation
         shift = FOLLOWING_SHARE * far * self._rng.normal(size=3) / np.sqrt(3)
         middle = goal.apply(self._middle) + shift
-        with self._lock:
-            self._from, self._begun = self.pose(), time.monotonic()
-            self._to = Pose(turn, middle - turn @ self._middle)
+        self._go_to(Pose(turn, middle - turn @ self._middle))
 
     def put(self, pose: Pose) -> None:
         """Begin to move to a known pose, as into a slot: exactly.
@@ -104,56 +168,26 @@ class SimulatedHand:
         Args:
             pose: world_from_board.
         """
-        with self._lock:
-            self._from, self._begun = self.pose(), time.monotonic()
-            self._to = pose
+        self._go_to(pose)
 
-    def pose(self, when: float | None = None) -> Pose:
-        """world_from_board on its way, without the tremor.
+    def shown(self, pose: Pose) -> Target:
+        """What cameras look at when it is at a pose.
 
         Args:
-            when: As of time.monotonic(); None for now.
+            pose: world_from_board.
         """
-        passed = (time.monotonic() if when is None else when) - self._begun
-        part = 1.0 if self.seconds <= 0 else float(np.clip(passed / self.seconds, 0, 1))
-        part = part * part * (3 - 2 * part)
-        turn = vector_from_rotation(self._to.rotation @ self._from.rotation.T)
-        rotation = rotation_from_vector(part * turn) @ self._from.rotation
-        here, there = self._from.apply(self._middle), self._to.apply(self._middle)
-        middle = here + part * (there - here)
-        return Pose(rotation, middle - rotation @ self._middle)
-
-    def held(self, camera: int) -> tuple[Pose, Pose]:
-        """Where the board is when a picture begins, and when it ends: one instant for one set of pictures, as if all
-        cameras were exposed together, however long this computer takes from one to the next.
-
-        Args:
-            camera: That takes the picture; one that has its picture of the set begins another.
-        """
-        with self._lock:
-            now = time.monotonic()
-            whole = len(self._in_set) == len(self.rig.cameras)
-            if whole or camera in self._in_set or now - self._set_begun > MAX_SET_SECONDS:
-                shake = TREMOR_MM * self.rig.units_per_mm if self.seconds > 0 else 0.0
-                tremor = shake * self._rng.normal(size=3)
-                self._held = tuple(  # type: ignore[assignment]
-                    Pose(pose.rotation, pose.translation + tremor)
-                    for pose in (self.pose(now), self.pose(now + EXPOSURE_SECONDS))
-                )
-                self._set_begun, self._in_set = now, set()
-            self._in_set.add(camera)
-            return self._held
+        return board_target(self.target, pose, self.marks)
 
 
-class BoardCamera:
-    """Stands in for a camera: photographs the board of a `SimulatedHand` through a simulated lens.
+class HandCamera:
+    """Stands in for a camera: photographs what a hand holds through a simulated lens.
 
-    fail_for: the next n calls of `frame` fail, as if it were unplugged. hand: that holds the board.
+    fail_for: the next n calls of `frame` fail, as if it were unplugged. hand: that holds the board or the wand.
     """
 
     live = simulated = True
 
-    def __init__(self, studio: Studio, camera: int, hand: SimulatedHand) -> None:
+    def __init__(self, studio: Studio, camera: int, hand: MovingHand) -> None:
         self.name = studio.rig.cameras[camera].name
         self._studio, self._camera, self.hand = studio, camera, hand
         self._fails = self._number = 0
@@ -170,7 +204,7 @@ class BoardCamera:
         """Nothing to connect."""
 
     def frame(self, timeout: float = 5.0) -> Frame:
-        """A photograph of the board as it is held now.
+        """A photograph of the target as it is held now.
 
         Args:
             timeout: Not used: the picture is there at once.
@@ -196,7 +230,7 @@ class BoardCamera:
         """Nothing to release."""
 
     def _photograph(self, pose: Pose) -> Any:
-        shown = board_target(self.hand.target, pose, self.hand.marks)
+        shown = self.hand.shown(pose)
         return self._studio.showing(shown, seed=self._studio.seed + SEED_STEP * self._number).picture(self._camera, 0)
 
     def _pixels(self, pose: Pose) -> Floats:
@@ -326,7 +360,7 @@ def _facing(
 
 def simulated_hand(
     rig: Rig, target: Mapping[str, Any], *, seed: int, seconds: float = 0.0, optics: Optics | None = None
-) -> tuple[list[BoardCamera], SimulatedHand]:
+) -> tuple[list[HandCamera], SimulatedHand]:
     """Cameras, and a hand that holds a board in front of them.
 
     Args:
@@ -345,4 +379,4 @@ def simulated_hand(
     hand = SimulatedHand(rig, target, seed=seed, seconds=seconds)
     shown = board_target(target, hand.pose(), hand.marks)
     studio = Studio(rig, shown, optics or Optics(), seed).showing(shown, seed=seed)
-    return [BoardCamera(studio, c, hand) for c in range(len(rig.cameras))], hand
+    return [HandCamera(studio, c, hand) for c in range(len(rig.cameras))], hand

@@ -13,6 +13,7 @@ from implicam.active.board_loop import BoardLoop
 from implicam.active.board_poses import KnownPosesLoop, described, poses_from, poses_of
 from implicam.calibrators import DEFAULT_METHOD, calibrator_from_name
 from implicam.dataset.boards import BOARD_KINDS, check_size, corner_positions
+from implicam.dataset.wand import WAND
 from implicam.detect import ALSO_CALLED, TARGETS, Detector, options_of
 from implicam.errors import UsageError, did_you_mean
 from implicam.hardware import FrameSource, Person
@@ -67,8 +68,8 @@ def board_detector(setup: Setup) -> Detector:
     """
     if setup.target not in BOARD_KINDS:
         raise UsageError(
-            f"a session cannot show a target {setup.target!r}{did_you_mean(setup.target, (BALL, *BOARD_KINDS))}.",
-            fix=f"--target {'|'.join((BALL, *BOARD_KINDS))}",
+            f"a session cannot show a target {setup.target!r}{did_you_mean(setup.target, (BALL, *BOARD_KINDS, WAND))}.",
+            fix=f"--target {'|'.join((BALL, *BOARD_KINDS, WAND))}",
         )
     known, given = options_of(setup.target), sizes_of(setup)
     for name in given:

@@ -178,6 +178,11 @@ class Session:
             return self._data
 
     @property
+    def empty(self) -> Dataset:
+        """The session's dataset without points: name, unit, cameras, and what it shows."""
+        return self._empty
+
+    @property
     def settings(self) -> dict[str, Any]:
         """A copy of the settings as they are stored: tuples are lists, NumPy's numbers plain ones."""
         with self._lock:
@@ -188,8 +193,8 @@ class Session:
 
         Args:
             point: The views of all cameras, one point of a ball or several of a board or wand, of one shot whose name
-                is new; with known positions, or all shots of the session without. Its numbers are kept bit by bit, its columns
-                too; its dataset name is not.
+                is new; with known positions, or all shots of the session without. Its numbers are kept bit by bit, its
+                columns too; its dataset name is not.
             pictures: Camera name -> grey (height, width) from 0 to 1; 16 bits are written where 8 would lose something.
             notes: Plain values, kept as JSON beside the shot.
 

@@ -32,7 +32,8 @@ from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_na
 from implicam.dataset import Camera, Floats
 from implicam.dataset.boards import BOARD_KINDS
 from implicam.dataset.units import METRES_PER_UNIT, refuse_unknown_unit
-from implicam.detect import Ball
+from implicam.dataset.wand import WAND
+from implicam.detect import Ball, Detector
 from implicam.errors import DatasetError, HardwareError, UsageError
 from implicam.hardware import (
     CAMERAS,
@@ -78,10 +79,20 @@ from implicam.session.trust import (
     in_words,
     remember,
 )
+from implicam.session.wand_setup import (
+    WAND_OPTIONS,
+    made_wand_session,
+    wand_detector,
+    wand_hardware,
+    wand_settings,
+)
 from implicam.simulate import BALL_RADIUS_MM, Rig, build_rig
 
 CAMERAS_KEY = "camera_settings"
 """The setting of a session that holds what its cameras were set to, as `keep_settings` gives it."""
+
+MAX_POINTS, MAX_FRAMES = 60, 1000
+"""Points or boards, and frames of a wand, after which a session ends that says nothing else."""
 
 SIMULATED = "simulated"
 SIMULATED_SPEED = 0.4
@@ -118,7 +129,7 @@ class Setup:
 
     rig: Annotated[str, _rig("bar6, grid9, dome8 ..., or a drawing RIG.toml")] = "bar6"
     rig_cameras: Annotated[str | None, _rig("Some of its cameras: 2R, cam1,cam4", "LIST", flags="--cameras")] = None
-    target: Annotated[str, _shown(lambda: f"{', '.join((BALL, *BOARD_KINDS))}")] = BALL
+    target: Annotated[str, _shown(lambda: f"{', '.join((BALL, *BOARD_KINDS, WAND))}")] = BALL
     board: Annotated[str | None, _shown("Of a board: inner corners, squares, tags or dots, 8x11", "RxC")] = None
     square: Annotated[float | None, _shown("Edge of its squares", "LENGTH", 0)] = None
     marker: Annotated[float | None, _shown("charuco: edge of its markers", "LENGTH", 0)] = None
@@ -128,6 +139,10 @@ class Setup:
     ] = None
     dictionary: Annotated[str | None, _shown("charuco, aprilgrid: OpenCV's name of the markers")] = None
     legacy: Annotated[bool, _shown("charuco: printed with OpenCV before 4.6", flags="--legacy/--no-legacy")] = False
+    wand: Annotated[float | None, _shown("Of a wand: between its two ends", "LENGTH", 0)] = None
+    wand_sd: Annotated[float | None, _shown("Standard uncertainty of that length", "LENGTH", 0)] = None
+    markers: Annotated[int | None, _shown("wand: 2 (default), or 3 on a line", "N", 2)] = None
+    told_by: Annotated[str | None, _shown("wand: which end is which: size, brightness, spacing", "NAME")] = None
     poses: Annotated[
         str, _shown('A board at known poses, one after the other: a CSV, or "x=0 y=0 z=0:190:10"', "WHAT")
     ] = ""
@@ -152,7 +167,7 @@ class Setup:
     below: Annotated[float | None, _plan("Stop at this 95 % uncertainty, everywhere", "LENGTH")] = None
     within: Annotated[float, _plan("Or at so many times what pixel noise leaves", "TIMES")] = 1.2
     converged: Annotated[float | None, _plan("Or when five points changed it by less than so many %", "PERCENT")] = None
-    budget: Annotated[int, _plan("Or after N points", "N", 1)] = 60
+    budget: Annotated[int | None, _plan("Or after N points, boards (60) or frames of a wand (1000)", "N", 1)] = None
     minutes: Annotated[float | None, _plan("Or after so many minutes of this sitting", "MIN")] = None
     acquisition: Annotated[str, _plan(lambda: ", ".join(ACQUISITIONS))] = DEFAULT_ACQUISITION
     reach: Annotated[float | None, _plan("A way that costs as much time as one point: no zigzag", "LENGTH")] = None
@@ -178,15 +193,17 @@ class Setup:
                 raise UsageError(f"{what} = {value:g} is not possible.", fix="give a number greater than zero")
         if not 0 <= self.pulse_every < np.inf:
             raise UsageError(f"--pulse-every {self.pulse_every:g} is no time.", fix="give seconds, or 0 for no pulse")
-        if self.target != BALL:
+        if self.target == WAND:
+            wand_detector(self)
+        elif self.target != BALL:
             board_detector(self)
-        elif self.poses:
+        if self.poses and self.target in (BALL, WAND):
             raise UsageError(
                 "--poses are those of a board.", fix=f"--target {'|'.join(BOARD_KINDS)}; a ball: --workspace"
             )
-        if self.budget < MIN_POINTS_PER_CAMERA:
+        if self.most < MIN_POINTS_PER_CAMERA:
             raise UsageError(
-                f"{self.budget} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
+                f"{self.most} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
             )
 
     @classmethod
@@ -227,11 +244,19 @@ class Setup:
         return not self.cameras
 
     @property
+    def most(self) -> int:
+        """After so many points, boards or frames it ends."""
+        return self.budget or (MAX_FRAMES if self.target == WAND else MAX_POINTS)
+
+    @property
     def rule(self) -> Rule:
         """When to stop."""
-        rule = Within(self.within) | (Budget if self.target == BALL else Pictures)(self.budget)
+        most: Rule = Budget(self.most)
+        if self.target != BALL:
+            most = Pictures(self.most, "frames" if self.target == WAND else "boards")
+        rule = Within(self.within) | most
         if self.below is not None:
-            rule = Below(self.below) | rule
+            rule = Below(self.below, "usual" if self.target == WAND else "worst") | rule
         if self.converged is not None:
             rule = rule | Converged(self.converged / 100)
         return rule if self.minutes is None else rule | Time(60 * self.minutes)
@@ -349,11 +374,18 @@ def open_session(
             settings={
                 **setup.as_settings(),
                 CAMERAS_KEY: keep_settings(hardware[0]),
-                **({} if setup.target == BALL else board_settings(setup)),
+                **_shown_settings(setup),
             },
         )
         remember(folder, setup.as_settings())
         return _made(session, setup, hardware, auto)
+
+
+def _shown_settings(setup: Setup) -> dict[str, Any]:
+    """What a session keeps of what it shows."""
+    if setup.target == BALL:
+        return {}
+    return wand_settings(setup) if setup.target == WAND else board_settings(setup)
 
 
 def _compare_cameras(session: Session, cameras: Sequence[FrameSource], say: Callable[[str], None]) -> None:
@@ -418,7 +450,14 @@ def _continued(session: Session, setup: Setup | None) -> Setup:
 
 def _lasting(before: Setup) -> list[str]:
     """What a session keeps to its end."""
-    return ["unit", "target", "poses", *SIZES, *(("rig", "rig_cameras", "seed") if before.simulated else ())]
+    return [
+        "unit",
+        "target",
+        "poses",
+        *SIZES,
+        *WAND_OPTIONS,
+        *(("rig", "rig_cameras", "seed") if before.simulated else ()),
+    ]
 
 
 def changes_to(folder: Path, before: Setup, given: Mapping[str, Any], *, all_given: bool = False) -> dict[str, Any]:
@@ -458,11 +497,15 @@ def _made(session: Session, setup: Setup, hardware: Hardware, auto: bool) -> Ses
         radius = BALL_RADIUS_MM * setup.built().units_per_mm
     waits = trigger is None and not all(source.live for source in cameras)
     timeout = PICTURE_TIMEOUT_SECONDS if waits else LIVE_TIMEOUT_SECONDS
-    detector = Ball(bright=setup.bright) if setup.target == BALL else board_detector(setup)
+    detector: Detector = Ball(bright=setup.bright)
+    if setup.target != BALL:
+        detector = wand_detector(setup) if setup.target == WAND else board_detector(setup)
     equipment = Equipment(
         cameras, robot, detector, trigger, radius, timeout, setup.dry_run, setup.unit,
         setup.pulse_every,
     )  # fmt: skip
+    if setup.target == WAND:
+        return made_wand_session(session, setup, equipment, workspace)
     if setup.target != BALL:
         return made_board_session(session, setup, equipment, workspace)
     assert workspace is not None
@@ -481,7 +524,8 @@ def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
     if setup.target != BALL:
         if setup.simulated:
             trigger_of(setup)  # there must be none
-        return board_hardware(setup, None if setup.simulated else cameras_of(setup))
+        shown = None if setup.simulated else cameras_of(setup)
+        return wand_hardware(setup, shown) if setup.target == WAND else board_hardware(setup, shown)
     if setup.simulated:
         return _simulated(setup)
     cameras = cameras_of(setup)
