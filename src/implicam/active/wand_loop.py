@@ -19,7 +19,6 @@ from implicam.active.board_loop import CameraProgress
 from implicam.active.design_model import PredictedCovariance
 from implicam.active.loop import Target, summarise_step
 from implicam.active.stopping import Below, Never, Rule, Step, parts_of
-from implicam.active.volume_design import VolumeDesign
 from implicam.active.wand_coverage import (
     WAVED_FRAMES,
     Cells,
@@ -133,7 +132,7 @@ class WandLoop:
         return None if self.fitted is None else self.fitted.calibration
 
     @property
-    def design(self) -> VolumeDesign | None:
+    def design(self) -> WaveDesign | None:
         """What it knows of the volume."""
         return None if self.fitted is None else self.fitted.design
 

@@ -46,8 +46,8 @@ def write_wand_report(path: Path, name: str, calibration: Calibration, data: Dat
     )
     notes = (
         "Nobody knows where the wand was, but how long it is: in a third of the frames, which another fit did not "
-        f"know, it comes out {wand.length + float(np.mean(held_out.errors)):.6g} {unit} in the mean. The points are the ends "
-        "of the wand, as the calibration from all frames measures them.",
+        f"know, it comes out {wand.length + float(np.mean(held_out.errors)):.6g} {unit} in the mean. The points are "
+        "the ends of the wand, as the calibration from all frames measures them.",
         *calibration.notes,
     )
     lengths = KnownLengths(

@@ -29,6 +29,7 @@ from implicam.images import Grey, read_picture
 from implicam.session.board_session import BoardController
 from implicam.session.controller import CALIBRATION_FILE, REPORT_FILE, SessionController, State
 from implicam.session.typed import PositionQuestion, TypedPosition, parse_position
+from implicam.session.wand_session import WandController
 from implicam.viewer import words
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, list_cameras, up_of
 from implicam.viewer.snapshot import curve, finite_or_none, snapshot
@@ -471,8 +472,11 @@ def _without_position(question: dict[str, Any] | None) -> dict[str, Any] | None:
 
 
 def _page_of(controller: SessionController) -> BenchPage:
-    from implicam.viewer.board_page import BoardPage  # late: it is built on this page
+    from implicam.viewer.board_page import BoardPage  # late: they are built on this page
+    from implicam.viewer.wand_page import WandPage
 
+    if isinstance(controller, WandController):
+        return WandPage(controller)
     return BoardPage(controller) if isinstance(controller, BoardController) else BenchPage(controller)
 
 

@@ -1,4 +1,4 @@
-"""The page of a session with a board: that of every guided session, with corners, outlines, and no robot."""
+"""The pages of sessions by hand: that of every guided session, with corners, outlines, and no robot; and of a board."""
 
 from __future__ import annotations
 
@@ -7,23 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from implicam.dataset.boards import corner_shots
 from implicam.formatting import json_safe
 from implicam.session.board_session import BoardController, BoardState
+from implicam.session.by_hand import ByHandController, ByHandState
 from implicam.session.controller import State
+from implicam.session.database import shots_of
 from implicam.viewer.bench_page import BenchPage
-from implicam.viewer.board_words import allowed, board_snapshot
+from implicam.viewer.board_words import board_snapshot
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, list_cameras, up_of
+from implicam.viewer.hand_words import allowed
 from implicam.viewer.space import Placing, edges
 
 
-class BoardPage(BenchPage):
-    """The application, for a board."""
+class HandPage(BenchPage):
+    """The application, for something that is held by hand."""
 
-    _controller: BoardController
+    _controller: ByHandController
 
     def _buttons_of(self, state: State) -> dict[str, bool]:
-        assert isinstance(state, BoardState)
+        assert isinstance(state, ByHandState)
         return allowed(state)
 
     def _action(self, word: str, given: Mapping[str, Any]) -> Callable[[], Any] | dict[str, Any]:
@@ -31,10 +33,6 @@ class BoardPage(BenchPage):
         if word == "go" and controller.state.phase not in ("trouble", "done"):
             return controller.go
         return super()._action(word, given)
-
-    def _snapshot(self, state: State, measured: Any, skipped: int) -> dict[str, Any]:
-        assert isinstance(state, BoardState)
-        return board_snapshot(state, self._names, self._controller.loop.rule, unit=self._unit, skipped=skipped)
 
     def about(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """As of every session; `boards` says which buttons and words are of no use."""
@@ -66,12 +64,26 @@ class BoardPage(BenchPage):
             "excess": [] if predicted is None else json_safe(predicted.excess.tolist()),
         }
 
+    def _has(self, point: str) -> bool:
+        data = self._controller.session.data
+        return data is not None and point in shots_of(data).tolist()
+
+
+class BoardPage(HandPage):
+    """The application, for a board."""
+
+    _controller: BoardController
+
+    def _snapshot(self, state: State, measured: Any, skipped: int) -> dict[str, Any]:
+        assert isinstance(state, BoardState)
+        return board_snapshot(state, self._names, self._controller.loop.rule, unit=self._unit, skipped=skipped)
+
     def points(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The boards so far, and what was seen of each."""
         data = self._controller.session.data
         if data is None:
             return {"points": []}
-        shots, seen = corner_shots(data.points), data.observations.seen
+        shots, seen = shots_of(data), data.observations.seen
         names = list(dict.fromkeys(shots.tolist()))
         rows = [(name, seen[shots == name]) for name in names]
         return {
@@ -80,7 +92,3 @@ class BoardPage(BenchPage):
                 for name, part in rows
             ]
         }
-
-    def _has(self, point: str) -> bool:
-        data = self._controller.session.data
-        return data is not None and point in corner_shots(data.points).tolist()
