@@ -32,7 +32,7 @@ from implicam.active.workspace import Workspace
 from implicam.calibrators import (
     Calibration,
     Calibrator,
-    HoldsLengthsOut,
+    FromWand,
     LengthsHeldOut,
     PredictsPixels,
     RigCalibration,
@@ -273,7 +273,7 @@ class WandLoop:
         held_out: LengthsHeldOut | None = None
         faults: tuple[str, ...] = ()
         used = self.wand
-        if isinstance(calibration, HoldsLengthsOut):
+        if isinstance(calibration, FromWand):
             used = calibration.wand or used
             with suppress(FitError):  # then that is among the faults
                 held_out = calibration.hold_lengths_out()

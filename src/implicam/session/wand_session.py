@@ -20,21 +20,22 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from implicam import calibration_file
 from implicam.active.wand_coverage import Cells
 from implicam.active.wand_loop import MIN_WHOLE_FRAMES, WandLoop
-from implicam.calibrators import Calibration
+from implicam.calibrators import Calibration, FromWand
 from implicam.dataset import Camera, Dataset, Floats, Observations
 from implicam.dataset.wand import FRAME, MARKER
 from implicam.detect import Detected, View
 from implicam.errors import HardwareError, ImplicamError, UsageError
 from implicam.hardware import Frame
 from implicam.progress import Progress, silent
-from implicam.report import ReportData
+from implicam.report import ReportData, write_report
+from implicam.report.data import report_of_lengths
 from implicam.session.by_hand import ByHandController, ByHandState, Judgement
 from implicam.session.controller import Equipment
 from implicam.session.detections import Look
 from implicam.session.journal import Session
-from implicam.session.wand_report import write_wand_report
 
 _LOG = logging.getLogger(__name__)
 
@@ -230,7 +231,13 @@ class WandController(ByHandController):
         )
 
     def _report(self, path: Path, calibration: Calibration, data: Dataset) -> ReportData:
-        return write_wand_report(path, self.session.name, calibration, data)
+        assert isinstance(calibration, FromWand)
+        held_out = calibration.hold_lengths_out()
+        assert held_out is not None
+        title, checksum = f"{self.session.name}: calibrated with a wand", calibration_file.checksum(calibration)
+        said = report_of_lengths(calibration, held_out, title, checksum)
+        write_report(path, said)
+        return said
 
     def _aim(self, before: str = "") -> None:
         with self._loop_lock:
