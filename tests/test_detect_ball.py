@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-pytest.importorskip("cv2")
+cv2 = pytest.importorskip("cv2")
 
 from implicam.calibrators import ForwardGP
 from implicam.detect.ball import Ball, Template
@@ -584,3 +584,16 @@ def few(data, n):
 def test_a_ball_has_a_radius(calibrated, radius):
     with pytest.raises(UsageError, match="no radius"):
         correct_outlines(calibrated[1], radius)
+
+
+def test_an_edge_that_leaves_its_band_is_none():
+    """Seed 1448: no pixel was left on one side, and the noise of that side was asked for."""
+    for seed in (0, 1, 2, 3, 1448):
+        random = np.random.default_rng(seed)
+        picture = np.full((60, 60), 0.8, dtype=np.float32)
+        for _ in range(random.integers(1, 4)):
+            cv2.circle(picture, random.integers(10, 50, 2).tolist(), int(random.integers(2, 12)), random.uniform(), -1)
+        blurred = cv2.GaussianBlur(picture, (0, 0), random.uniform(0.5, 3))
+        noisy = np.clip(blurred + random.normal(0, 0.02, blurred.shape), 0, 1).astype(np.float32)
+        edge = fit_edge(noisy, Ellipse(random.uniform(20, 40, 2), np.eye(2) / random.uniform(3, 10)))
+        assert edge is None or edge.ellipse.is_one

@@ -413,6 +413,8 @@ def _gauss_newton(band: _Band, start: Ellipse, blur: float, last: _Fit | None) -
         model, J, step = _evaluate_model(uv, fit)
         residual = grey - model
         if iteration >= 2 or last is not None:  # outliers are known after a first fit
+            if step.min() >= 0.5 or step.max() < 0.5:  # the edge has left the band
+                return None
             fit = fit._replace(noise=_estimate_noise(residual, step))
             weight = np.maximum(1 - residual**2 / (25 * _noise_variance(fit.noise, step)), 0) ** 2
         sharpness = np.sqrt(weight / _noise_variance(fit.noise, step))
