@@ -175,7 +175,9 @@ def _tell_calibration(calibration: Calibration, verdict: Verdict, output: Path |
         return
     unit = calibration.data.length_unit
     show.line(f"{output or 'no file written'}: {calibration.method} from {summary.points_used} points")
-    within = ", ".join(f"{axis} {decimal_number(value)}" for axis, value in summary.leave_one_out_rms.items())
+    rms = summary.leave_one_out_rms
+    names = [f"{axis} " for axis in rms] if len(rms) > 1 else [""]  # a wand has its length only, named before
+    within = ", ".join(f"{name}{decimal_number(value)}" for name, value in zip(names, rms.values(), strict=True))
     show.line(f"{summary.how} within {within} {unit} rms")
     show.notes(show.counted((entry.reason for entry in calibration.unused), "known point", "not used"))
     show.notes([note for note in notes if note not in verdict.reasons])

@@ -476,7 +476,7 @@ class ForwardGPCalibration(RigCalibration):
                 points_used=len(self.used),
                 points_unused=len(self.waved.unused),
                 views_rejected=len(self.rejected),
-                held_out="the length of the wand in each frame, from what the cameras saw there, is right",
+                held_out="the length of the wand, measured in each frame without knowing it, is right",
                 leave_one_out_rms={"length": float(np.sqrt(np.mean(self.waved.errors**2)))},
                 leave_one_out_mean_sd={"length": float(np.mean(self.waved.sds))},
                 noise_px=dict(zip(self.camera_names, map(float, noise), strict=True)),
