@@ -14,9 +14,19 @@ import pytest
 import implicam as ic
 from board_pictures import checkered, corners_of, photograph, rotated
 from implicam.active.board_coverage import framing_of, is_new, unseen_framing, usual_pixels
-from implicam.active.board_design import BoardDesign, BoardShape, board_pose
+from implicam.active.board_design import BoardDesign, BoardShape, PlacedBoardDesign, board_pose
 from implicam.active.board_loop import BoardLoop, BoardTarget, Pictures
-from implicam.active.board_poses import POSE_COLUMN, KnownPose, KnownPosesLoop, described, poses_from, poses_of
+from implicam.active.board_poses import (
+    HELD_OUT_COLUMN,
+    POSE_COLUMN,
+    KnownPose,
+    KnownPosesLoop,
+    carried_poses,
+    described,
+    poses_from,
+    poses_of,
+    turn_from,
+)
 from implicam.active.stopping import Step, Within
 from implicam.active.volume_design import linear_views
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
@@ -25,6 +35,7 @@ from implicam.detect import AprilGrid, Charuco, View
 from implicam.detect.sharpness import edge_width
 from implicam.errors import DatasetError, HardwareError, UsageError
 from implicam.geometry import Pose, look_at, rotation_from_vector, vector_from_rotation
+from implicam.hardware.simulated import SimulatedRobot
 from implicam.hardware.simulated_hand import board_target, match_pose, simulated_hand
 from implicam.report import words
 from implicam.session import board_report
@@ -32,6 +43,7 @@ from implicam.session.board_session import BoardController, BoardState
 from implicam.session.journal import TARGET_KEY, Session
 from implicam.session.setup import Setup, changes_to, open_session
 from implicam.simulate import build_rig, simulate, simulate_boards
+from implicam.viewer.board_page import BoardPage
 from implicam.viewer.board_words import CURE, headline
 
 BOARD = {"kind": "board", "rows": 5, "columns": 8, "square": 20.0}
@@ -98,6 +110,25 @@ def test_the_pose_of_the_board_is_integrated_out(design, calibration, poses):
     joint = np.block([[np.eye(len(S)) + H.T @ H, H.T @ K], [K.T @ H, K.T @ K]])
     marginal = np.linalg.inv(joint)[: len(S), : len(S)]
     assert np.allclose(np.linalg.inv(np.eye(len(S)) + S), marginal, atol=1e-4)
+
+
+def test_of_a_board_that_is_put_somewhere_its_shift_alone_is_integrated_out(design, poses):
+    """Against the joint normal matrix of unknowns and shift, the shift with its prior; and the gain is what is lost."""
+    placed = PlacedBoardDesign(design.rig, design.judged, shape=design.shape, placed_sd=0.2)
+    pose = poses[int(np.argmax(design.gains(poses)))]
+    (S,) = placed._informations([pose], None)
+    xyz = pose.apply(design.shape.some())
+    linear = linear_views(design.rig, xyz, np.tile(design.visible([pose]), (len(xyz), 1)))
+    weight = np.where(linear.seen, np.sqrt(len(design.shape.corners) / len(xyz)) / linear.sd, 0)[..., None]
+    H = (linear.half * weight).reshape(-1, linear.half.shape[2])
+    K = (linear.slope * weight).reshape(-1, 3)
+    joint = np.block([[np.eye(len(S)) + H.T @ H, H.T @ K], [K.T @ H, K.T @ K + np.eye(3) / 0.2**2]])
+    assert np.allclose(np.linalg.inv(np.eye(len(S)) + S), np.linalg.inv(joint)[: len(S), : len(S)], atol=1e-6)
+    now, then = (np.trace(one.at_judged.total, axis1=1, axis2=2) for one in (placed, placed.after(pose)))
+    assert placed.gains([pose])[0] == pytest.approx(np.nanmean(now - then), rel=1e-6)
+    exact = PlacedBoardDesign(design.rig, design.judged, shape=design.shape)
+    assert exact.gains([pose])[0] > placed.gains([pose])[0]  # who knows it better learns more
+    assert np.nanmean(exact.at_judged.sd**2) > np.nanmean(design.at_judged.sd**2)  # in the world, not in its own frame
 
 
 def test_errors_that_move_the_whole_rig_do_not_count(design):
@@ -372,7 +403,34 @@ def test_boards_at_unknown_places_are_kept_and_come_back(tmp_path, eight):
         ({"target": "board", "board": "8x11"}, "size of the squares"),
         ({"target": "board", "board": "8x11", "square": 13290.0}, "no size for a board"),
         ({"target": "charuco", "tag": 3.0}, "no option --tag"),
-        ({"target": "charuco", "robot": "ur:10.0.0.1"}, "holds no board"),
+        ({"target": "charuco", "robot": "ur:10.0.0.1"}, "in front of simulated cameras"),
+        ({"target": "charuco", "facing": "0,0,-1"}, "how a robot holds the board"),
+        ({"target": "charuco", "robot": "simulated", "facing": "0,0"}, "does not say how the board is turned"),
+        ({"target": "charuco", "hold_out": 3}, "held out by themselves"),
+        (
+            {
+                "target": "charuco",
+                "board": "9x12",
+                "square": 20.0,
+                "marker": 15.0,
+                "robot": "ur:10.0.0.1",
+                "cameras": ["a=0", "b=1"],
+            },
+            "there is no workspace",
+        ),
+        (
+            {
+                "target": "charuco",
+                "square": 20.0,
+                "marker": 15.0,
+                "board": "9x12",
+                "robot": "ur:10.0.0.1",
+                "cameras": ["a=0", "b=1"],
+                "workspace": "0:1,0:1,0:1",
+            },
+            "how the board is turned is not known",
+        ),
+        ({"hold_out": 3}, "are those of a board"),
         ({"target": "charuco", "method": "inverse-gp"}, "takes no boards"),
         ({"target": "aprilgrid", "board": "6x6"}, "needs --tag"),
     ],
@@ -496,6 +554,84 @@ def test_a_board_goes_through_known_poses_by_number(rig, slots):
         loop.ask()
 
 
+def test_poses_that_judge_are_spread_and_do_not_calibrate(rig, slots):
+    cameras = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
+    loop = KnownPosesLoop(ic.Explicit(lens="brown-conrady"), shape_of(BOARD), cameras, poses=slots, hold_out=1)
+    data = corners_at(rig, slots, 2)
+    loop.reset(data)
+    (third,) = loop.ask()
+    assert third.held_out
+    assert "slot 3" in third.words
+    assert "held-out board 1 of 1: it judges the calibration" in third.words
+    extra = {**corners_at(rig, slots, 4).known.extra}
+    whole = corners_at(rig, slots, 4)
+    extra[HELD_OUT_COLUMN] = np.where(extra[POSE_COLUMN] == "slot 3", "yes", "")
+    whole = replace(whole, known=replace(whole.known, extra=extra))
+    assert set(loop.held_out(whole).shots.tolist()) == {"p003"}
+    assert set(loop.used(whole).shots.tolist()) == {"p001", "p002", "p004"}
+    loop.tell(whole.select(whole.shots != "p004"))
+    assert loop.points == 2  # that it has come changes nothing
+    assert not loop.ask()[0].held_out
+    loop.adopt(whole, loop.calibration)
+    loop.held, loop.data = loop.held_out(whole), loop.used(whole)
+    assert loop.stop == "all 3 poses are taken, and 1 more are held out"
+    with pytest.raises(UsageError, match="cannot be held out"):
+        KnownPosesLoop(loop.calibrator, loop.shape, cameras, poses=slots, hold_out=3)
+
+
+@pytest.fixture(scope="module")
+def carried(rig: Any) -> tuple[KnownPose, ...]:
+    """Where a robot can put a board in front of both cameras, without turning it."""
+    box, shape = rig.volume.world_from_box, shape_of(BOARD)
+    lattice = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.4, 0.0, 0.4)])
+    return carried_poses(box.apply(lattice * rig.volume.size - shape.middle), box.rotation)
+
+
+def test_a_robot_is_sent_far_apart_first_then_where_most_is_told_then_for_boards_that_judge(rig, carried, slots):
+    cameras = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
+    loop = KnownPosesLoop(
+        ic.Explicit(lens="brown-conrady"), shape_of(BOARD), cameras, rule=Pictures(3), poses=carried, free=True,
+        hold_out=2,
+    )  # fmt: skip
+    (first,) = loop.ask()
+    places = np.array([one.pose.translation for one in carried])
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2
+    assert np.linalg.norm(first.pose.translation - middle) == np.linalg.norm(places - middle, axis=1).min()
+    loop.refuse(first.pose.translation, "in the way")  # the robot is sent to corner 1
+    (second,) = loop.ask()
+    assert second.name != first.name
+    chosen = (carried[0], carried[4], carried[11])
+    loop.reset(corners_at(rig, chosen[:2], 2))
+    assert loop.problem is None
+    (third,) = loop.ask()
+    assert third.score > 0
+    assert third.why.startswith("of 9 places it tells most")
+    assert not third.held_out
+    left = [one for one in carried if one.name not in (first.name, *loop.taken)]
+    gains = loop._design_now().gains([one.pose for one in left])
+    assert third.name == left[int(np.argmax(gains))].name
+    loop.reset(corners_at(rig, chosen, 3))
+    assert not loop.stop  # enough to calibrate, and two are missing that judge
+    (judging,) = loop.ask()
+    assert judging.held_out
+    assert "held-out board 1 of 2" in judging.words
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("0,0", "three numbers"), ("0,0,0", "normal is zero"), ("1,0,0", "lies along x"), ("x:1,2,3", "")],
+)
+def test_turns_that_are_none(text, says):
+    with pytest.raises(UsageError, match="how the board is turned") as caught:
+        turn_from(text, "--facing")
+    assert says in str(caught.value)
+
+
+def test_how_a_board_is_turned_is_read():
+    assert np.allclose(turn_from("0,0,-2", "--facing"), np.eye(3))
+    assert np.allclose(turn_from("r:0.1,0.2,0.3", "--facing"), rotation_from_vector([0.1, 0.2, 0.3]))
+
+
 # --- played sessions ------------------------------------------------------------------------------------------------
 
 
@@ -532,6 +668,68 @@ def test_a_session_is_played_to_its_end_and_goes_on_after_it_was_left(tmp_path):
         assert "held by hand" in (folder / "report.html").read_text()
     again = ic.Explicit(lens="brown-conrady").fit(read_dataset(folder))  # the folder is a dataset of boards
     assert set(again.camera_names) == {"cam1", "cam2"}
+
+
+@pytest.mark.slow
+def test_a_robot_carries_the_board_where_it_is_let_and_some_boards_judge(tmp_path):
+    setup = Setup(
+        rig="stereo", seed=1, target="checkerboard", board="5x8", square=20.0, robot="simulated", speed=1000.0,
+        budget=8, hold_out=2, sd=0.05,
+    )  # fmt: skip
+    folder = tmp_path / "s"
+    with open_session(folder, setup) as controller:
+        assert isinstance(controller, BoardController)
+        controller._background = False
+        assert not controller.state.auto  # it moves when somebody says so
+        controller.start()
+        assert not np.isfinite(controller.state.history[-1].worst if controller.state.history else np.nan)
+        controller.go()
+        controller.go()
+        assert controller.loop.points == 2
+        assert np.allclose(controller.equipment.robot.position(), controller.session.data.xyz[-1], atol=200)
+        controller.stop_robot()
+        assert headline(controller.state, moves=True).detail.startswith("Stopped by hand")
+    with open_session(folder, None) as controller:
+        path = controller.run()
+        assert controller.state.phase == "done", controller.state.problem
+        assert controller.state.stop.endswith("and 2 more are held out")
+        assert "2 held out" in controller.state.message
+    data = read_dataset(folder)
+    judging = data.known.extra[HELD_OUT_COLUMN] == "yes"
+    assert len(set(data.shots[judging].tolist())) == 2
+    found = ic.load_calibration(path)
+    assert set(found.data.shots.tolist()) == set(data.shots[~judging].tolist())
+    off = found.measure(data.select(judging).observations).xyz - data.xyz[judging]
+    assert np.sqrt(np.nanmean(off**2)) < 0.5  # mm
+    assert "2 boards held out" in (folder / "report.html").read_text()
+
+
+def test_each_move_of_a_board_is_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(SimulatedRobot, "simulated", False)  # it asks, as a real one
+    setup = Setup(rig="stereo", target="checkerboard", board="5x8", square=20.0, robot="simulated", speed=1000.0)
+    controller = open_session(tmp_path / "s", setup)
+    try:
+        robot = controller.equipment.robot
+        page = BoardPage(controller)
+        controller.start()
+        asked = page.do({"word": "go"})["ask"]
+        assert asked["title"] == "The robot moves"
+        before = robot.position()
+        with pytest.raises(HardwareError, match="not confirmed"):
+            robot.move(controller.state.target.xyz)
+        assert page.do({"word": "auto", "on": True})["ask"]["yes"] == "Go on by itself"
+        assert np.array_equal(robot.position(), before)
+        taken: list[Any] = []
+        controller._take = lambda **given: taken.append(given)  # type: ignore[method-assign]
+        place = controller.state.target.xyz
+        page._action("go", {"yes": asked["number"]})()
+        assert np.array_equal(robot.position(), place)
+        assert np.array_equal(taken[0]["where"], place)
+        state = page._snapshot(controller.state, np.full(3, np.nan), 0)
+        assert state["buttons"]["stop"]["enabled"]
+        assert state["buttons"]["go"]["label"] == "Go"
+    finally:
+        controller.close()
 
 
 @pytest.mark.slow

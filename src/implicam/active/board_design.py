@@ -141,9 +141,13 @@ class BoardDesign(VolumeDesign):
         W = flat.T @ flat / len(off)
         whole = float(np.trace(W))
         found = np.zeros(len(poses))
-        for i, S in enumerate(self._informations(poses, seen)):
-            if S is not None:
-                found[i] = whole - float(np.trace(np.linalg.solve(np.eye(len(S)) + S, W)))
+        for i, left in enumerate(self._looks(poses, seen)):
+            if left is None:
+                continue
+            if len(left) < len(W):  # (I + L'L)^-1 = I - L' (I + L L')^-1 L: of few rows
+                found[i] = np.trace(np.linalg.solve(np.eye(len(left)) + left @ left.T, left @ W @ left.T))
+            else:
+                found[i] = whole - np.trace(np.linalg.solve(np.eye(len(W)) + left.T @ left, W))
         return found
 
     def after(self, pose: Pose, seen: Bools | None = None) -> BoardDesign:
@@ -161,6 +165,10 @@ class BoardDesign(VolumeDesign):
 
     def _informations(self, poses: Sequence[Pose], seen: Sequence[Bools] | None) -> list[Floats | None]:
         """S (k, k) of the board at each pose about z'; None where no camera sees it well."""
+        return [None if left is None else left.T @ left for left in self._looks(poses, seen)]
+
+    def _looks(self, poses: Sequence[Pose], seen: Sequence[Bools] | None) -> list[Floats | None]:
+        """L (rows, k) of the board at each pose, L^T L its information about z'; None where no camera sees it well."""
         corners = self.shape.some()
         showing = self.visible(poses) if seen is None else np.array(seen, dtype=np.bool_).reshape(len(poses), -1)
         found: list[Floats | None] = []
@@ -178,13 +186,16 @@ class BoardDesign(VolumeDesign):
             H = (part.half @ self._spread) * weight[..., None]
             used = part.seen.ravel()
             K, H = K.reshape(-1, 6)[used], H.reshape(-1, H.shape[2])[used]
-            Q, R = np.linalg.qr(K)
-            if len(K) < 6 or np.abs(np.diag(R)).min() < 1e-9 * np.abs(np.diag(R)).max():
-                found.append(None)
-                continue
-            left = H - Q @ (Q.T @ H)
-            found.append(left.T @ left)
+            found.append(self._without_pose(K, H))
         return found
+
+    def _without_pose(self, K: Floats, H: Floats) -> Floats | None:
+        """L of a board, by its whitened views of the pose (rows, 6) and of the unknowns (rows, k): nobody knows the
+        pose."""
+        Q, R = np.linalg.qr(K)
+        if len(K) < 6 or np.abs(np.diag(R)).min() < 1e-9 * np.abs(np.diag(R)).max():
+            return None
+        return np.asarray(H - Q @ (Q.T @ H), dtype=np.float64)
 
     def visible(self, poses: Sequence[Pose]) -> Bools:
         """Which cameras see a board well: its printed side, and enough of it.
@@ -272,6 +283,24 @@ class BoardDesign(VolumeDesign):
         if xyz is None:
             xyz = seen_by_two(rig, shape, seed)
         return cls(rig, Places.predicted(rig, xyz), shape=shape)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedBoardDesign(BoardDesign):
+    """The same of a board that is put somewhere, turned as it is said to be: the rig is in the world.
+
+    Attributes:
+        placed_sd: Standard uncertainty of where it is put, along each axis.
+    """
+
+    placed_sd: float = field(kw_only=True, default=0.0)
+
+    frame_is_free: ClassVar[bool] = False
+
+    def _without_pose(self, K: Floats, H: Floats) -> Floats | None:
+        """The same; its place alone is not known, and that to `placed_sd`."""
+        shift = np.eye(len(K)) + self.placed_sd**2 * K[:, 3:] @ K[:, 3:].T
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(shift), H), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)

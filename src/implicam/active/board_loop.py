@@ -87,6 +87,7 @@ class BoardTarget(Target):
         why: Why there.
         pose: In the frame of the calibration; None where there is none.
         known: Whether the board is put exactly there, so that its corners are known points.
+        held_out: Whether its picture judges the calibration, and is not used for it.
     """
 
     outlines: tuple[Floats | None, ...] = ()
@@ -95,6 +96,7 @@ class BoardTarget(Target):
     why: str = ""
     pose: Pose | None = None
     known: bool = False
+    held_out: bool = False
 
 
 class CameraProgress(NamedTuple):
@@ -197,6 +199,11 @@ class BoardLoop:
         return len(self._shots())
 
     @property
+    def holds_out(self) -> bool:
+        """Whether some boards judge the calibration, and are not used for it."""
+        return False
+
+    @property
     def predicted(self) -> PredictedCovariance | None:
         """The covariance at the judged places; None before there is a calibration."""
         return None if self.design is None else self.design.at_judged
@@ -215,6 +222,22 @@ class BoardLoop:
             return Workspace.hull(self.design.judged.xyz)
         size = self.shape.diagonal
         return Workspace.box([-size, -size, size], [size, size, 3 * size])
+
+    def used(self, data: Dataset | None) -> Dataset | None:
+        """What calibrates.
+
+        Args:
+            data: All corners.
+        """
+        return data
+
+    def held_out(self, data: Dataset | None) -> Dataset | None:
+        """What is kept to judge the calibration; None where nothing is.
+
+        Args:
+            data: All corners.
+        """
+        return None
 
     def refuse(self, xyz: Floats, reason: str) -> None:
         """Another pose is asked for instead of this one.
@@ -259,11 +282,11 @@ class BoardLoop:
             data: The corners that it was fitted to; others may have come meanwhile.
             found: What it gave.
         """
-        self._fitted = len(_shots(data))
+        self._fitted = len(shots_of(data))
         self.problem = found if isinstance(found, ImplicamError) else None
         self.calibration = None if isinstance(found, ImplicamError) else found
         self.design = self._designed()
-        shots = _shots(data)
+        shots = shots_of(data)
         self._note(len(shots))
         for shot in self._shots()[len(shots) :]:
             self._learn(shot)
@@ -375,7 +398,7 @@ class BoardLoop:
         return [c for c, name in enumerate(self._names) if name not in known]
 
     def _shots(self) -> list[str]:
-        return _shots(self.data)
+        return shots_of(self.data)
 
     def _boards(self, c: int) -> int:
         return 0 if self.data is None else len(_seen_by(self.data)[self._names[c]])
@@ -548,7 +571,12 @@ class BoardLoop:
         return f"{told}, {decimal_number(far, 2)} {self.data.length_unit} from it"
 
 
-def _shots(data: Dataset | None) -> list[str]:
+def shots_of(data: Dataset | None) -> list[str]:
+    """The boards of a dataset of corners, in their order.
+
+    Args:
+        data: None for none.
+    """
     return [] if data is None else list(dict.fromkeys(_shot_and_number(str(point))[0] for point in data.points))
 
 

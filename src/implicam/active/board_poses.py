@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from implicam.active.board_design import BoardDesign
-from implicam.active.board_loop import BoardLoop, BoardTarget, CameraProgress, Ints, Worth
-from implicam.active.design_model import PredictedCovariance, can_design_experiments, design_model_of
+from implicam.active.board_design import BoardDesign, PlacedBoardDesign
+from implicam.active.board_loop import BoardLoop, BoardTarget, CameraProgress, Ints, Worth, shots_of
+from implicam.active.design_model import Places, PredictedCovariance, can_design_experiments, design_model_of
 from implicam.active.loop import summarise_step
 from implicam.active.stopping import Step
 from implicam.active.workspace import Workspace, lattice_places
@@ -36,6 +36,12 @@ from implicam.threads import blas_threads
 
 POSE_COLUMN = "pose"
 """The column of points.csv that says at which of the known poses a board was."""
+
+HELD_OUT_COLUMN = "held_out"
+"""The column of points.csv that says "yes" of a board that does not calibrate, but judges."""
+
+ROBOT_CANDIDATES = 60
+"""Of the places where a robot can put the board: so many are weighed for the next picture."""
 
 MAX_POSES = 1000
 
@@ -123,38 +129,99 @@ def _rotation(kind: str, turn: Floats) -> Floats:
 
 @dataclass(eq=False)
 class KnownPosesLoop(BoardLoop):
-    """The loop of a board that goes through known poses, one after the other; corners are known points then.
+    """The loop of a board at known poses; corners are known points then.
 
     Attributes:
         poses: In their order.
+        free: Whether they are only where the board can be, as in the hands of a robot: the next is the one that tells
+            most, until the rule says stop. If not, the board goes through all of them, one after the other.
+        placed_sd: Standard uncertainty of where the board is put, along each axis.
+        hold_out: So many boards are not used to calibrate, but to judge the calibration in the report: of poses in
+            their order, spread evenly; of free ones, at random places once the others are enough.
     """
 
     poses: tuple[KnownPose, ...] = ()
+    free: bool = False
+    placed_sd: float = 0.0
+    hold_out: int = 0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.hold_out < len(self.poses) - 1:
+            raise UsageError(
+                f"{self.hold_out} of {len(self.poses)} poses cannot be held out.",
+                why="two poses or more calibrate",
+                fix="give more poses, or hold out fewer",
+            )
+        step = len(self.poses) / max(self.hold_out, 1)
+        self._judging = set() if self.free else {int((k + 0.5) * step) for k in range(self.hold_out)}
+        self.held: Dataset | None = None
         corners = np.concatenate([one.pose.apply(self.shape.corners) for one in self.poses])
         self._swept = Workspace.hull(corners)
         self._predicted: PredictedCovariance | None = None
         self._skipped: set[str] = set()
+        self._asked_design: BoardDesign | None = None
         super().__post_init__()
 
     @property
     def taken(self) -> list[str]:
         """The names of the poses at which there is a picture."""
-        if self.data is None or self.data.known is None:
-            return []
-        return list(dict.fromkeys(self.data.known.extra[POSE_COLUMN].tolist()))
+        return [*_poses_in(self.data), *_poses_in(self.held)]
+
+    @property
+    def holds_out(self) -> bool:
+        """Whether some boards judge the calibration, and are not used for it."""
+        return self.hold_out > 0
+
+    def used(self, data: Dataset | None) -> Dataset | None:
+        """What calibrates: all corners but those of boards that are held out.
+
+        Args:
+            data: All corners.
+        """
+        if data is None or data.known is None or HELD_OUT_COLUMN not in data.known.extra:
+            return data
+        keep = data.known.extra[HELD_OUT_COLUMN] == ""
+        return data.select(keep) if keep.any() else None
+
+    def held_out(self, data: Dataset | None) -> Dataset | None:
+        """The corners of boards that are held out; None where there are none.
+
+        Args:
+            data: All corners.
+        """
+        if data is None or data.known is None or HELD_OUT_COLUMN not in data.known.extra:
+            return None
+        out = data.known.extra[HELD_OUT_COLUMN] != ""
+        return data.select(out) if out.any() else None
 
     @property
     def stop(self) -> str:
-        """Why to stop: a rule says so, or all poses are taken."""
+        """Why to stop: a rule says so, or all poses are taken; and the boards that are held out are there."""
+        enough = self._enough()
+        if not enough or self._held_left():
+            return ""
+        return f"{enough}, and {self.hold_out} more are held out" if self.hold_out else enough
+
+    def _enough(self) -> str:
+        """Why no more boards are needed to calibrate."""
         if self.data is None:
             return ""
-        left = self._left()
-        spent = f"all {len(self.poses)} poses are taken" if not left else ""
+        left = [one for one in self._left() if not self._judges(one)]
+        count = len(self.poses) - len(self._judging)
+        spent = f"all {count} poses are taken" if not left else ""
         if left and self._skipped and all(one.name in self._skipped for one in left):
-            spent = f"{len(self.poses) - len(left)} of {len(self.poses)} poses are taken, and the others left out"
+            spent = f"{count - len(left)} of {count} poses are taken, and the others left out"
         return spent or self._met()
+
+    def _judges(self, one: KnownPose) -> bool:
+        """Whether a pose of those in their order is held out."""
+        return bool(self._judging) and self.poses.index(one) in self._judging
+
+    def _held_left(self) -> int:
+        """How many boards are to be held out yet."""
+        if self.free:
+            return max(self.hold_out - len(_poses_in(self.held)), 0)
+        return sum(self._judges(one) and one.name not in self._skipped for one in self._left())
 
     @property
     def predicted(self) -> PredictedCovariance | None:
@@ -172,15 +239,45 @@ class KnownPosesLoop(BoardLoop):
         return self.volume if self.volume is not None else self._swept
 
     def refuse(self, xyz: Floats, reason: str) -> None:
-        """The pose that is asked for now is left out.
+        """A pose is left out.
 
         Args:
-            xyz: Not used.
+            xyz: (3,) where corner 1 or the middle of the board was to be; the next pose where none is there.
             reason: Not used.
         """
         left = [one for one in self._left() if one.name not in self._skipped]
-        if left:
-            self._skipped.add(left[0].name)
+        there = [one for one in left if _is_at(one.pose, self.shape.middle, xyz)]
+        if there or left:
+            self._skipped.add((there or left)[0].name)
+
+    def reset(self, data: Dataset | None, progress: Progress = silent) -> None:
+        """Go on with these corners, and fit.
+
+        Args:
+            data: All corners from now on; None for none.
+            progress: Called as the fit goes on.
+        """
+        self.held = self.held_out(data)
+        super().reset(self.used(data), progress)
+
+    def adopt(self, data: Dataset | None, found: Calibration | ImplicamError | None) -> None:
+        """Take what `fit` gave.
+
+        Args:
+            data: The corners that it was fitted to; others may have come meanwhile.
+            found: What it gave.
+        """
+        super().adopt(self.used(data), found)
+
+    def tell(self, data: Dataset) -> None:
+        """One board more, without a fit.
+
+        Args:
+            data: All corners, those of the new board last.
+        """
+        self.held, used = self.held_out(data), self.used(data)
+        if used is not None and len(shots_of(used)) > self.points:
+            super().tell(used)
 
     def fit(self, data: Dataset | None, progress: Progress = silent) -> Calibration | ImplicamError | None:
         """What these corners say of the rig; nothing of the loop changes.
@@ -192,6 +289,7 @@ class KnownPosesLoop(BoardLoop):
         Returns:
             The calibration, why there is none, or None where it is too early.
         """
+        data = self.used(data)
         if data is None or data.known is None or len(data) < MIN_POINTS_PER_CAMERA:
             return None
         if len(set(data.known.shots.tolist())) < 2:
@@ -214,19 +312,70 @@ class KnownPosesLoop(BoardLoop):
         left = [one for one in self._left() if one.name not in self._skipped] or self._left()
         if not left:
             raise UsageError(f"all {len(self.poses)} poses are taken.", fix="finish, or take one back")
+        if self.free:
+            return [self._of_a_robot(left)]
         one = left[0]
         place = 1 + self.poses.index(one)
-        corner, normal = one.pose.translation, -one.pose.rotation[:, 2]
-        told = ", ".join(f"{axis} {value:.5g}" for axis, value in zip("xyz", corner, strict=True))
+        normal = -one.pose.rotation[:, 2]
         facing = ", ".join(f"{value:.2g}" for value in np.round(normal, 9) + 0.0)
-        words = f"pose {place} of {len(self.poses)}: {one.name}, corner 1 at {told}, facing ({facing})"
+        words = f"pose {place} of {len(self.poses)}: {one.name}, {_corner(one.pose)}, facing ({facing})"
+        target = self._target_of(one, words, "press the key when it is there")
+        return [self._judging_one(target) if self._judges(one) else target]
+
+    def _target_of(self, one: KnownPose, words: str, why: str, gain: float = np.nan) -> BoardTarget:
         nowhere = tuple(None for _ in self.cameras)
         corners = np.full((len(self.cameras), len(self.shape.some()), 2), np.nan)
         target = BoardTarget(
-            one.name, one.pose.apply(self.shape.middle), corners[:, 0], float("nan"), nowhere, corners, words,
-            "press the key when it is there", one.pose, known=True,
+            one.name, one.pose.apply(self.shape.middle), corners[:, 0], gain, nowhere, corners, words, why, one.pose,
+            known=True,
         )  # fmt: skip
-        return [self._outlined(target, one.pose)]
+        return self._outlined(target, one.pose)
+
+    def _judging_one(self, target: BoardTarget) -> BoardTarget:
+        """The board is not used to calibrate."""
+        number = 1 + self.hold_out - self._held_left()
+        told = f"held-out board {number} of {self.hold_out}: it judges the calibration, and is not used for it"
+        return replace(target, words=f"{target.words} ({told})", why=told, held_out=True)
+
+    def _of_a_robot(self, left: Sequence[KnownPose]) -> BoardTarget:
+        """Where a robot is to put the board: where it tells most; once that is enough, anywhere, to be held out."""
+        self._asked += 1
+        rng = np.random.default_rng([self.seed, self._asked, 23])
+        if self._held_left() and self._enough():
+            one = left[int(rng.integers(len(left)))]
+            return self._judging_one(self._target_of(one, _corner(one.pose), ""))
+        self._asked_design = self._asked_design or self._design_now()
+        if self._asked_design is None or not self.guided:
+            one = self._farthest(left) if self.guided else left[int(rng.integers(len(left)))]
+            return self._target_of(one, _corner(one.pose), "the first places are spread through the workspace")
+        some = [left[k] for k in rng.permutation(len(left))[:ROBOT_CANDIDATES]]
+        with blas_threads(1):
+            gains = self._asked_design.gains([one.pose for one in some])
+        k = int(np.argmax(gains))
+        why = f"of {len(some)} places it tells most" if gains[k] > 0 else "no place would tell much more"
+        return self._target_of(some[k], _corner(some[k].pose), why, float(gains[k]))
+
+    def _farthest(self, left: Sequence[KnownPose]) -> KnownPose:
+        """The pose farthest from those that were taken or left out; at first that nearest to the middle of all."""
+        places = np.array([one.pose.translation for one in left])
+        done = {*self.taken, *self._skipped}
+        known = np.array([one.pose.translation for one in self.poses if one.name in done]).reshape(-1, 3)
+        if not len(known):
+            return left[int(np.argmin(np.linalg.norm(places - (places.min(axis=0) + places.max(axis=0)) / 2, axis=1)))]
+        away = np.linalg.norm(places[:, None] - known, axis=2).min(axis=1)
+        return left[int(np.argmax(away))]
+
+    def _design_now(self) -> BoardDesign | None:
+        """What the calibration knows, and what a board that is put somewhere would add; None where it is not known."""
+        found = self.calibration
+        if not isinstance(found, PredictsPixels) or self._cold():
+            return None
+        try:
+            judged = Places.predicted(found, self.judged_at)
+            return PlacedBoardDesign(found, judged, shape=self.shape, placed_sd=self.placed_sd)
+        except UsageError as error:
+            self.problem = error
+            return None
 
     def name_of(self, target: BoardTarget) -> str:
         """The name of a known pose.
@@ -317,11 +466,13 @@ class KnownPosesLoop(BoardLoop):
         design = BoardDesign.of(self.calibration, self.shape, self.judged_at)
         seen = design.visible([pose])[0]
         made = self._with_pixels(target, pose, np.asarray(seen))
+        if self.free:
+            return made
         return replace(made, why="a picture is taken by itself where the cameras see it there, held still")
 
     def _designed(self) -> BoardDesign | None:
         """Nothing to choose: the poses are given. What positions will be good for is said as of known points."""
-        self._predicted = None
+        self._predicted = self._asked_design = None
         if self.calibration is None or not can_design_experiments(self.calibration):
             return None
         if not isinstance(self.calibration, PredictsPixels):
@@ -345,6 +496,56 @@ class KnownPosesLoop(BoardLoop):
             self.history.append(
                 Step(boards, seconds=passed) if known is None else summarise_step(known, boards, passed)
             )
+
+
+def carried_poses(positions: Floats, rotation: Floats) -> tuple[KnownPose, ...]:
+    """The poses of a board that a robot carries without turning it.
+
+    Args:
+        positions: (n, 3) of corner 1, in the world.
+        rotation: (3, 3) world_from_board.
+    """
+    return tuple(KnownPose(f"place{k + 1:03d}", Pose(rotation, xyz)) for k, xyz in enumerate(positions))
+
+
+def turn_from(text: str, option: str) -> Floats:
+    """How a board is turned, from the words of a command line.
+
+    Args:
+        text: "nx,ny,nz", the normal of the printed side, towards the cameras; or "r:rx,ry,rz", a rotation vector.
+        option: That the error names.
+
+    Returns:
+        (3, 3) world_from_board.
+
+    Raises:
+        UsageError: It is neither.
+    """
+    kind, _, numbers = text.rpartition(":")
+    try:
+        turn = np.array([float(part) for part in numbers.split(",")])
+        if turn.shape != (3,) or not np.isfinite(turn).all() or kind not in ("", "r"):
+            raise ValueError("it takes three numbers")
+        return _rotation("rx" if kind else "nx", turn)
+    except ValueError as error:
+        raise UsageError(
+            f"{text!r} does not say how the board is turned.",
+            why=str(error),
+            fix=f"write {option}=0,0,-1, the normal of its printed side; or {option}=r:0.1,0,0, its whole turn",
+        ) from error
+
+
+def _poses_in(data: Dataset | None) -> list[str]:
+    return [] if data is None or data.known is None else list(dict.fromkeys(data.known.extra[POSE_COLUMN].tolist()))
+
+
+def _is_at(pose: Pose, middle: Floats, xyz: Floats) -> bool:
+    return any(np.allclose(place, xyz, rtol=1e-9, atol=1e-9) for place in (pose.translation, pose.apply(middle)))
+
+
+def _corner(pose: Pose) -> str:
+    told = ", ".join(f"{axis} {value:.5g}" for axis, value in zip("xyz", pose.translation, strict=True))
+    return f"corner 1 at {told}"
 
 
 def described(poses: Sequence[KnownPose]) -> list[list[object]]:

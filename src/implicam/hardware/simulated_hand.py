@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,7 @@ class MovingHand:
     Attributes:
         seconds: That it takes from one place to the next; 0 for at once.
         corners: (n, 3) points of what it holds, in that thing's own frame.
+        carried: Where that is, if a robot holds it and no hand; None for a hand.
     """
 
     simulated = True
@@ -63,6 +64,7 @@ class MovingHand:
         self._rng = np.random.default_rng([seed, 31])
         self._from = self._to = first
         self._begun = -np.inf
+        self.carried: Callable[[], Pose] | None = None
         self._lock = threading.Lock()
         self._held = (first, first)  # in the set of pictures that is being taken
         self._set_begun = -np.inf
@@ -96,6 +98,8 @@ class MovingHand:
 
     def _carried(self, when: float) -> Pose:
         """On its way from one place to the next."""
+        if self.carried is not None:
+            return self.carried()
         passed = when - self._begun
         part = 1.0 if self.seconds <= 0 else float(np.clip(passed / self.seconds, 0, 1))
         part = part * part * (3 - 2 * part)
@@ -117,7 +121,8 @@ class MovingHand:
             whole = len(self._in_set) == len(self.rig.cameras)
             if whole or camera in self._in_set or now - self._set_begun > MAX_SET_SECONDS:
                 self._begin_set()
-                shake = TREMOR_MM * self.rig.units_per_mm if self.seconds > 0 else 0.0
+                shakes = self.seconds > 0 and self.carried is None
+                shake = TREMOR_MM * self.rig.units_per_mm if shakes else 0.0
                 tremor = shake * self._rng.normal(size=3)
                 self._held = tuple(  # type: ignore[assignment]
                     Pose(pose.rotation, pose.translation + tremor)

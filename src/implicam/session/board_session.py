@@ -15,24 +15,24 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from implicam.active.board_loop import BoardLoop, BoardTarget, Ints
-from implicam.active.board_poses import POSE_COLUMN
+from implicam.active.board_poses import HELD_OUT_COLUMN, POSE_COLUMN
 from implicam.calibrators import Calibration
 from implicam.dataset import Camera, Dataset, Floats, KnownPositions, Observations
 from implicam.dataset.boards import corner_name
 from implicam.detect.sharpness import edge_width
-from implicam.errors import UsageError
-from implicam.evaluation import leave_out_shots
+from implicam.errors import HardwareError, UsageError
+from implicam.evaluation import evaluate, leave_out_shots
 from implicam.geometry import Pose
 from implicam.progress import Progress, silent
 from implicam.report import ReportData, report_of, write_report
 from implicam.session.board_report import write_board_report
 from implicam.session.by_hand import ByHandController, ByHandState, Judgement
-from implicam.session.controller import Equipment
+from implicam.session.controller import MAX_TARGETS_WITHOUT_BALL, Equipment, SessionController
 from implicam.session.detections import Look
 from implicam.session.journal import Session
 
@@ -109,8 +109,30 @@ class BoardController(ByHandController):
     # called by a page
 
     def go(self) -> None:
-        """Take a picture now, as the board is held; UsageError with the reason where it would be of no use."""
-        self._take(asked=True)
+        """Take a picture now, as the board is held, or let the robot put it there first; UsageError with the reason
+        where it would be of no use."""
+        if self.equipment.robot.moves:
+            super().go()
+        else:
+            self._take(asked=True)
+
+    def _take_pictures(self, where: Floats, *, typed: Any = None, asks: bool = False) -> None:
+        """The robot has put the board there."""
+        self._take(asked=True, where=where)
+
+    def set_auto(self, auto: bool) -> None:
+        """Turn on or off that a picture is taken by itself; of a robot, that it goes on by itself.
+
+        Args:
+            auto: Whether it is.
+
+        Raises:
+            UsageError: The robot is one that needs a person, or this is a dry run.
+        """
+        if self.equipment.robot.moves:
+            SessionController.set_auto(self, auto)
+        else:
+            super().set_auto(auto)
 
     def skip(self, reason: str = "skipped by hand") -> None:
         """Show another pose instead of this one.
@@ -129,10 +151,32 @@ class BoardController(ByHandController):
             self._aim()
 
     def step(self) -> None:
-        """Take a picture, if the board is held so that it tells enough."""
-        if self.state.phase == "aim" and self.state.judgement.ready:
+        """Take a picture, if the board is held so that it tells enough; or let the robot put it there."""
+        if self.equipment.robot.moves:
+            self._step_of_robot()
+        elif self.state.phase == "aim" and self.state.judgement.ready:
             with suppress(UsageError):  # it moved just now: the next look says so
                 self._take(asked=False)
+
+    def _step_of_robot(self) -> None:
+        if self.state.phase != "aim":
+            return
+        try:
+            self._move()
+            self._targets_without_ball = 0
+        except UsageError as error:  # no picture of it was kept
+            self._targets_without_ball += 1
+            if self._targets_without_ball < MAX_TARGETS_WITHOUT_BALL:
+                self.skip(error.what)
+                return
+            self._targets_without_ball = 0
+            self._report_trouble(
+                HardwareError(
+                    f"no picture of the board was kept at {MAX_TARGETS_WITHOUT_BALL} places in a row.",
+                    why=error.what,
+                    fix="look at the pictures, and at how the board is said to be turned (--facing)",
+                )
+            )
 
     def run(self, progress: Progress = silent) -> Path | None:
         """Take picture after picture until a rule says stop or something fails, then finish; somebody holds the board.
@@ -152,6 +196,10 @@ class BoardController(ByHandController):
         refused = 0
         while self.state.auto and self.state.phase == "aim" and not self.state.stop and self.state.target is not None:
             before = self.loop.points
+            if self.equipment.robot.moves:
+                self.step()
+                progress("boards", self.loop.points, max(self.loop.points, self.loop.start))
+                continue
             self.live()
             known = isinstance(self.state.target, BoardTarget) and self.state.target.known
             if known and self.loop.calibration is None and self._hand is not None:
@@ -187,11 +235,23 @@ class BoardController(ByHandController):
     def _report(self, path: Path, calibration: Calibration, data: Dataset) -> ReportData:
         if data.known is None:
             return write_board_report(path, self.session.name, self.loop.calibrator, calibration, data)
-        said = report_of(
-            leave_out_shots(self.loop.calibrator.fit, data), f"{self.session.name}: a board at known poses"
-        )
+        title, held = f"{self.session.name}: a board at known poses", self.loop.held_out(data)
+        if held is None:
+            said = report_of(leave_out_shots(self.loop.calibrator.fit, data), title)
+        else:
+            by = f"{_boards(held)} boards held out, by a calibration from {self.loop.points} others"
+            said = report_of(evaluate(calibration, held), title, calibration=calibration, by=by)
         write_report(path, said)
         return said
+
+    def _used(self, data: Dataset) -> Dataset:
+        used = self.loop.used(data)
+        assert used is not None  # there is a calibration
+        return used
+
+    def _also(self, data: Dataset) -> str:
+        held = self.loop.held_out(data)
+        return "" if held is None else f", and {_boards(held)} held out"
 
     def _aim(self, before: str = "") -> None:
         try:
@@ -201,25 +261,37 @@ class BoardController(ByHandController):
             self._show(phase="aim", target=None, message=f"{before}{error.what}")
             return
         target = replace(target, name=self.session.next_name())
+        if self.equipment.robot.moves and target.pose is not None:
+            target = replace(target, xyz=target.pose.translation)  # what the robot is sent to: corner 1
         self._last, self._still_since = {}, 0.0
         self._show(
             phase="aim", target=target, message=f"{before}{target.words}", problem=None, judgement=Judgement(False, ""),
             cameras=tuple(self.loop.camera_progress()),
         )  # fmt: skip
+        if self._hand is not None and self.equipment.robot.moves:
+            return  # it carries the board
         if self._hand is not None and target.known and target.pose is not None:
             self._hand.put(target.pose)
         elif self._hand is not None:
             self._hand.follow(self.loop.shape.some(), target.corners)
 
-    def _take(self, *, asked: bool) -> None:
-        """Take a set of pictures and keep it; UsageError with the reason where it is of no use."""
+    def _take(self, *, asked: bool, where: Floats | None = None) -> None:
+        """Take a set of pictures and keep it; UsageError with the reason where it is of no use. where: (3,) corner 1,
+        as the robot says."""
         target = self._require_target()
         assert isinstance(target, BoardTarget)
+        if self.equipment.dry_run:
+            raise UsageError("this is a dry run: nothing moves, so nothing is kept.", fix="skip, to see the next place")
+        column = self.loop.name_of(target)
+        if where is not None and target.pose is not None:
+            target = replace(target, pose=Pose(target.pose.rotation, where))
         before = self._last
         with self._camera_lock:
             if asked and self._each_when_it_likes:  # it may be elsewhere than at the last look
                 before = self._views(self._detect_all(self._take_frames(None)))
             frames = self._take_frames(self.equipment.trigger)
+        if where is not None:
+            self._check_standing(where)
         looks = self._detect_all(frames)
         views = self._views(looks)
         moved = _moved(before, views)
@@ -234,7 +306,7 @@ class BoardController(ByHandController):
             _LOG.info("%s not taken: %s", target.name, why)
             self._show(looks=looks, judgement=Judgement(False, why))
             raise UsageError(f"no picture was kept: {why}.", fix="hold the board still, in sight of a camera")
-        shot = self._make_shot(target, looks)
+        shot = self._make_shot(target, looks, column)
         pictures = {look.camera: look.frame.picture for look in looks if look.frame is not None}
         notes = {
             "target": target.xyz.tolist() if np.isfinite(target.xyz).all() else [],
@@ -314,7 +386,7 @@ class BoardController(ByHandController):
                     off.append(float(np.linalg.norm(uv - target.corners[c, k])))
         return float(np.mean(off)) if off else float("nan")
 
-    def _make_shot(self, target: BoardTarget, looks: Sequence[Look]) -> Dataset:
+    def _make_shot(self, target: BoardTarget, looks: Sequence[Look], pose: str) -> Dataset:
         """What the cameras see, as corners of one board; with their positions, where those are known."""
         name = target.name
         numbers = sorted({_number(point) for look in looks for point in look.found.points})
@@ -329,9 +401,15 @@ class BoardController(ByHandController):
         if target.known and target.pose is not None:
             xyz = target.pose.apply(self.loop.shape.corners[numbers])
             spread = np.broadcast_to(np.array(self.equipment.robot.sd, dtype=np.float64), xyz.shape)
-            columns = {POSE_COLUMN: np.full(len(numbers), self.loop.name_of(target))}
+            columns = {POSE_COLUMN: np.full(len(numbers), pose)}
+            if self.loop.holds_out:
+                columns[HELD_OUT_COLUMN] = np.full(len(numbers), "yes" if target.held_out else "")
             known = KnownPositions(np.full(len(numbers), name), xyz, spread, columns)
         return Dataset(self.session.name, self.session.length_unit, Observations(names, tuple(cameras), uv, sd), known)
+
+
+def _boards(data: Dataset) -> int:
+    return len(set(data.shots.tolist()))
 
 
 def _number(point: str) -> int:

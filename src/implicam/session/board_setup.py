@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,13 +11,24 @@ import numpy as np
 from implicam.active import Workspace, workspace_from
 from implicam.active.board_design import BoardShape
 from implicam.active.board_loop import BoardLoop
-from implicam.active.board_poses import KnownPosesLoop, described, poses_from, poses_of
+from implicam.active.board_poses import (
+    KnownPosesLoop,
+    carried_poses,
+    described,
+    poses_from,
+    poses_of,
+    turn_from,
+)
 from implicam.calibrators import DEFAULT_METHOD, calibrator_from_name
+from implicam.dataset import Floats
 from implicam.dataset.boards import BOARD_KINDS, check_size, corner_positions
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.dataset.wand import WAND
 from implicam.detect import ALSO_CALLED, TARGETS, Detector, options_of
 from implicam.errors import UsageError, did_you_mean
-from implicam.hardware import FrameSource, Person
+from implicam.geometry import Pose
+from implicam.hardware import FrameSource, Person, Robot
+from implicam.hardware.simulated import SimulatedRobot
 from implicam.hardware.simulated_hand import simulated_hand
 from implicam.session.board_session import BoardController
 from implicam.session.controller import Equipment
@@ -43,6 +55,13 @@ EXAMPLE_BOARDS: dict[str, dict[str, Any]] = {
 
 POSES_KEY = "known_poses"
 """The setting of a session that holds the known poses of its board, as `described` gives them."""
+
+ROBOT_PLACES = 600
+"""Where a robot can put the board, among which it is sent."""
+
+SIMULATED = "simulated"
+SIMULATED_SPEED = 0.4
+"""m/s of the simulated robot: fast enough not to wait for, slow enough to see it move."""
 
 SIZES = ("board", "square", "marker", "tag", "spacing", "dictionary", "legacy")
 """The options of a session that say what the board is."""
@@ -126,32 +145,95 @@ def shape_of(detector: Detector) -> BoardShape:
 
 
 def board_hardware(
-    setup: Setup, cameras: list[FrameSource] | None
-) -> tuple[list[FrameSource], Person, Workspace | None]:
-    """Cameras, who holds the board, and where positions have to be good.
+    setup: Setup, cameras: list[FrameSource] | None, robot: Callable[[], Robot]
+) -> tuple[list[FrameSource], Robot, Workspace | None]:
+    """Cameras, who holds the board, and where positions have to be good; of a robot, where it may put corner 1.
 
     Args:
         setup: With a target that is a board.
-        cameras: Those of the setup; None for simulated ones, and a hand that says so.
+        cameras: Those of the setup; None for simulated ones, and a hand, or a simulated robot, that holds the board.
+        robot: Makes that of the setup, where it names one.
 
     Raises:
-        UsageError: Simulated cameras cannot show such a board, or a robot is named.
+        UsageError: A pose is wrong, or it is not known where the robot may go, or how the board is turned.
     """
     detector = board_detector(setup)
     if setup.poses:
         poses_from(setup.poses)  # what is wrong with them is said before anything is begun
-    if setup.robot not in ("", Person.spec):
-        raise UsageError(
-            f"the robot {setup.robot!r} holds no board.",
-            why="a board is held by hand here, at places that nobody knows",
-            fix="leave --robot out",
-        )
+    carried = is_carried(setup)
+    _refuse_useless(setup, carried)
     volume = workspace_from(setup.workspace, None) if setup.workspace else None
+    if carried:
+        volume = volume if volume is not None else _swept(setup, detector)
+        turn = _rotation_of(setup)
     if cameras is None:
-        found, _ = simulated_hand(setup.built(), detector.describe(), seed=setup.seed, seconds=HAND_SECONDS)
+        rig = setup.built()
+        found, hand = simulated_hand(rig, detector.describe(), seed=setup.seed, seconds=HAND_SECONDS)
+        if carried and volume is not None:
+            speed = (setup.speed or SIMULATED_SPEED) / METRES_PER_UNIT[setup.unit]
+            rng = np.random.default_rng([setup.seed, 51])
+            arm = SimulatedRobot(volume.centre, sd=setup.sd or 0.0, speed=speed, rng=rng)
+            hand.carried = lambda: Pose(turn, arm.true_position)
+            return list(found), arm, volume
         cameras = list(found)
+    if carried:
+        return cameras, robot(), volume
     sd = (setup.sd if setup.sd is not None else np.nan,) * 3
     return cameras, Person(lambda _: None, sd), volume
+
+
+def is_carried(setup: Setup) -> bool:
+    """Whether a robot moves the board.
+
+    Args:
+        setup: With a target that is a board.
+    """
+    return setup.robot not in ("", Person.spec)
+
+
+def _refuse_useless(setup: Setup, carried: bool) -> None:
+    """UsageError for options that say nothing of such a session, or are missing."""
+    if setup.facing and not carried:
+        raise UsageError("--facing says how a robot holds the board.", fix="give --robot, or leave it out")
+    if setup.hold_out and not (carried or setup.poses):
+        raise UsageError(
+            "boards held by hand are held out by themselves.",
+            why="the report judges by every third board, at places that nobody knows",
+            fix="leave --hold-out out; it is for --poses, or a robot",
+        )
+    if setup.simulated and carried and setup.robot != SIMULATED:
+        raise UsageError(
+            f"the robot {setup.robot!r} does not move in front of simulated cameras.",
+            fix=f"give cameras (--camera NAME=WHAT), or --robot {SIMULATED}",
+        )
+    if carried and not setup.simulated and setup.robot == SIMULATED:
+        raise UsageError("a simulated robot does not move in front of real cameras.", fix="name another --robot")
+    if carried and not setup.simulated and not setup.workspace:
+        raise UsageError(
+            "there is no workspace.",
+            why="where the robot may put the board is not known",
+            fix="give places of the board's corner 1 in the dataset's unit: --workspace=x0:x1,y0:y1,z0:z1",
+        )
+    if carried and not setup.simulated and not setup.facing:
+        raise UsageError(
+            "how the board is turned is not known.",
+            why="the robot moves it without turning it, and tells where it is",
+            fix="--facing=0,0,-1, the normal of its printed side in the robot's frame; or --facing=r:RX,RY,RZ",
+        )
+
+
+def _rotation_of(setup: Setup) -> Floats:
+    """(3, 3) world_from_board of a board that a robot holds; a simulated one faces the cameras."""
+    return turn_from(setup.facing, "--facing") if setup.facing else setup.built().volume.world_from_box.rotation
+
+
+def _swept(setup: Setup, detector: Detector) -> Workspace:
+    """Where a simulated robot may put corner 1 so that the board stays in the rig's volume, or at its middle."""
+    shape, box = shape_of(detector), setup.built().volume
+    low, high = shape.corners.min(axis=0), shape.corners.max(axis=0)
+    half = np.maximum((box.size - (high - low)) / 2, 0.02 * box.size)  # of a large board: a little
+    ends = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) * half - (low + high) / 2
+    return Workspace.hull(box.world_from_box.apply(ends))
 
 
 def made_board_session(
@@ -170,12 +252,18 @@ def made_board_session(
     """
     kept = session.settings.get(POSES_KEY)
     hand = getattr(equipment.cameras[0], "hand", None)  # only simulated cameras know who holds the board
-    if kept:
+    carried = is_carried(setup)
+    if kept or carried:
+        poses, free = poses_of(kept or []), not kept
+        if free:
+            assert volume is not None
+            poses = carried_poses(volume.candidates(ROBOT_PLACES, setup.seed), _rotation_of(setup))
         known = KnownPosesLoop(
-            calibrator_from_name(setup.method), shape_of(equipment.detector), session.cameras, volume, setup.rule,
-            setup.seed, poses=poses_of(kept),
+            calibrator_from_name(setup.method), shape_of(equipment.detector), session.cameras,
+            None if carried else volume, setup.rule, setup.seed, poses=poses, free=free,
+            placed_sd=float(np.nan_to_num(np.max(equipment.robot.sd))), hold_out=setup.hold_out,
         )  # fmt: skip
-        return BoardController(session, equipment, known, hand=hand)
+        return BoardController(session, equipment, known, hand=hand, auto=not carried)
     method = BOARD_METHOD if setup.method == DEFAULT_METHOD else setup.method
     if method.partition(":")[0] != BOARD_METHOD:
         raise UsageError(f"{method} takes no boards held by hand.", fix=f"--method {BOARD_METHOD}, or leave it out")

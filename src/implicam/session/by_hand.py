@@ -210,11 +210,11 @@ class ByHandController(SessionController):
             data = self.session.data
             if self.loop.calibration is None or data is None:
                 raise self._too_few()
-            calibration = self.loop.calibrator.fit(data)
+            calibration = self.loop.calibrator.fit(self._used(data))
             calibration.save(path)
             report = self.session.folder / REPORT_FILE
             report.unlink(missing_ok=True)  # it may be of an earlier calibration
-            words, verdict = f"{self.loop.points} {self.things}. Saved: {path}", ("", "unknown")
+            words, verdict = f"{self.loop.points} {self.things}{self._also(data)}. Saved: {path}", ("", "unknown")
             try:
                 said = self._report(report, calibration, data)
                 about_bars, _, tone = judgement(said)
@@ -248,6 +248,14 @@ class ByHandController(SessionController):
     def _report(self, path: Path, calibration: Calibration, data: Dataset) -> ReportData:
         """Write the page; ImplicamError where there is nothing to report."""
         raise NotImplementedError
+
+    def _used(self, data: Dataset) -> Dataset:
+        """What calibrates."""
+        return data
+
+    def _also(self, data: Dataset) -> str:
+        """What there is besides, in words."""
+        return ""
 
     def _fit(self) -> None:
         """With everything, now."""

@@ -26,6 +26,7 @@ from implicam.active import (
 )  # fmt: skip
 from implicam.active.acquisitions import ACQUISITIONS, DEFAULT_ACQUISITION
 from implicam.active.board_loop import Pictures
+from implicam.active.board_poses import turn_from
 from implicam.active.design_model import can_design_experiments, design_error, design_methods
 from implicam.addresses import without_secrets
 from implicam.calibrators import CALIBRATORS, DEFAULT_METHOD, calibrator_from_name
@@ -60,6 +61,8 @@ from implicam.registry import Option
 from implicam.rig_model import MIN_POINTS_PER_CAMERA
 from implicam.session.board_setup import (
     BALL,
+    SIMULATED,
+    SIMULATED_SPEED,
     SIZES,
     board_detector,
     board_hardware,
@@ -93,10 +96,6 @@ CAMERAS_KEY = "camera_settings"
 
 MAX_POINTS, MAX_FRAMES = 60, 1000
 """Points or boards, and frames of a wand, after which a session ends that says nothing else."""
-
-SIMULATED = "simulated"
-SIMULATED_SPEED = 0.4
-"""m/s of the simulated robot: fast enough not to wait for, slow enough to see it move."""
 
 PICTURE_TIMEOUT_SECONDS, LIVE_TIMEOUT_SECONDS = 60.0, 10.0
 """For the next picture: of a camera that has none to spare, because somebody or another program has to take it; and of
@@ -146,6 +145,12 @@ class Setup:
     poses: Annotated[
         str, _shown('A board at known poses, one after the other: a CSV, or "x=0 y=0 z=0:190:10"', "WHAT")
     ] = ""
+    facing: Annotated[
+        str, _shown('A board on a robot: "nx,ny,nz", the normal of its printed side, or r:rx,ry,rz', "N")
+    ] = ""
+    hold_out: Annotated[
+        int, _shown("Boards at known poses that judge the calibration, and are not used for it", "N", 0)
+    ] = 0
     cameras: Annotated[
         tuple[tuple[str, str], ...],
         _real(lambda: f"One a camera; WHAT is {list_specs(CAMERAS)}", "NAME=WHAT", flags="--camera", kind=list[str]),
@@ -197,9 +202,12 @@ class Setup:
             wand_detector(self)
         elif self.target != BALL:
             board_detector(self)
-        if self.poses and self.target in (BALL, WAND):
+            if self.facing:
+                turn_from(self.facing, "--facing")
+        if (self.poses or self.facing or self.hold_out) and self.target in (BALL, WAND):
             raise UsageError(
-                "--poses are those of a board.", fix=f"--target {'|'.join(BOARD_KINDS)}; a ball: --workspace"
+                "--poses, --facing and --hold-out are those of a board.",
+                fix=f"--target {'|'.join(BOARD_KINDS)}; a ball: --workspace",
             )
         if self.most < MIN_POINTS_PER_CAMERA:
             raise UsageError(
@@ -454,6 +462,8 @@ def _lasting(before: Setup) -> list[str]:
         "unit",
         "target",
         "poses",
+        "facing",
+        "hold_out",
         *SIZES,
         *WAND_OPTIONS,
         *(("rig", "rig_cameras", "seed") if before.simulated else ()),
@@ -525,7 +535,9 @@ def _hardware(setup: Setup, say: Callable[[str], None]) -> Hardware:
         if setup.simulated:
             trigger_of(setup)  # there must be none
         shown = None if setup.simulated else cameras_of(setup)
-        return wand_hardware(setup, shown) if setup.target == WAND else board_hardware(setup, shown)
+        if setup.target == WAND:
+            return wand_hardware(setup, shown)
+        return board_hardware(setup, shown, lambda: _robot(setup, say))
     if setup.simulated:
         return _simulated(setup)
     cameras = cameras_of(setup)

@@ -26,18 +26,25 @@ class HandPage(BenchPage):
 
     def _buttons_of(self, state: State) -> dict[str, bool]:
         assert isinstance(state, ByHandState)
-        return allowed(state)
+        return allowed(state, self._moves)
 
     def _action(self, word: str, given: Mapping[str, Any]) -> Callable[[], Any] | dict[str, Any]:
         controller = self._controller
-        if word == "go" and controller.state.phase not in ("trouble", "done"):
+        if word == "go" and not self._moves and controller.state.phase not in ("trouble", "done"):
             return controller.go
         return super()._action(word, given)
+
+    def _set_auto(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        if self._moves:
+            return super()._set_auto(given)
+        self._controller.set_auto(given.get("on") is True)
+        return {}
 
     def about(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """As of every session; `boards` says which buttons and words are of no use."""
         simulated = any(getattr(source, "simulated", False) for source in self._controller.equipment.cameras)
-        return {**super().about(given), "boards": True, "auto": True, "simulated": simulated}
+        found = super().about(given)
+        return {**found, "boards": True, "auto": found["auto"] or not self._moves, "simulated": simulated}
 
     def scene(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The volume in three dimensions, in the frame of the first camera, and the corners where they were."""
@@ -76,7 +83,8 @@ class BoardPage(HandPage):
 
     def _snapshot(self, state: State, measured: Any, skipped: int) -> dict[str, Any]:
         assert isinstance(state, BoardState)
-        return board_snapshot(state, self._names, self._controller.loop.rule, unit=self._unit, skipped=skipped)
+        rule = self._controller.loop.rule
+        return board_snapshot(state, self._names, rule, unit=self._unit, skipped=skipped, moves=self._moves)
 
     def points(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """The boards so far, and what was seen of each."""

@@ -38,6 +38,10 @@ def common_headline(state: ByHandState, aim: Headline, done: Headline | None, un
     if state.phase == "trouble":
         problem = state.problem
         return Headline("Something needs you", problem.what if problem is not None else state.message, "bad")
+    if state.phase == "moving" and state.stopped:
+        return Headline("Stopped", "The robot was stopped by hand; what was begun comes to its end.", "bad")
+    if state.phase == "moving":
+        return Headline("The robot moves …", "", "busy")
     if state.phase == "fitting":
         return Headline("Calculating …", f"{sentence(state.message)}.", "busy")
     if state.phase != "done":
@@ -52,11 +56,12 @@ def common_headline(state: ByHandState, aim: Headline, done: Headline | None, un
     return Headline("Calibrated, and not checked", unchecked, "ask")
 
 
-def allowed(state: ByHandState) -> dict[str, bool]:
+def allowed(state: ByHandState, moves: bool = False) -> dict[str, bool]:
     """Which buttons make sense now.
 
     Args:
         state: Of the controller.
+        moves: Whether a robot moves the target, or a person.
     """
     aim = state.phase == "aim"
     return {
@@ -68,7 +73,7 @@ def allowed(state: ByHandState) -> dict[str, bool]:
         "again": False,
         "finish": state.phase == "done" or (aim and state.calibration is not None),
         "auto": state.phase not in ("trouble", "done"),
-        "stop": False,
+        "stop": moves,
     }
 
 
@@ -82,6 +87,7 @@ def common_snapshot(
     skipped: int,
     word: str,
     labels: Mapping[str, str],
+    moves: bool = False,
 ) -> dict[str, Any]:
     """All that the page needs to know of a state, without pictures and places.
 
@@ -94,6 +100,7 @@ def common_snapshot(
         skipped: How many places were left out.
         word: What is counted: board, frame.
         labels: Of the buttons go and skip; finish with what it reaches.
+        moves: Whether a robot moves the target, or a person.
     """
     problem = state.problem if state.phase == "trouble" else None
     following = "finish" if state.stop or state.phase == "done" else "go" if state.phase != "fitting" else ""
@@ -115,7 +122,7 @@ def common_snapshot(
         "auto": state.auto,
         "buttons": {
             button: {"enabled": enabled, "next": button == following, "label": named.get(button, "")}
-            for button, enabled in allowed(state).items()
+            for button, enabled in allowed(state, moves).items()
         },
         "cameras": list(cameras),
         "numbers": {**numbers_of(state.history, rule, unit, skipped), "word": word},

@@ -593,7 +593,7 @@ async function begin() {
   by("by-itself").hidden = !about.auto;
   if (about.boards) {
     for (const word of ["accept", "redo"]) by(word).hidden = true;
-    by("auto").nextSibling.textContent = " take pictures by itself, when the board is held still"
+    if (!about.moves) by("auto").nextSibling.textContent = " take pictures by itself, when the board is held still"
       + (about.simulated ? " (cameras, board and the hand that holds it are simulated)" : "");
     for (const kind of ["wanted", "ball"]) document.querySelector(`.dots .${kind}`).parentNode.remove();
     document.querySelector(".dots .known").nextSibling.textContent = "corners";
