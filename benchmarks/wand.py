@@ -4,6 +4,7 @@
     python benchmarks/wand.py --clean                  all views there and right
     python benchmarks/wand.py --frames 50 --rigs 4     fewer frames, four rigs of each kind
     python benchmarks/wand.py --real ../shared/real/caliscope-charuco   two corners of a board held by hand as a wand
+    python benchmarks/wand.py --worlds --rigs 3        joint NEES in the wand's world, and in others set later
     python benchmarks/wand.py -o benchmarks/results/wand.md   the tables that are kept: all of these
 
 Every rig is another one (lens errors of 0.5 px, 0.2 px noise); the wand is 0.6 of the volume's shortest edge, waved at
@@ -29,10 +30,10 @@ from scipy.stats import chi2
 
 import implicam as ic
 from implicam.dataset.boards import CORNER, corner_positions
-from implicam.derived import distances
+from implicam.derived import distances, joint
 from implicam.errors import ImplicamError
-from implicam.geometry import register
-from implicam.simulate import as_wand, build_rig, random_positions, simulate, waved_wand
+from implicam.geometry import Pose, register
+from implicam.simulate import Target, as_wand, build_rig, random_positions, simulate, waved_wand
 
 KINDS = ("stereo", "bar2", "bar3", "bar4", "bar6", "bar8", "dome3", "dome4", "dome6", "dome8")
 HEAD = (
@@ -80,6 +81,60 @@ def one(kind: str, seed: int, frames: int, outliers: float, missing: float, lens
         "frames": len(calibration.waved.errors),
         "cameras": len(calibration.camera_names) / len(rig.cameras),
     }
+
+
+WORLDS = ("the wand's", "an L-frame", "the same by axes", "a camera")
+
+
+def worlds(kind: str, seed: int, frames: int, outliers: float, missing: float, lens_error: float) -> dict[str, float]:
+    """Joint NEES of 30 positions over 90, in each of the worlds; and how far off they are there (rms)."""
+    rig = build_rig(kind, seed=seed, lens_error=lens_error)
+    target = waved_wand(rig, frames, np.random.default_rng([seed, 11]))
+    recorded = simulate(rig, target, seed=seed, outliers=outliers, missing=missing)
+    held = simulate(rig, random_positions(rig, 30, np.random.default_rng([seed, 2])), seed=seed + 1_000_003)
+    calibration = ic.ForwardGP(wand=target.wand).fit(as_wand(recorded, target))
+    row = {str(name): i for i, name in enumerate(recorded.points)}
+    at = target.xyz[[row[str(name)] for name in calibration.data.points]]
+    own, _ = register(at, calibration.data.xyz)
+    # an L-frame of half the shortest edge in the middle, exactly known
+    edge = 0.5 * float(min(rig.volume.size))
+    arms = edge * np.array([[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0], [0, 1, 0]])
+    corner = rig.volume.world_from_box @ Pose(np.eye(3), edge * np.array([-0.4, -0.4, 0]))
+    names = np.array(["o", "x1", "x2", "y"])
+    seen = simulate(rig, Target("l-frame", names, names, corner.apply(arms)), seed=seed + 500_009)
+    known = replace(seen, known=ic.KnownPositions(names, arms, np.full((4, 3), 1e-4 * edge)))
+    placed = {
+        "the wand's": (calibration, own),
+        "an L-frame": (ic.set_world(calibration, known), corner.inverse()),
+        "the same by axes": (
+            ic.set_world(calibration, replace(seen, known=None), origin="o", x="x2", y="y"), corner.inverse()
+        ),
+        "a camera": (ic.set_world(calibration, camera="cam1"), rig.cameras[0].camera_from_world),
+    }  # fmt: skip
+    found = {}
+    for name, (one, to_world) in placed.items():
+        measured = one.measure(held.observations)
+        good = np.flatnonzero(measured.measured)
+        off = (measured.xyz[good] - to_world.apply(held.truth.xyz[good])).ravel()
+        found[name] = float(off @ np.linalg.solve(joint(measured, good.tolist()).cov, off)) / len(off)
+        found[f"{name} rms"] = float(np.sqrt(3 * np.mean(off**2)))
+    return found
+
+
+def table_of_worlds(kinds, count: int, seed0: int, frames: int, outliers: float, missing: float, lens_error: float):
+    """Joint NEES over its degrees of freedom, line by line."""
+    yield f"| rig | rigs | {' | '.join(WORLDS)} |\n|{'---|' * (2 + len(WORLDS))}"
+    every = []
+    for kind in kinds:
+        rows = [worlds(kind, seed0 + i, frames, outliers, missing, lens_error) for i in range(count)]
+        every += rows
+        yield f"| {kind} | {count} | {' | '.join(told(rows, name, 2) for name in WORLDS)} |"
+    yield f"| **all** | {len(every)} | {' | '.join(told(every, name, 3) for name in WORLDS)} |"
+    wand = np.array([row["the wand's"] for row in every])
+    parts = (
+        f"{np.std([row[name] - wand[i] for i, row in enumerate(every)]) / len(every) ** 0.5:.3f}" for name in WORLDS[1:]
+    )
+    yield f"\nStandard errors of the differences from the first column: {', '.join(parts)}."
 
 
 def length_errors(measured, true):
@@ -182,6 +237,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--lens-error", type=float, default=0.5)
     parser.add_argument("--clean", action="store_true")
+    parser.add_argument("--worlds", action="store_true")
     parser.add_argument("-o", type=Path)
     parser.add_argument("--real", type=Path)
     args = parser.parse_args()
@@ -197,7 +253,8 @@ def main() -> None:
         args.o.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return
     wrong, missing = (0.0, 0.0) if args.clean else (0.1, 0.3)
-    for text in table(args.kinds, args.rigs, args.seed0, args.frames, wrong, missing, args.lens_error):
+    lines = table_of_worlds if args.worlds else table
+    for text in lines(args.kinds, args.rigs, args.seed0, args.frames, wrong, missing, args.lens_error):
         print(text, flush=True)
 
 

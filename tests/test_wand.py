@@ -197,7 +197,7 @@ def test_single_points_are_frames_of_one_marker() -> None:
 def test_what_makes_no_sense_is_refused(waving: Waving) -> None:
     with pytest.raises(UsageError, match="length of the wand is not known"):
         ForwardGP().fit(replace(waving.data, extra={"target": {"kind": "wand"}}))
-    with pytest.raises(UsageError, match="cannot be used together"):
+    with pytest.raises(UsageError, match="markers are not known"):
         ForwardGP(wand=96).fit(waving.recorded)
     with pytest.raises(UsageError, match="it is a length"):
         ForwardGP(wand=-1.0)

@@ -24,7 +24,15 @@ from implicam.errors import DatasetError, FitError, UsageError, did_you_mean
 from implicam.formatting import decimal_number, list_some
 from implicam.geometry import Floats, Pose, register, rotation_from_vector, vector_from_rotation
 from implicam.measurement import Measurement
-from implicam.rig_model.placement import Placement, motions_about, step_between
+from implicam.rig_model.placement import (
+    MAX_EXTENT_ERROR,
+    MAX_SCALE_ERROR,
+    MAX_SCALE_SDS,
+    Placement,
+    motions_about,
+    other_scale,
+    step_between,
+)
 
 MIN_POINTS, MAX_POINTS = 3, 200
 """Known points that a world takes; more than the second are thinned out at random: the world is as well known."""
@@ -34,15 +42,6 @@ SUSPECTS = 5
 
 MAX_CHANCE_PROBABILITY = 1e-4
 """Known points contradict each other, or a plane is none, where chance would leave so much so rarely."""
-
-MAX_SCALE_SDS, MAX_SCALE_ERROR = 4.0, 0.02
-"""By how many standard deviations a scale may be off before that is told, and by which part before it is no world."""
-
-MAX_EXTENT_ERROR = 0.1
-"""The same of the extents, before anything else is looked at."""
-
-UNITS_APART = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3, 25.4, 1 / 25.4, 304.8, 1 / 304.8, 0.3048, 1 / 0.3048)
-"""Ratios of length units that are mistaken for each other; a scale that is one of them by 5 % is told so."""
 
 MIRRORED_RATIO = 0.2
 """Part of the misfit that a mirror image leaves where the known points are one."""
@@ -285,7 +284,7 @@ def _by_known_points(calibration: PlacesItsWorld, data: Dataset, middle: Floats)
     _refuse_line(xyz, "known points", list(data.points[rows]))
     extent, there_extent = (float(np.linalg.norm(at - at.mean(axis=0))) for at in (positions.xyz, xyz))
     if abs(there_extent / extent - 1) > MAX_EXTENT_ERROR:
-        raise _other_scale(there_extent / extent, unit)
+        raise other_scale(there_extent / extent)
     declared = bool((sd > 0).any())
     wrong: list[str] = []
     while True:
@@ -299,7 +298,7 @@ def _by_known_points(calibration: PlacesItsWorld, data: Dataset, middle: Floats)
         xyz, sd, rows = xyz[keep], sd[keep], rows[keep]
         positions = joint_of_rows(measured, rows, short=False)
     if abs(found.scale - 1) > max(MAX_SCALE_ERROR, MAX_SCALE_SDS * found.scale_sd):
-        raise _other_scale(found.scale, unit)
+        raise other_scale(found.scale)
     n = len(xyz)
     stated = sd**2 + found.untold**2
     turn = found.new_from_old.rotation
@@ -335,7 +334,7 @@ def _notes(found: Aligned, wrong: list[str], measured: Measurement, unit: str) -
     off = (found.scale - 1) / found.scale_sd
     if abs(off) > MAX_SCALE_SDS:
         notes.append(
-            f"The known points are {100 * (found.scale - 1):+.2g} % as far apart as the wand says, "
+            f"The known points are {100 * found.scale:.4g} % as far apart as the wand says, "
             f"{abs(off):.1f} standard deviations: is the wand's length right? Distances are those of the wand."
         )
     if found.untold == 0 and chdtrc(found.freedom, found.chi2) < MAX_CHANCE_PROBABILITY:
@@ -373,18 +372,6 @@ def _wrong_point(positions: JointPositions, xyz: Floats, sd: Floats, middle: Flo
     best = int(np.argmin([one.chi2 for one in left]))
     good = chdtrc(left[best].freedom, left[best].chi2) > MAX_CHANCE_PROBABILITY
     return int(worst[best]) if good or left[best].chi2 < raw.chi2 / 10 else None
-
-
-def _other_scale(ratio: float, unit: str) -> FitError:
-    apart = [factor for factor in UNITS_APART if abs(ratio / factor - 1) < 0.05]
-    return FitError(
-        f"the known points are {ratio:.4g} times as far apart as the wand says.",
-        why=f"they, or the length of the wand, are not in {unit}: the ratio is that of two length units" if apart
-        else "the length of the wand, or the known positions, are wrong",
-        fix="state the length unit of the known points (length_unit in dataset.toml, --unit)" if apart
-        else f"measure the wand again: with these points it would be {ratio:.4g} times as long; check names and "
-        "positions",
-    )  # fmt: skip
 
 
 def _refuse_mirror(measured: Floats, xyz: Floats) -> None:

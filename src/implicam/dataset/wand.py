@@ -13,6 +13,7 @@ to frame, by flex and by what a detector takes for the middle of a marker. Other
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -125,6 +126,63 @@ def marker_rows(data: Dataset, ends: tuple[str, ...]) -> tuple[list[str], NDArra
         place[ends.index(marker)] = row
     rows = [*at.values(), *([row, -1] for row in single)]
     return [*at, *(frames[row] for row in single)], np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+
+STILL_PX, STILL_SHARE = 1.0, 0.7
+"""A marker lies still where this share of its views are within so many pixels (of an image of 1280) of those of a frame
+before."""
+
+
+def lying_still(data: Dataset, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Frames in which nothing moved since one before: the same place seen again, with the same errors of detector and
+    lens.
+
+    Args:
+        data: Markers in frames.
+        rows: (F, 2) as of `marker_rows`.
+
+    Returns:
+        (F,) number of the first frame at that place, its own where it is that.
+    """
+    uv = data.observations.uv
+    half = np.array([max(c.width or 1280, c.height or 0) / 2 for c in data.cameras]) / 640
+    markers = data.further_columns()[MARKER]
+    first, last = np.arange(len(rows)), dict[str, int]()
+    for f, pair in enumerate(rows.tolist()):
+        key = str(markers[pair[0]]) if pair[0] >= 0 and pair[1] < 0 else ""
+        single = key != "" and key in last and (rows[last[key]] >= 0).sum() == 1
+        before = last.get(key) if key == "" or single else None
+        if before is not None:
+            both = [(a, b) for a, b in zip(rows[before].tolist(), pair, strict=True) if a >= 0 and b >= 0]
+            off = (
+                np.concatenate([np.linalg.norm(uv[a] - uv[b], axis=1) / half for a, b in both]) if both else np.zeros(0)
+            )
+            off = off[np.isfinite(off)]
+            if len(off) >= 2 and np.mean(off <= STILL_PX) >= STILL_SHARE:
+                first[f] = before
+                continue
+        last[key] = f
+    return first
+
+
+def each_place_once(data: Dataset, rows: NDArray[np.int64], first: NDArray[np.int64]) -> Dataset:
+    """The markers with the middle of the pixels of all frames in which they lay still, at the first of these.
+
+    Args:
+        data: Markers in frames.
+        rows: (F, 2) as of `marker_rows`.
+        first: (F,) as of `lying_still`.
+    """
+    uv = data.observations.uv.copy()
+    for f in np.flatnonzero(np.bincount(first, minlength=len(rows)) > 1):
+        for end in (0, 1):
+            mine = rows[first == f, end]
+            mine = mine[mine >= 0]
+            if rows[f, end] < 0 or not len(mine):
+                continue
+            seen = np.isfinite(data.observations.uv[mine, :, 0]).any(axis=0) & np.isfinite(uv[rows[f, end], :, 0])
+            uv[rows[f, end], seen] = np.nanmedian(data.observations.uv[mine][:, seen], axis=0)
+    return replace(data, observations=replace(data.observations, uv=uv))
 
 
 def _error(why: str) -> DatasetError:

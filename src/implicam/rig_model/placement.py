@@ -11,10 +11,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from implicam.errors import FitError
 from implicam.geometry import Floats, Pose, cross_matrices, vector_from_rotation
 from implicam.gp.linalg import covariance_root
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.training_data import Frame
+
+MAX_EXTENT_ERROR = 0.1
+"""By which part the extent of known points may be off before anything else is looked at: it is no world."""
+
+MAX_SCALE_SDS, MAX_SCALE_ERROR = 4.0, 0.02
+"""By how many standard deviations a scale may be off before that is told, and by which part before it is no world."""
+
+UNITS_APART = (1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3, 25.4, 1 / 25.4, 304.8, 1 / 304.8, 0.3048, 1 / 0.3048)
+"""Ratios of length units that are mistaken for each other; a scale that is one of them by 5 % is told so."""
+
+
+def other_scale(ratio: float) -> FitError:
+    """What to say where known points and a wand are of another scale.
+
+    Args:
+        ratio: Of known over measured distances.
+    """
+    if any(abs(ratio / factor - 1) < 0.05 for factor in UNITS_APART):
+        why = "they and the length of the wand are not in one unit: the ratio is that of two length units"
+        fix = "state the length unit of the known points (length_unit in dataset.toml, --unit), the wand's in the same"
+    else:
+        why = "the length of the wand, or the known positions, are wrong"
+        fix = f"measure the wand: with these points it would be {ratio:.4g} times as long; check names and positions"
+    return FitError(f"the known points are {ratio:.4g} times as far apart as the wand says.", why=why, fix=fix)
 
 
 @dataclass(frozen=True, eq=False)

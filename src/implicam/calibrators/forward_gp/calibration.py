@@ -20,6 +20,7 @@ from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
 from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings, Training
 from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, find_faults, fit_to_wand
+from implicam.calibrators.forward_gp.wand.fitted import stated_again
 from implicam.calibrators.forward_gp.wand.gauge import cameras_move_with_the_world
 from implicam.calibrators.forward_gp.wand.held_out import hold_lengths_out
 from implicam.calibrators.protocol import (
@@ -70,7 +71,8 @@ class ForwardGP(CalibratorBase):
     wand: the distance between two markers that were waved at places nobody knows (the columns `frame` and `marker` say
     which they are), in the dataset's unit; wand_sd: its standard uncertainty, one error for all frames; wand_jitter:
     how much it varies from frame to frame; wand_ends: the names of the two, where there are others: single points.
-    What [target] of the dataset says of a wand holds where these are not given. Cameras are ordinary ones then (`lens`
+    known: known points that the same cameras saw: they say where the world is, and more. What [target] of the dataset
+    says of a wand holds where these are not given. Cameras are ordinary ones then (`lens`
     does not count). docs/wand.md.
 
     seed changes nothing: no part of this method is left to chance. settings: all priors and thresholds; a calibration
@@ -89,6 +91,9 @@ class ForwardGP(CalibratorBase):
     wand_sd: float = field(default=0.0, metadata=option("standard uncertainty of that length", "LENGTH"))
     wand_jitter: float = field(default=0.0, metadata=option("sd of the length from frame to frame", "LENGTH"))
     wand_ends: str = field(default="", metadata=option("the wand's two markers, if there are others", "A,B"))
+    known: Dataset | None = field(
+        default=None, metadata=option("known points, adjusted together with a wand", "DATASET", is_dataset=True)
+    )
     seed: int = 0
     settings: ForwardGPSettings = DEFAULT_SETTINGS
 
@@ -152,8 +157,13 @@ class ForwardGP(CalibratorBase):
             wand = self._wand(data)
             if wand is not None:
                 with solvable(), blas_threads(1):
-                    kept, frame, fitted, waved = fit_to_wand(data, wand, self.settings, progress)
+                    kept, frame, fitted, waved = fit_to_wand(data, wand, self.settings, progress, self.known)
                 return ForwardGPCalibration(self, kept, frame, fitted, waved=waved)
+            if self.known is not None:
+                raise UsageError(
+                    "known points apart are for a wand, and there is none.",
+                    fix="state its length (--wand 500), or give the known points as the dataset",
+                )
             return self._fit(data, progress)
 
     def _fit(
@@ -308,7 +318,7 @@ class ForwardGPCalibration(RigCalibration):
     @property
     def free_world(self) -> bool:
         """Whether its data do not say where the world is."""
-        return self.waved is not None
+        return self.waved is not None and not self.waved.known
 
     def in_world(self, placement: Placement, told: tuple[str, ...] = ()) -> ForwardGPCalibration:
         """The same calibration, which measures in another world. `set_world` finds where it is.
@@ -516,7 +526,7 @@ class ForwardGPCalibration(RigCalibration):
             KeyError, ValueError, TypeError: Something is missing or does not fit.
         """
         before_wands = {name: getattr(ForwardGP, name) for name in ("wand", "wand_sd", "wand_jitter", "wand_ends")}
-        calibrator = ForwardGP.from_table({**before_wands, **table})
+        calibrator = ForwardGP.from_table({**before_wands, **table}, known=stated_again(data))
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = remove_copies(data)
         fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, calibrator.settings)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.calibrators.forward_gp.wand.bundle import Bundle, FrameEquations, Lengths
-from implicam.calibrators.forward_gp.wand.gauge import posterior_in_gauge
+from implicam.calibrators.forward_gp.wand.gauge import posterior_in_gauge, posterior_of
+from implicam.calibrators.forward_gp.wand.known import (
+    MIN_KNOWN,
+    NOTHING_KNOWN,
+    Facts,
+    KnownPlaces,
+    known_that_agree,
+    lay_known_over,
+    refuse_contradicting_known,
+)
 from implicam.calibrators.forward_gp.wand.sizes import add_priors, estimate_sizes, size_fields, white_models
 from implicam.calibrators.forward_gp.wand.start import (
     MIN_LENGTH_SHARE,
@@ -81,6 +90,9 @@ class WandFit:
         lengths: (F,) of which frames the length is used.
         places: (2 F, 3) in the working frame, NaN where unknown.
         checked: (2 F,) which places say where the world is: those that something checks.
+        known: (k,) which known positions are used: then the working frame has the axes of their world.
+        offset: (3,) of the working frame in that world, in units of the wand's length.
+        known_scale: Ratio of known distances over those by the wand alone, and its sd.
         hyper: Lengthscales, signal, noise.
         scale: Of the working frame.
         length_errors: (k,) of the frames whose length is used: wand as measured from its views alone, less its length;
@@ -98,6 +110,9 @@ class WandFit:
     scale: float
     length_errors: Floats
     length_sds: Floats
+    known: Bools
+    offset: Floats
+    known_scale: tuple[float, float]
 
 
 def fit_wand(waves: Waves, settings: ForwardGPSettings, length_sd: float, progress: Progress) -> WandFit:
@@ -136,7 +151,7 @@ def _from_start(
     waves: Waves, started: Started, settings: ForwardGPSettings, length_sd: float, progress: Progress
 ) -> WandFit:
     progress("adjusting", 1, 3)
-    state = _adjusted(waves, started, settings)
+    state = _adjusted(waves, started, settings, length_sd)
     progress("fitting", 2, 3)
     state = _with_fields(state, settings)
     progress("fitting", 3, 3)
@@ -146,7 +161,8 @@ def _from_start(
 @dataclass(frozen=True, eq=False)
 class _State:
     """cameras: numbers; models; places (F, 2, 3) in the working frame, whose unit is `scale`; known (2 F,) places with
-    two views or more in use; used (2 F, C of all); lengths (F,) in use."""
+    two views or more in use; used (2 F, C of all); lengths (F,) in use; anchors: known positions in the working frame,
+    anchored (k,) those in use; growth: of all lengths, with its sd; offset: of the working frame."""
 
     waves: Waves
     cameras: tuple[int, ...]
@@ -155,6 +171,12 @@ class _State:
     used: Bools
     lengths: Bools
     scale: float
+    anchors: KnownPlaces = NOTHING_KNOWN
+    anchored: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    growth: float = 0.0
+    growth_sd: float = 0.0
+    offset: Floats = field(default_factory=lambda: np.zeros(3))
+    known_scale: tuple[float, float] = (1.0, 0.0)
     hyper: Hyperparameters | None = None
     equations: FrameEquations | None = None
     root: Floats | None = None
@@ -178,6 +200,12 @@ class _State:
         """The lengths in use."""
         return self.lengths_of(np.flatnonzero(self.lengths & self.known.reshape(-1, 2).all(axis=1)))
 
+    @property
+    def facts(self) -> Facts:
+        """Lengths and known places in use."""
+        known = self.anchors.select(self.anchored & self.known[self.anchors.rows])
+        return Facts(self.length_rows, known, self.growth, self.growth_sd)
+
     def lengths_of(self, frames: NDArray[np.int64]) -> Lengths:
         """The wand in some frames.
 
@@ -187,8 +215,17 @@ class _State:
         sd = np.full(len(frames), self.waves.jitter / self.scale)
         return Lengths(frames, self.waves.length / self.scale, sd)
 
+    def grown_lengths_of(self, frames: NDArray[np.int64]) -> Lengths:
+        """The same, as long as the known places say.
 
-def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings) -> _State:
+        Args:
+            frames: Their numbers.
+        """
+        lengths = self.lengths_of(frames)
+        return lengths._replace(length=lengths.length * (1 + self.growth))
+
+
+def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings, length_sd: float) -> _State:
     """Lenses alone, robustly; then again with what agrees."""
     cameras, near = started.cameras, 6.0
     numbers = tuple(sorted(cameras))
@@ -221,7 +258,12 @@ def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings) -> _S
     agree &= known[:, None]
     middle = at[known].mean(axis=0)
     scale = float(np.sqrt(np.mean((at[known] - middle) ** 2)))
-    turn = cameras[numbers[0]].pose.rotation
+    turn, offset, anchors, laid = cameras[numbers[0]].pose.rotation, np.zeros(3), waves.known, None
+    if len(waves.known.rows):
+        laid = lay_known_over(waves.known, np.where(known[:, None], at, np.nan), length_sd)
+        here = laid.here_from_world
+        turn, offset = here.rotation.T, here.inverse().apply(middle)
+        anchors = waves.known.moved(Pose(np.eye(3), -offset), scale)
     working = np.where(known[:, None], (at - middle) @ turn.T / scale, 0.0).reshape(-1, 2, 3)
     models = []
     for c in numbers:
@@ -234,10 +276,17 @@ def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings) -> _S
     # seen by cameras of any kind alone, the world may be stretched: there lengths are needed from the start
     odd = any(isinstance(camera, GeneralCamera) for camera in cameras.values())
     lengths = _likely_lengths(waves, at, known) if odd else np.zeros(waves.frames, dtype=np.bool_)
-    state = _State(waves, numbers, tuple(models), working, agree, lengths, scale)
+    unused = np.zeros(len(anchors.rows), dtype=np.bool_)
+    state = _State(
+        waves, numbers, tuple(models), working, agree, lengths, scale, anchors, unused, offset=offset
+    )  # fmt: skip
     # a wrong marker and a stiff length would pull everything: lengths are first judged by the views alone
     state = _judged(_relocated(state), settings)
-    return _judged(_solved(state, fields=False), settings)
+    state = _judged(_solved(state, fields=False), settings)
+    # so do known places, before the cameras have come to rest
+    if laid is None:
+        return state
+    return replace(state, anchored=laid.fits, growth_sd=length_sd, known_scale=(laid.ratio, laid.ratio_sd))
 
 
 def _freed(
@@ -319,7 +368,7 @@ def _with_fields(state: _State, settings: ForwardGPSettings) -> _State:
     for number in range(MAX_ROUNDS):
         stated = state.waves.stated[list(state.cameras)]
         hyper = estimate_sizes(
-            state.models, state.places, state.seen, state.length_rows, stated, settings, state.hyper, search=search
+            state.models, state.places, state.seen, state.facts, stated, settings, state.hyper, search=search
         )
         sized = size_fields(
             state.models, state.places.reshape(-1, 3), state.seen, hyper, settings.typical_log_distance_sd
@@ -340,9 +389,9 @@ def _with_fields(state: _State, settings: ForwardGPSettings) -> _State:
 
 def _solved(state: _State, *, fields: bool) -> _State:
     """Gauss-Newton for cameras and places, exact for the fields."""
-    models, places = state.models, state.places
+    models, places, growth = state.models, state.places, state.growth
     for number in range(MAX_GAUSS_NEWTON_STEPS):
-        equations = _equations(replace(state, models=models, places=places))
+        equations = _equations(replace(state, models=models, places=places, growth=growth))
         L, G, g = equations.halved()
         S = equations.A - G.T @ G
         if not (np.diag(S) > 0).all():
@@ -350,23 +399,24 @@ def _solved(state: _State, *, fields: bool) -> _State:
         root, mean, _ = solve_normal(S, equations.b - G.T @ g)
         back = (g - G @ mean).reshape(-1, 6, 1)
         step = np.linalg.solve(L.swapaxes(1, 2), back)[..., 0].reshape(-1, 2, 3)
-        means = np.split(mean, np.cumsum([model.size for model in models])[:-1])
-        sd = np.split(np.sqrt(np.sum(root**2, axis=0)), np.cumsum([model.size for model in models])[:-1])
+        growth += float(mean[-1]) if state.facts.grows else 0.0
+        ends = np.cumsum([model.size for model in models])
+        means = np.split(mean[: ends[-1]], ends[:-1])
+        sd = np.split(np.sqrt(np.sum(root**2, axis=0))[: ends[-1]], ends[:-1])
         models = move_to_mean(models, means)
         places = places + np.where(state.known.reshape(-1, 2)[..., None], np.clip(step, *LARGEST_STEP_WF), 0.0)
         small = all(np.all(np.abs(mean[:14]) <= 0.05 * sd[:14]) for mean, sd in zip(means, sd, strict=True))
         if small or (number > 2 and not fields):
             break
     # a stiff length bends the way of a place: how far it fits is known when the places have come to rest
-    return _relocated(replace(state, models=models, places=places, root=root))
+    return _relocated(replace(state, models=models, places=places, growth=growth, root=root))
 
 
 def _equations(state: _State, *, with_fields: bool = False) -> FrameEquations:
     """Those of all views and lengths in use, with the priors; with_fields as of `white_models`."""
-    flat, lengths = state.places.reshape(-1, 3), state.length_rows
-    white = white_models(state.models, flat, state.seen, with_fields=with_fields)
-    found = FrameEquations.of(white, len(state.places), (lengths.frames, *lengths.linear(state.places)))
-    add_priors(found, state.models, fields=True)
+    white = white_models(state.models, state.places.reshape(-1, 3), state.seen, with_fields=with_fields)
+    found = state.facts.equations(white, state.places)
+    add_priors(found, state.models, fields=True, held=not len(state.facts.known.rows))
     return found
 
 
@@ -398,14 +448,27 @@ def _judged(state: _State, settings: ForwardGPSettings) -> _State:
     wrong = np.repeat(state.waves.ends & ~lengths, 2)
     used[wrong & (used.sum(axis=1) <= 2)] = False
     used[used.sum(axis=1) < 2] = False
-    return _without_poor_cameras(replace(state, used=used, lengths=lengths))
+    anchored = state.anchored
+    if len(anchored) and state.hyper is not None:  # before fields, cameras are off by more than known places
+        there = state.known[state.anchors.rows]
+        whole = _whole_covariance(state, spread, state.anchors.rows // 2)
+        agree = known_that_agree(state.anchors, state.places, whole, anchored & there, limit)
+        # of three nothing tells which is wrong
+        anchored = there & agree if (there & agree).sum() >= MIN_KNOWN else anchored
+    return _without_poor_cameras(replace(state, used=used, lengths=lengths, anchored=anchored))
+
+
+def _whole_covariance(state: _State, spread: Floats, frames: NDArray[np.int64]) -> Floats:
+    """(k, 6, 6) of the places of some frames, with what is unknown of the cameras."""
+    follow = spread[frames] @ _known(state.equations).G[frames] @ _known(state.root).T
+    return np.asarray(spread[frames] + follow @ follow.swapaxes(1, 2), dtype=np.float64)
 
 
 def _lengths_that_agree(state: _State, spread: Floats, limit: float) -> Bools:
     """(F,) frames of the wand whose length agrees with what the cameras saw, or that have none."""
     whole = np.flatnonzero(state.known.reshape(-1, 2).all(axis=1) & state.waves.ends)
     used = state.length_rows
-    off, slope = state.lengths_of(whole).linear(state.places)
+    off, slope = state.grown_lengths_of(whole).linear(state.places)
     leverage = np.einsum("ki,kij,kj->k", slope, spread[whole], slope)
     left = np.where(np.isin(whole, used.frames), np.maximum(1 - leverage, 1e-9), 1 + leverage)
     agree = state.waves.ends.copy()
@@ -465,9 +528,15 @@ def _finished(state: _State, settings: ForwardGPSettings, length_sd: float) -> W
             fix="wave the wand longer where two cameras or more see both its markers",
         )
     _refuse_contradicted(state, whole)
-    posterior = posterior_in_gauge(state.models, state.places, checked, equations, root, length_sd)
+    refuse_contradicting_known(state.anchors, state.places, state.anchored & state.known[state.anchors.rows])
+    anchors = state.facts.known
+    checked[anchors.rows] = True
+    if len(anchors.rows):
+        posterior = posterior_of(state.models, equations, root)
+    else:
+        posterior = posterior_in_gauge(state.models, state.places, checked, equations, root, length_sd)
     lengths = state.length_rows
-    off, slope = lengths.linear(state.places)
+    off, slope = state.grown_lengths_of(lengths.frames).linear(state.places)
     leverage = np.einsum("ki,kij,kj->k", slope, _frame_covariance(equations)[lengths.frames], slope)
     left, unit = np.maximum(1 - leverage, 1e-6), state.scale * lengths.sd
     places = np.where(known[:, None], state.places.reshape(-1, 3), np.nan)
@@ -484,6 +553,9 @@ def _finished(state: _State, settings: ForwardGPSettings, length_sd: float) -> W
         state.scale,
         -off / left * unit,
         unit * np.sqrt(leverage / left),
+        state.anchored & state.known[state.anchors.rows],
+        state.offset,
+        state.known_scale,
     )
 
 

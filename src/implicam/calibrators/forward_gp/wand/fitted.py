@@ -12,19 +12,23 @@ from numpy.typing import NDArray
 
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.calibrators.forward_gp.wand.fit import WandFit, fit_wand
+from implicam.calibrators.forward_gp.wand.known import LEAST_SD, KnownPlaces
 from implicam.calibrators.forward_gp.wand.waves import Waves
 from implicam.calibrators.protocol import Arrays, finite_column
-from implicam.dataset import Dataset, KnownPositions
+from implicam.dataset import Dataset, KnownPositions, Observations
+from implicam.dataset.requirements import match_cameras
 from implicam.dataset.unused import Rejected, Unused
-from implicam.dataset.wand import Wand, marker_rows
-from implicam.errors import UsageError
+from implicam.dataset.wand import FRAME, MARKER, Wand, each_place_once, lying_still, marker_rows
+from implicam.errors import DatasetError, UsageError
 from implicam.geometry import Floats
 from implicam.progress import Progress
 from implicam.rig_model import MAX_NAMED_IN_NOTE, Diagnosis, FitResult, Frame, image_of, stated_noise
+from implicam.rig_model.placement import MAX_SCALE_SDS
 from implicam.rig_model.training_data import camera_views_of
 
 UNCHECKED = "two views meet there, and no third one and no length checks it"
 CONTRADICTED = "its views contradict each other, or the length of the wand"
+STILL = "it lay still since a frame before: one place counts once"
 TOO_FEW = "fewer than two calibrated cameras saw it"
 
 
@@ -39,6 +43,9 @@ class Waved:
         sds: (k,) of these.
         rejected_lengths: Names of the frames whose length contradicts what the cameras saw.
         unused: Points that are not among the known ones of the calibration.
+        known: Names of the known positions that were used together with the wand.
+        known_rejected: Of those that contradict the wand, or the others.
+        known_scale: Ratio of the distances of the known positions over those that the wand alone gives, and its sd.
     """
 
     wand: Wand
@@ -46,6 +53,9 @@ class Waved:
     sds: Floats
     rejected_lengths: tuple[str, ...]
     unused: tuple[Unused, ...]
+    known: tuple[str, ...] = ()
+    known_rejected: tuple[str, ...] = ()
+    known_scale: tuple[float, float] = (1.0, 0.0)
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """A readable table, and arrays, of a calibration file."""
@@ -54,6 +64,9 @@ class Waved:
             "rejected_lengths": list(self.rejected_lengths),
             "unused": [[one.point, one.reason] for one in self.unused],
         }
+        if self.known:
+            table |= {"known": list(self.known), "known_rejected": list(self.known_rejected)}
+            table["known_scale"] = list(self.known_scale)
         return {"waved": table}, {"waved/errors": self.errors, "waved/sds": self.sds}
 
     @classmethod
@@ -73,7 +86,7 @@ class Waved:
         if "waved" not in table:
             return None
         own = table["waved"]
-        k = len(arrays["waved/errors"])
+        k, scale = len(arrays["waved/errors"]), own.get("known_scale", (1.0, 0.0))
         wand = Wand(
             tuple(map(str, own.get("ends", ()))), *(float(own.get(n, 0)) for n in ("length", "length_sd", "jitter"))
         )
@@ -85,11 +98,14 @@ class Waved:
             finite_column(arrays, "waved/sds", (k,), positive=True),
             tuple(map(str, own["rejected_lengths"])),
             tuple(Unused(str(point), str(reason)) for point, reason in own["unused"]),
+            tuple(map(str, own.get("known", ()))),
+            tuple(map(str, own.get("known_rejected", ()))),
+            (float(scale[0]), float(scale[1])),
         )
 
 
 def fit_to_wand(
-    data: Dataset, wand: Wand, settings: ForwardGPSettings, progress: Progress
+    data: Dataset, wand: Wand, settings: ForwardGPSettings, progress: Progress, stated: Dataset | None = None
 ) -> tuple[Dataset, Frame, FitResult, Waved]:
     """Cameras from a wand.
 
@@ -98,6 +114,7 @@ def fit_to_wand(
         wand: What is known of it.
         settings: Priors and thresholds.
         progress: Is told how far the fit is.
+        stated: Known positions, which say where the world is and more.
 
     Returns:
         The markers with the positions that the fit gives them, as far as something checks these; the working frame; the
@@ -116,15 +133,25 @@ def fit_to_wand(
         )
     if data.known is not None:
         raise UsageError(
-            "a wand and known positions cannot be used together yet.",
-            fix="leave out --wand to calibrate from the known positions, or points.csv to calibrate from the wand",
+            "the positions of a wand's markers are not known.",
+            why=f"dataset {data.name!r} has known positions for all its points",
+            fix="leave out --wand to calibrate from the known positions; or give the wand as DATASET and the known "
+            "points apart: --known OTHER",
         )
     names, rows = marker_rows(data, wand.ends)
+    first = lying_still(data, rows)
+    own = first == np.arange(len(rows))
+    data, again = each_place_once(data, rows, first), rows[~own]
+    names, rows = [name for name, one in zip(names, own.tolist(), strict=True) if one], rows[own]
+    if stated is not None:
+        data, names, rows = with_stated_positions(data, names, rows, stated)
     jitter = wand.jitter or settings.usual_wand_jitter_ratio * wand.length
     waves = _waves(data, rows, jitter / wand.length)
+    if stated is not None:
+        waves = replace(waves, known=_known_places(data, rows, wand.length))
     found = fit_wand(waves, settings, wand.length_sd / wand.length, progress)
     scale = found.scale * wand.length
-    frame = Frame(np.zeros(3), scale)
+    frame = Frame(found.offset * wand.length, scale)
     flat = rows.ravel()
     placed = np.flatnonzero(found.checked & (flat >= 0))
     placed = placed[np.argsort(flat[placed])]
@@ -142,13 +169,95 @@ def fit_to_wand(
     unused = tuple(
         Unused(str(data.points[flat[i]]), _why(found, i, waves))
         for i in np.flatnonzero(~found.checked & (flat >= 0)).tolist()
-    )
+    ) + tuple(Unused(str(data.points[i]), STILL) for i in again[again >= 0].tolist())
     wrong = waves.ends & ~found.lengths & np.isfinite(found.places[:, 0]).reshape(-1, 2).all(axis=1)
+    stated_names = [
+        tuple(str(data.points[flat[i]]) for i in waves.known.rows[one]) for one in (found.known, ~found.known)
+    ]
     waved = Waved(
         wand._replace(jitter=jitter), found.length_errors * wand.length, found.length_sds * wand.length,
         tuple(names[i] for i in np.flatnonzero(wrong)), unused,
+        stated_names[0], stated_names[1],
+        found.known_scale,
     )  # fmt: skip
     return kept, frame, fitted, waved
+
+
+STATED = ("stated_x", "stated_y", "stated_z", "stated_sd_x", "stated_sd_y", "stated_sd_z")
+"""Columns of points: the positions that were known beside a wand, and their standard uncertainties."""
+
+
+def with_stated_positions(
+    data: Dataset, names: list[str], rows: NDArray[np.int64], stated: Dataset
+) -> tuple[Dataset, list[str], NDArray[np.int64]]:
+    """The markers of a wand, and after them known points as single ones.
+
+    Args:
+        data: Markers in frames.
+        names: (F,) of the frames.
+        rows: (F, 2) as of `marker_rows`.
+        stated: Known positions.
+
+    Returns:
+        Data, names and rows of both.
+
+    Raises:
+        DatasetError: A name is in both, no camera is, or there are no positions.
+    """
+    known = stated.in_unit(data.length_unit) if stated.length_unit != data.length_unit else stated
+    positions, cameras = known.positions, data.observations.camera_names
+    shared = [name for name in cameras if name in known.observations.camera_names]
+    match_cameras(data.observations.with_cameras(shared) if shared else data.observations, known.observations)
+    twice = sorted(set(map(str, data.points)) & set(map(str, known.points)))
+    if twice:
+        raise DatasetError(
+            f"point {twice[0]!r} is in both datasets, {data.name!r} and {known.name!r}.", fix="rename it in one of them"
+        )
+    mine, theirs = data.observations, known.observations
+    uv, sd = np.full((2, len(known), len(cameras), 2), np.nan)
+    for c, name in enumerate(cameras):
+        if name in shared:
+            at = theirs.camera_names.index(name)
+            uv[:, c], sd[:, c] = theirs.uv[:, at], theirs.sd[:, at]
+    points = np.concatenate([data.points, known.points])
+    observations = Observations(
+        points, mine.cameras, np.concatenate([mine.uv, uv]), np.concatenate([mine.sd, sd]), {}
+    )  # fmt: skip
+    columns = {name: np.concatenate([column, np.full(len(known), "")]) for name, column in data.columns.items()}
+    columns[FRAME] = np.concatenate([data.further_columns()[FRAME], known.points])
+    columns[MARKER] = np.concatenate([data.further_columns()[MARKER], known.points])
+    numbers = np.concatenate([positions.xyz, np.nan_to_num(positions.sd)], axis=1)
+    for name, column in zip(STATED, numbers.T, strict=True):
+        columns[name] = np.concatenate([np.full(len(data), ""), np.array([repr(float(v)) for v in column])])
+    more = np.column_stack([len(data) + np.arange(len(known)), np.full(len(known), -1)])
+    both = replace(data, observations=observations, columns=columns)
+    return both, [*names, *map(str, known.points)], np.concatenate([rows, more])
+
+
+def _known_places(data: Dataset, rows: NDArray[np.int64], length: float) -> KnownPlaces:
+    """Those of the points with stated positions, in units of the wand's length."""
+    flat = rows.ravel()
+    places = np.flatnonzero((flat >= 0) & (data.columns[STATED[0]][flat] != ""))
+    numbers = np.column_stack([data.columns[name][flat[places]].astype(np.float64) for name in STATED]) / length
+    return KnownPlaces(places, numbers[:, :3], np.maximum(numbers[:, 3:], LEAST_SD))
+
+
+def stated_again(data: Dataset) -> Dataset | None:
+    """The known positions that a calibration from a wand was made with, out of its own data.
+
+    Args:
+        data: Of the calibration.
+
+    Returns:
+        None where there were none.
+    """
+    extra = {} if data.known is None else data.known.extra
+    if STATED[0] not in extra:
+        return None
+    rows = np.flatnonzero(extra[STATED[0]] != "")
+    numbers = np.column_stack([extra[name][rows].astype(np.float64) for name in STATED])
+    known = KnownPositions(data.points[rows], numbers[:, :3], numbers[:, 3:])
+    return replace(data, observations=data.observations.select(rows), known=known, columns={})
 
 
 def _waves(data: Dataset, rows: NDArray[np.int64], jitter: float) -> Waves:
@@ -158,7 +267,9 @@ def _waves(data: Dataset, rows: NDArray[np.int64], jitter: float) -> Waves:
     place = np.full(len(data), -1, dtype=np.int64)
     flat = rows.ravel()
     place[flat[flat >= 0]] = np.flatnonzero(flat >= 0)
-    seen = tuple(views._replace(rows=place[views.rows]) for views in camera_views_of(observations, stated))
+    every = camera_views_of(observations, stated)
+    used = (views.select(place[views.rows] >= 0) for views in every)  # not frames in which the wand lay still
+    seen = tuple(views._replace(rows=place[views.rows]) for views in used)
     images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
     return Waves(rows, seen, images, stated, 1.0, jitter, np.asarray((rows >= 0).all(axis=1)))
 
@@ -199,6 +310,8 @@ class WandDiagnosis(Diagnosis):
 
     def notes(self) -> list[str]:
         """Where the world is; cameras that could not be calibrated; views and lengths that contradict the others."""
+        if self.waved.known:
+            return [self._known_note(), *super().notes(), *self._length_notes()]
         first = self.data.observations.camera_names[self.fitted.cameras[0]]
         own = (
             "The world is the wand's: its origin is the middle of all places where the wand was, its axes are those "
@@ -206,6 +319,19 @@ class WandDiagnosis(Diagnosis):
             "implicam world says where it is instead, from an L-frame, known points, a floor or a plumb line."
         )
         return [*(self.world or (own,)), *super().notes(), *self._length_notes()]
+
+    def _known_note(self) -> str:
+        wrong = self.waved.known_rejected
+        count = len(self.waved.known)
+        text = f"The world is that of {count} known points, which were adjusted together with the wand."
+        text += f" Not used, because they contradict the others: {', '.join(wrong)}." if wrong else ""
+        ratio, sd = self.waved.known_scale
+        if abs(ratio - 1) > MAX_SCALE_SDS * sd:
+            text += (
+                f" They are {100 * ratio:.4g} % as far apart as the wand alone says, {abs(ratio - 1) / sd:.1f} "
+                "standard deviations: is its length right? State how exact it is (--wand-sd)."
+            )
+        return text
 
     def _length_notes(self) -> list[str]:
         notes = []

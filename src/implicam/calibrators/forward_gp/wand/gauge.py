@@ -63,8 +63,19 @@ def posterior_in_gauge(
     parts = [turned, (N @ lower).T]
     if length_sd > 0:
         parts.append(length_sd * cameras_grow_with_the_world(models, middle)[None])
-    joint = np.linalg.qr(np.concatenate(parts), mode="r")  # of as many rows as unknowns
+    return posterior_of(models, equations, np.concatenate(parts))
+
+
+def posterior_of(models: Sequence[CameraModel], equations: FrameEquations, root: Floats) -> Posterior:
+    """All cameras tied.
+
+    Args:
+        models: The cameras at the optimum.
+        equations: At the optimum, priors included.
+        root: (q, P or more) of the covariance of the cameras; unknowns beside theirs come last.
+    """
     starts = np.concatenate([[0], np.cumsum([model.size for model in models])])
+    joint = np.linalg.qr(root[:, : starts[-1]], mode="r")  # of as many rows as unknowns
     alone = []
     for c, (start, end) in enumerate(pairwise(starts)):
         own = equations.A[start:end, start:end]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from implicam.calibrators.forward_gp.wand.fitted import STATED
 from implicam.calibrators.protocol import LengthsHeldOut
 from implicam.dataset.wand import FRAME, MARKER, marker_rows
 from implicam.derived import distances
@@ -45,6 +46,8 @@ def hold_lengths_out(calibration: ForwardGPCalibration, progress: Progress) -> L
     assert calibration.waved is not None
     wand, data = calibration.waved.wand, calibration.data
     markers = replace(data, known=None, columns={name: data.positions.extra[name] for name in (FRAME, MARKER)})
+    if calibration.waved.known:
+        markers = markers.select(data.positions.extra[STATED[0]] == "")
     _, rows = marker_rows(markers, wand.ends)
     whole = np.flatnonzero((rows >= 0).all(axis=1))
     held = np.random.default_rng(0).permutation(whole)[: len(whole) // FOLDS]

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
-from implicam.calibrators.forward_gp.wand.bundle import FrameEquations, Lengths, WhiteRows
+from implicam.calibrators.forward_gp.wand.bundle import FrameEquations, WhiteRows
+from implicam.calibrators.forward_gp.wand.known import Facts
 from implicam.geometry import Floats
 from implicam.rig_model import CameraModel, CameraViews, Hyperparameters
 from implicam.rig_model.field import DepthScale, empty_field, field_coordinates
@@ -76,14 +77,17 @@ def white_models(
     return found
 
 
-def add_priors(equations: FrameEquations, models: Sequence[CameraModel], *, fields: bool) -> tuple[float, Floats]:
+def add_priors(
+    equations: FrameEquations, models: Sequence[CameraModel], *, fields: bool, held: bool
+) -> tuple[float, Floats]:
     """The priors of the lenses, and of the weights of the fields, into normal equations; and six numbers that say where
-    the world is: the pose of the first camera is held.
+    the world is, if no known place does: the pose of the first camera is held.
 
     Args:
         equations: Of these cameras; changed.
         models: The cameras.
         fields: Whether weights have their prior too.
+        held: Whether no known place says where the world is.
 
     Returns:
         Squares of the priors, and (P,) the precision that was added to each unknown of a lens.
@@ -101,8 +105,9 @@ def add_priors(equations: FrameEquations, models: Sequence[CameraModel], *, fiel
             index = np.arange(field.start, field.stop)
             equations.A[index, index] += 1.0
         start += model.size
-    pose = np.arange(models[0].camera.size - 6, models[0].camera.size)
-    equations.A[pose, pose] += 1e3 * equations.A[pose, pose]
+    if held:
+        pose = np.arange(models[0].camera.size - 6, models[0].camera.size)
+        equations.A[pose, pose] += 1e3 * equations.A[pose, pose]
     return squares, added
 
 
@@ -132,21 +137,18 @@ def size_fields(
     return tuple(sized)
 
 
-def evidence_of(
-    models: Sequence[CameraModel], places: Floats, seen: Sequence[CameraViews], lengths: Lengths
-) -> Evidence:
+def evidence_of(models: Sequence[CameraModel], places: Floats, seen: Sequence[CameraViews], facts: Facts) -> Evidence:
     """The evidence of the sizes of fields and noise, near those of the models.
 
     Args:
         models: The cameras where they are linearised, with fields.
         places: (F, 2, 3).
         seen: Per camera the views to use.
-        lengths: Those to use.
+        facts: Those to use.
     """
-    white = white_models(models, places.reshape(-1, 3), seen)
-    frames = len(places)
-    equations = FrameEquations.of(white, frames, (lengths.frames, *lengths.linear(places)))
-    squares, added = add_priors(equations, models, fields=False)
+    equations = facts.equations(white_models(models, places.reshape(-1, 3), seen), places)
+    held = not len(facts.known.rows)
+    squares, added = add_priors(equations, models, fields=False, held=held)
     _, G, g = equations.halved()
     S, b = equations.A - G.T @ G, equations.b - G.T @ g
     squares += equations.squares - float(g @ g)
@@ -155,6 +157,8 @@ def evidence_of(
     for model in models:
         lens[start : start + model.camera.size] = True
         start += model.size
+    if facts.grows:
+        lens[start], added[start] = True, facts.growth_sd**-2
     scale = 1 / np.sqrt(np.diag(S)[lens])
     L = np.linalg.cholesky(S[np.ix_(lens, lens)] * scale[:, None] * scale + 1e-12 * np.eye(len(scale)))
     half = np.linalg.solve(L, scale[:, None] * np.column_stack([S[np.ix_(lens, ~lens)], b[lens]]))
@@ -163,9 +167,10 @@ def evidence_of(
     squares -= float(half[:, -1] @ half[:, -1])
     e, V = np.linalg.eigh(M)
     good = e > MIN_EIGENVALUE_RATIO * e[-1]
-    told = float(np.sum(1 - np.minimum(added[lens] * np.sum(np.linalg.inv(L) ** 2, axis=0) * scale**2, 1))) - 6
+    told = float(np.sum(1 - np.minimum(added[lens] * np.sum(np.linalg.inv(L) ** 2, axis=0) * scale**2, 1)))
+    told -= 6 if held else 0
     unknown = 3 * len(np.unique(np.concatenate([views.rows for views in seen])))
-    degrees = 2 * sum(len(views.rows) for views in seen) + len(lengths.frames) - unknown - told
+    degrees = 2 * sum(len(views.rows) for views in seen) + facts.numbers - unknown - told
     return Evidence(e[good], V[:, good].T @ c, squares, max(degrees, 1.0))
 
 
@@ -173,7 +178,7 @@ def estimate_sizes(
     models: Sequence[CameraModel],
     places: Floats,
     seen: Sequence[CameraViews],
-    lengths: Lengths,
+    facts: Facts,
     stated: Floats,
     settings: ForwardGPSettings,
     before: Hyperparameters | None,
@@ -186,7 +191,7 @@ def estimate_sizes(
         models: The cameras, near their optimum.
         places: (F, 2, 3).
         seen: Per camera the views to use.
-        lengths: Those to use.
+        facts: Lengths and known places to use.
         stated: (C,) stated noise, NaN where none is.
         settings: Priors.
         before: Those of the last round; None in the first.
@@ -213,7 +218,7 @@ def estimate_sizes(
         inside = np.clip(log_lengthscale, least, most)
         hyper = Hyperparameters(np.tile(np.exp(inside), (len(models), 1)), usual_signal, noise)
         sized = size_fields(models, flat, seen, hyper, settings.typical_log_distance_sd)
-        evidence = evidence_of(sized, places, seen, lengths)
+        evidence = evidence_of(sized, places, seen, facts)
         base = float(np.mean(np.log(noise / usual)))
 
         def loss(z: Floats) -> float:

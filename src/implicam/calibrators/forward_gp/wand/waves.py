@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.forward_gp.wand.known import NOTHING_KNOWN, KnownPlaces
 from implicam.geometry import Bools, Floats
 from implicam.rig_model import CameraViews, Image
 
@@ -24,6 +25,7 @@ class Waves:
         length: Of the wand.
         jitter: Sd of the length of one frame about that of all: flex, and centres of markers.
         ends: (F,) whether the two markers are the wand's ends.
+        known: Places that are known, in a world of their own.
     """
 
     rows: NDArray[np.int64]
@@ -33,6 +35,7 @@ class Waves:
     length: float
     jitter: float
     ends: Bools
+    known: KnownPlaces = NOTHING_KNOWN
 
     @property
     def frames(self) -> int:
