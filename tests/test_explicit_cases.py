@@ -19,8 +19,16 @@ from implicam.calibrators.explicit.zhang import calibrate_camera
 from implicam.dataset import Camera, Dataset, KnownPositions, Observations, read_dataset
 from implicam.dataset.boards import corner_positions
 from implicam.errors import FitError
-from implicam.geometry import Pose, poses_from_rays, resect_any_pixels, rotation_from_vector, vector_from_rotation
+from implicam.geometry import (
+    Pose,
+    poses_from_rays,
+    register,
+    resect_any_pixels,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 from implicam.lenses import BrownConrady
+from implicam.simulate import build_rig, random_positions, simulate, simulate_boards
 
 CASES = Path(__file__).parent / "data" / "cases"
 SIZE = (1280, 720)
@@ -481,3 +489,22 @@ def test_real_boards_before_webcams_have_squares_of_their_size() -> None:
     off = np.array(off)[np.isfinite(off)]
     assert len(off) >= 900
     assert np.median(np.abs(off)) < 0.43
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [6, 12])
+def test_error_bars_hold_where_no_model_holds_the_lenses(count: int) -> None:
+    """Lenses off by 0.5 px, smoothly: the poses of boards follow, and the corners show 0.13 px of it."""
+    inside = []
+    for seed in range(4):
+        rig = build_rig("stereo", seed=seed, lens_error=0.5)
+        names = [camera.name for camera in rig.cameras]
+        calibration = Explicit(lens="brown-conrady").fit(simulate_boards(rig, [names] * count, seed=seed))
+        target = random_positions(rig, 300, np.random.default_rng(seed))
+        measured = calibration.measure(simulate(rig, target, seed=seed + 50).observations)
+        there = measured.measured
+        pose, _ = register(measured.xyz[there], target.xyz[there])
+        off = pose.apply(measured.xyz[there]) - target.xyz[there]
+        cov = pose.rotation @ measured.cov[there] @ pose.rotation.T
+        inside.append(np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off) < 7.815))
+    assert np.mean(inside) > 0.88  # 0.70 to 0.75 without

@@ -438,6 +438,22 @@ def root_with_slack(bundle: Bundle, root: Floats) -> Floats:
     return np.asarray(np.linalg.qr(both, mode="r"), dtype=np.float64)
 
 
+def slack_in_pixels(bundle: Bundle) -> Floats:
+    """How far slack moves the corners of a view, which residuals do not show: the poses of boards follow it.
+
+    Args:
+        bundle: With its slack.
+
+    Returns:
+        (cameras,) pixels along u or v, rms over the corners of all views.
+    """
+    plain, found = replace(bundle, slack=0.0), np.zeros(len(bundle.cameras))
+    for c, stack in enumerate(bundle.views.stacks):
+        squares = [np.sum(size**2) for _, size in _slacks(bundle, c, _whitened(plain, c, robust=False)[2])]
+        found[c] = bundle.noise[c] * np.sqrt(np.sum(squares) / max(2 * len(stack.uv), 1))
+    return found
+
+
 def unexplained(bundle: Bundle, c: int) -> Floats:
     """What the slack of a camera's boards does not explain of its residuals either.
 

@@ -22,6 +22,7 @@ from implicam.calibrators.explicit.adjust import (
     adjust,
     log_marginal_with_slack,
     root_with_slack,
+    slack_in_pixels,
     unexplained,
 )
 from implicam.calibrators.explicit.boards import BoardView
@@ -128,7 +129,8 @@ def loosened(found: Adjusted, progress: Progress = silent) -> Adjusted:
     """The same cameras with the covariance that they have if boards moved a little between the pictures of them.
 
     Errors that all corners of a view share, those of a lens that its model does not hold, too, are not errors of single
-    corners, which would cancel; the cameras stay as they are, since it is not known which it was.
+    corners, which would cancel; the cameras stay as they are, since it is not known which it was. The noise is raised
+    by as much: a point that is measured has such errors, and what is left at the corners does not show them.
 
     Args:
         found: An adjustment by plain least squares.
@@ -148,8 +150,9 @@ def loosened(found: Adjusted, progress: Progress = silent) -> Adjusted:
     for part in settings.unnoticed_moves_extents:
         trial = adjust(replace(bundle, slack=part * extent), robust=False, iterations=4).bundle
         if log_marginal_with_slack(trial) > before + settings.min_moved_gain_nats:
-            slack = _most_probable(trial, progress).slack
-            return found._replace(root=root_with_slack(replace(bundle, slack=slack), found.root))
+            moved = replace(bundle, slack=_most_probable(trial, progress).slack)
+            noise = np.hypot(bundle.noise, slack_in_pixels(moved))
+            return found._replace(bundle=replace(bundle, noise=noise), root=root_with_slack(moved, found.root))
     return found
 
 
