@@ -23,6 +23,7 @@ from implicam.dataset import read_dataset
 from implicam.detect.labelling import Labelling
 from implicam.detect.model import View
 from implicam.hardware import Person
+from implicam.session.board_session import BoardController
 from implicam.session.controller import SessionController
 from implicam.session.setup import Setup, open_session
 from implicam.viewer import bench_page
@@ -95,6 +96,28 @@ def acquire(folder: Path) -> None:
         page.screenshot(path=IMAGES / "acquire.png")
         browser.close()
     by_hand(folder)
+    board(folder)
+
+
+def board(folder: Path) -> None:
+    """The page with a board: five boards by a simulated hand, and the outline of the next."""
+    setup = Setup(rig="stereo", target="charuco", budget=40)
+    with open_session(folder / "board", setup) as controller:
+        assert isinstance(controller, BoardController)
+        controller.set_auto(False)
+        controller.start()
+        while controller.loop.points < 5:
+            controller.live()
+            controller.step()
+        with bench_page.open_page(controller) as (url, _), sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+            page = browser.new_page(viewport={"width": 1440, "height": 900}, color_scheme="light")
+            page.goto(url)
+            page.wait_for_selector("svg polygon.aim", timeout=60_000)
+            page.wait_for_timeout(4000)
+            page.wait_for_function("window.implicam.state.title !== 'Looking'")
+            page.screenshot(path=IMAGES / "acquire-board.png")
+            browser.close()
 
 
 def by_hand(folder: Path) -> None:

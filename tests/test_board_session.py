@@ -605,8 +605,9 @@ def test_a_robot_is_sent_far_apart_first_then_where_most_is_told_then_for_boards
     assert loop.problem is None
     (third,) = loop.ask()
     assert third.score > 0
-    assert third.why.startswith("of 9 places it tells most")
+    assert third.why.startswith("of 9 places this one tells most")
     assert not third.held_out
+    assert [one.words for one in loop.camera_progress()] == ["2 boards"] * 2
     left = [one for one in carried if one.name not in (first.name, *loop.taken)]
     gains = loop._design_now().gains([one.pose for one in left])
     assert third.name == left[int(np.argmax(gains))].name

@@ -40,6 +40,9 @@ POSE_COLUMN = "pose"
 HELD_OUT_COLUMN = "held_out"
 """The column of points.csv that says "yes" of a board that does not calibrate, but judges."""
 
+ENOUGH_EXCESS = 1.2
+"""Times what pixel noise leaves of a position's uncertainty: then the bar of a camera is full."""
+
 ROBOT_CANDIDATES = 60
 """Of the places where a robot can put the board: so many are weighed for the next picture."""
 
@@ -352,7 +355,7 @@ class KnownPosesLoop(BoardLoop):
         with blas_threads(1):
             gains = self._asked_design.gains([one.pose for one in some])
         k = int(np.argmax(gains))
-        why = f"of {len(some)} places it tells most" if gains[k] > 0 else "no place would tell much more"
+        why = f"of {len(some)} places this one tells most" if gains[k] > 0 else "no place would tell much more"
         return self._target_of(some[k], _corner(some[k].pose), why, float(gains[k]))
 
     def _farthest(self, left: Sequence[KnownPose]) -> KnownPose:
@@ -426,9 +429,13 @@ class KnownPosesLoop(BoardLoop):
         for c in range(len(self.cameras)):
             boards = self._boards(c)
             part = min(1.0, boards / len(self.poses))
+            if self.free:  # by what pixel noise leaves, of all cameras together
+                reached = self.history[-1].excess if self.history else np.nan
+                part = min(1.0, ENOUGH_EXCESS / reached) if reached > 0 else 0.0
             calibrated = c not in self._cold()
             part = 0.4 + 0.6 * part if calibrated else min(0.4, part)
-            found.append(CameraProgress(part, boards, f"{boards} of {len(self.poses)} poses"))
+            told = f"{boards} board{'s' * (boards != 1)}" if self.free else f"{boards} of {len(self.poses)} poses"
+            found.append(CameraProgress(part, boards, told))
         return found
 
     # private

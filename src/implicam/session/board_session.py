@@ -217,6 +217,8 @@ class BoardController(ByHandController):
         """As of every session; and judge how the board is held."""
         before = self.state.looks
         super().live()
+        if self.equipment.robot.moves:
+            return  # it is on no way there before somebody lets it go
         if self.state.phase == "aim" and self.state.looks is not before:
             with self._loop_lock:
                 judged = self._judge(self.state.looks)
