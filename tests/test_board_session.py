@@ -229,6 +229,11 @@ def test_a_board_where_one_was_is_worth_little_and_one_in_the_outline_enough(loo
     best = replace(target, score=20 * target.score)
     assert not loop.worth(views, best).enough
     assert "5 %" in loop.worth(views, best).reason
+    assert "go on to the outline" in loop.worth(views, best).reason
+    name = min(views)
+    both = replace(best, outlines=tuple(np.zeros((4, 2)) for _ in best.outlines))
+    alone = loop.worth({name: views[name]}, both).reason  # it is in its place, and another camera is to see it, too
+    assert alone.startswith("cam2 does not see it: so it tells" if name == "cam1" else "cam1 does not see it")
 
 
 def test_a_board_more_is_predicted_before_it_is_fitted(loop, rig, eight):

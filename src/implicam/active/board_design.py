@@ -56,12 +56,14 @@ class BoardShape(NamedTuple):
         square: About from one corner to the next.
         whole: Whether a picture counts only where it shows all of them: a board without markers.
         edges: Whether lines between neighbours are edges, by which blur is seen; not of dots, whose middles stay.
+        facing: Cosine of the angle between its normal and the line to a camera that sees it well, at least.
     """
 
     corners: Floats
     square: float
     whole: bool
     edges: bool = True
+    facing: float = MIN_FACING_COSINE
 
     @property
     def outline(self) -> Floats:
@@ -220,7 +222,7 @@ class BoardDesign(VolumeDesign):
             if name in self.rig.camera_names:
                 towards = self._eye(name).centre - middle
                 cosine = np.sum(towards * normal, axis=1) / np.linalg.norm(towards, axis=1)
-                facing[:, c] = cosine > MIN_FACING_COSINE
+                facing[:, c] = cosine > self.shape.facing
         return np.asarray(enough & facing)
 
     def candidates(self, count: int, rng: np.random.Generator) -> list[Pose]:

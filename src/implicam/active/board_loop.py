@@ -351,6 +351,12 @@ class BoardLoop:
             return Worth(True, share, "")
         if not np.isfinite(share):
             return Worth(False, share, "hold it as the outline shows")
+        outlines = () if target is None else target.outlines
+        blind = [name for name, outline in zip(self._names, outlines, strict=False) if outline is not None]
+        blind = [name for name in blind if name not in views]
+        if blind and len(blind) < sum(outline is not None for outline in outlines):
+            which = f"{', '.join(blind)} {'does' if len(blind) == 1 else 'do'} not see it"
+            return Worth(False, share, f"{which}: so it tells {100 * share:.0f} % of what the outline would")
         return Worth(False, share, f"so it tells {100 * share:.0f} % of what the outline would: go on to the outline")
 
     def name_of(self, target: BoardTarget) -> str:

@@ -56,6 +56,9 @@ EXAMPLE_BOARDS: dict[str, dict[str, Any]] = {
 POSES_KEY = "known_poses"
 """The setting of a session that holds the known poses of its board, as `described` gives them."""
 
+MIN_DOTS_COSINE = 0.5
+"""Of the angle between a plate of dots and the line to a camera that is to find all of them."""
+
 ROBOT_PLACES = 600
 """Where a robot can put the board, among which it is sent."""
 
@@ -140,8 +143,10 @@ def shape_of(detector: Detector) -> BoardShape:
     table = detector.describe()
     flat = corner_positions(table)
     square = float(table.get("square", table.get("tag", table.get("spacing", 0.0))))
-    whole = table["kind"] in ("board", "dotgrid")
-    return BoardShape(np.column_stack([flat, np.zeros(len(flat))]), square, whole, edges=table["kind"] != "dotgrid")
+    shape = BoardShape(np.column_stack([flat, np.zeros(len(flat))]), square, table["kind"] == "board")
+    if table["kind"] != "dotgrid":
+        return shape
+    return shape._replace(whole=True, edges=False, facing=MIN_DOTS_COSINE)  # flat ellipses are not found
 
 
 def board_hardware(
