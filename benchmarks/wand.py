@@ -83,7 +83,9 @@ def one(kind: str, seed: int, frames: int, outliers: float, missing: float, lens
     }
 
 
-WORLDS = ("the wand's", "an L-frame", "the same by axes", "a camera")
+WORLDS = ("the wand's", "an L-frame", "the same by axes", "a camera", "ten known points in the fit")
+LENGTH_SD, KNOWN_SD = 0.002, 0.001
+"""Of a wand that is used together with known points, over its length; of these, over the volume's shortest edge."""
 
 
 def worlds(kind: str, seed: int, frames: int, outliers: float, missing: float, lens_error: float) -> dict[str, float]:
@@ -111,6 +113,14 @@ def worlds(kind: str, seed: int, frames: int, outliers: float, missing: float, l
         ),
         "a camera": (ic.set_world(calibration, camera="cam1"), rig.cameras[0].camera_from_world),
     }  # fmt: skip
+    rng = np.random.default_rng([seed, 7])
+    shown = simulate(rig, random_positions(rig, 10, rng), seed=seed + 700_001)
+    sd = KNOWN_SD * float(min(rig.volume.size))
+    at = shown.truth.xyz + sd * rng.normal(size=(10, 3))
+    known = replace(shown, known=ic.KnownPositions(shown.points, at, np.full((10, 3), sd)))
+    length = target.wand * (1 + LENGTH_SD * rng.normal())
+    together = ic.ForwardGP(wand=length, wand_sd=LENGTH_SD * length, known=known).fit(as_wand(recorded, target))
+    placed["ten known points in the fit"] = together, Pose(np.eye(3), np.zeros(3))
     found = {}
     for name, (one, to_world) in placed.items():
         measured = one.measure(held.observations)
@@ -227,6 +237,9 @@ def kept(seed0: int):
     ):
         yield f"\n## {title}\n"
         yield from table(KINDS, count, seed0, frames, outliers, missing, 0.5)
+    for frames in (200, 100):
+        yield f"\n## Joint NEES in the world that is named, {frames} frames\n"
+        yield from table_of_worlds(KINDS, 3, seed0, frames, 0.1, 0.3, 0.5)
 
 
 def main() -> None:

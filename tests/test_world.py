@@ -172,6 +172,45 @@ def test_a_plumb_line_says_what_is_up(waving: Waving) -> None:
     assert "not on one plumb line: b is" in crooked.world[1]
 
 
+def test_what_falls_says_what_is_up(waving: Waving) -> None:
+    world, n = waving.rig.volume.world_from_box, 25
+    t = np.linspace(0, 1, n)
+    way = waving.edge * np.stack([-0.8 + 1.6 * t, 0.3 * t, -0.4 + 3.6 * t - 3.8 * t**2], axis=1)  # thrown
+    frames = np.array([str(100 + i) for i in range(n)])
+    points = [f"{f} ball" for f in frames]
+    seen = show(waving.rig, points, world.apply(way), 64)
+    seen = replace(seen, columns={"frame": frames, "marker": np.full(n, "ball")})
+    upright = set_world(waving.calibration, seen, falling="ball")
+    assert "falling thing in 25 frames" in upright.world[0]
+    assert len(upright.world) == 1
+    measured = upright.measure(seen)
+    bend = np.polyfit(t, measured.xyz, 2)[0]
+    assert bend[2] < 0
+    held = held_out(waving)
+    assert held.truth is not None
+    # which way the line through two measured points rises is known wherever the origin is
+    up = upright.measure(held)
+    line = np.array([world.apply(np.array([[0, 0, z]]))[0] for z in (0.0, 1.0)])
+    rise = held.truth.xyz @ (line[1] - line[0])
+    assert np.polyfit(rise, up.xyz[:, 2], 1)[0] == pytest.approx(1, abs=0.02)
+    with pytest.raises(UsageError, match="in 3 frames"):
+        set_world(
+            waving.calibration, replace(seen.select([0, 9, 20]), columns=_first(seen, [0, 9, 20])), falling="ball"
+        )
+    with pytest.raises(DatasetError, match="no marker 'bal'"):
+        set_world(waving.calibration, seen, falling="bal")
+    flat = show(waving.rig, points, world.apply(way * [1, 1, 0.0]), 65)
+    with pytest.raises(FitError, match="bends too little"):
+        set_world(waving.calibration, replace(flat, columns=seen.columns), falling="ball")
+    carried = way + waving.edge * 0.2 * np.sin(9 * t)[:, None]
+    jumping = replace(show(waving.rig, points, world.apply(carried), 66), columns=seen.columns)
+    assert "do not fall freely" in set_world(waving.calibration, jumping, falling="ball").world[1]
+
+
+def _first(data: Dataset, rows: list[int]) -> dict[str, np.ndarray]:
+    return {name: np.asarray(column)[rows] for name, column in data.columns.items()}
+
+
 def test_a_camera_is_the_world(waving: Waving) -> None:
     here = set_world(waving.calibration, camera="cam2")
     pose = here.cameras["cam2"].camera_from_world

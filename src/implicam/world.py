@@ -54,6 +54,15 @@ MAX_STILL_PX = 3.0
 
 STEPS = 4
 
+MIN_FLIGHT = 5
+"""Frames of a falling thing."""
+
+MIN_BEND_SDS = 10.0
+"""By how many standard deviations its way must bend."""
+
+MAX_TURN_SD = 0.1
+"""Radians, beyond which points say nothing of where axes are."""
+
 MIN_JUDGED_POINTS, LAYING_ROUNDS, MAX_SQUARED_MAHALANOBIS = 6, 4, 25.0
 """Known points that a world of its own is laid over; rounds in which those that do not fit are left out of that; the
 squared distance, in standard deviations, beyond which they do not."""
@@ -71,6 +80,7 @@ def set_world(
     y: str = "",
     plane: Sequence[str] = (),
     down: Sequence[str] = (),
+    falling: str = "",
     camera: str = "",
 ) -> PlacesItsWorld:
     """The calibration with its world where something says; for one made without known positions, as from a wand.
@@ -86,7 +96,9 @@ def set_world(
         x: A point on the x axis, seen from the origin; or two, from the one to the other.
         y: A point on the side of the xy plane where y is positive.
         plane: Three points or more of the plane z = 0; z points to the cameras' side.
-        down: Two points or more of a plumb line or a falling thing, from top to bottom: z points up.
+        down: Two points or more of a plumb line, from top to bottom: z points up.
+        falling: A marker of a thing that was dropped or thrown, in frames at equal times: z points up, against what
+            bends its way.
         camera: Its centre is the origin, its axes are x (right), y (down) and z (forward).
 
     Returns:
@@ -110,7 +122,7 @@ def set_world(
         )
     axes = Axes(origin, (x,) if isinstance(x, str) and x else tuple(x), y, tuple(plane), tuple(down))
     if camera:
-        if data is not None or axes.named:
+        if data is not None or axes.named or falling:
             raise UsageError("the world of a camera takes no points.", fix="leave them out, or the camera")
         return calibration.in_world_of_camera(camera)
     if data is None:
@@ -119,6 +131,9 @@ def set_world(
             fix="give what the cameras saw of an L-frame, of known points, or of points on axes, a plane or a plumb "
             "line; or name a camera",
         )
+    if falling:
+        points, times = _flight(data, falling, down)
+        axes = replace(axes, down=points, times=times)
     middle = calibration.data.xyz.mean(axis=0)
     laid = _by_axes(calibration, data, axes, middle) if axes.named else _by_known_points(calibration, data, middle)
     return calibration.in_world(laid.placement, laid.told)
@@ -133,6 +148,7 @@ class Axes:
     y: str
     plane: tuple[str, ...]
     down: tuple[str, ...]
+    times: tuple[float, ...] = ()  # of the points of `down`, where these are of a falling thing
 
     @property
     def named(self) -> list[str]:
@@ -146,6 +162,11 @@ class Axes:
             raise UsageError(f"{len(self.x)} points are given for the x axis.", fix="give one, or two: from, to")
         if self.plane and len(self.plane) < MIN_POINTS:
             raise UsageError(f"{len(self.plane)} points are no plane.", fix="name three or more of them")
+        if self.times and len(self.times) < MIN_FLIGHT:
+            raise UsageError(
+                f"two cameras see the falling thing in {len(self.times)} frames.",
+                fix=f"it takes {MIN_FLIGHT} frames, better 20: three say how a way bends, more whether it is a fall",
+            )
         if self.down and len(self.down) < 2:
             raise UsageError("one point is no plumb line.", fix="name two or more, from top to bottom")
         if self.plane and self.down:
@@ -522,6 +543,8 @@ def _by_axes(calibration: PlacesItsWorld, data: Dataset, axes: Axes, middle: Flo
     def pose_of(xyz: Floats) -> Pose:
         return _pose_by_axes(axes, number, xyz, middle, centres)
 
+    if axes.times:
+        _refuse_straight(axes, number, positions)
     here, n = pose_of(positions.xyz), len(wanted)
     h = 1e-5 * max(float(np.ptp(positions.xyz, axis=0).max()), 1e-300)
     J = np.zeros((6, n, 3))
@@ -531,8 +554,19 @@ def _by_axes(calibration: PlacesItsWorld, data: Dataset, axes: Axes, middle: Flo
             step[i, axis] = h
             both = [step_between(here, pose_of(positions.xyz + sign * step), middle) for sign in (1.0, -1.0)]
             J[:, i, axis] = (both[0] - both[1]) / (2 * h)
-    own = np.einsum("knd,nde,lne->kl", J, positions.own, J)
-    placement = Placement(here, middle, np.einsum("knd,ndq->kq", J, positions.shared), own)
+    own, follows = np.einsum("knd,nde,lne->kl", J, positions.own, J), np.einsum("knd,ndq->kq", J, positions.shared)
+    placement = Placement(here, middle, follows, own)
+    turn_sd = float(np.sqrt(np.linalg.eigvalsh((own + follows @ follows.T)[:3, :3])[-1]))
+    if turn_sd > MAX_TURN_SD:
+        raise FitError(
+            f"these points say where the axes are to {np.degrees(turn_sd):.0f} degrees only.",
+            why="they are too near each other for how exactly they are measured"
+            if not axes.times
+            else "its way bends too little: too few frames, or too short a time",
+            fix="take points that are farther apart"
+            if not axes.times
+            else "film a longer fall, with more frames a second",
+        )
     unit = calibration.data.length_unit
     sd = float(placement.sd_at(middle[None])[0])
     told = (
@@ -547,7 +581,9 @@ def _axes_in_words(axes: Axes) -> str:
     words = []
     if axes.plane:
         words.append(f"{list_some(list(axes.plane))} are in the plane z = 0, z points to the cameras' side")
-    if axes.down:
+    if axes.times:
+        words.append(f"z points up, against what bends the way of the falling thing in {len(axes.times)} frames")
+    elif axes.down:
         words.append(f"z points up, against the line from {axes.down[0]} to {axes.down[-1]}")
     if axes.x:
         words.append(f"x points from {axes.origin if len(axes.x) == 1 else axes.x[0]} to {axes.x[-1]}")
@@ -571,7 +607,8 @@ def _pose_by_axes(axes: Axes, number: dict[str, int], xyz: Floats, middle: Float
         origin = origin - z * ((origin - foot) @ z)
     elif axes.down:
         line = np.array([at[name] for name in axes.down])
-        z = -_line_of(line)
+        bend = _flight_of(line, axes.times)[0] if axes.times else _line_of(line)
+        z = -bend / np.linalg.norm(bend)
     else:
         assert along is not None
         side = at[axes.y] - at[axes.origin]
@@ -606,24 +643,81 @@ def _line_of(xyz: Floats) -> Floats:
     return np.asarray(along * np.sign(along @ (xyz[-1] - xyz[0])), dtype=np.float64)
 
 
+def _flight(data: Dataset, marker: str, down: Sequence[str]) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """The points of a falling marker that two cameras see, and the numbers of their frames."""
+    columns = data.further_columns()
+    if not {FRAME, MARKER} <= columns.keys():
+        raise DatasetError(
+            f"dataset {data.name!r} does not say which point is in which frame.",
+            fix=f"a falling thing needs the columns {FRAME!r} and {MARKER!r}",
+        )
+    if down:
+        raise UsageError("a plumb line and a falling thing both say what is down.", fix="give one of them")
+    mine = (columns[MARKER] == marker) & (data.observations.seen.sum(axis=1) >= 2)
+    if not (columns[MARKER] == marker).any():
+        names = sorted(set(columns[MARKER].tolist()))
+        raise DatasetError(
+            f"dataset {data.name!r} has no marker {marker!r}{did_you_mean(marker, names)}.",
+            fix=f"its markers are {list_some(names)}",
+        )
+    try:
+        times = columns[FRAME][mine].astype(np.float64)
+    except ValueError:
+        raise DatasetError(
+            f"the frames of marker {marker!r} have no numbers.", fix="number them by equal times, as a film does"
+        ) from None
+    order = np.argsort(times)
+    points = data.points[mine][order]
+    return tuple(map(str, points)), tuple(times[order].tolist())
+
+
+def _flight_of(xyz: Floats, times: Sequence[float]) -> tuple[Floats, Floats, Floats]:
+    """By how much a way (n, 3) bends (3,), how that follows the places (n,), what is left (n, 3) of an even bend."""
+    t = np.array(times)
+    t = (t - t.mean()) / np.std(t)
+    design = np.stack([np.ones(len(t)), t, t**2], axis=1)
+    follow = np.linalg.pinv(design)
+    found = follow @ xyz
+    return found[2], follow[2], xyz - design @ found
+
+
+def _refuse_straight(axes: Axes, number: dict[str, int], positions: JointPositions) -> None:
+    """Stop where a way does not bend by more than it could seem to."""
+    rows = [number[name] for name in axes.down]
+    bend, follow, _ = _flight_of(positions.xyz[rows], axes.times)
+    shared = np.einsum("n,ndq->dq", follow, positions.shared[rows])
+    cov = np.einsum("n,nde->de", follow**2, positions.own[rows]) + shared @ shared.T
+    if bend @ np.linalg.solve(cov, bend) < MIN_BEND_SDS**2:
+        raise FitError(
+            "the way of the falling thing bends too little to say what is down.",
+            why="the time is too short for how exactly it is measured, or nothing pulled at it",
+            fix="film a longer fall, with more frames a second",
+        )
+
+
 def _not_straight(axes: Axes, number: dict[str, int], positions: JointPositions, unit: str) -> list[str]:
     """What is left where more points are given than a plane or a line needs."""
-    names, what = (axes.plane, "plane") if axes.plane else (axes.down, "plumb line")
+    names, what = (axes.plane, "are not on one plane") if axes.plane else (axes.down, "are not on one plumb line")
+    what = "do not fall freely" if axes.times else what
     rows = [number[name] for name in names]
     free = len(rows) - 3 if axes.plane else 2 * (len(rows) - 2)
+    free = 3 * (len(rows) - 3) if axes.times else free
     if free < 1:
         return []
-    centred = positions.xyz[rows] - positions.xyz[rows].mean(axis=0)
-    directions = np.linalg.svd(centred)[2]
-    across = directions[2:] if axes.plane else directions[1:]
-    off = centred @ across.T
-    variance = np.einsum("ad,nde,ae->na", across, positions.own[rows], across)
-    chi2 = float(np.sum(off**2 / variance))
+    if axes.times:
+        across, off = np.eye(3), _flight_of(positions.xyz[rows], axes.times)[2]
+        chi2 = float(np.einsum("ni,nij,nj->", off, np.linalg.inv(positions.own[rows]), off))
+    else:
+        centred = positions.xyz[rows] - positions.xyz[rows].mean(axis=0)
+        directions = np.linalg.svd(centred)[2]
+        across = directions[2:] if axes.plane else directions[1:]
+        off = centred @ across.T
+        chi2 = float(np.sum(off**2 / np.einsum("ad,nde,ae->na", across, positions.own[rows], across)))
     if chdtrc(free, chi2) >= MAX_CHANCE_PROBABILITY:
         return []
     worst = int(np.argmax(np.abs(off).max(axis=1)))
     return [
-        f"The points are not on one {what}: {names[worst]} is {decimal_number(float(np.abs(off[worst]).max()))} {unit} "
+        f"The points {what}: {names[worst]} is {decimal_number(float(np.abs(off[worst]).max()))} {unit} "
         f"off, {np.sqrt(chi2 / free):.1f} times what the error bars of the points allow. These do not contain it."
     ]
 

@@ -56,6 +56,10 @@ def world_command(
         str | None,
         typer.Option(metavar="A,...,B", help="A plumb line from top to bottom; z is up.", rich_help_panel=_AXES),
     ] = None,
+    falling: Annotated[
+        str | None,
+        typer.Option(metavar="MARKER", help="It was dropped or thrown, in frames; z is up.", rich_help_panel=_AXES),
+    ] = None,
     camera: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Its centre and axes are the world's.", rich_help_panel=_AXES),
@@ -72,13 +76,13 @@ def world_command(
     fitted = load_calibration(calibration)
     data = None
     if dataset is not None:
-        named = points is not None or any((origin, x, y, plane, down))
+        named = points is not None or any((origin, x, y, plane, down, falling))
         data = read_to_measure(dataset, table, fitted) if named else read(dataset, table, calibration=fitted)
     if points is not None and data is not None:
         data = with_known_positions(data, *read_points(points))
     placed = set_world(
         fitted, data, origin=origin or "", x=_names(x), y=y or "", plane=_names(plane), down=_names(down),
-        camera=camera or "",
+        falling=falling or "", camera=camera or "",
     )  # fmt: skip
     verdict = calibration_file.describe(calibration).get("verdict")
     calibration_file.save(placed, output, verdict)
