@@ -19,7 +19,7 @@ from implicam.dataset import Floats
 from implicam.dataset.boards import aprilgrid_corners
 from implicam.detect.board import MAX_SEARCH_PIXELS, explain_unusable, parse_board_size
 from implicam.detect.dictionaries import check_dictionary, dictionary_of
-from implicam.detect.marked import fit_marked_corners, report_corners
+from implicam.detect.marked import explain_mirrored, fit_marked_corners, report_corners
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import resize, to_original_pixels
 from implicam.errors import UsageError
@@ -198,8 +198,12 @@ class AprilGrid(DetectorBase):
                 f"{self.first + total - 1}. Give --first, the number of its first tag, or the size that it has."
             )
         if len(best.ids) == 0:
+            mirrored = explain_mirrored(
+                picture, self.dictionary, self.border or BORDERS[0], range(self.first, self.first + total)
+            )
             return best._replace(
-                reason=f"no tag of {self.dictionary} was read. Show the board sharp and "
+                reason=mirrored
+                or f"no tag of {self.dictionary} was read. Show the board sharp and "
                 "near (a tag needs twenty pixels), and check that it was printed from these tags."
             )
         if len(np.unique(best.ids)) < len(best.ids):

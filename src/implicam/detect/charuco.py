@@ -19,7 +19,7 @@ from implicam.dataset import Floats
 from implicam.detect.board import MAX_SEARCH_PIXELS, explain_unusable, parse_board_size
 from implicam.detect.dictionaries import check_dictionary, dictionary_of
 from implicam.detect.grid import predict_places
-from implicam.detect.marked import MIN_CORNERS, fit_marked_corners, in_squares, report_corners
+from implicam.detect.marked import MIN_CORNERS, explain_mirrored, fit_marked_corners, in_squares, report_corners
 from implicam.detect.model import Detected, DetectorBase, View, nothing
 from implicam.detect.seeds import resize, to_original_pixels
 from implicam.errors import UsageError
@@ -158,8 +158,10 @@ class Charuco(DetectorBase):
         except cv2.error as error:
             return _refuse(f"OpenCV could not read the ChArUco board: {error}")
         if names is None or len(names) == 0:
+            mirrored = explain_mirrored(picture, self.dictionary, 1, range(self.rows * self.columns // 2))
             return _refuse(
-                f"no marker of {self.dictionary} was read. Show the board sharp and near (a marker needs a dozen "
+                mirrored
+                or f"no marker of {self.dictionary} was read. Show the board sharp and near (a marker needs a dozen "
                 "pixels), and check that it was printed from this dictionary."
             )
         names = names.ravel()

@@ -12,9 +12,13 @@ from implicam.dataset.boards import corner_name
 from implicam.detect.board import explain_missing, hull_of
 from implicam.detect.corner_noise import agreeing, true_sd
 from implicam.detect.corners import Bools, Corners, fit_corners
+from implicam.detect.dictionaries import dictionary_of
 from implicam.detect.grid import MAX_ASTRAY_SQUARES, MAX_RESIDUAL_HEIGHTS, Places, predict_places
 from implicam.detect.model import Detected, nothing
-from implicam.images import Grey
+from implicam.images import Grey, eight_bit, opencv
+
+MIN_MIRRORED = 4
+"""Markers in the mirror image of a picture without any, from which it is mirrored."""
 
 MIN_CORNERS = 6
 """Corners from which their neighbourhood can be checked."""
@@ -89,6 +93,28 @@ def report_corners(
         true_sd(nodes[number], corners[number], half_length),
         explain_missing(len(number), len(nodes)),
         (hull_of(corners.uv[number]),),
+    )
+
+
+def explain_mirrored(picture: Grey, dictionary: str, border: int, own: range) -> str:
+    """That a picture is mirrored in which no marker was read, in words; empty where its mirror image shows none either.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        dictionary: OpenCV's name of the markers.
+        border: Bits that their black border is wide.
+        own: Numbers of the board's markers.
+    """
+    how = opencv().aruco.DetectorParameters()
+    how.markerBorderBits = border
+    reader = opencv().aruco.ArucoDetector(dictionary_of(dictionary), how)
+    _, ids, _ = reader.detectMarkers(np.ascontiguousarray(eight_bit(picture)[:, ::-1]))
+    count = 0 if ids is None else sum(number in own for number in ids.ravel().tolist())
+    if count < MIN_MIRRORED:
+        return ""
+    return (
+        f"the picture is mirrored: no marker was read in it, and {count} in its mirror image. Turn mirroring off where "
+        "the camera is set up, or flip the pictures back."
     )
 
 

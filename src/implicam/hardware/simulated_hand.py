@@ -259,12 +259,12 @@ def print_of(target: Mapping[str, Any]) -> NDArray[np.float32] | Print | None:
     kind = target.get("kind")
     if kind == "board":
         return None
-    if kind == "charuco":
+    if kind == "charuco" and not (target.get("legacy") and int(target["rows"]) % 2 == 0):
         return _markers_of(target)
     detector = detector_of(target)
     assert isinstance(detector, Printable)  # as all boards are
     shown = printed(detector)
-    samples = SAMPLES_PER_SQUARE / float(target.get("tag", target.get("spacing", 0.0)))
+    samples = SAMPLES_PER_SQUARE / float(next(target[name] for name in ("square", "tag", "spacing") if name in target))
     black = shown.picture(samples)
     return Print(black, -shown.origin - shown.white, np.array(black.shape[::-1]) / samples)  # whole samples
 

@@ -47,6 +47,8 @@ STILL_SECONDS = 0.3
 MAX_EDGE_PX = 6.0
 """Pixels from black to white, beyond which a picture is blurred."""
 
+NOT_SEEN = "no camera sees the board"
+
 MIN_CORNERS = 12
 """Of a view that `explicit` takes."""
 
@@ -307,7 +309,13 @@ class BoardController(ByHandController):
         if why:
             _LOG.info("%s not taken: %s", target.name, why)
             self._show(looks=looks, judgement=Judgement(False, why))
-            raise UsageError(f"no picture was kept: {why}.", fix="hold the board still, in sight of a camera")
+            cure = "hold the board still, in sight of a camera"
+            if where is not None:
+                cure = (
+                    "look whether it sits firmly, is turned as --facing says, and has squares as large as was said: "
+                    "measure several with a ruler"
+                )
+            raise UsageError(f"no picture was kept: {why}.", fix=cure)
         shot = self._make_shot(target, looks, column)
         pictures = {look.camera: look.frame.picture for look in looks if look.frame is not None}
         notes = {
@@ -353,7 +361,7 @@ class BoardController(ByHandController):
         """Why a picture would be of no use; empty where it would."""
         if not views:
             some = [look.found.reason for look in looks if len(look.found)]
-            return "too few corners are seen: show more of the board" if some else "no camera sees the board"
+            return "too few corners are seen: show more of the board" if some else NOT_SEEN
         if not self.loop.shape.edges:
             return ""
         blurred = []

@@ -11,7 +11,7 @@ import numpy as np
 from implicam.active import Rule, Target
 from implicam.active.board_loop import BoardTarget
 from implicam.dataset import Floats
-from implicam.session.board_session import BoardState
+from implicam.session.board_session import NOT_SEEN, BoardState
 from implicam.session.detections import Look
 from implicam.viewer.hand_words import camera_table, common_headline, common_snapshot, finish_label, sentence
 from implicam.viewer.words import Headline
@@ -66,6 +66,8 @@ def _guidance(state: BoardState, moves: bool) -> Headline:
         return Headline("No pose is left", state.message, "ask")
     if moves:
         return _of_robot(state, target, why)
+    if judged.reason == NOT_SEEN:  # nowhere: then why is more use than where it is to be
+        why = next((f"{look.camera}: {look.found.reason}" for look in state.looks if look.found.reason), why)
     board = f"Board {len(state.history) + 1}: hold it into the outline"
     if isinstance(target, BoardTarget) and target.known:
         board = f"Put it at {target.words.partition(',')[0]}"
