@@ -176,12 +176,36 @@ def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
     Raises:
         numpy.linalg.LinAlgError: A is not finite, or the views do not fix the camera.
     """
+    L, scale = _scaled_cholesky(A)
+    root = np.ascontiguousarray(solve_triangular(L, np.diag(scale), lower=True))
+    return root, root.T @ (root @ b), float(2 * np.sum(np.log(np.diag(L) / scale)))
+
+
+def eliminate_camera(normal: NormalEquations, across: Floats) -> tuple[Floats, float]:
+    """Take a camera out of normal equations that it shares with others.
+
+    Args:
+        normal: Its own.
+        across: The blocks (q, P) with the others.
+
+    Returns:
+        L^-1 of those (P, q) and of its right hand side (P,), side by side; and what it adds to twice the evidence.
+
+    Raises:
+        numpy.linalg.LinAlgError: The views do not fix it.
+    """
+    L, scale = _scaled_cholesky(normal.A)
+    half = solve_triangular(L, scale[:, None] * np.column_stack([across.T, normal.b]), lower=True)
+    logs = 2 * float(np.sum(np.log(np.diag(L) / scale)))
+    return np.asarray(half, dtype=np.float64), float(np.sum(half[:, -1] ** 2)) - logs
+
+
+def _scaled_cholesky(A: Floats) -> tuple[Floats, Floats]:
+    """L (P, P) and scale (P,) of `scale A scale = L L^T`, with a unit diagonal."""
     if not np.isfinite(A).all():
         raise np.linalg.LinAlgError("a camera has turned its back on points that it saw")
     scale = 1 / np.sqrt(np.diag(A))
-    L = stable_cholesky(A * scale[:, None] * scale)
-    root = np.ascontiguousarray(solve_triangular(L, np.diag(scale), lower=True))
-    return root, root.T @ (root @ b), float(2 * np.sum(np.log(np.diag(L) / scale)))
+    return stable_cholesky(A * scale[:, None] * scale), np.asarray(scale, dtype=np.float64)
 
 
 def slices(n: int, size: int = POINTS_PER_CHUNK) -> Iterator[slice]:

@@ -16,7 +16,13 @@ from scipy.linalg import block_diag
 
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel, CameraViews
-from implicam.rig_model.normal_equations import NormalEquations, camera_normals, name_failing_camera, solve_normal
+from implicam.rig_model.normal_equations import (
+    NormalEquations,
+    camera_normals,
+    eliminate_camera,
+    name_failing_camera,
+    solve_normal,
+)
 from implicam.rig_model.schur import ShotSchurBlock, Unknowns, eliminate, unknowns_given_cameras, views_by_shots
 from implicam.rig_model.shot_errors import ShotErrors
 
@@ -121,6 +127,41 @@ def condition(
     if errors is None:
         return _condition_independent(models, normals)
     return _condition_tied(models, points, camera_views, normals, errors)
+
+
+def log_evidence(
+    models: tuple[CameraModel, ...], points: Floats, camera_views: tuple[CameraViews, ...], errors: ShotErrors
+) -> float:
+    """As `condition(...).evidence`, of shots that few cameras each see. Cameras are eliminated first, one by one, and the
+    shots are left: work grows linearly with the cameras, and their joint covariance is never made.
+
+    Args:
+        models: The cameras where they are linearised, with their priors.
+        points: Known positions (n, 3) in the working frame.
+        camera_views: Per camera, what it saw.
+        errors: How whole shots may be off.
+
+    Raises:
+        CameraFailedError: The views of a camera do not fix it.
+    """
+    normals = camera_normals(models, points, camera_views)
+    k = errors.basis.shape[2]
+    shots = np.unique(np.concatenate([errors.shot[seen.rows] for seen in camera_views]))
+    H, g = np.eye(k * len(shots)), np.zeros(k * len(shots))
+    value = -sum(normal.squares + normal.logs for normal in normals)
+    for c, (normal, seen) in enumerate(zip(normals, camera_views, strict=True)):
+        own = np.unique(errors.shot[seen.rows])
+        block = ShotSchurBlock.of((models[c],), points, (seen,), errors.only(own), slice(0, len(own)))
+        with name_failing_camera(c):
+            half, squares_less_logs = eliminate_camera(normal, block.G.reshape(k * len(own), -1))
+        value += squares_less_logs
+        at = k * np.searchsorted(shots, own)[:, None] + np.arange(k)  # (own, k)
+        H[at[:, :, None], at[:, None, :]] += block.H - np.eye(k)
+        at = at.ravel()
+        both = slice(None) if len(own) == len(shots) else np.ix_(at, at)  # a slice is copied four times faster
+        H[both] -= half[:, :-1].T @ half[:, :-1]
+        g[at] += block.g.ravel() - half[:, :-1].T @ half[:, -1]
+    return 0.5 * (value + eliminate(H[None], g[None, :, None])[1])
 
 
 def _condition_independent(models: tuple[CameraModel, ...], normals: list[NormalEquations]) -> Posterior:

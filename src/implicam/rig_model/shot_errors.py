@@ -216,6 +216,15 @@ class ShotErrors:
         """Whether any sd is estimated."""
         return bool((self.group >= 0).any())
 
+    def only(self, shots: NDArray[np.int64]) -> ShotErrors:
+        """Of some shots, numbered anew; the points of others must not be asked for.
+
+        Args:
+            shots: (s,) their numbers, in order.
+        """
+        number = np.minimum(np.searchsorted(shots, self.shot), len(shots) - 1)
+        return replace(self, shot=number, sd=self.sd[shots])
+
     def update(self, mean: Floats, variance: Floats, settings: RigModelSettings) -> tuple[ShotErrors, Floats]:
         """More probable sds: one step of EM, eq. (17).
 

@@ -13,7 +13,8 @@ from implicam.geometry import Floats
 from implicam.rig_model.camera import ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel, CameraViews, thin_views
 from implicam.rig_model.field import DepthScale, Hyperparameters, empty_field, field_coordinates
-from implicam.rig_model.posterior import condition
+from implicam.rig_model.posterior import log_evidence
+from implicam.rig_model.shot_errors import ShotErrors
 
 FIELD_VARIANCE_TOLERANCE = {"central": 1e-6, "general": 1e-6, "none": 1e-9}
 """Part of the field's variance that its features may leave out; without a lens model the field is large."""
@@ -54,7 +55,7 @@ def estimate_hyperparameters(
         groups.append((numbers, rig))
     if training.errors is None or training.errors.estimated:
         return found
-    return _joint_sizes(training, models, used, found, groups)
+    return _joint_sizes(training, models, used, found, groups, training.errors)
 
 
 def _group_by_kind(models: tuple[CameraModel, ...]) -> list[list[int]]:
@@ -129,6 +130,7 @@ def _joint_sizes(
     used: tuple[CameraViews, ...],
     hyper: Hyperparameters,
     groups: list[tuple[list[int], RigEvidence]],
+    errors: ShotErrors,
 ) -> Hyperparameters:
     """Signal and noise from all cameras at once, where positions have errors of their own.
 
@@ -144,7 +146,7 @@ def _joint_sizes(
     def loss(z: Floats) -> float:
         signal, noise = np.exp(z)
         sized = tuple(replace(m, signal=m.signal * signal, noise=m.noise * noise) for m in laid_out)
-        evidence = condition(sized, training.points, some, training.errors).evidence
+        evidence = log_evidence(sized, training.points, some, errors)
         penalties = (rig.penalty(hyper.signal[c] * signal, hyper.noise[c] * noise) for c, rig in groups)
         return float(sum(penalties)) - evidence
 
