@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal
 
 from implicam.calibrators import ForwardGP, ForwardGPCalibration
 from implicam.dataset import Dataset, KnownPositions
+from implicam.errors import FitError
 from implicam.evaluation import cross_validate, evaluate
 from implicam.rig_model.camera_model import CameraViews
 from implicam.rig_model.leave_one_out import left_out_points
@@ -449,3 +450,20 @@ def test_what_cameras_see_is_sensitive_to_what_ties_them() -> None:
         expected = design @ joint.T @ joint @ design.T
         np.testing.assert_allclose(found.half[i] @ found.half[i].T, expected, rtol=1e-6, atol=1e-9 * expected.max())
         assert np.abs(expected[:2, 2:]).max() > 0
+
+
+def test_more_cameras_than_can_be_tied_are_refused_or_said() -> None:
+    rig = build_rig("bar4", seed=1)
+    data = simulate(rig, random_positions(rig, 40, np.random.default_rng(1)), seed=2, robot_noise=0.5)
+    few = ForwardGP(settings=replace(ForwardGP().settings, max_tied_unknowns=100))
+    with pytest.raises(FitError, match="too many for known positions with declared errors") as refused:
+        few.fit(data)
+    assert "leave sd_x, sd_y and sd_z out" in str(refused.value.fix)
+    assert data.known is not None
+    exact = few.fit(replace(data, known=replace(data.known, sd=np.full((40, 3), np.nan))))
+    assert not exact.posterior.tied
+    (note,) = [note for note in exact.notes if "was not looked for" in note]
+    assert "rather too large than too small" in note
+    new = simulate(rig, random_positions(rig, 300, np.random.default_rng(3)), seed=4)
+    overall = evaluate(exact, new, regions=False).coverage.overall
+    assert overall.nees.value < 3.3, "too small error bars; a perfect calibration has 3"

@@ -17,7 +17,7 @@ from implicam.rig_model.camera import CentralCamera, Prior
 from implicam.rig_model.camera_model import CameraModel, CameraViews
 from implicam.rig_model.field import empty_field
 from implicam.rig_model.leave_one_out import left_out_residuals, squared_distances
-from implicam.rig_model.posterior import Posterior, condition
+from implicam.rig_model.posterior import Posterior, condition, log_evidence
 from implicam.rig_model.shot_errors import ShotErrors
 from implicam.rig_model.tied import Scatter, condition_scattered
 
@@ -422,3 +422,16 @@ def test_the_steps_to_the_posterior_do_not_wait_for_a_part_of_the_views(
         for one, other in zip(by_some.models, by_all.models, strict=True):
             off = one.predict(points)[0] - other.predict(points)[0]
             assert np.abs(off).max() < 0.02 * one.noise
+
+
+@pytest.mark.parametrize("shots", [50, 9], ids=["each point its own", "several together"])
+def test_the_evidence_is_the_same_whichever_is_eliminated_first(shots: int) -> None:
+    models, points, camera_views = two_cameras()
+    alone = camera_views[1].rows < 30  # some points are seen by one camera, some by none
+    camera_views = (camera_views[0].select(camera_views[0].rows < 40), camera_views[1].select(alone))
+    sd = np.random.default_rng(5).uniform(0.001, 0.01, (shots, 3))
+    shot = np.arange(50) % shots
+    errors = ShotErrors(shot, np.tile(np.eye(3), (50, 1, 1)), sd, np.full(3, -1))
+    expected = condition(models, points, camera_views, errors).evidence
+    assert abs(expected) > 10
+    np.testing.assert_allclose(log_evidence(models, points, camera_views, errors), expected, atol=1e-6)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import lapack, solve_triangular
 
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel, CameraViews
@@ -177,7 +177,7 @@ def solve_normal(A: Floats, b: Floats) -> tuple[Floats, Floats, float]:
         numpy.linalg.LinAlgError: A is not finite, or the views do not fix the camera.
     """
     L, scale = _scaled_cholesky(A)
-    root = np.ascontiguousarray(solve_triangular(L, np.diag(scale), lower=True))
+    root = np.ascontiguousarray(lapack.dtrtri(L, lower=1)[0] * scale)  # a third of the work of solving for a matrix
     return root, root.T @ (root @ b), float(2 * np.sum(np.log(np.diag(L) / scale)))
 
 

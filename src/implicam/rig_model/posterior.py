@@ -132,8 +132,8 @@ def condition(
 def log_evidence(
     models: tuple[CameraModel, ...], points: Floats, camera_views: tuple[CameraViews, ...], errors: ShotErrors
 ) -> float:
-    """As `condition(...).evidence`, of shots that few cameras each see. Cameras are eliminated first, one by one, and the
-    shots are left: work grows linearly with the cameras, and their joint covariance is never made.
+    """As `condition(...).evidence`, of shots with few unknowns. Cameras are eliminated first, one by one, and the shots
+    are left: work grows linearly with the cameras, and their joint covariance is never made.
 
     Args:
         models: The cameras where they are linearised, with their priors.

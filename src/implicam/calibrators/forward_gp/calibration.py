@@ -434,10 +434,20 @@ class ForwardGPCalibration(RigCalibration):
             f"{sd:.2g} {unit}, as is usual. State sd_x, sd_y, sd_z if you know better."
         ]
 
+    def _inseparable_notes(self) -> list[str]:
+        unknowns, most = self.posterior.offsets[-1], self.calibrator.settings.max_tied_unknowns
+        if self.posterior.tied or unknowns <= most:
+            return []
+        return [
+            f"Whether single known positions are off was not looked for: the {unknowns} unknowns of so many cameras are "
+            "too many for that. Such errors count as noise of the pixels, and error bars are rather too large than too "
+            "small."
+        ]
+
     def _single_notes(self) -> list[str]:
         errors = self.fitted.position_errors
         if errors is None:
-            return []
+            return self._inseparable_notes()
         sd = ", ".join(f"{x:.2g}" for x in np.sqrt(np.diagonal(errors.covariance)) * self.frame.scale)
         noise = [model.noise for model in self.posterior.models]
         tails = "" if np.isinf(errors.freedom) else ", a few by much more"

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from implicam.calibrators.forward_gp.evidence import CameraEvidence, RigEvidence
-from implicam.calibrators.forward_gp.settings import Training
+from implicam.calibrators.forward_gp.settings import ForwardGPSettings, Training
+from implicam.errors import FitError
 from implicam.geometry import Floats
 from implicam.rig_model.camera import ProjectiveCamera
 from implicam.rig_model.camera_model import CameraModel, CameraViews, thin_views
@@ -55,7 +56,20 @@ def estimate_hyperparameters(
         groups.append((numbers, rig))
     if training.errors is None or training.errors.estimated:
         return found
+    _refuse_too_many(size_fields(training, models, used, found), training.settings)
     return _joint_sizes(training, models, used, found, groups, training.errors)
+
+
+def _refuse_too_many(models: tuple[CameraModel, ...], settings: ForwardGPSettings) -> None:
+    unknowns = sum(model.size for model in models)
+    if unknowns > settings.max_tied_unknowns:
+        raise FitError(
+            f"{len(models)} cameras are too many for known positions with declared errors (sd_x, sd_y, sd_z).",
+            why=f"all cameras share these errors, so all of their {unknowns} unknowns are one system of equations; "
+            f"{settings.max_tied_unknowns} at most can be solved in reasonable time and memory",
+            fix="leave sd_x, sd_y and sd_z out: the errors then count as noise of the pixels, and error bars are "
+            "rather too large than too small; or calibrate fewer cameras",
+        )
 
 
 def _group_by_kind(models: tuple[CameraModel, ...]) -> list[list[int]]:

@@ -51,6 +51,8 @@ def separate_position_errors(training: Training, fitted: FitResult, shots: Names
 
 def _separate(training: Training, fitted: FitResult) -> FitResult:
     seen, settings = training.of_cameras(fitted.cameras).camera_views, training.settings
+    if fitted.posterior.offsets[-1] > settings.max_tied_unknowns:
+        return fitted
     if fitted.tails is not None:
         seen = fitted.tails.weight_views(seen, with_loss=True)
     inliers, points = fitted.inliers, training.points

@@ -145,6 +145,9 @@ class ForwardGPSettings(RigModelSettings):
     """Median error of a fitted camera at its own views, in its noise, beyond which the fit has failed."""
     max_points_for_position_errors: int = 400
     """Points that errors of known positions are estimated from; more cost time and tell little more."""
+    max_tied_unknowns: int = 5000
+    """Unknowns of all cameras that errors of known positions can tie together: a joint covariance of 0.2 GB, several of
+    which are needed, and a minute for each step of the fit."""
 
     # a wand
     usual_wand_jitter_ratio: float = 1e-4
