@@ -439,9 +439,9 @@ class ForwardGPCalibration(RigCalibration):
         if self.posterior.tied or unknowns <= most:
             return []
         return [
-            f"Whether single known positions are off was not looked for: the {unknowns} unknowns of so many cameras are "
-            "too many for that. Such errors count as noise of the pixels, and error bars are rather too large than too "
-            "small."
+            f"Whether single known positions are off was not looked for: the {unknowns} unknowns of so many cameras "
+            "are too many for that. Such errors count as noise of the pixels, and error bars are rather too large than "
+            "too small."
         ]
 
     def _single_notes(self) -> list[str]:
