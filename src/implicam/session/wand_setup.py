@@ -18,6 +18,7 @@ from implicam.hardware.simulated_wave import simulated_wave
 from implicam.session.controller import Equipment
 from implicam.session.journal import TARGET_KEY, Session
 from implicam.session.wand_session import WandController
+from implicam.simulate import Optics
 from implicam.simulate.targets import WAND_SHARE
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ WAND_METHOD = DEFAULT_METHOD
 
 WAVING_SECONDS = 1.5
 """That a simulated hand takes from one place to the next, to be watched."""
+
+DARK_ROOM = Optics(clutter=False)
+"""Of simulated cameras: as people choose it for a wand with bright balls."""
 
 WAND_OPTIONS = ("wand", "wand_sd", "markers", "told_by")
 """The options of a session that say what the wand is."""
@@ -103,7 +107,9 @@ def wand_hardware(
     """
     volume = workspace_from(setup.workspace, None) if setup.workspace else None
     if cameras is None:
-        found, _ = simulated_wave(setup.built(), wand_length(setup), seed=setup.seed, seconds=WAVING_SECONDS)
+        found, _ = simulated_wave(
+            setup.built(), wand_length(setup), seed=setup.seed, seconds=WAVING_SECONDS, optics=DARK_ROOM
+        )
         cameras = list(found)
     return cameras, Person(lambda _: None, (np.nan,) * 3), volume
 

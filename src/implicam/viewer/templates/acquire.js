@@ -11,6 +11,21 @@ const LOST_MS = 6000, LOUPE_RADII = 4, ON_TARGET_PX = 12, GAP_PX = 8, SIDE_PX = 
 
 let about = null, state = null, scene = null, world = null, heard = Date.now(), dismissed = new Set();
 let sceneNumber = -1, curveNumber = -1, chosen = 0, typed = null, questioned = null, listed = null, closed = false, fetching = false, lastTexts = "";
+// What sessions by hand say, of a board and of a wand.
+const BY_HAND = {
+  board: {things: "boards", list: "Boards", auto: "take pictures by itself, when the board is held still",
+    simulated: "cameras, board and the hand that holds it are simulated", points: "corners",
+    none: "no calibration yet: each camera is shown what it has not seen",
+    meaning: "These are predictions of the calibration, for a position measured anywhere in the volume, in the frame that fits it best; "
+      + "the report at the end gives the rms error of distances between corners of boards that were held out."},
+  wand: {things: "frames", list: "Frames", auto: "keep what is seen by itself, while the wand is waved",
+    simulated: "cameras, wand and the hand that waves it are simulated", points: "where it was",
+    none: "no calibration yet: each camera is shown what it has not seen",
+    meaning: "These are what the last fit states, for a position measured anywhere in the volume, relative to where the wand was; "
+      + "the held-out lengths say whether that is so."},
+};
+const byHand = () => BY_HAND[about.wand ? "wand" : "board"];
+const goodness = (part) => `hsl(${Math.round(125 * part)}, 75%, 45%)`;  // red to green
 window.implicam = {get state() { return state; }, get scene() { return scene; }, get world() { return world; }};
 
 const number = (value, digits = 3) => Number.isFinite(value) ? String(Number(value.toPrecision(digits))) : "–";
@@ -272,7 +287,7 @@ function drawTiles() {
     const one = state.cameras[i], {image, svg, says, reason, bar} = tile.parts;
     bar.hidden = one.part === undefined;  // how far its calibration is, red to green
     if (!bar.hidden) {
-      Object.assign(bar.style, {width: `${100 * one.part}%`, background: `hsl(${Math.round(125 * one.part)} 75% 45%)`});
+      Object.assign(bar.style, {width: `${100 * one.part}%`, background: goodness(one.part)});
       bar.title = one.told;
     }
     tile.classList.toggle("chosen", i === chosen);
@@ -329,6 +344,7 @@ function drawMarks(svg, one, tile) {
     element(name, {...attributes, class: "halo", "stroke-width": (wide + 3) * pixel}, svg);
     element(name, {...attributes, class: kind, "stroke-width": wide * pixel}, svg);
   };
+  if (one.cells) drawCells(svg, one);
   if (one.hold) stroke("polygon", {points: one.hold.map(centre).map((p) => p.join()).join(" ")}, "aim", 3.5);
   for (const [u, v] of one.corners ?? [])
     element("circle", {cx: u + 0.5, cy: v + 0.5, r: 2.2 * pixel, class: "corner", "stroke-width": 0.8 * pixel}, svg);
@@ -363,6 +379,16 @@ function drawMarks(svg, one, tile) {
   stroke("polyline", {points: [head[0], tip, head[1]].map((p) => p.join()).join(" ")}, "go");
 }
 
+// What is known of the picture, in cells from red to green; the better known, the less they hide.
+function drawCells(svg, one) {
+  const high = one.height / one.cells.length, group = element("g", {class: "cells"}, svg);
+  one.cells.forEach((row, r) => row.forEach((known, c) => {
+    const wide = one.width / row.length, gap = 0.012 * one.width;
+    if (known !== null) element("rect", {x: c * wide + gap / 2, y: r * high + gap / 2, width: wide - gap, height: high - gap, rx: gap,
+      fill: goodness(known), opacity: 0.36 - 0.16 * known}, group);
+  }));
+}
+
 function loupe(tile, one, ball, radius) {  // in the corner that is farthest from it: whether its outline is right
   let box = tile.querySelector(".loupe");
   if (!box) {
@@ -390,7 +416,7 @@ function drawNumbers() {
   const word = state.numbers.word ?? "point";
   by("numbers").replaceChildren(bold(String(points)), ` ${word}${points === 1 ? "" : "s"}${skipped ? ` · ${skipped} skipped` : ""}`,
     ...(usual ? [" · ", bold(usual), " in 95 % of the workspace, ", bold(worst), " everywhere"]
-      : [about.boards ? " · no calibration yet: each camera is shown what it has not seen" : " · no calibration yet: the first places are spread evenly"]));
+      : [about.boards ? ` · ${byHand().none}` : " · no calibration yet: the first places are spread evenly"]));
   by("meaning").hidden = !usual;
   by("rules").replaceChildren(...progress.filter(Boolean).map((words) =>
     Object.assign(document.createElement("li"), {textContent: words})));
@@ -429,11 +455,12 @@ async function refreshPoints() {
 
 function listBoards(rows) {
   const table = document.createElement("table"), cell = (kind, text) => Object.assign(document.createElement(kind), {textContent: text});
-  table.insertRow().append(...["", "corners", "cameras", ""].map((text) => cell("th", text)));
+  table.insertRow().append(...["", about.wand ? "ends" : "corners", "cameras", ""].map((text) => cell("th", text)));
   for (const row of rows.reverse()) {
     const acts = cell("td", "");
     table.insertRow().append(cell("td", row.name), cell("td", row.corners), cell("td", row.cameras), acts);
-    for (const [label, act] of [["look", () => lookAt({...row, words: `${row.corners} corners`})], ["delete", () => remove(row)]]) {
+    const look = ["look", () => lookAt({...row, words: `${row.corners} corners`})];  // of a wand no pictures are kept
+    for (const [label, act] of [...(about.wand ? [] : [look]), ["delete", () => remove(row)]]) {
       const button = cell("button", label);
       button.disabled = label !== "look" && !state.buttons.delete.enabled;
       button.addEventListener("click", act);
@@ -476,7 +503,7 @@ async function refreshCurve() {
     }
   for (let points = 0; points <= most; points += most / 5)
     element("text", {x: x(points), y: high - 18, "text-anchor": "middle"}, svg, String(points));
-  element("text", {x: (left + wide - right) / 2, y: high - 4, "text-anchor": "middle"}, svg, `${about.boards ? "boards" : "known points"}; 95 % uncertainty, ${about.unit}`);
+  element("text", {x: (left + wide - right) / 2, y: high - 4, "text-anchor": "middle"}, svg, `${about.boards ? byHand().things : "known points"}; 95 % uncertainty, ${about.unit}`);
   for (const one of data.stops) {
     element("line", {x1: left, x2: wide - right, y1: y(one.value), y2: y(one.value), class: "rule"}, svg);
     element("text", {x: wide - right, y: y(one.value) - 4, "text-anchor": "end", class: "rule-word"}, svg, "stop");
@@ -528,6 +555,13 @@ async function refreshScene() {
 }
 
 function colourCloud() {
+  if (about.wand) {
+    by("key").hidden = !world.good.length;
+    by("low").textContent = "uncertain";
+    by("high").textContent = "enough";
+    scene.setCloud(world.judged, world.good, 0, 1, -1, goodness);
+    return;
+  }
   const values = world[by("colour").value], known = values.filter((value) => value !== null).sort((a, b) => a - b);
   by("key").hidden = !known.length;
   if (!known.length) return;
@@ -593,13 +627,18 @@ async function begin() {
   by("by-itself").hidden = !about.auto;
   if (about.boards) {
     for (const word of ["accept", "redo"]) by(word).hidden = true;
-    if (!about.moves) by("auto").nextSibling.textContent = " take pictures by itself, when the board is held still"
-      + (about.simulated ? " (cameras, board and the hand that holds it are simulated)" : "");
-    for (const kind of ["wanted", "ball"]) document.querySelector(`.dots .${kind}`).parentNode.remove();
-    document.querySelector(".dots .known").nextSibling.textContent = "corners";
-    by("list").querySelector("summary").textContent = "Boards";
-    by("meaning").textContent = "These are predictions of the calibration, for a position measured anywhere in the volume, "
-      + "in the frame that fits it best; the report at the end gives the rms error of distances between corners of boards that were held out.";
+    const told = byHand();
+    if (!about.moves) by("auto").nextSibling.textContent = ` ${told.auto}${about.simulated ? ` (${told.simulated})` : ""}`;
+    for (const kind of about.wand ? [] : ["wanted", "ball"]) document.querySelector(`.dots .${kind}`).parentNode.remove();
+    document.querySelector(".dots .known").nextSibling.textContent = told.points;
+    by("list").querySelector("summary").textContent = told.list;
+    by("meaning").textContent = told.meaning;
+    if (about.wand) {
+      document.querySelector(".dots .wanted").nextSibling.textContent = "wave here";
+      document.querySelector(".dots .ball").nextSibling.textContent = "the wand now";
+      for (const id of ["colour", "least"]) by(id).hidden = true;
+      by("bar").style.background = `linear-gradient(to right, ${[0, 0.25, 0.5, 0.75, 1].map(goodness).join(", ")})`;
+    }
   }
   makeTiles();
   for (const word of Object.values(KEYS)) by(word).addEventListener("click", () => word === "skip" ? skip() : press(word));
@@ -627,7 +666,7 @@ async function begin() {
   by("scene").addEventListener("wheel", () => { if (scene) scene.turned = true; }, {passive: true});
   document.addEventListener("keydown", key);
   const pen = by("bar").getContext("2d");
-  for (let x = 0; x < 256; x++) {
+  for (let x = 0; x < 256 && !about.wand; x++) {
     pen.fillStyle = `rgb(${cividis(x / 255).map((v) => Math.round(255 * v)).join(",")})`;
     pen.fillRect(x, 0, 1, 1);
   }

@@ -458,8 +458,8 @@ export class Scene3D {
 
   // ------------------------------------------------------------------------------------- the region of the uncertainty
 
-  // Places coloured by a value, those from a level on; grey where there is none.
-  setCloud(xyz, values, low, high, level) {
+  // Places coloured by a value, those from a level on; grey where there is none. colour: of a part from 0 to 1, CSS.
+  setCloud(xyz, values, low, high, level, colour = null) {
     const group = this.groups.cloud;
     this.empty(group);
     const shown = xyz.map((_, i) => i).filter((i) => values[i] === null || values[i] >= level);
@@ -467,7 +467,8 @@ export class Scene3D {
       const drawn = this.points(shown.map((i) => this.place(xyz[i])), "soft", group, POINT_PX);
       const grey = this.colour("soft");
       const colours = shown.flatMap((i) => values[i] === null ? [grey.r, grey.g, grey.b]
-        : [...new THREE.Color().setRGB(...cividis((values[i] - low) / Math.max(high - low, 1e-300)), THREE.SRGBColorSpace)]);
+        : [...(colour ? new THREE.Color(colour((values[i] - low) / Math.max(high - low, 1e-300)))
+          : new THREE.Color().setRGB(...cividis((values[i] - low) / Math.max(high - low, 1e-300)), THREE.SRGBColorSpace))]);
       drawn.geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 3));
       Object.assign(drawn.material, {vertexColors: true, transparent: true, opacity: 0.8});
       drawn.material.color.set(0xffffff);
