@@ -2,24 +2,42 @@
 
 from __future__ import annotations
 
+import shutil
+import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from command_line import cli  # noqa: F401
 from implicam.active.board_loop import Pictures
 from implicam.active.stopping import Below, Within
 from implicam.active.volume_design import linear_views
 from implicam.active.wand_coverage import Cells, WaveDesign, _gains, count_views, ends_of, unknown_cells
-from implicam.active.wand_loop import MIN_WHOLE_FRAMES, WandLoop
+from implicam.active.wand_loop import MIN_WHOLE_FRAMES, WandLoop, WaveTarget
 from implicam.active.workspace import Workspace
-from implicam.calibrators import ForwardGP, ForwardGPCalibration
-from implicam.dataset import Dataset
+from implicam.calibrators import ForwardGP, ForwardGPCalibration, load_calibration
+from implicam.dataset import Camera, Dataset, read_dataset
 from implicam.dataset.image_bounds import are_on_image
 from implicam.dataset.wand import Wand
+from implicam.detect import Detected, View
+from implicam.detect.wand import WandMarkers
+from implicam.errors import UsageError
 from implicam.geometry import register
+from implicam.hardware import Frame, Person
+from implicam.hardware.simulated_wave import SimulatedWave
+from implicam.session.by_hand import Judgement
+from implicam.session.controller import Equipment
+from implicam.session.detections import Look
+from implicam.session.folder import is_session
+from implicam.session.journal import Session
+from implicam.session.setup import Setup
+from implicam.session.wand_session import CLUTTERED, FEW, TOO_FAST, UNTOLD, WandController, WandState
+from implicam.session.wand_setup import made_wand_session, wand_settings
 from implicam.simulate import Rig, as_wand, build_rig, simulate, waved_wand
+from implicam.viewer.wand_words import headline, wand_snapshot
 
 
 def wave(rig: Rig, frames: int, seed: int = 3, **options: float) -> Dataset:
@@ -195,3 +213,201 @@ def test_the_volume_of_a_session_is_in_the_frame_of_the_first_camera(rig, data):
     assert camera is not None
     there = camera.apply(loop.workspace.vertices)
     np.testing.assert_allclose(np.sort(there, axis=0)[[0, -1]], np.sort(box.vertices, axis=0)[[0, -1]], atol=20)
+
+
+# --- the session ----------------------------------------------------------------------------------------------------
+
+
+class TableCamera:
+    """A camera whose pictures show nothing: `TableDetector` knows where the ends are."""
+
+    live = simulated = True
+
+    def __init__(self, rig: Rig, c: int, hand: SimulatedWave) -> None:
+        camera = rig.cameras[c]
+        self.name, self.hand, self.number = camera.name, hand, c
+        self.picture = np.tile(np.linspace(0, 1, camera.width, dtype=np.float32), (camera.height, 1))
+
+    def open(self) -> None:
+        pass
+
+    def frame(self, timeout: float = 5.0) -> Frame:
+        self.hand.held(self.number)
+        return Frame(self.picture.copy(), 1, time.time())
+
+    def close(self) -> None:
+        pass
+
+
+class TableDetector(WandMarkers):
+    """Where the simulated hand holds the ends, with noise; nothing where a camera does not see both."""
+
+    def detect(self, picture: Any, view: View) -> Detected:
+        rig, hand = HANDS[0]
+        camera = next(one for one in rig.cameras if one.name == view.camera)
+        uv, inside = camera.pixel_from_world(hand.shown(hand._held[0]).xyz)
+        if not inside.all():
+            return Detected(reason="one marker only", notes={"spots": [[0.0] * 6]})
+        noise = 0.2 * RNG.normal(size=(2, 2))
+        return Detected((f"{view.shot}-a", f"{view.shot}-b"), uv + noise, np.full((2, 2), 0.2), notes={"spots": []})
+
+    def settle(self, found: Any) -> Any:
+        return dict(found)
+
+
+HANDS: list[tuple[Rig, SimulatedWave]] = []
+RNG = np.random.default_rng(4)
+
+
+def session_of(folder: Path, **options: Any) -> WandController:
+    """A session with the stereo rig whose pictures are made up."""
+    rig = build_rig("stereo", seed=1)
+    hand = SimulatedWave(rig, 144.0, seed=3)
+    HANDS[:] = [(rig, hand)]
+    setup = Setup(rig="stereo", seed=1, target="wand", **options)
+    cameras = [TableCamera(rig, c, hand) for c in range(2)]
+    if is_session(folder):
+        session = Session.open(folder)
+    else:
+        sized = tuple(Camera(camera.name, camera.width, camera.height) for camera in rig.cameras)
+        kept = {**setup.as_settings(), **wand_settings(setup)}
+        session = Session.create(folder, name="s", length_unit="mm", cameras=sized, settings=kept)
+    robot = Person(lambda _: None, (np.nan,) * 3)
+    return made_wand_session(session, setup, Equipment(cameras, robot, TableDetector(length=144.0)), None)
+
+
+def wave_at(controller: WandController, frames: int) -> None:
+    while controller.loop.points < frames:
+        controller.live()
+        controller.step()
+
+
+def test_frames_are_on_disk_before_they_are_counted_and_a_kill_loses_none(tmp_path):
+    with session_of(tmp_path / "s") as controller:
+        controller._hand.seconds = 0.0
+        controller.start()
+        assert controller.state.phase == "aim"
+        assert controller.state.target.words.startswith("middle of cam")
+        wave_at(controller, 5)
+        (tmp_path / "killed").mkdir()
+        shutil.copy(tmp_path / "s" / "session.db", tmp_path / "killed")  # as the disk is after kill -9
+        kept = controller.state.taken
+        assert kept == 5
+        assert (
+            wand_snapshot(controller.state, ["cam1", "cam2"], controller.loop.rule, unit="mm", skipped=0)["numbers"][
+                "points"
+            ]
+            == kept
+        )
+    with session_of(tmp_path / "killed") as again:
+        again._hand.seconds = 0.0
+        again.start()
+        assert again.loop.points == kept
+        assert set(again.session.data.columns["marker"].tolist()) == {"a", "b"}
+        again.remove("p002")
+        assert again.loop.points == kept - 1
+    data = read_dataset(tmp_path / "killed")
+    assert set(data.columns["frame"].tolist()) == {"p001", "p003", "p004", "p005"}
+    assert data.extra["target"]["length"] == 144.0
+
+
+def test_what_would_be_wrong_is_left_out_and_counted_by_why(tmp_path):
+    with session_of(tmp_path / "s") as controller:
+        look = Look(
+            "cam1", None, Detected(reason="?", notes={"spots": [[0.0] * 6] * 2, "log_ratio": 0.01}), np.zeros(2)
+        )
+        assert controller._judge((look,)) == (False, UNTOLD)
+        many = replace(look, found=Detected(reason="?", notes={"spots": [[0.0] * 6] * 4}))
+        assert controller._judge((many,)) == (False, CLUTTERED)
+        nobody = replace(look, found=Detected(reason="no marker", notes={"spots": []}))
+        assert controller._judge((nobody,)).reason == FEW
+        assert controller._left_out == {UNTOLD: 1, CLUTTERED: 1}  # where nobody waves nothing is left out
+        controller._require_target = lambda: None  # type: ignore[assignment]
+        controller._detect_all = lambda frames, **_: (nobody,)  # type: ignore[method-assign]
+        with pytest.raises(UsageError, match="nothing was kept"):
+            controller.go()
+
+
+def test_cameras_without_a_trigger_take_no_wand_that_is_fast(tmp_path):
+    with session_of(tmp_path / "s") as controller:
+        controller._simulated = False
+
+        def at(u: float) -> tuple[Look, ...]:
+            found = Detected(("1-a", "1-b"), np.array([[u, 100.0], [u, 300.0]]), np.full((2, 2), 0.2))
+            return tuple(Look(name, Frame(np.zeros((2, 2)), 1, 0.0), found, np.zeros(2)) for name in ("cam1", "cam2"))
+
+        controller._judge(at(100))
+        controller._before = (time.monotonic() - 0.2, controller._before[1])
+        assert controller._judge(at(160)).reason == TOO_FAST  # 300 px a second: 10 px within a thirtieth
+        controller._before = (time.monotonic() - 0.2, controller._before[1])
+        assert controller._judge(at(161)) == (True, "")
+        controller._kept = controller._before[1]
+        controller._before = (time.monotonic() - 0.2, controller._before[1])
+        assert controller._judge(at(162)) == (False, "")  # as the one before
+
+
+@pytest.mark.slow
+def test_a_session_by_itself_calibrates_reports_and_says_what_it_rests_on(tmp_path):
+    with session_of(tmp_path / "s", budget=70) as controller:
+        path = controller.run()
+        state = controller.state
+        assert path is not None
+        assert state.phase == "done"
+        assert state.stop == "all 70 frames of the budget are taken"
+        assert "held-out lengths 14" in state.lengths
+        assert "both ends of the wand in" in state.verdict[0]
+        assert state.report is not None
+        snapshot = wand_snapshot(state, ["cam1", "cam2"], controller.loop.rule, unit="mm", skipped=0)
+        assert snapshot["title"].startswith(("Done", "Calibrated"))
+        assert len(snapshot["cameras"][0]["cells"]) == 4
+        assert controller.loop.design is not None
+        assert len(controller.loop.design.good) == len(controller.loop.judged_at)
+    calibration = load_calibration(path)
+    assert calibration.wand.length == 144.0
+    again = ForwardGP().fit(read_dataset(tmp_path / "s"))
+    np.testing.assert_allclose(again.data.xyz, calibration.data.xyz, atol=1e-6)
+
+
+def test_the_page_says_where_to_wave_and_never_enough_where_lengths_contradict():
+    state = WandState(
+        phase="aim", auto=True, stop="0.29 mm in 95 % of the workspace", lengths="held-out lengths 500 mm"
+    )
+    assert headline(state).title == "Enough: 0.29 mm in 95 % of the workspace"
+    assert "Held-out lengths 500 mm." in headline(state).detail
+    assert headline(replace(state, contradictions=("5 mm off.",))).kind == "bad"
+    target = WaveTarget("p1", np.full(3, np.nan), np.full((2, 2), np.nan), words="left third of cam2, near", why="red")
+    assert headline(WandState(phase="aim", auto=True, target=target)).title == "Wave it in the left third of cam2"
+    untold = WandState(phase="aim", auto=True, target=target, judgement=Judgement(False, UNTOLD))
+    assert "turn the wand across" in headline(untold).detail
+    assert headline(replace(untold, auto=False)).title.startswith("Paused")
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"cameras": ("left=0", "right=1")}, "the length of the wand is not known"),
+        ({"method": "inverse-gp"}, "takes no wand"),
+        ({"told_by": "colour"}, "not told apart by 'colour'"),
+        ({"robot": "ur:10.0.0.1", "wand": 500.0, "cameras": ("left=0",)}, "waves no wand"),
+        ({"poses": "x=0 y=0 z=0:190:10"}, "those of a board"),
+    ],
+)
+def test_what_is_wrong_with_a_session_with_a_wand_is_said_first(options, what):
+    with pytest.raises(UsageError, match=what):
+        Setup(**{"target": "wand", **options})
+    assert Setup(target="wand").most == 1000
+
+
+# --- afterwards -----------------------------------------------------------------------------------------------------
+
+
+def test_suggest_says_of_a_recording_whether_it_was_waved_enough(calibration, cli):
+    calibration.save("w.implicam")
+    told = cli("suggest", "w.implicam", "--below", "30", "--json").json
+    assert told["enough"]
+    assert told["places"][0]["words"].endswith("mm from it")
+    assert set(told["cells"]) == {"cam1", "cam2"}
+    out = cli("suggest", "w.implicam", "-n", "2", "-o", "where.csv").out
+    assert "Not enough. Where to wave next:" in out
+    assert "Held-out lengths 14" in out
+    assert len(Path("where.csv").read_text().splitlines()) == 3

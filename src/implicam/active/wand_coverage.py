@@ -28,7 +28,6 @@ from implicam.calibrators import PredictsPixels
 from implicam.dataset import Camera, Dataset, Floats
 from implicam.dataset.image_bounds import are_on_image
 from implicam.dataset.wand import Wand, marker_rows
-from implicam.errors import UsageError
 from implicam.formatting import decimal_number
 
 CELLS = 6, 4
@@ -55,8 +54,8 @@ POWER = 2.0
 MAX_UNKNOWNS_OF_CANDIDATES = 6e7
 """Numbers that the candidates take at once: of rigs with very many cameras there are fewer."""
 
-DEPTH_QUANTILES = 0.05, 0.95
-"""Of the distances from a camera at which the wand was: so near and so far positions have to be good."""
+WAVED_QUANTILES, WAVED_RIM = (0.02, 0.98), 0.05
+"""Of where the wand was along each axis: between these positions have to be good, and so much of the width beyond."""
 
 
 class Cells(NamedTuple):
@@ -176,15 +175,15 @@ class WaveDesign(VolumeDesign):
         Args:
             rig: From a wand.
             wand: As the calibration used it.
-            volume: Where positions have to be good, in the frame of the calibration; None for all that two cameras see
-                at the distances at which the wand was waved.
+            volume: Where positions have to be good, in the frame of the calibration; None for the box about
+                where the wand was, as far as two cameras see it.
             target: The 95 % uncertainty that is enough there; NaN where only the noise says what is.
             seed: Of the judged places.
 
         Raises:
             UsageError: Hardly any place is seen by two cameras.
         """
-        xyz = seen_by_two(rig, JUDGED_PLACES, seed) if volume is None else volume.judged(JUDGED_PLACES, seed)
+        xyz = waved_places(rig, JUDGED_PLACES, seed) if volume is None else volume.judged(JUDGED_PLACES, seed)
         return cls(rig, Places.predicted(rig, xyz), wand=wand, target=target)
 
     @cached_property
@@ -322,38 +321,21 @@ def _gains(L: Floats, M: Floats) -> Floats:
     return np.asarray(np.einsum("mij,mij->m", inverse, through @ through.swapaxes(1, 2)), dtype=np.float64)
 
 
-def seen_by_two(rig: PredictsPixels, count: int, seed: int = 0) -> Floats:
-    """Places that two cameras see, as far from a camera as the wand was.
+def waved_places(rig: PredictsPixels, count: int, seed: int = 0) -> Floats:
+    """Places that two cameras see, in the box about where the wand was.
 
     Args:
         rig: A calibration from a wand.
-        count: How many, about.
+        count: How many, at most.
         seed: Of the places.
 
     Returns:
         (g, 3) in the frame of the calibration.
     """
-    rng = np.random.default_rng([seed, 22])
     known = rig.data.xyz
-    known = known[np.isfinite(known).all(axis=1)]
-    places = []
-    for c, camera in enumerate(rig.trained.cameras):
-        if camera.name not in rig.camera_names or camera.width is None or camera.height is None:
-            continue
-        seen = known[rig.trained.seen[:, c]]
-        parts = rng.uniform(0.03, 0.97, size=(4 * count, 2))
-        depth = rng.uniform(size=4 * count)
-        centre, rays = rig.lines_of_sight(camera.name, parts * [camera.width - 1, camera.height - 1])
-        if len(seen) < 2:
-            continue
-        low, high = np.quantile(np.linalg.norm(seen - centre, axis=1), DEPTH_QUANTILES)
-        away = np.cbrt(low**3 + depth * (high**3 - low**3))  # as many in each part of the volume, not of the depth
-        side = np.sign(np.nanmedian((seen.mean(axis=0) - centre) @ rays.T))
-        places.append(centre + side * away[:, None] * rays)
-    if not places:
-        raise UsageError("no camera says how large its picture is.", fix="state width and height of the cameras")
-    xyz = rng.permutation(np.concatenate(places))
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    low, high = np.quantile(known[np.isfinite(known).all(axis=1)], WAVED_QUANTILES, axis=0)
+    rim = WAVED_RIM * (high - low)
+    xyz = np.random.default_rng([seed, 22]).uniform(low - rim, high + rim, size=(8 * count, 3))
     inside = are_on_image(rig.trained, rig.predict(xyz)).sum(axis=1) >= 2
     return np.asarray(xyz[inside][:count], dtype=np.float64)
 

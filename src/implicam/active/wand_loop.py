@@ -9,6 +9,7 @@ while not loop.stop:
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -85,6 +86,85 @@ class WaveFit(NamedTuple):
     faults: tuple[str, ...]
 
 
+def judge_waving(
+    calibration: Calibration,
+    wand: Wand,
+    volume: Workspace | None = None,
+    *,
+    target: float = float("nan"),
+    seed: int = 0,
+    count: int = 4,
+    avoided: Sequence[Floats] = (),
+    progress: Progress = silent,
+) -> WaveFit:
+    """Was it waved enough, and where not?
+
+    Args:
+        calibration: From a wand.
+        wand: As it was waved.
+        volume: Where positions have to be good, in the frame of the calibration; None for the box about where the
+            wand was, as far as two cameras see it.
+        target: The 95 % uncertainty that is enough there; NaN where only the noise says what is.
+        seed: Of the places that are tried and judged.
+        count: How many places are named.
+        avoided: (3,) places, near which nobody can or wants to go.
+        progress: Called as it goes on.
+    """
+    held_out: LengthsHeldOut | None = None
+    faults: tuple[str, ...] = ()
+    if isinstance(calibration, FromWand):
+        wand = calibration.wand or wand
+        with suppress(FitError):  # then that is among the faults
+            held_out = calibration.hold_lengths_out()
+        faults = tuple(finding.reason for finding in calibration.find_faults(progress))
+    design: WaveDesign | None = None
+    places: tuple[WavePlace, ...] = ()
+    if isinstance(calibration, PredictsPixels):
+        with suppress(UsageError, np.linalg.LinAlgError), blas_threads(1):
+            design = WaveDesign.of(calibration, wand, volume, target=target, seed=seed)
+            places = tuple(design.next_places(count, seed=len(calibration.data), avoided=avoided))
+    return WaveFit(calibration, design, places, held_out, faults)
+
+
+def describe_lengths(held_out: LengthsHeldOut | None, wand: Wand, unit: str) -> str:
+    """What the lengths that were held out say: "held-out lengths 499.98 ± 0.12 mm".
+
+    Args:
+        held_out: They; None for none.
+        wand: Its length.
+        unit: Of lengths.
+    """
+    if held_out is None or not len(held_out.errors):
+        return ""
+    spread = float(np.sqrt(np.mean(held_out.errors**2)))
+    digits = int(np.clip(1 - np.floor(np.log10(max(spread, 1e-9))), 0, 6))
+    mean = wand.length + float(np.mean(held_out.errors))
+    stated = float(np.sqrt(np.mean(held_out.sds**2)))
+    return (
+        f"held-out lengths {mean:.{digits}f} ± {spread:.{digits}f} {unit} ({len(held_out.errors)} frames that a fit "
+        f"did not know; its error bars say ± {stated:.{digits}f})"
+    )
+
+
+def describe_reach(design: WaveDesign, unit: str) -> str:
+    """That no waving reaches what is wanted, because pixel noise alone leaves more; empty where it may.
+
+    Args:
+        design: With its target.
+        unit: Of lengths.
+    """
+    if not np.isfinite(design.target):
+        return ""
+    floor = design.at_judged.floor
+    left = float(np.nanquantile(PredictedCovariance(floor, lambda: floor).u95, 0.95))
+    if left <= design.target:
+        return ""
+    return (
+        f"Pixel noise alone leaves {decimal_number(left, 2)} {unit} in 95 % of the volume: no waving reaches "
+        f"{decimal_number(design.target, 2)} {unit}. Sharper pictures, larger balls, or cameras that are nearer do."
+    )
+
+
 @dataclass(eq=False)
 class WandLoop:
     """Guided waving; it changes with what it is told.
@@ -93,8 +173,8 @@ class WandLoop:
         calibrator: The method, which knows the wand: `forward-gp`.
         wand: Its ends and its length.
         cameras: Those that look at it, with the size of their pictures.
-        volume: Where positions have to be good, in the frame of the first camera; None for all that two cameras see at
-            the distances at which the wand was.
+        volume: Where positions have to be good, in the frame of the first camera; None for the box about where the
+            wand was, as far as two cameras see it.
         rule: When to stop, once all cameras are calibrated.
         seed: Of the places that are tried and judged.
         data: All frames so far; None for none.
@@ -205,18 +285,9 @@ class WandLoop:
     @property
     def out_of_reach(self) -> str:
         """That no waving reaches what is wanted, because pixel noise alone leaves more; empty where it may."""
-        wanted, now = self._target, self.predicted
-        if now is None or self.data is None or not np.isfinite(wanted):
+        if self.fitted is None or self.fitted.design is None or self.data is None:
             return ""
-        floor = PredictedCovariance(now.floor, lambda: now.floor).u95
-        left = float(np.nanquantile(floor, 0.95))
-        if left <= wanted:
-            return ""
-        unit = self.data.length_unit
-        return (
-            f"Pixel noise alone leaves {decimal_number(left, 2)} {unit} in 95 % of the volume: no waving reaches "
-            f"{decimal_number(wanted, 2)} {unit}. Sharper pictures, larger balls, or cameras that are nearer do."
-        )
+        return describe_reach(self.fitted.design, self.data.length_unit)
 
     def refuse(self, xyz: Floats, reason: str) -> None:
         """Another place is asked for instead of this one.
@@ -270,26 +341,11 @@ class WandLoop:
             calibration = self.calibrator.fit(data, progress)
         except FitError as error:
             return error
-        held_out: LengthsHeldOut | None = None
-        faults: tuple[str, ...] = ()
-        used = self.wand
-        if isinstance(calibration, FromWand):
-            used = calibration.wand or used
-            with suppress(FitError):  # then that is among the faults
-                held_out = calibration.hold_lengths_out()
-            faults = tuple(finding.reason for finding in calibration.find_faults(progress))
-        design: WaveDesign | None = None
-        places: tuple[WavePlace, ...] = ()
-        if isinstance(calibration, PredictsPixels):
-            try:
-                with blas_threads(1):
-                    design = WaveDesign.of(
-                        calibration, used, self._volume_of(calibration), target=self._target, seed=self.seed
-                    )
-                    places = tuple(design.next_places(4, seed=len(data), avoided=self._refused))
-            except (UsageError, np.linalg.LinAlgError):
-                design = None
-        return WaveFit(calibration, design, places, held_out, faults)
+        volume = self._volume_of(calibration) if isinstance(calibration, PredictsPixels) else None
+        return judge_waving(
+            calibration, self.wand, volume, target=self._target, seed=self.seed, avoided=self._refused,
+            progress=progress,
+        )  # fmt: skip
 
     def adopt(self, data: Dataset | None, found: WaveFit | ImplicamError | None) -> None:
         """Take what `fit` gave.

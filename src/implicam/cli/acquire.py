@@ -16,7 +16,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from implicam.calibrators import load_calibration
+from implicam.calibrators import FromWand, load_calibration
 from implicam.cli import show
 from implicam.cli.app import Json, Seed, command, command_line, must_be_folder, must_not_replace
 from implicam.cli.options import OptionsOfParts, options_of_setup
@@ -24,12 +24,13 @@ from implicam.dataset import Floats
 from implicam.dataset.written_table import check_table_name, write_table
 from implicam.errors import ImplicamError, UsageError, import_extra
 from implicam.files import refuse_folder
-from implicam.formatting import decimal_number, percent, without_dust
+from implicam.formatting import decimal_number, json_safe, percent, without_dust
 from implicam.images import opencv
 from implicam.logs import LOG, log_to_file
 from implicam.threads import return_large_memory
 
 if TYPE_CHECKING:
+    from implicam.active import Below, Within
     from implicam.session.controller import SessionController
 
 
@@ -37,11 +38,12 @@ def _suggest(
     calibration: Annotated[Path, typer.Argument(help="A calibration file.")],
     count: Annotated[int, typer.Option("--count", "-n", min=1, max=200, metavar="N", help="How many targets.")] = 5,
     workspace: Annotated[
-        str,
+        str | None,
         typer.Option(
-            metavar="WHERE", help="x0:x1,y0:y1,z0:z1, a CSV of places, box or hull of the known points, or view."
+            metavar="WHERE",
+            help="x0:x1,y0:y1,z0:z1, a CSV of places, box or hull of the known points, or view. Default box.",
         ),
-    ] = "box",
+    ] = None,
     here: Annotated[
         str | None, typer.Option("--from", metavar="X,Y,Z", help="Where the robot is: the targets in a short order.")
     ] = None,
@@ -53,7 +55,10 @@ def _suggest(
     json: Json = False,
     **options: Any,
 ) -> None:
-    """Where to put the next known points, and what each camera will see."""
+    """Where to put the next known points, and what each camera will see.
+
+    Of a calibration from a wand: whether it was waved enough, and where not.
+    """
     from implicam.active import acquisition_from_name, suggest, workspace_from
     from implicam.active.acquisitions import DEFAULT_ACQUISITION
     from implicam.session.setup import position_from_text
@@ -64,9 +69,14 @@ def _suggest(
         must_not_replace(output, calibration)
         check_table_name(output)
     fitted = load_calibration(calibration)
+    if isinstance(fitted, FromWand) and fitted.wand is not None:
+        _advise_waving(fitted, workspace, count=count, below=options["below"], output=output, seed=seed, json=json)
+        return
+    if options["below"] is not None:
+        raise UsageError("--below is for a calibration from a wand.", fix="leave it out: the uncertainty is printed")
     if reach is not None and not reach > 0:
         raise UsageError(f"a reach of {reach:g} is no length.", fix="give one greater than zero")
-    space = None if workspace == "view" else workspace_from(workspace, fitted.data.xyz)
+    space = None if workspace == "view" else workspace_from(workspace or "box", fitted.data.xyz)
     found = suggest(
         fitted,
         space,
@@ -108,8 +118,85 @@ def _suggest(
         show.line(f"{output}: {len(found.targets)} targets")
 
 
-_shared_options = partial(options_of_setup, "acquisition", "reach")
+_shared_options = partial(options_of_setup, "acquisition", "reach", "below")
 suggest_command = command("suggest")(OptionsOfParts(_suggest, "workspace", _shared_options))
+
+
+def _advise_waving(
+    fitted: FromWand, workspace: str | None, *, count: int, below: float | None, output: Path | None, seed: int,
+    json: bool,
+) -> None:  # fmt: skip
+    """Was the wand waved enough, and where not: what the guided session says, of a recording afterwards."""
+    from implicam.active import Below, Target, Within, Workspace, summarise_step, workspace_from
+    from implicam.active.wand_loop import describe_lengths, describe_reach, judge_waving
+    from implicam.calibrators import PredictsPixels
+
+    wand, data = fitted.wand, fitted.data
+    assert wand is not None
+    assert isinstance(fitted, PredictsPixels)
+    space = None if workspace in (None, "box", "view") else workspace_from(str(workspace), data.xyz)
+    if workspace == "view":
+        space = Workspace.in_view(fitted, data.xyz)
+    rule = Within() if below is None else Below(below, "usual")
+    with show.progress(json) as progress:
+        found = judge_waving(
+            fitted, wand, space, target=np.nan if below is None else below, seed=seed, count=count, progress=progress
+        )
+    cameras, unit, design = data.observations.camera_names, data.length_unit, found.design
+    if design is None:
+        raise UsageError(
+            "hardly any place of the volume is seen by two cameras.", fix="give another --workspace, or leave it out"
+        )
+    now = summarise_step(design.at_judged, len(data))
+    missing = [name for name in cameras if name not in fitted.camera_names]
+    enough = "" if found.faults or missing else rule.met([now], unit)
+    targets = [Target(f"w{k}", one.xyz, one.uv, one.gain) for k, one in enumerate(found.places, start=1)]
+    cells = {
+        camera.name: design.cells(c, data.observations.uv[:, c], (camera.width, camera.height)).known
+        for c, camera in enumerate(data.cameras)
+        if camera.name in fitted.camera_names and camera.width is not None and camera.height is not None
+    }
+    if output is not None:
+        write_table(output, _columns(cameras, targets))
+    if json:
+        held_out = found.held_out
+        show.emit_json({
+            "length_unit": unit, "enough": bool(enough), "now": asdict(now), "reasons": list(found.faults),
+            "out_of_reach": describe_reach(design, unit), "not_calibrated": missing,
+            "held_out": None if held_out is None else {
+                "errors": held_out.errors.tolist(), "sds": held_out.sds.tolist(),
+            },
+            "places": [
+                {"xyz": one.xyz.tolist(), "words": one.words, "why": one.why, "gain": one.gain,
+                 "pixels": {name: uv.tolist() if np.isfinite(uv[0]) else None for name, uv in _pairs(cameras, one.uv)}}
+                for one in found.places
+            ],
+            "cells": {name: json_safe(known.tolist()) for name, known in cells.items()},
+        })  # fmt: skip
+        return
+    reached = f"{decimal_number(now.usual, 3)} {unit} in 95 % of the volume"
+    times = f"{decimal_number(now.excess, 3)} times what pixel noise alone leaves"
+    show.line(f"95 % uncertainty: {reached}, {times}; enough is {_wanted(rule, unit)}.")
+    if told := describe_lengths(found.held_out, wand, unit):
+        show.line(f"{told[:1].upper()}{told[1:]}.")
+    for text in (*found.faults, describe_reach(design, unit), *(f"{name} is not calibrated." for name in missing)):
+        if text:
+            show.note(text)
+    show.line(f"Enough: {enough}. Where more would help most:" if enough else "Not enough. Where to wave next:")
+    rows = [[str(k), one.words, one.why] for k, one in enumerate(found.places, start=1)]
+    show.table(show.text_table("", ["", "where", "why"], rows))
+    for name, known in cells.items():
+        some = known[np.isfinite(known)]
+        if len(some):
+            show.line(f"  {name}: {percent(float(np.mean(some >= 1)))} of what it sees of the volume is well known")
+    if output is not None:
+        show.line(f"{output}: {len(targets)} places")
+
+
+def _wanted(rule: Within | Below, unit: str) -> str:
+    from implicam.active import Below
+
+    return f"{rule.value:g} {unit}" if isinstance(rule, Below) else f"{rule.times:g} times"
 
 
 def _pairs(cameras: Sequence[str], uv: Floats) -> list[tuple[str, Floats]]:

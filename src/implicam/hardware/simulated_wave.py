@@ -20,6 +20,9 @@ from implicam.simulate.targets import WAND_ENDS, WAND_JITTER_RATIO, WAND_SHARE
 REACH_SHARE = 0.12
 """How far the middle of the wand goes to each side while it is waved at a place, over the volume's edges."""
 
+ARMS_SHARE = 0.7
+"""How far from the middle of the volume it goes along each axis, over the volume's edges: it is no farther reached."""
+
 WAVES_PER_SECOND = np.array([0.17, 0.23, 0.13])
 """To and fro along each axis: slow enough for pictures that are hardly blurred."""
 
@@ -52,7 +55,8 @@ class SimulatedWave(MovingHand):
         if goal is None:
             return
         box = self.rig.volume
-        goal = goal + box.world_from_box.rotation @ (0.03 * box.size * self._rng.normal(size=3))
+        inside = box.world_from_box.inverse().apply(goal[None])[0] + 0.03 * box.size * self._rng.normal(size=3)
+        goal = box.world_from_box.apply(np.clip(inside, -ARMS_SHARE * box.size, ARMS_SHARE * box.size)[None])[0]
         self._go_to(Pose(np.eye(3), goal))
 
     def shown(self, pose: Pose) -> Target:

@@ -22,7 +22,7 @@ import numpy as np
 
 from implicam import calibration_file
 from implicam.active.wand_coverage import Cells
-from implicam.active.wand_loop import MIN_WHOLE_FRAMES, WandLoop
+from implicam.active.wand_loop import MIN_WHOLE_FRAMES, WandLoop, describe_lengths
 from implicam.calibrators import Calibration, FromWand
 from implicam.dataset import Camera, Dataset, Floats, Observations
 from implicam.dataset.wand import FRAME, MARKER
@@ -252,7 +252,9 @@ class WandController(ByHandController):
     def _show_loop(self) -> None:
         super()._show_loop()
         self._show(
-            cells=tuple(self.loop.cells()), lengths=lengths_in_words(self.loop), out_of_reach=self.loop.out_of_reach
+            cells=tuple(self.loop.cells()),
+            lengths=describe_lengths(self.loop.lengths, self.loop.wand, self.equipment.unit),
+            out_of_reach=self.loop.out_of_reach,
         )
 
     def _keep(self, looks: Sequence[Look]) -> None:
@@ -345,26 +347,6 @@ class WandController(ByHandController):
         columns = {FRAME: np.full(len(markers), name), MARKER: np.array(markers)}
         observations = Observations(points, tuple(cameras), uv, sd)
         return Dataset(self.session.name, self.session.length_unit, observations, columns=columns)
-
-
-def lengths_in_words(loop: WandLoop) -> str:
-    """What the lengths that were held out say: "held-out lengths 499.98 ± 0.12 mm".
-
-    Args:
-        loop: After a fit.
-    """
-    found = loop.lengths
-    if found is None or loop.data is None or not len(found.errors):
-        return ""
-    spread = float(np.sqrt(np.mean(found.errors**2)))
-    digits = int(np.clip(1 - np.floor(np.log10(max(spread, 1e-9))), 0, 6))
-    mean = loop.wand.length + float(np.mean(found.errors))
-    stated = float(np.sqrt(np.mean(found.sds**2)))
-    unit = loop.data.length_unit
-    return (
-        f"held-out lengths {mean:.{digits}f} ± {spread:.{digits}f} {unit} ({len(found.errors)} frames that a fit did "
-        f"not know; its error bars say ± {stated:.{digits}f})"
-    )
 
 
 def _markers_in(looks: Sequence[Look]) -> dict[str, Seen]:

@@ -121,7 +121,7 @@ def made_wand_session(session: Session, setup: Setup, equipment: Equipment, volu
         session: New, or to go on with.
         setup: With a wand.
         equipment: With its detector.
-        volume: Where positions have to be good, in the frame of the first camera; None for all that two cameras see.
+        volume: Where positions have to be good, in the frame of the first camera; None for where the wand was.
     """
     wand = wand_of(session.empty)
     assert wand is not None  # as `wand_settings` has kept it

@@ -32,6 +32,9 @@ RAYS_PER_PIXEL_SIDE = 2
 
 BALL_RADIUS_MM = 8.0
 
+FARTHEST_PX = 1e6
+"""From the picture's corner: where a target is that no picture shows."""
+
 WAND_RADII_MM, WAND_BRIGHTNESS, WAND_ROD_MM = (9.0, 6.0), (0.9, 0.9), 2.0
 """Of a wand's two balls, the larger of which is `a`, and of its rod."""
 
@@ -337,6 +340,7 @@ class Studio:
         uv = uv[np.isfinite(uv).all(axis=1)]
         if len(uv) == 0:
             return None
+        uv = np.clip(uv, -FARTHEST_PX, FARTHEST_PX)  # of what is beside the lens, or nearly
         rim = 2 * _PATCH_MARGIN_PX
         low = np.maximum(np.floor(uv.min(axis=0)).astype(int) - rim, -PADDING_PX) + PADDING_PX
         high = (
