@@ -375,8 +375,17 @@ def test_the_page_says_where_to_wave_and_never_enough_where_lengths_contradict()
     assert headline(state).title == "Enough: 0.29 mm in 95 % of the workspace"
     assert "Held-out lengths 500 mm." in headline(state).detail
     assert headline(replace(state, contradictions=("5 mm off.",))).kind == "bad"
-    target = WaveTarget("p1", np.full(3, np.nan), np.full((2, 2), np.nan), words="left third of cam2, near", why="red")
-    assert headline(WandState(phase="aim", auto=True, target=target)).title == "Wave it in the left third of cam2"
+    target = WaveTarget(
+        "p1",
+        np.full(3, np.nan),
+        np.full((2, 2), np.nan),
+        words="left third, upper part of cam2, 300 mm from it",
+        why="red",
+    )
+    assert (
+        headline(WandState(phase="aim", auto=True, target=target)).title
+        == "Wave it in the left third, upper part of cam2"
+    )
     untold = WandState(phase="aim", auto=True, target=target, judgement=Judgement(False, UNTOLD))
     assert "turn the wand across" in headline(untold).detail
     assert headline(replace(untold, auto=False)).title.startswith("Paused")

@@ -259,10 +259,12 @@ class WandLoop:
     @property
     def workspace(self) -> Workspace:
         """The volume in which positions have to be good; about a wand before there is any."""
-        if self.design is not None:
-            return Workspace.hull(self.design.judged.xyz)
+        if self.design is not None and self.volume is None:
+            xyz = self.design.judged.xyz
+            return Workspace.box(xyz.min(axis=0), xyz.max(axis=0))
         if self.volume is not None:
-            return self.volume
+            placed = None if self.calibration is None else self._volume_of(self.calibration)
+            return placed or self.volume
         size = self.wand.length
         return Workspace.box([-size, -size, size], [size, size, 3 * size])
 
@@ -341,7 +343,7 @@ class WandLoop:
             calibration = self.calibrator.fit(data, progress)
         except FitError as error:
             return error
-        volume = self._volume_of(calibration) if isinstance(calibration, PredictsPixels) else None
+        volume = self._volume_of(calibration)
         return judge_waving(
             calibration, self.wand, volume, target=self._target, seed=self.seed, avoided=self._refused,
             progress=progress,
@@ -434,7 +436,7 @@ class WandLoop:
     def _target(self) -> float:
         return next((one.value for one in parts_of(self.rule) if isinstance(one, Below)), float("nan"))
 
-    def _volume_of(self, calibration: PredictsPixels) -> Workspace | None:
+    def _volume_of(self, calibration: Calibration) -> Workspace | None:
         """The volume in the frame of a calibration; None where nobody has said which, or its camera is not known."""
         first = self.cameras[0].name
         if self.volume is None or not isinstance(calibration, RigCalibration) or first not in calibration.camera_names:

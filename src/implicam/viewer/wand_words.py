@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from implicam.active import Rule
+from implicam.active import AtLeast, Rule, Step
+from implicam.active.stopping import parts_of
 from implicam.active.wand_loop import MIN_WHOLE_FRAMES, WaveTarget
 from implicam.formatting import json_safe
 from implicam.session.detections import Look
 from implicam.session.wand_session import CLUTTERED, FEW, TOO_FAST, UNTOLD, WandState
-from implicam.viewer.hand_words import camera_table, common_headline, common_snapshot, finish_label
+from implicam.viewer.hand_words import camera_table, common_headline, common_snapshot, finish_label, sentence
 from implicam.viewer.words import Headline
 
 CURES = {
@@ -49,8 +50,8 @@ def _aim(state: WandState) -> Headline:
     target = state.target
     if state.judgement.reason:
         return Headline("Wave the wand", f"Not kept: {state.judgement.reason}. {CURES[state.judgement.reason]}", "ask")
-    words = target.words.split(",")[0] if isinstance(target, WaveTarget) else ""
-    why = f"{target.why}." if isinstance(target, WaveTarget) and target.why else ""
+    words = target.words.rsplit(", ", 1)[0] if isinstance(target, WaveTarget) else ""
+    why = f"{sentence(target.why)}." if isinstance(target, WaveTarget) and target.why else ""
     title = f"Wave it in the {words}" if words else "Wave the wand"
     return Headline(
         title, " ".join(filter(None, (_early(state), why, said))), "good" if state.judgement.ready else "ask"
@@ -66,7 +67,7 @@ def _early(state: WandState) -> str:
 
 
 def _told(state: WandState) -> str:
-    lengths = f"{state.lengths[:1].upper()}{state.lengths[1:]}." if state.lengths else ""
+    lengths = f"{sentence(state.lengths)}." if state.lengths else ""
     failed = f"The last fit failed: {state.unfitted}" if state.unfitted and state.calibration is not None else ""
     return " ".join(filter(None, (lengths, state.out_of_reach, failed)))
 
@@ -90,7 +91,10 @@ def wand_snapshot(state: WandState, cameras: Sequence[str], rule: Rule, *, unit:
     found = common_snapshot(state, head, rows, rule, unit=unit, skipped=skipped, word="frame", labels=labels)
     kept = 0 if state.data is None else len(set(state.data.columns.get("frame", np.array([])).tolist()))
     left = [f"{count} left out: {why}" for why, count in state.left_out]
-    numbers = {**found["numbers"], "points": kept, "progress": [*found["numbers"]["progress"], *left]}
+    rules = [  # frames are counted when they are kept, all else when they are fitted
+        one.progress([Step(kept)] if isinstance(one, AtLeast) else state.history, unit) for one in parts_of(rule)
+    ]
+    numbers = {**found["numbers"], "points": kept, "progress": [*rules, *left]}
     shown = target is not None and state.phase == "aim"
     return {
         **found,
