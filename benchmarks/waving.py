@@ -4,9 +4,9 @@
 
 The rig's volume is the volume that has to be good; no camera is known at first. *guided*: a simulated hand goes where
 `WandLoop` says, as well as hands do, and waves there in all directions. *all over*: any place of the volume and any
-direction, as nobody without a grid in mind does. *as people do*: any direction, places normal about the middle of
-the volume, with a fifth of its edges as sd. 10 % of the views are missing and 3 % are wrong. Fits come with every
-quarter more frames; *enough* is 1.2 times what pixel noise alone leaves, in 95 % of the volume. Then 300 random positions are
+direction, as nobody without a grid in mind does. *as people do*: any direction, places normal about the middle of the
+volume, with a fifth of its edges as sd. 10 % of the views are missing and 3 % are wrong. Fits come with every quarter
+more frames; *enough* is 1.2 times what pixel noise alone leaves, in 95 % of the volume. Then 300 random positions are
 measured: the rms error over that which the covariances state, and the share in the 95 % ellipsoids.
 """
 

@@ -34,7 +34,7 @@ from implicam.session.detections import Look
 from implicam.session.folder import is_session
 from implicam.session.journal import Session
 from implicam.session.setup import Setup
-from implicam.session.wand_session import CLUTTERED, FEW, TOO_FAST, UNTOLD, WandController, WandState
+from implicam.session.wand_session import CLUTTERED, FEW, TOO_FAST, UNTOLD, WandController, WandState, _surer
 from implicam.session.wand_setup import made_wand_session, wand_settings
 from implicam.simulate import Rig, as_wand, build_rig, simulate, waved_wand
 from implicam.viewer.wand_words import headline, wand_snapshot
@@ -198,7 +198,7 @@ def test_wrong_error_bars_are_never_enough(loop):
     """Lengths that were held out contradict them: the rule alone would stop."""
     other = replace(loop, rule=Within(50.0), data=None)
     other.data, other.history = loop.data, list(loop.history)
-    other.fitted = loop.fitted
+    other.fitted, other._fitted = loop.fitted, 60
     assert "times what pixel noise alone leaves" in other.stop
     other.fitted = loop.fitted._replace(faults=("The wand comes out 5 mm off.",))
     assert other.stop == ""
@@ -420,3 +420,11 @@ def test_suggest_says_of_a_recording_whether_it_was_waved_enough(calibration, cl
     assert "Not enough. Where to wave next:" in out
     assert "Held-out lengths 14" in out
     assert len(Path("where.csv").read_text().splitlines()) == 3
+
+
+def test_a_wand_near_the_cameras_is_told_by_each_picture_where_a_few_together_leave_it_open():
+    clear = Detected(("1-a", "1-b"), np.zeros((2, 2)), np.ones((2, 2)), notes={"log_ratio": 0.4})
+    nothing = Detected(reason="which end is which is not sure")
+    assert _surer(clear, nothing, 0.2) is clear
+    assert _surer(replace(clear, notes={"log_ratio": 0.15}), nothing, 0.2) is nothing
+    assert _surer(nothing, clear, 0.2) is clear  # what stands still was left out

@@ -48,6 +48,9 @@ from implicam.threads import blas_threads
 MIN_WHOLE_FRAMES = 30
 """In which two cameras have seen both ends, before a fit is worth its time."""
 
+MIN_ENOUGH_FRAMES = 50
+"""Fewer are never enough: a third of them, held out, says little."""
+
 MIN_GROWTH, MIN_MORE_FRAMES = 1.1, 5
 """From one fit to the next there are so many times as many frames, and so many more."""
 
@@ -223,7 +226,8 @@ class WandLoop:
         if self.data is None:
             return ""
         unit = self.data.length_unit
-        found = "" if self._cold() or self._faults else self.rule.met(self.history, unit)
+        early = self._fitted < MIN_ENOUGH_FRAMES
+        found = "" if early or self._cold() or self._faults else self.rule.met(self.history, unit)
         passed = Step(self.points, seconds=time.monotonic() - self._started)
         return found or self.rule.met([*self.history, passed], unit)
 

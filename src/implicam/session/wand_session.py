@@ -332,7 +332,12 @@ class WandController(ByHandController):
             for look, one in zip(looks, row, strict=True)
         }  # fmt: skip
         settled = self.equipment.detector.settle(found)
-        return tuple(replace(look, found=settled[View(look.camera, f"{self._number}")]) for look in looks)
+        ratios = [one.notes["log_ratio"] for _, row in self._window for one in row if "log_ratio" in one.notes]
+        least = 0.5 * float(np.median(ratios)) if ratios else 0.0
+        return tuple(
+            replace(look, found=_surer(look.found, settled[View(look.camera, f"{self._number}")], least))
+            for look in looks
+        )
 
     def _make_frame(self, name: str, seen: Mapping[str, Seen]) -> Dataset:
         """What the cameras see, as the markers of one frame."""
@@ -347,6 +352,14 @@ class WandController(ByHandController):
         columns = {FRAME: np.full(len(markers), name), MARKER: np.array(markers)}
         observations = Observations(points, tuple(cameras), uv, sd)
         return Dataset(self.session.name, self.session.length_unit, observations, columns=columns)
+
+
+def _surer(alone: Detected, settled: Detected, least: float) -> Detected:
+    """What is sure of a picture: what does not move left out, or where all of a few pictures together leave it open
+    which end is which (a wand that is waved near a camera), the picture alone, if its ends differ as much as usual."""
+    if len(settled) or not len(alone) or alone.notes.get("log_ratio", least) < least:
+        return settled
+    return alone
 
 
 def _markers_in(looks: Sequence[Look]) -> dict[str, Seen]:
