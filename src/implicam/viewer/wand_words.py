@@ -111,7 +111,9 @@ def _camera(state: WandState, c: int, name: str, look: Look | None) -> dict[str,
     if not table["shown"] or look is None:
         return {**table, "cells": cells}
     count = len(look.found)
-    says, kind = ("both ends", "good") if count else ("no wand", "idle")
+    spots = len(look.found.notes.get("spots", ()))
+    nothing = "which end is which?" if "log_ratio" in look.found.notes else "one end" if spots == 1 else "no wand"
+    says, kind = ("both ends", "good") if count else (nothing, "idle")
     target = state.target
     uv = target.uv[c] if target is not None and state.phase == "aim" and c < len(target.uv) else np.full(2, np.nan)
     return {
