@@ -33,9 +33,11 @@ from implicam.calibrators.forward_gp.wand.start import (
     bundle_of,
     consensus,
     describe_stranger,
+    explain_no_rig,
     prior_of,
     start,
 )
+from implicam.calibrators.forward_gp.wand.timing import Offset, clear_offsets, time_offsets, velocities
 from implicam.calibrators.forward_gp.wand.waves import Waves
 from implicam.errors import FitError
 from implicam.geometry import Bools, Floats, Pose
@@ -95,6 +97,8 @@ class WandFit:
         known_scale: Ratio of known distances over those by the wand alone, and its sd.
         hyper: Lengthscales, signal, noise.
         scale: Of the working frame.
+        exchanged: (F, C) pictures in which the names of both ends were exchanged.
+        offsets: Cameras whose pictures are earlier or later than those of the others.
         length_errors: (k,) of the frames whose length is used: wand as measured from its views alone, less its length;
             length_sds: (k,) of these.
     """
@@ -108,6 +112,8 @@ class WandFit:
     checked: Bools
     hyper: Hyperparameters
     scale: float
+    exchanged: Bools
+    offsets: tuple[Offset, ...]
     length_errors: Floats
     length_sds: Floats
     known: Bools
@@ -134,24 +140,31 @@ def fit_wand(waves: Waves, settings: ForwardGPSettings, length_sd: float, progre
         try:
             started = start(waves, settings, tried)
         except FitError as error:
-            raise failure or error from error
+            raise _explained(failure or error, waves) from error
         tried.append(started.first)
         try:
-            return _from_start(waves, started, settings, length_sd, progress)
+            return _from_start(started, settings, length_sd, progress)
         except (FitError, np.linalg.LinAlgError) as error:
             failure = failure or error
             _LOG.info("from %s: %s", started.first, error)
         if len(tried) == MAX_FIRST_PAIRS:
             break
     assert failure is not None
-    raise failure
+    raise _explained(failure, waves)
 
 
-def _from_start(
-    waves: Waves, started: Started, settings: ForwardGPSettings, length_sd: float, progress: Progress
-) -> WandFit:
+def _explained(failure: FitError | np.linalg.LinAlgError, waves: Waves) -> FitError | np.linalg.LinAlgError:
+    """With the cause, where it can be told."""
+    why = explain_no_rig(waves)
+    if not why:
+        return failure
+    what = failure.what if isinstance(failure, FitError) else "no camera can be calibrated from this wand."
+    return FitError(what, why=why, fix="trigger all cameras by one signal; of films, detect --offsets says by how much")
+
+
+def _from_start(started: Started, settings: ForwardGPSettings, length_sd: float, progress: Progress) -> WandFit:
     progress("adjusting", 1, 3)
-    state = _adjusted(waves, started, settings, length_sd)
+    state = _adjusted(started.waves, started, settings, length_sd)
     progress("fitting", 2, 3)
     state = _with_fields(state, settings)
     progress("fitting", 3, 3)
@@ -551,12 +564,27 @@ def _finished(state: _State, settings: ForwardGPSettings, length_sd: float) -> W
         checked,
         hyper,
         state.scale,
+        waves.exchanged,
+        _offsets(state),
         -off / left * unit,
         unit * np.sqrt(leverage / left),
         state.anchored & state.known[state.anchors.rows],
         state.offset,
         state.known_scale,
     )
+
+
+def _offsets(state: _State) -> tuple[Offset, ...]:
+    """Cameras out of step, by all views of places that are known."""
+    waves, known = state.waves, state.known
+    moving = velocities(waves.frame_names, state.places, (known & np.repeat(waves.ends, 2)).reshape(-1, 2))
+    if moving is None:
+        return ()
+    white = white_models(state.models, state.places.reshape(-1, 3), state.seen)
+    lengths = state.length_rows
+    equations = (lengths.frames, *lengths.linear(state.places))
+    found = time_offsets(white, equations, _known(state.equations), moving.reshape(-1, 3))
+    return clear_offsets(state.cameras, found)
 
 
 def _refuse_contradicted(state: _State, whole: Bools) -> None:

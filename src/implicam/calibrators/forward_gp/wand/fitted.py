@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -20,7 +20,7 @@ from implicam.dataset.requirements import match_cameras
 from implicam.dataset.unused import Rejected, Unused
 from implicam.dataset.wand import FRAME, MARKER, Wand, each_place_once, lying_still, marker_rows
 from implicam.errors import DatasetError, UsageError
-from implicam.geometry import Floats
+from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
 from implicam.rig_model import MAX_NAMED_IN_NOTE, Diagnosis, FitResult, Frame, image_of, stated_noise
 from implicam.rig_model.placement import MAX_SCALE_SDS
@@ -46,6 +46,9 @@ class Waved:
         known: Names of the known positions that were used together with the wand.
         known_rejected: Of those that contradict the wand, or the others.
         known_scale: Ratio of the distances of the known positions over those that the wand alone gives, and its sd.
+        exchanged: Names of cameras, and in how many of their pictures the two ends bore each other's names.
+        offsets: Names of cameras whose pictures are not of the instants of the others', by how many frames they are
+            later, and its standard uncertainty.
     """
 
     wand: Wand
@@ -56,6 +59,8 @@ class Waved:
     known: tuple[str, ...] = ()
     known_rejected: tuple[str, ...] = ()
     known_scale: tuple[float, float] = (1.0, 0.0)
+    exchanged: tuple[tuple[str, int], ...] = ()
+    offsets: tuple[tuple[str, float, float], ...] = ()
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """A readable table, and arrays, of a calibration file."""
@@ -63,6 +68,8 @@ class Waved:
             **self.wand.as_table(),
             "rejected_lengths": list(self.rejected_lengths),
             "unused": [[one.point, one.reason] for one in self.unused],
+            "exchanged": [list(one) for one in self.exchanged],
+            "offsets": [list(one) for one in self.offsets],
         }
         if self.known:
             table |= {"known": list(self.known), "known_rejected": list(self.known_rejected)}
@@ -101,6 +108,8 @@ class Waved:
             tuple(map(str, own.get("known", ()))),
             tuple(map(str, own.get("known_rejected", ()))),
             (float(scale[0]), float(scale[1])),
+            tuple((str(camera), int(number)) for camera, number in own.get("exchanged", ())),
+            tuple((str(camera), float(late), float(sd)) for camera, late, sd in own.get("offsets", ())),
         )
 
 
@@ -146,7 +155,7 @@ def fit_to_wand(
     if stated is not None:
         data, names, rows = with_stated_positions(data, names, rows, stated)
     jitter = wand.jitter or settings.usual_wand_jitter_ratio * wand.length
-    waves = _waves(data, rows, jitter / wand.length)
+    waves = _waves(data, names, rows, jitter / wand.length)
     if stated is not None:
         waves = replace(waves, known=_known_places(data, rows, wand.length))
     found = fit_wand(waves, settings, wand.length_sd / wand.length, progress)
@@ -162,7 +171,8 @@ def fit_to_wand(
         np.full((len(placed), 3), np.nan),
         {name: column[flat[placed]] for name, column in data.columns.items()},
     )
-    kept = replace(data, observations=data.observations.select(flat[placed]), known=known, columns={})
+    right = _put_right(data.observations, rows, found.exchanged)
+    kept = replace(data, observations=right.select(flat[placed]), known=known, columns={})
     inliers = tuple(found.used[placed, c][kept.observations.seen[:, c]] for c in found.cameras)
     posterior = replace(found.posterior, displacement=np.zeros((len(placed), 3)))
     fitted = FitResult(posterior, found.cameras, found.uncalibrated, inliers, found.hyper, None, None)
@@ -179,6 +189,8 @@ def fit_to_wand(
         tuple(names[i] for i in np.flatnonzero(wrong)), unused,
         stated_names[0], stated_names[1],
         found.known_scale,
+        tuple((name, int(n)) for name, n in zip(waves.names, found.exchanged.sum(axis=0), strict=True) if n),
+        tuple((waves.names[one.camera], one.frames, one.sd) for one in found.offsets),
     )  # fmt: skip
     return kept, frame, fitted, waved
 
@@ -260,7 +272,7 @@ def stated_again(data: Dataset) -> Dataset | None:
     return replace(data, observations=data.observations.select(rows), known=known, columns={})
 
 
-def _waves(data: Dataset, rows: NDArray[np.int64], jitter: float) -> Waves:
+def _waves(data: Dataset, names: Sequence[str], rows: NDArray[np.int64], jitter: float) -> Waves:
     """What was seen, in units of the wand's length."""
     observations = data.observations
     stated = stated_noise(observations)
@@ -271,7 +283,20 @@ def _waves(data: Dataset, rows: NDArray[np.int64], jitter: float) -> Waves:
     used = (views.select(place[views.rows] >= 0) for views in every)  # not frames in which the wand lay still
     seen = tuple(views._replace(rows=place[views.rows]) for views in used)
     images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
-    return Waves(rows, seen, images, stated, 1.0, jitter, np.asarray((rows >= 0).all(axis=1)))
+    none = np.zeros((len(rows), len(observations.cameras)), dtype=np.bool_)
+    ends = np.asarray((rows >= 0).all(axis=1))
+    return Waves(rows, seen, images, stated, 1.0, jitter, ends, none, observations.camera_names, tuple(names))
+
+
+def _put_right(observations: Observations, rows: NDArray[np.int64], exchanged: Bools) -> Observations:
+    """With the views of both ends exchanged where their names were."""
+    uv, sd = observations.uv.copy(), None if observations.sd is None else observations.sd.copy()
+    for frame, c in np.argwhere(exchanged).tolist():
+        both = rows[frame]
+        uv[both, c] = uv[both[::-1], c]
+        if sd is not None:
+            sd[both, c] = sd[both[::-1], c]
+    return replace(observations, uv=uv, sd=sd)
 
 
 def _why(found: WandFit, place: int, waves: Waves) -> str:
@@ -318,7 +343,14 @@ class WandDiagnosis(Diagnosis):
             f"of {first} (x right, y down, z forward). Error bars are of positions relative to these places. "
             "implicam world says where it is instead, from an L-frame, known points, a floor or a plumb line."
         )
-        return [*(self.world or (own,)), *super().notes(), *self._length_notes()]
+        return [*(self.world or (own,)), *super().notes(), *self._picture_notes(), *self._length_notes()]
+
+    def _picture_notes(self) -> list[str]:
+        notes = [
+            f"In {number} pictures of {camera} the two ends of the wand bore each other's names: they are put right."
+            for camera, number in self.waved.exchanged
+        ]
+        return notes + [f"{text}." for text in describe_offsets(self.waved)]
 
     def _known_note(self) -> str:
         wrong = self.waved.known_rejected
@@ -348,6 +380,19 @@ class WandDiagnosis(Diagnosis):
                 f"markers; {MIN_RECOMMENDED_FRAMES} frames or more."
             )
         return notes
+
+
+def describe_offsets(waved: Waved) -> list[str]:
+    """Cameras that are out of step, without full stops.
+
+    Args:
+        waved: How the wand was used.
+    """
+    return [
+        f"The pictures of {camera} are taken {abs(late):.2g} ± {sd:.1g} frames {'after' if late > 0 else 'before'} "
+        "those of the other cameras: trigger all of them by one signal, or give detect --offsets for films"
+        for camera, late, sd in waved.offsets
+    ]
 
 
 MIN_RECOMMENDED_FRAMES = 50

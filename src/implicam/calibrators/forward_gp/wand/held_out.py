@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from implicam.calibrators.forward_gp.wand.fitted import STATED
+from implicam.calibrators.forward_gp.wand.fitted import STATED, describe_offsets
 from implicam.calibrators.protocol import LengthsHeldOut
 from implicam.dataset.wand import FRAME, MARKER, marker_rows
 from implicam.derived import distances
@@ -75,6 +75,8 @@ def find_faults(calibration: ForwardGPCalibration, progress: Progress) -> Iterat
     """
     assert calibration.waved is not None
     used, unit = len(calibration.waved.errors), calibration.data.length_unit
+    for text in describe_offsets(calibration.waved):
+        yield Finding(False, f"{text}.")
     if used < MIN_FRAMES:
         yield Finding(
             False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from implicam.calibrators.forward_gp.choose_camera import as_started, candidates
 from implicam.calibrators.forward_gp.families import Scene, family_prior
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.calibrators.forward_gp.wand.bundle import Bundle, Lengths, rows_of
+from implicam.calibrators.forward_gp.wand.exchanged import find_exchanged
 from implicam.calibrators.forward_gp.wand.pairs import (
     MIN_SHARED_POINTS,
     MIN_WHOLE_FRAMES,
@@ -58,8 +59,9 @@ NEAR_PX = 6.0
 @dataclass(frozen=True, eq=False)
 class Started:
     """Cameras by number, in units of the wand's length: places (2 F, 3), NaN where unknown, and agree (2 F, C) which
-    views agree; first, the two that all others were joined to."""
+    views agree; first, the two that all others were joined to; waves, what was seen, with exchanged ends put right."""
 
+    waves: Waves
     first: tuple[int, ...]
     cameras: dict[int, WandCamera]
     places: Floats
@@ -94,7 +96,8 @@ def start(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int
     Raises:
         FitError: No two cameras can be.
     """
-    cameras = _best_pair(waves, settings, tried)
+    pair = _best_pair(waves, settings, tried)
+    cameras, waves = pair.cameras, pair.waves
     first = tuple(cameras)
     while True:
         places, agree = consensus(waves, cameras)
@@ -103,39 +106,68 @@ def start(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int
         each = {c: _resected(waves, c, places, settings, ordinary_first=not odd) for c in left}
         joined = {c: found for c, found in each.items() if found is not None}
         if not joined:
+            waves, joined = _resected_exchanged(waves, left, places, settings)
+        if not joined:
             break
         cameras = _adjusted_together(waves, cameras | joined, settings)
         _LOG.info("cameras %s", sorted(cameras))
-    return Started(first, cameras, places, agree)
+    wrong = find_exchanged(waves, cameras, NEAR_PX)
+    if wrong.any():
+        _LOG.info("ends exchanged in %s pictures", wrong.sum(axis=0))
+        waves = waves.with_exchanged(wrong)
+        places, agree = consensus(waves, cameras)
+    return Started(waves, first, cameras, places, agree)
 
 
-def _best_pair(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int, ...]]) -> dict[int, WandCamera]:
+def _resected_exchanged(
+    waves: Waves, left: Sequence[int], places: Floats, settings: ForwardGPSettings
+) -> tuple[Waves, dict[int, WandCamera]]:
+    """Cameras that belong to the others when their two markers are exchanged in all frames."""
+    joined: dict[int, WandCamera] = {}
+    for c in left:
+        other = waves.all_exchanged(c)
+        camera = _resected_ordinary(other, c, places, settings, min_share=GOOD_SHARE)
+        if camera is not None:
+            waves, joined[c] = other, camera
+    return waves, joined
+
+
+class _Pair(NamedTuple):
+    """Two cameras: the cost per view, they, whether they are good enough, and what was seen."""
+
+    score: float
+    cameras: dict[int, WandCamera]
+    good: bool
+    waves: Waves
+
+
+def _best_pair(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int, ...]]) -> _Pair:
     uv = waves.uv
     seen = np.isfinite(uv).all(axis=2).astype(np.int64)
     shared = np.einsum("ni,nj->ij", seen, seen)
     pairs = sorted(combinations(range(seen.shape[1]), 2), key=lambda pair: -shared[pair])
-    best: tuple[float, dict[int, WandCamera], bool] | None = None
+    best: _Pair | None = None
     for pair in [pair for pair in pairs if pair not in tried][:MAX_PAIRS]:
         found = _pair(waves, pair, settings)
         if found is None:
             continue
-        score, _cameras, good = found
-        _LOG.info("pair %s: score %.3g, %s", pair, score, "good" if good else "poor")
-        if best is None or score < best[0]:
+        _LOG.info("pair %s: score %.3g, %s", pair, found.score, "good" if found.good else "poor")
+        if best is None or found.score < best.score:
             best = found
-        if good:
+        if found.good:
             break
-    if best is None or not best[2]:
+    if best is None or not best.good:
         best = _best_of_odd(waves, [pair for pair in pairs if pair not in tried][:1], settings, best)
     if best is None:
         most = max((int(shared[pair]) for pair in pairs), default=0)
+        two = " and ".join(waves.names[c] for c in pairs[0]) if pairs else "two cameras"
         raise FitError(
             "no two cameras can be started from this wand.",
-            why=f"the two that share most see {most} markers at the same time; it takes {MIN_SHARED_POINTS}, and both "
+            why=f"{two}, which share most, see {most} markers at the same time; it takes {MIN_SHARED_POINTS}, and both "
             f"markers in {MIN_WHOLE_FRAMES} frames, that agree on two cameras",
             fix="wave the wand longer where the cameras see it together, turned in all directions, near and far",
         )
-    return best[1]
+    return best
 
 
 class Odd(NamedTuple):
@@ -176,22 +208,26 @@ def _best_of_odd(
     waves: Waves,
     pairs: Sequence[tuple[int, int]],
     settings: ForwardGPSettings,
-    best: tuple[float, dict[int, WandCamera], bool] | None,
-) -> tuple[float, dict[int, WandCamera], bool] | None:
-    """Two cameras that are no ordinary ones, if they are good and better; else what there was."""
+    best: _Pair | None,
+) -> _Pair | None:
+    """Two cameras that are no ordinary ones, or one of which has the ends exchanged, if they are better; else what
+    there was."""
     for pair in pairs:
+        exchanged = _pair(waves.all_exchanged(pair[1]), pair, settings)
+        if exchanged is not None and exchanged.good:
+            return exchanged
         for odd in ODD_PAIRS:
             found = _pair(waves, pair, settings, odd)
-            if found is not None and (best is None or found[0] < best[0]):
-                _LOG.info("pair %s as %s: score %.3g, %s", pair, odd, found[0], "good" if found[2] else "poor")
+            if found is not None and (best is None or found.score < best.score):
+                _LOG.info("pair %s as %s: score %.3g, %s", pair, odd, found.score, "good" if found.good else "poor")
                 best = found
     return best
 
 
 def _pair(
     waves: Waves, pair: tuple[int, int], settings: ForwardGPSettings, odd: tuple[Odd, Odd] = (Odd(), Odd())
-) -> tuple[float, dict[int, WandCamera], bool] | None:
-    """The cost per view of two cameras, they, and whether they are good enough."""
+) -> _Pair | None:
+    """Two cameras from what both saw; None where that is too little."""
     uv = waves.uv[:, pair]
     both = np.flatnonzero(np.isfinite(uv).all(axis=(1, 2)))
     if len(both) < MIN_SHARED_POINTS:
@@ -221,7 +257,7 @@ def _pair(
     at[both] = near
     right &= at[2 * every.frames] & at[2 * every.frames + 1]
     good = near.mean() > GOOD_SHARE and np.median(off[near]) < GOOD_PX and right.mean() > MIN_LENGTH_SHARE
-    return score / len(both), dict(zip(pair, bundle.cameras, strict=True)), bool(good)
+    return _Pair(score / len(both), dict(zip(pair, bundle.cameras, strict=True)), bool(good), waves)
 
 
 class _Trial(NamedTuple):
@@ -389,17 +425,118 @@ def describe_stranger(waves: Waves, c: int, known: Floats, settings: ForwardGPSe
     """
     there = int(np.isfinite(known[waves.seen[c].rows]).all(axis=1).sum())
     if there < MIN_POINTS_PER_CAMERA:
-        return f"it saw {there} of the markers that the others place, and it takes {MIN_POINTS_PER_CAMERA}."
-    whole = known.reshape(-1, 2, 3)
-    shifted = {
-        "its two markers are exchanged: exchange them in all its frames": whole[:, ::-1],
-        "its frames are one ahead of the others'": np.roll(whole, -1, axis=0),
-        "its frames are one behind the others'": np.roll(whole, 1, axis=0),
-    }
-    for why, places in shifted.items():
-        if _resected_ordinary(waves, c, places.reshape(-1, 3), settings, min_share=0.5) is not None:
-            return f"{why}."
+        few = f"it saw {there} of the markers that the others place, and it takes {MIN_POINTS_PER_CAMERA}."
+        return few + _friends(waves, c)
+    exchanged = known.reshape(-1, 2, 3)[:, ::-1].reshape(-1, 3)
+    if _resected_ordinary(waves, c, exchanged, settings, min_share=0.5) is not None:
+        return "its two markers are exchanged: exchange them in all its frames."
+
+    def misfit(tried: Waves) -> float:
+        camera = _resected_ordinary(tried, c, known, settings, min_share=0.5)
+        if camera is None:
+            return np.inf
+        views = tried.seen[c]
+        off = np.linalg.norm(camera.pixel(known[views.rows]) - views.uv, axis=1)
+        return float(np.nanmedian(off))
+
+    late = find_shift(waves, c, misfit, SHIFTS)
+    if late is not None:
+        return f"its pictures are taken {describe_shift(late)} those of the others: trigger all cameras by one signal."
     return "too few of its views agree with the places that the other cameras know."
+
+
+SHIFTS = (0.25, 0.5, 0.75, *map(float, range(1, 13)))
+"""Frames by which a camera is looked for, early or late, that belongs to the others in no other way."""
+
+MAX_SHIFTED_RATIO = 0.5
+"""A shift leaves less than this part of what no shift leaves, or it is none."""
+
+
+def find_shift(waves: Waves, c: int, misfit: Callable[[Waves], float], shifts: Sequence[float]) -> float | None:
+    """By how many frames a camera is late.
+
+    Args:
+        waves: What was seen.
+        c: Its number.
+        misfit: How little it agrees with the others, as it is or shifted; infinite where not at all.
+        shifts: To be tried, early and late.
+
+    Returns:
+        Frames, negative where it is early; None where no shift makes it agree much better.
+    """
+    now = misfit(waves)
+    tried = {0.0: now}
+
+    def try_one(late: float) -> None:
+        moved = waves.shifted(c, late)
+        if moved is not None and late not in tried:
+            tried[late] = misfit(moved)
+
+    for late in (sign * size for size in shifts for sign in (1.0, -1.0)):
+        try_one(late)
+    best = min(tried, key=lambda late: tried[late])
+    for step in (0.12, 0.06):
+        for late in (best - step, best + step):
+            try_one(round(late, 3))
+        best = min(tried, key=lambda late: tried[late])
+    good = best != 0 and np.isfinite(tried[best]) and tried[best] < MAX_SHIFTED_RATIO * now
+    return float(best) if good else None
+
+
+def describe_shift(late: float) -> str:
+    """A part of a sentence.
+
+    Args:
+        late: By so many frames.
+    """
+    return f"about {abs(late):.2g} frame{'s' * (abs(late) != 1)} {'after' if late > 0 else 'before'}"
+
+
+def explain_no_rig(waves: Waves) -> str:
+    """What is wrong with the two cameras that share most, if it can be told; empty where not.
+
+    Args:
+        waves: What was seen.
+    """
+    seen = np.isfinite(waves.uv).all(axis=2).astype(np.int64)
+    shared = np.einsum("ni,nj->ij", seen, seen)
+    pair = max(combinations(range(len(waves.seen)), 2), key=lambda two: int(shared[two]))
+    images = [waves.images[c] for c in pair]
+
+    def misfit(tried: Waves) -> float:
+        uv = tried.uv[:, pair]
+        both = np.flatnonzero(np.isfinite(uv).all(axis=(1, 2)))
+        if len(both) < MIN_SHARED_POINTS:
+            return np.inf
+        frames = np.unique(both // 2)
+        both = both[np.isin(both // 2, frames[:: -(-len(frames) // MAX_SHIFTED_FRAMES)])]
+        marker = np.where(tried.ends[both // 2], both % 2, -1)
+        starts = pair_starts(uv[both], both // 2, marker, images, tried.length)
+        return float(np.exp(starts[0].rank)) if starts else np.inf
+
+    late = find_shift(waves, pair[1], misfit, PAIR_SHIFTS)
+    if late is None:
+        return ""
+    one, two = (waves.names[c] for c in pair)
+    return f"the pictures of {two} are taken {describe_shift(late)} those of {one}"
+
+
+MAX_SHIFTED_FRAMES = 100
+"""Frames that are enough to see whether two cameras are in step."""
+
+PAIR_SHIFTS = (0.25, 0.5, 1.0, 2.0, 3.0, 5.0)
+"""Frames by which two cameras are tried to be out of step, where they do not make a rig."""
+
+
+def _friends(waves: Waves, c: int) -> str:
+    """Which camera it shares most with, as another sentence."""
+    seen = np.isfinite(waves.uv[..., 0])
+    shared = (seen & seen[:, c, None]).sum(axis=0)
+    shared[c] = 0
+    best = int(np.argmax(shared))
+    if shared[best] < MIN_SHARED_POINTS:
+        return " It hardly sees the wand when any other camera does."
+    return f" With {waves.names[best]} it shares {shared[best]}: wave where cameras of both groups see it."
 
 
 def _adjusted_together(

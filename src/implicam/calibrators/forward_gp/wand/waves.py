@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,8 @@ class Waves:
         length: Of the wand.
         jitter: Sd of the length of one frame about that of all: flex, and centres of markers.
         ends: (F,) whether the two markers are the wand's ends.
+        exchanged: (F, C) where the names of the ends were exchanged, and are put right in `seen`.
+        names: (C,) of the cameras; frame_names (F,).
         known: Places that are known, in a world of their own.
     """
 
@@ -35,6 +37,9 @@ class Waves:
     length: float
     jitter: float
     ends: Bools
+    exchanged: Bools
+    names: tuple[str, ...]
+    frame_names: tuple[str, ...]
     known: KnownPlaces = NOTHING_KNOWN
 
     @property
@@ -49,6 +54,70 @@ class Waves:
         for c, seen in enumerate(self.seen):
             uv[seen.rows, c] = seen.uv
         return uv
+
+    @cached_property
+    def whole_views(self) -> Bools:
+        """(F, C) which cameras see both ends."""
+        both = np.isfinite(self.uv[..., 0]).reshape(self.frames, 2, -1).all(axis=1)
+        return np.asarray(both & self.ends[:, None])
+
+    def with_exchanged(self, wrong: Bools) -> Waves:
+        """With the names of both ends exchanged.
+
+        Args:
+            wrong: (F, C) in which pictures.
+        """
+        seen = []
+        for c, views in enumerate(self.seen):
+            rows = np.where(wrong[views.rows // 2, c], views.rows ^ 1, views.rows)
+            order = np.argsort(rows)
+            seen.append(CameraViews(rows[order], views.uv[order], views.relative[order]))
+        return replace(self, seen=tuple(seen), exchanged=self.exchanged ^ wrong)
+
+    def all_exchanged(self, c: int) -> Waves:
+        """With the names of both ends exchanged in all frames of a camera.
+
+        Args:
+            c: Its number.
+        """
+        wrong = np.zeros((self.frames, len(self.seen)), dtype=np.bool_)
+        wrong[:, c] = self.ends
+        return self.with_exchanged(wrong)
+
+    @cached_property
+    def _number(self) -> Floats | None:
+        """(F,) of the frames; None where their names are no numbers."""
+        try:
+            return np.array([float(name) for name in self.frame_names])
+        except ValueError:
+            return None
+
+    def shifted(self, c: int, late: float) -> Waves | None:
+        """With what a camera would have seen if its pictures had not been late.
+
+        Args:
+            c: Its number.
+            late: By so many frames; what is between two frames is interpolated.
+
+        Returns:
+            The same of all other cameras; None where frames have no numbers.
+        """
+        if self._number is None:
+            return None
+        at = {
+            (number, single): i for i, (number, single) in enumerate(zip(self._number.tolist(), self.ends, strict=True))
+        }
+        below = np.floor(-late)
+        part = -late - below
+        uv = self.uv[:, c].reshape(-1, 2, 2)
+        there = np.full_like(uv, np.nan)
+        for i, number in enumerate(self._number.tolist()):
+            one, two = at.get((number + below, self.ends[i])), at.get((number + below + 1, self.ends[i]))
+            if one is not None and (two is not None or part == 0):
+                there[i] = uv[one] if part == 0 else (1 - part) * uv[one] + part * uv[two]
+        rows = np.flatnonzero(np.isfinite(there.reshape(-1, 2)).all(axis=1))
+        moved = CameraViews(rows, there.reshape(-1, 2)[rows], np.ones(len(rows)))
+        return replace(self, seen=tuple(moved if k == c else views for k, views in enumerate(self.seen)))
 
     def usual_noise(self, c: int, usual_half_sides: float) -> float:
         """Of a camera, in pixels: what it states, or what is usual.
