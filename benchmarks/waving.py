@@ -152,6 +152,7 @@ def main() -> None:
                     print(name, mode, seed, error.what, file=sys.stderr, flush=True)
                     found = []
                 ends += found[-1:]
+                print(f"{name} {mode} {seed}: {found[-1:]}", file=sys.stderr, flush=True)
             counts = [one.frames if one.excess <= 1.2 else np.inf for one in ends]
             each = ", ".join(f"{count:g}" if np.isfinite(count) else f"> {given.frames}" for count in counts)
             middle = np.median(counts)

@@ -428,3 +428,23 @@ def test_a_wand_near_the_cameras_is_told_by_each_picture_where_a_few_together_le
     assert _surer(clear, nothing, 0.2) is clear
     assert _surer(replace(clear, notes={"log_ratio": 0.15}), nothing, 0.2) is nothing
     assert _surer(nothing, clear, 0.2) is clear  # what stands still was left out
+
+
+@pytest.mark.slow
+def test_a_camera_that_never_sees_the_wand_together_with_another_is_named_and_is_never_enough():
+    """As in JARVIS-AcquisitionTool issue 18: two of seven cameras rarely or never see the target with the others."""
+    data = wave(build_rig("bar3", seed=1), 75)
+    alone = np.array([int(frame) > 55 for frame in data.columns["frame"]])
+    uv = data.observations.uv.copy()
+    uv[~alone, 2], uv[alone, :2] = np.nan, np.nan
+    sd = np.where(np.isfinite(uv), data.observations.sd, np.nan)
+    extra = {}  # the truth of a simulation, which is not missing where a view is
+    data = replace(data, observations=replace(data.observations, uv=uv, sd=sd, extra=extra))
+    length = float(data.extra["target"]["length"])
+    loop = WandLoop(ForwardGP(), Wand(("a", "b"), length), data.cameras, rule=Within(50.0), data=data)
+    assert loop.calibration is not None
+    assert loop.points == 55
+    assert loop.stop == ""
+    cold = [target for target in (loop.ask()[0], loop.ask()[0]) if target.words.endswith("another camera sees it too")]
+    assert "of cam3, where another camera sees it too" in cold[0].words
+    assert loop.camera_progress()[2].part < 0.5 < loop.camera_progress()[0].part

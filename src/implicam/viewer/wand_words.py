@@ -49,7 +49,9 @@ def _aim(state: WandState) -> Headline:
         return Headline("Paused: nothing is kept by itself", "Tick the box to go on, or keep single sets.", "ask")
     target = state.target
     if state.judgement.reason:
-        return Headline("Wave the wand", f"Not kept: {state.judgement.reason}. {CURES[state.judgement.reason]}", "ask")
+        return Headline(
+            "Wave the wand", f"Not kept: {state.judgement.reason}. {CURES.get(state.judgement.reason, '')}", "ask"
+        )
     words = target.words.rsplit(", ", 1)[0] if isinstance(target, WaveTarget) else ""
     why = f"{sentence(target.why)}." if isinstance(target, WaveTarget) and target.why else ""
     title = f"Wave it in the {words}" if words else "Wave the wand"
