@@ -11,7 +11,7 @@ pytest.importorskip("cv2")
 from implicam.calibrators import ForwardGP
 from implicam.detect.ball import Ball, Template
 from implicam.detect.edge import Ellipse, find_rough_edge, fit_edge, fit_ellipse
-from implicam.detect.model import Detected, View
+from implicam.detect.model import Detected, View, nothing
 from implicam.detect.silhouette import correct_outlines, predict_outline_shift
 from implicam.errors import ImageError, UsageError
 from implicam.images import opencv, read_picture, write_picture
@@ -421,6 +421,27 @@ def test_a_long_disc_is_a_ball_only_far_from_the_middle_of_the_picture():
         picture[top : top + 80, left : left + 80] = patch
         found.append(len(Ball().detect(noisy(picture, 1), VIEW)))
     assert found == [0, 1]
+
+
+@pytest.mark.parametrize("elsewhere", [True, False], ids=["a thing", "a ball"])
+def test_what_is_found_once_and_is_in_the_other_pictures_too_is_no_ball(elsewhere):
+    """A look-alike on the edge of what is accepted: found in one of six pictures, and there in all of them."""
+    shown = {View("cam1", f"shot{i}"): noisy(plates(rests(0)) if i == 2 or elsewhere else plates(), i) for i in range(6)}
+    found = {view: nothing("none") for view in shown} | {View("cam2", f"shot{i}"): nothing("none") for i in range(6)}
+    once = View("cam1", "shot2")
+    found[once] = Ball().detect(shown[once], once)
+    assert len(found[once]) == 1
+    left = Ball().look_again(found, shown.__getitem__)
+    assert [view for view, one in left.items() if len(one)] == ([] if elsewhere else [once])
+    assert not elsewhere or "is in other pictures, too" in left[once].reason
+
+
+def test_a_ball_that_rests_for_most_cameras_is_kept_though_one_hardly_finds_it():
+    shown = noisy(plates(rests(0)), 0)
+    ball = Ball().detect(shown, VIEW)
+    found = {View(camera, f"shot{i}"): ball for camera in ("cam1", "cam2", "cam3") for i in range(6)}
+    found |= {View("cam1", f"shot{i}"): nothing("missed") for i in range(1, 6)}
+    assert len(Ball().look_again(found, lambda view: shown)[View("cam1", "shot0")]) == 1
 
 
 def test_settling_keeps_cameras_apart():

@@ -84,6 +84,10 @@ ball that comes nearer along a line of sight grows); and it must be there in so 
 second number where other cameras tell whether the ball rested."""
 
 
+MAX_DOUBTFUL_SHARE, OTHER_PICTURES = 0.5, 3
+"""Where a camera shows a ball in no more than this part of its pictures, each is looked for in so many others."""
+
+
 @dataclass(frozen=True, eq=False)
 class Template:
     """A crop of a picture with the ball in its middle, and the ball's radius in it, pixels."""
@@ -308,8 +312,7 @@ class Ball(DetectorBase):
         Args:
             found: What `detect` gave of each picture.
         """
-        cameras = dict.fromkeys(view.camera for view in found)
-        views = {camera: [view for view in found if view.camera == camera] for camera in cameras}
+        views = _by_camera(found)
         white = {camera: _usual_white([found[view] for view in own]) for camera, own in views.items()}
         found = {view: _drop_if_dim(one, white[view.camera]) for view, one in found.items()}
         tracks = {camera: _Track.of(own, found) for camera, own in views.items()}
@@ -325,6 +328,33 @@ class Ball(DetectorBase):
             if every
         }
         return {view: _drop_if_faint(moving[view], usual.get(view.camera, 0.0)) for view in found}
+
+    def look_again(self, found: Mapping[View, Detected], read: Callable[[View], Grey]) -> dict[View, Detected]:
+        """Drop a ball that a camera shows now and then, where its other pictures show the same thing at that place.
+
+        Args:
+            found: What `settle` gave of each picture.
+            read: Gives a picture, (height, width) grey.
+        """
+        kept = dict(found)
+        tracks = {camera: _Track.of(own, found) for camera, own in _by_camera(found).items()}
+        for camera, own in _by_camera(found).items():
+            balls = [view for view in own if len(found[view])]
+            if len(balls) > MAX_DOUBTFUL_SHARE * len(own):
+                continue
+            for view in balls:
+                others = _spread([other for other in own if not _is_there(found[other], found[view])])
+                shots = {view.shot, *(other.shot for other in others)}
+                witnesses = [track for name, track in tracks.items() if name != camera]
+                rests = sum(_rests(track, shots) for track in witnesses) > 0.5 * len(witnesses)
+                if len(others) == OTHER_PICTURES and not rests:
+                    picture = read(view)
+                    if all(self.was_there(read(other), picture, found[view]) for other in others):
+                        u, v = found[view].uv[0]
+                        kept[view] = nothing(
+                            f"no ball: what looks like one at ({u:.0f}, {v:.0f}) is in other pictures, too"
+                        )
+        return kept
 
     def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
         """Move the pixels from the middle of the ball's outline to the ball's middle, where the radius is known.
@@ -499,6 +529,22 @@ class _Track(NamedTuple):
         each = [(view.shot, ball) for view in views for ball in _all_candidates(found[view])]
         uvr = np.array([[*ball.uv[0], ball.notes["radius_px"]] for _, ball in each]).reshape(-1, 3)
         return cls(uvr, np.array([shot for shot, _ in each], dtype=np.str_), frozenset(view.shot for view in views))
+
+
+def _by_camera(found: Mapping[View, Detected]) -> dict[str, list[View]]:
+    cameras = dict.fromkeys(view.camera for view in found)
+    return {camera: [view for view in found if view.camera == camera] for camera in cameras}
+
+
+def _is_there(found: Detected, ball: Detected) -> bool:
+    """Whether a ball is found within another ball's radius of that one."""
+    return len(found) > 0 and float(np.linalg.norm(found.uv[0] - ball.uv[0])) < float(ball.notes["radius_px"])
+
+
+def _spread(views: list[View]) -> list[View]:
+    """So many of a camera's pictures as are looked at again, far from each other."""
+    at = np.linspace(0, len(views) - 1, min(OTHER_PICTURES, len(views))).round().astype(int)
+    return [views[i] for i in at]
 
 
 def _find_still_objects(track: _Track, others: list[_Track]) -> Floats:

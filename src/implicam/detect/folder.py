@@ -31,13 +31,13 @@ from implicam.dataset.folder import DESCRIPTION, IMAGES, POINTS, VIEWS, csv_text
 from implicam.dataset.model import check_name
 from implicam.dataset.tables import parse_toml
 from implicam.detect.journal import Entry, JournalResults, detect_all
-from implicam.detect.model import Detector, View, nothing
+from implicam.detect.model import Detector, LooksAgain, View, nothing
 from implicam.detect.overlay import Result
 from implicam.detect.sheets import draw_sheets
 from implicam.errors import DatasetError, ImageError, UsageError, did_you_mean
 from implicam.files import replacing, toml_text, write_text
 from implicam.formatting import list_some
-from implicam.images import Stored, one_thread_each, stored_jpeg
+from implicam.images import Stored, one_thread_each, read_picture, stored_jpeg
 from implicam.picture_names import find_pictures, in_order, sort_pictures
 from implicam.progress import Progress, silent
 from implicam.simulate.truth import limit_of_detection
@@ -410,6 +410,8 @@ def _settle(rig: _Rig, detector: Detector, looked: JournalResults) -> tuple[list
         view: looked.entries[view].found for view in rig.pictures if view in looked.entries and view not in problems
     }
     settled = detector.settle(found)
+    if isinstance(detector, LooksAgain):
+        settled = detector.look_again(settled, lambda view: read_picture(rig.pictures[view]))
     results = [
         Result(view, path, nothing(problems[view]) if view in problems else settled[view], rig.expected(view))
         for view, path in rig.pictures.items()

@@ -5,9 +5,9 @@ CONTRIBUTING.md has the recipe for one more.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -152,6 +152,19 @@ class Detector(Protocol):
 
         Returns:
             The dataset, and notes for the user.
+        """
+
+
+@runtime_checkable
+class LooksAgain(Protocol):
+    """A detector that looks into some pictures a second time, when it knows what was found in all of them."""
+
+    def look_again(self, found: Mapping[View, Detected], read: Callable[[View], Grey]) -> dict[View, Detected]:
+        """What is left of what was found.
+
+        Args:
+            found: What `settle` gave of each picture.
+            read: Gives a picture, (height, width) grey from 0 to 1.
         """
 
 
