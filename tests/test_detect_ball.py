@@ -426,7 +426,9 @@ def test_a_long_disc_is_a_ball_only_far_from_the_middle_of_the_picture():
 @pytest.mark.parametrize("elsewhere", [True, False], ids=["a thing", "a ball"])
 def test_what_is_found_once_and_is_in_the_other_pictures_too_is_no_ball(elsewhere):
     """A look-alike on the edge of what is accepted: found in one of six pictures, and there in all of them."""
-    shown = {View("cam1", f"shot{i}"): noisy(plates(rests(0)) if i == 2 or elsewhere else plates(), i) for i in range(6)}
+    shown = {
+        View("cam1", f"shot{i}"): noisy(plates(rests(0)) if i == 2 or elsewhere else plates(), i) for i in range(6)
+    }
     found = {view: nothing("none") for view in shown} | {View("cam2", f"shot{i}"): nothing("none") for i in range(6)}
     once = View("cam1", "shot2")
     found[once] = Ball().detect(shown[once], once)
