@@ -245,3 +245,22 @@ def test_convert_reads_and_writes_them(tmp_path: Path, capsys: pytest.CaptureFix
     assert (tmp_path / "ptv" / "target_file").exists()
     assert "names of the points are lost" in capsys.readouterr().err
     assert convert(tmp_path / "rig", tmp_path / "x.csv", "--positions", tmp_path / "cal_xyz.csv") == 2
+
+
+@pytest.mark.parametrize("kind", ["dltdv", "easywand", "argus"])
+def test_the_markers_of_a_wand_are_a_row_a_frame(kind: str, tmp_path: Path) -> None:
+    uv = np.arange(24.0).reshape(6, 2, 2) + 10
+    uv[1, 0] = np.nan
+    frame, marker = np.array(["3", "3", "4", "4", "7", "7"]), np.array(["a", "b"] * 3)
+    names = np.char.add(np.char.add(frame, " "), marker)
+    seen = Observations(names, (Camera("left"), Camera("right")), uv, np.full(uv.shape, np.nan))
+    data = Dataset("wand", "mm", seen, None, columns={"frame": frame, "marker": marker})
+    path = tmp_path / "wand_xypts.csv"
+    notes = write_program(data, path, kind)
+    assert "The points are 1 = a, 2 = b." in notes
+    assert "Row 1 is frame 3." in notes
+    assert len(path.read_text(encoding="utf-8").splitlines()) == 6  # the heading, and frames 3 to 7
+    again = read_program(path, kind, MM)
+    assert again.columns["frame"].tolist() == ["1", "1", "2", "2", "5", "5"]
+    assert len(set(again.columns["marker"].tolist())) == 2
+    np.testing.assert_allclose(again.observations.uv, uv, atol=1e-9)

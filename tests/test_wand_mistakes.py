@@ -12,7 +12,7 @@ from implicam.calibrators import ForwardGP, ForwardGPCalibration
 from implicam.calibrators.forward_gp.wand.exchanged import _minority
 from implicam.calibrators.forward_gp.wand.waves import Waves
 from implicam.dataset import Dataset
-from implicam.errors import FitError
+from implicam.errors import FitError, UsageError
 from implicam.geometry import register
 from implicam.rig_model import CameraViews, Image
 from implicam.simulate import Rig, Target, as_wand, build_rig, random_positions, simulate, waved_wand
@@ -133,6 +133,7 @@ def swung(rig: Rig, frames: int, late: dict[str, float], *, speed: float = 1.0) 
 @pytest.mark.slow
 @pytest.mark.parametrize(("spec", "late"), [("bar4", 0.08), ("bar4", -0.1), ("stereo", 0.1), ("bar4", 0.0)])
 def test_a_camera_a_little_late_is_named_with_its_offset(spec: str, late: float) -> None:
+    """Situation of multicam_calibration issue 7: cameras that expose at about the same time."""
     rig = build_rig(spec, seed=3)
     data, length = swung(rig, 180, {"cam2": late})
     calibration = ForwardGP(wand=length).fit(data)
@@ -151,6 +152,7 @@ def test_a_camera_a_little_late_is_named_with_its_offset(spec: str, late: float)
 @pytest.mark.slow
 @pytest.mark.parametrize(("late", "said"), [(7.0, "7 frames after"), (-0.4, "frames before")])
 def test_a_camera_far_out_of_step_is_named_with_the_reason(late: float, said: str) -> None:
+    """Situation of JARVIS issue 7 and calico issue 3: one film begins elsewhere than the others."""
     rig = build_rig("bar4", seed=3)
     data, length = swung(rig, 180, {"cam3": late})
     calibration = ForwardGP(wand=length).fit(data)
@@ -193,3 +195,62 @@ def test_two_cameras_that_share_nothing_are_named() -> None:
     with pytest.raises(FitError) as error:
         ForwardGP(wand=target.wand or 0.0).fit(replace(data, observations=replace(data.observations, uv=uv)))
     assert "cam1 and cam2, which share most, see 10 markers" in error.value.why
+
+
+@pytest.mark.parametrize("given", [0.144, 14.4, 144000.0])
+def test_a_length_in_another_unit_than_the_datasets_is_refused(given: float) -> None:
+    """Situation of Pose2Sim issue 48 and Anipose issue 122: metres here and millimetres there."""
+    _, target, _, data = recorded_wand("stereo", 30)
+    assert target.wand == pytest.approx(144.0)
+    with pytest.raises(UsageError) as error:
+        ForwardGP(wand=given).fit(data)
+    assert "144 mm" in error.value.what
+    assert "another unit" in error.value.why
+
+
+@pytest.mark.slow
+def test_cameras_that_are_joined_in_a_chain_have_error_bars_that_hold() -> None:
+    """Situation of caliscope issue 660: neighbours see the wand together, and no camera sees it with all others."""
+    rig, target, recorded, data = recorded_wand("bar6", 240)
+    uv = data.observations.uv.copy()
+    frame = np.array([int(name) for name in data.columns["frame"]])
+    for c in range(6):
+        uv[np.abs(frame % 5 - c + 0.5) > 1, c] = np.nan  # in a frame two neighbours see it
+    chain = replace(data, observations=replace(data.observations, uv=uv))
+    calibration = ForwardGP(wand=target.wand or 0.0).fit(chain)
+    row = {str(name): i for i, name in enumerate(recorded.points)}
+    rows = [row[str(name)] for name in calibration.data.points]
+    to_truth, _ = register(calibration.data.xyz, target.xyz[rows])
+    held = simulate(rig, random_positions(rig, 200, np.random.default_rng(9)), seed=900)
+    measured = calibration.measure(held.observations)
+    good = measured.measured
+    assert held.truth is not None
+    error = to_truth.apply(measured.xyz[good]) - held.truth.xyz[good]
+    cov = to_truth.rotation @ measured.cov[good] @ to_truth.rotation.T
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)
+    assert good.mean() > 0.9
+    assert np.mean(nees < 7.81) > 0.85
+
+
+@pytest.mark.slow
+def test_what_lies_outside_of_where_the_wand_was_has_larger_error_bars_that_hold() -> None:
+    rig = build_rig("bar4", seed=5)
+    small = replace(rig, volume=replace(rig.volume, size=0.4 * rig.volume.size))
+    length = 0.5 * float(small.volume.size.min())
+    target = waved_wand(small, 160, np.random.default_rng(4), length=length)
+    recorded = simulate(rig, target, seed=4)
+    calibration = ForwardGP(wand=length).fit(as_wand(recorded, target))
+    row = {str(name): i for i, name in enumerate(recorded.points)}
+    to_truth, _ = register(calibration.data.xyz, target.xyz[[row[str(name)] for name in calibration.data.points]])
+    held = simulate(rig, random_positions(rig, 300, np.random.default_rng(9)), seed=900)
+    measured = calibration.measure(held.observations)
+    good = measured.measured
+    assert held.truth is not None
+    truth = held.truth.xyz[good]
+    error = to_truth.apply(measured.xyz[good]) - truth
+    cov = to_truth.rotation @ measured.cov[good] @ to_truth.rotation.T
+    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)
+    inside = (np.abs(rig.volume.world_from_box.inverse().apply(truth)) < small.volume.size / 2).all(axis=1)
+    size = np.sqrt(np.trace(cov, axis1=1, axis2=2))
+    assert np.median(size[~inside]) > 1.5 * np.median(size[inside])
+    assert np.mean(nees[~inside] < 7.81) > 0.85

@@ -126,6 +126,8 @@ class ForwardGP(CalibratorBase):
         if not self.wand and (told is None or data.known is not None):
             return None
         told = told or Wand()
+        if self.wand and told.length:
+            _refuse_other_unit(self.wand, told.length, data.length_unit)
         return Wand(
             self._ends or told.ends,
             self.wand or told.length,
@@ -181,6 +183,21 @@ class ForwardGP(CalibratorBase):
 
 
 _HELD_OUT = "_lengths_held_out"
+
+
+def _refuse_other_unit(given: float, told: float, unit: str) -> None:
+    """UsageError where the length of a wand is that of dataset.toml in another unit: no picture shows it."""
+    ratio = given / told
+    if any(abs(ratio * power - 1) < MAX_SAME_LENGTH_ERROR for power in (10.0, 0.1, 100.0, 0.01, 1000.0, 0.001)):
+        raise UsageError(
+            f"the length of the wand is given as {given:g}, and [target] of dataset.toml says {told:g} {unit}.",
+            why="it looks like the same length in another unit, and nothing in the pictures shows that",
+            fix=f"give --wand in {unit}, the dataset's unit, or leave it out",
+        )
+
+
+MAX_SAME_LENGTH_ERROR = 0.05
+"""Relative difference up to which two lengths are one in two units."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -15,11 +15,15 @@ from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from implicam.dataset.dialect import find_separator, rows_of
 from implicam.dataset.folder import csv_text, format_cells
 from implicam.dataset.model import Dataset
 from implicam.dataset.programs.views import Numbers, Views, pixel_number
 from implicam.dataset.tables import Row, check_width, read_lines, read_number
+from implicam.dataset.wand import FRAME, MARKER
 from implicam.errors import DatasetError, did_you_mean
 from implicam.files import write_text
 
@@ -187,7 +191,7 @@ def _pairs(header: list[str], form: re.Pattern[str], example: str, place: str) -
 
 
 def write_dltdv(data: Dataset, path: Path) -> list[str]:
-    """Write xypts.csv, and the known positions beside it: a row for each point.
+    """Write xypts.csv: a row for each point, and the known positions beside it; of markers a row for each frame.
 
     Args:
         data: The dataset; its pixels as the program counts them.
@@ -199,11 +203,11 @@ def write_dltdv(data: Dataset, path: Path) -> list[str]:
     Raises:
         ImplicamError: A file cannot be written.
     """
-    return _write(data, path, [f"pt1_cam{k + 1}_{axis}" for k in range(len(data.cameras)) for axis in "XY"])
+    return _write(data, path, "pt{point}_cam{camera}_{axis}", "XY")
 
 
 def write_argus(data: Dataset, path: Path) -> list[str]:
-    """Write xypts.csv as Argus has it, and the known positions beside it: a row for each point.
+    """Write xypts.csv as Argus has it, as `write_dltdv`.
 
     Args:
         data: The dataset; its pixels as the program counts them.
@@ -215,17 +219,55 @@ def write_argus(data: Dataset, path: Path) -> list[str]:
     Raises:
         ImplicamError: A file cannot be written.
     """
-    return _write(data, path, [f"track1_cam_{k + 1}_{axis}" for k in range(len(data.cameras)) for axis in "xy"])
+    return _write(data, path, "track{point}_cam_{camera}_{axis}", "xy")
 
 
-def _write(data: Dataset, path: Path, header: list[str]) -> list[str]:
-    pixels = data.observations.uv.reshape(len(data), -1)
-    rows = [[cell or "NaN" for cell in format_cells(row)] for row in pixels]
+def _write(data: Dataset, path: Path, form: str, axes: str) -> list[str]:
+    places, notes = _rows_of_frames(data)
+    frames, points = places.shape
+    uv = np.full((frames, points, len(data.cameras), 2), np.nan)
+    uv[places >= 0] = data.observations.uv[places[places >= 0]]
+    header = [
+        form.format(point=point + 1, camera=camera + 1, axis=axis)
+        for point in range(points)
+        for camera in range(len(data.cameras))
+        for axis in axes
+    ]
+    rows = [[cell or "NaN" for cell in format_cells(row)] for row in uv.reshape(frames, -1)]
     write_text(path, csv_text(header, rows))
-    notes = [f"The cameras are {', '.join(f'{i} = {c.name}' for i, c in enumerate(data.cameras, 1))}; names are lost."]
+    notes = [
+        f"The cameras are {', '.join(f'{i} = {c.name}' for i, c in enumerate(data.cameras, 1))}; names are lost.",
+        *notes,
+    ]
     if data.known is not None:
         beside = path.with_name(path.stem.replace("xypts", "xyz") + ".csv")
         beside = beside if beside != path else path.with_name(path.stem + "_xyz.csv")
         write_text(beside, "".join(",".join(format_cells(row)) + "\n" for row in data.xyz))
         notes.append(f"The known positions are in {beside.name}.")
     return notes
+
+
+MAX_EMPTY_ROWS = 20
+"""Rows of frames in which nothing was seen, for each row of one in which something was."""
+
+
+def _rows_of_frames(data: Dataset) -> tuple[NDArray[np.int64], list[str]]:
+    """(frames, points) which point of the data is in which row, -1 for none, and notes: a row a point, or, of markers
+    in frames whose positions are not known, a row a frame, numbered as the frames are where that is possible."""
+    columns = data.further_columns()
+    if data.known is not None or not {FRAME, MARKER} <= columns.keys():
+        return np.arange(len(data))[:, None], []
+    frames, markers = (columns[name].tolist() for name in (FRAME, MARKER))
+    names = list(dict.fromkeys(markers))
+    row_of = {frame: i for i, frame in enumerate(dict.fromkeys(frames))}
+    notes = [f"The points are {', '.join(f'{i} = {name}' for i, name in enumerate(names, 1))}."]
+    if all(frame.isdecimal() for frame in row_of):
+        numbers = [int(frame) for frame in row_of]
+        first = min(numbers)
+        if max(numbers) - first < MAX_EMPTY_ROWS * len(numbers) and len(set(numbers)) == len(numbers):
+            row_of = {frame: int(frame) - first for frame in row_of}
+            notes.append(f"Row 1 is frame {first}.")
+    places = np.full((max(row_of.values()) + 1, len(names)), -1, dtype=np.int64)
+    for row, (frame, marker) in enumerate(zip(frames, markers, strict=True)):
+        places[row_of[frame], names.index(marker)] = row
+    return places, notes
