@@ -254,3 +254,6 @@ def test_what_lies_outside_of_where_the_wand_was_has_larger_error_bars_that_hold
     size = np.sqrt(np.trace(cov, axis1=1, axis2=2))
     assert np.median(size[~inside]) > 1.5 * np.median(size[inside])
     assert np.mean(nees[~inside] < 7.81) > 0.85
+    narrow = [note for note in calibration.notes if "saw the wand in" in note]
+    assert len(narrow) == 4
+    assert "of its picture (u from" in narrow[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -350,7 +350,24 @@ class WandDiagnosis(Diagnosis):
             f"In {number} pictures of {camera} the two ends of the wand bore each other's names: they are put right."
             for camera, number in self.waved.exchanged
         ]
-        return notes + [f"{text}." for text in describe_offsets(self.waved)]
+        notes += [f"{text}." for text in describe_offsets(self.waved)]
+        return notes + list(self._narrow_notes())
+
+    def _narrow_notes(self) -> Iterator[str]:
+        """Cameras that saw the wand in a small part of their pictures only."""
+        seen = self.data.observations
+        for number, c in enumerate(self.fitted.cameras):
+            camera, uv = seen.cameras[c], seen.uv[seen.seen[:, c], c][self.fitted.inliers[number]]
+            if camera.width is None or camera.height is None or len(uv) < MIN_FOR_OUTLINE:
+                continue
+            low, high = np.quantile(uv, [0.01, 0.99], axis=0)
+            share = float(np.prod(high - low)) / (camera.width * camera.height)
+            if share < NARROW_SHARE:
+                yield (
+                    f"{camera.name} saw the wand in {100 * share:.0f} % of its picture (u from {low[0]:.0f} to "
+                    f"{high[0]:.0f}, v from {low[1]:.0f} to {high[1]:.0f}): elsewhere error bars are larger; wave it "
+                    "there too."
+                )
 
     def _known_note(self) -> str:
         wrong = self.waved.known_rejected
@@ -394,6 +411,9 @@ def describe_offsets(waved: Waved) -> list[str]:
         for camera, late, sd in waved.offsets
     ]
 
+
+NARROW_SHARE, MIN_FOR_OUTLINE = 0.15, 12
+"""Of a picture that the views of a wand enclose, below which a note says so; and views that tell what they enclose."""
 
 MIN_RECOMMENDED_FRAMES = 50
 """Frames with both markers, below which a rig is known by half as well as it could be."""
