@@ -19,7 +19,8 @@ from implicam.derived import distances, joint
 from implicam.errors import DatasetError, FitError, UsageError
 from implicam.geometry import Floats, Pose, rotation_from_vector
 from implicam.measurement import Measurement, SharedErrors
-from implicam.rig_model.placement import placed, placement_at_camera, step_between
+from implicam.rig_model import CentralCamera
+from implicam.rig_model.placement import lay_anew, placement_at_camera, step_between
 from implicam.simulate import Rig, Target, as_wand, build_rig, random_positions, simulate, waved_wand
 from implicam.world import lay_over, set_world, with_known_positions
 
@@ -103,32 +104,44 @@ def test_known_points_say_where_the_world_is(waving: Waving, frame: Dataset) -> 
 def test_distances_are_what_they_were(waving: Waving, frame: Dataset) -> None:
     held = held_out(waving)
     pairs = [(0, i) for i in range(1, 20)]
-    in_world = set_world(waving.calibration, frame)
-    before, after = (distances(one.measure(held), pairs) for one in (waving.calibration, in_world))
-    for one, two in zip(before, after, strict=True):
-        assert two.value == pytest.approx(one.value, abs=0.3 * one.sd)
-        assert two.sd == pytest.approx(one.sd, rel=0.02)
+    for other in (set_world(waving.calibration, frame), set_world(waving.calibration, camera="cam2")):
+        before, after = (distances(one.measure(held), pairs) for one in (waving.calibration, other))
+        for one, two in zip(before, after, strict=True):
+            assert two.value == pytest.approx(one.value, rel=1e-9)
+            assert two.sd == pytest.approx(one.sd, rel=1e-4)
 
 
 def test_the_pose_of_the_camera_that_is_the_world_is_certain(waving: Waving) -> None:
     posterior, working = waving.calibration.posterior, waving.calibration.frame
     middle = np.array([30.0, -20.0, 10.0])
     model = posterior.models[1].camera
+    assert isinstance(model, CentralCamera)
     here = Pose(model.pose.rotation, working.scale * model.pose.translation - model.pose.rotation @ working.offset)
-    placement = placement_at_camera(posterior, working, 1, here, middle)
-    moves = cameras_move_with_the_world(posterior.models, working.to_working(middle))
-    after, frame = placed(posterior, working, placement, moves)
+    placement = placement_at_camera(model, posterior.root(1), working, here, middle)
+    moved, frame, step = lay_anew(posterior, working, None, placement)
+    assert posterior.joint is not None
+    root = step.root(posterior.joint, cameras_move_with_the_world(moved.models, np.zeros(3)))
+    after = replace(moved, joint=root)
     own = slice(model.size - 6, model.size)
     certain = np.abs(after.root(1)[:, own]).max(axis=0)
     assert (certain < 1e-5 * np.abs(posterior.root(1)[:, own]).max(axis=0)).all()
-    moved = after.models[1].camera
-    assert np.allclose(moved.pose.rotation, np.eye(3), atol=1e-12)
-    assert np.allclose(frame.scale * moved.pose.translation, frame.offset, atol=1e-9)
+    camera = after.models[1].camera
+    assert isinstance(camera, CentralCamera)
+    assert np.allclose(camera.pose.rotation, np.eye(3), atol=1e-12)
+    assert np.allclose(frame.scale * camera.pose.translation, frame.offset, atol=1e-9)
     # what is known of the lenses does not depend on the world
     for c in (0, 1):
         lens = slice(0, model.size - 6)
-        before, now = (root[:, lens].T @ root[:, lens] for root in (posterior.root(c), after.root(c)))
+        before, now = (one[:, lens].T @ one[:, lens] for one in (posterior.root(c), after.root(c)))
         np.testing.assert_allclose(now, before, rtol=1e-6, atol=1e-9 * np.abs(before).max())
+
+
+def test_it_does_not_matter_which_worlds_came_before(waving: Waving, frame: Dataset) -> None:
+    held = held_out(waving)
+    straight = set_world(waving.calibration, frame).measure(held)
+    roundabout = set_world(set_world(set_world(waving.calibration, camera="cam2"), camera="cam1"), frame).measure(held)
+    np.testing.assert_allclose(roundabout.xyz, straight.xyz, atol=0.01)
+    np.testing.assert_allclose(roundabout.cov, straight.cov, rtol=0.01, atol=1e-4)
 
 
 def test_the_step_between_two_poses_moves_places_so() -> None:

@@ -8,12 +8,15 @@ is fitted: distances and their uncertainties stay what they are.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from implicam.errors import FitError
 from implicam.geometry import Floats, Pose, cross_matrices, vector_from_rotation
 from implicam.gp.linalg import covariance_root
+from implicam.rig_model.camera import CentralCamera
+from implicam.rig_model.general_camera import GeneralCamera
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.training_data import Frame
 
@@ -103,56 +106,109 @@ def step_between(before: Pose, after: Pose, middle: Floats) -> Floats:
 
 
 def placement_at_camera(
-    posterior: Posterior, frame: Frame, number: int, camera_from_world: Pose, middle: Floats
+    camera: CentralCamera | GeneralCamera, root: Floats, frame: Frame, camera_from_world: Pose, middle: Floats
 ) -> Placement:
     """The world of a camera: its centre and its axes.
 
     Args:
-        posterior: What is known of the cameras, all tied.
+        camera: As it was fitted, in the working frame.
+        root: (q, p or more) of the covariance of its numbers, of all tied cameras the same rows.
         frame: The working frame.
-        number: Of the camera in the posterior.
         camera_from_world: Where it is, its field taken into account: of the lens nearest to all that was learned.
         middle: (3,) as of `Placement`.
     """
-    camera = posterior.models[number].camera
 
     def from_world(pose: Pose) -> Pose:  # in the length unit
         return Pose(pose.rotation, frame.scale * pose.translation - pose.rotation @ frame.offset)
 
-    here = from_world(camera.pose)  # type: ignore[union-attr]  # those without a pose are told apart by the caller
-    h, slopes = 1e-6, []
+    here, h, slopes = from_world(camera.pose), 1e-6, []
     for i in range(camera.size):
         step = np.zeros(camera.size)
         step[i] = h
-        both = [from_world(camera.moved(sign * step).pose) for sign in (1.0, -1.0)]  # type: ignore[union-attr]
+        both = [from_world(camera.moved(sign * step).pose) for sign in (1.0, -1.0)]
         slopes.append((step_between(here, both[0], middle) - step_between(here, both[1], middle)) / (2 * h))
     # z are of the true cameras less the fitted ones
-    return Placement(
-        camera_from_world, middle, -np.array(slopes).T @ posterior.root(number)[:, : camera.size].T, np.zeros((6, 6))
-    )  # fmt: skip
+    return Placement(camera_from_world, middle, -np.array(slopes).T @ root[:, : camera.size].T, np.zeros((6, 6)))
 
 
-def placed(posterior: Posterior, frame: Frame, placement: Placement, moves: Floats) -> tuple[Posterior, Frame]:
+class WorldStep(NamedTuple):
+    """How a world that was laid anew is uncertain against that of the fit: a step of the motion about the origin of the
+    working frame, in its axes and unit; follows (6, q) the standard normal numbers z of the fit's root, and has own (6,
+    6) covariance besides."""
+
+    follows: Floats
+    own: Floats
+
+    @property
+    def half(self) -> Floats:
+        """(6, 6) a root of `own`: half half^T."""
+        return covariance_root(self.own)
+
+    def shared(self, xyz: Floats, E: Floats) -> Floats:
+        """What errors share in this world.
+
+        Args:
+            xyz: (n, 3) places in the working frame.
+            E: (n, 3, q) of their errors in the world of the fit.
+
+        Returns:
+            (n, 3, q + 6).
+        """
+        G = motions_about(xyz, np.zeros(3))
+        return np.concatenate([E + G @ self.follows, G @ self.half], axis=2)
+
+    def covariance(self, xyz: Floats, E: Floats, cov: Floats) -> Floats:
+        """The covariance of places in this world.
+
+        Args:
+            xyz: (n, 3) places in the working frame.
+            E: (n, 3, q) of their errors in the world of the fit.
+            cov: (n, 3, 3) there.
+
+        Returns:
+            (n, 3, 3).
+        """
+        now = self.shared(xyz, E)
+        return np.asarray(cov - E @ E.swapaxes(1, 2) + now @ now.swapaxes(1, 2), dtype=np.float64)
+
+    def root(self, joint: Floats, moves: Floats) -> Floats:
+        """(q + 6, P) of the covariance of all cameras in this world.
+
+        Args:
+            joint: (q, P) in the world of the fit.
+            moves: (P, 6) how the numbers of all cameras change when all places turn about the origin of the working
+                frame, and shift.
+        """
+        return np.concatenate([joint - (moves @ self.follows).T, (moves @ self.half).T])
+
+
+def lay_anew(
+    posterior: Posterior, frame: Frame, before: WorldStep | None, placement: Placement
+) -> tuple[Posterior, Frame, WorldStep]:
     """The cameras in a new world.
 
     Args:
-        posterior: What is known of them, all tied.
+        posterior: What the fit knows of them, all tied, in the world of the fit but the axes of now.
         frame: The working frame.
-        placement: Where the new world is.
-        moves: (P, 6) how the numbers of all cameras change when all places turn about the middle of the placement, and
-            shift, in the working frame.
+        before: How the world of now is uncertain against that of the fit; None where it is that.
+        placement: Where the new world is, seen from that of now.
 
     Returns:
-        The same cameras in a working frame that turns with the world and has its middle where it was; so of a camera
-        only the rotation changes, and what is known of its numbers is known of the same numbers.
+        The same, in a working frame that turns with the world and has its middle where it was: of a camera only the
+        rotation changes, and what is known of its numbers is known of the same numbers.
     """
     if posterior.joint is None:
         raise ValueError("the cameras of a calibration without known positions are tied")
-    unit = np.repeat([1.0, 1 / frame.scale], 3)[:, None]
-    half = covariance_root(unit * placement.own * unit.T)
-    parts = [posterior.joint - (moves @ (unit * placement.follows)).T, (moves @ half).T]
-    root = np.linalg.qr(np.concatenate(parts), mode="r")
+    q, middle = len(posterior.joint), frame.to_working(placement.middle)
+    about_origin = np.eye(6)
+    about_origin[3:, :3], about_origin[3:, 3:] = cross_matrices(middle[None])[0], np.eye(3) / frame.scale
+    follows, own = about_origin @ placement.follows, about_origin @ placement.own @ about_origin.T
+    if before is not None:
+        half = before.half + follows[:, q:]
+        follows, own = before.follows + follows[:, :q], half @ half.T + own
     turn = placement.new_from_old.rotation
+    both = np.zeros((6, 6))
+    both[:3, :3], both[3:, 3:] = turn, turn
     back = Pose(turn.T, np.zeros(3))
     models = []
     for model in posterior.models:
@@ -160,5 +216,6 @@ def placed(posterior: Posterior, frame: Frame, placement: Placement, moves: Floa
         field_camera = camera if model.field_camera is model.camera else model.field_camera.in_frame(back)
         models.append(replace(model, camera=camera, field_camera=field_camera))
     off = None if posterior.displacement is None else posterior.displacement @ turn.T
-    moved = replace(posterior, models=tuple(models), joint=np.ascontiguousarray(root), displacement=off)
-    return moved, Frame(placement.new_from_old.apply(frame.offset), frame.scale)
+    moved = replace(posterior, models=tuple(models), displacement=off)
+    there = Frame(placement.new_from_old.apply(frame.offset), frame.scale)
+    return moved, there, WorldStep(both @ follows, both @ own @ both.T)

@@ -21,6 +21,7 @@ from implicam.rig_model.camera_model import apply_covariance_root
 from implicam.rig_model.heavy_tails import information_loss
 from implicam.rig_model.measured_pixels import MeasuredPixels
 from implicam.rig_model.movement import Check, CheckedRig, check_movement
+from implicam.rig_model.placement import WorldStep
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.reasons import reason_codes, reasons_in_words
 from implicam.rig_model.repair import Repair, all_repaired
@@ -67,6 +68,9 @@ class FittedRig:
         misfit_adds: Residuals that are larger than the views state come from the lens models, and not from the views.
         degrees: Degrees of freedom of the noise; None where it is normal.
         settings: Which views disagree, and when that is an alarm.
+        laid: Where the world was laid anew after the fit: what the fit knows of the cameras, and how uncertain the new
+            world is against that of the fit. Positions are found as in that: the uncertainty of a far world would draw
+            each of them elsewhere.
     """
 
     trained: Observations
@@ -78,6 +82,7 @@ class FittedRig:
     misfit_adds: bool = False
     degrees: float | None = None
     settings: RigModelSettings = DEFAULT_SETTINGS
+    laid: tuple[Posterior, WorldStep] | None = None
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -190,7 +195,16 @@ class FittedRig:
         Returns:
             In the working frame.
         """
-        return locate(self.posterior, uv, noise, self.labels, self.degrees, self.settings)
+        if self.laid is None:
+            return locate(self.posterior, uv, noise, self.labels, self.degrees, self.settings)
+        fitted, step = self.laid
+        found = locate(fitted, uv, noise, self.labels, self.degrees, self.settings)
+        E = shared_errors(fitted, uv, noise, found.xyz, found.left_out, self.labels, self.degrees, self.settings)
+        if not E.shape[2]:  # nothing is measured
+            return found
+        cov = step.covariance(found.xyz, E, found.cov)
+        left = np.trace(found.cov, axis1=1, axis2=2) / np.trace(cov, axis1=1, axis2=2)
+        return found._replace(cov=cov, share=np.clip(1 - (1 - found.share) * left, 0, 1))
 
     def _alarm(self, uv: Floats, noise: Floats, found: Located) -> str:
         """What is wrong with a table as a whole."""
@@ -212,7 +226,11 @@ class FittedRig:
     def _shared_errors(self, uv: Floats, noise: Floats, found: Located, rows: NDArray[np.int64]) -> Floats:
         """(k, 3, q) of located points, in the world."""
         own = uv[rows], noise[rows], found.xyz[rows], found.left_out[rows]
-        return self.frame.scale * shared_errors(self.posterior, *own, self.labels, self.degrees, self.settings)
+        posterior = self.posterior if self.laid is None else self.laid[0]
+        E = shared_errors(posterior, *own, self.labels, self.degrees, self.settings)
+        if self.laid is not None and E.shape[2]:
+            E = self.laid[1].shared(found.xyz[rows], E)
+        return self.frame.scale * E
 
     def _matched(self, observations: Observations | Dataset) -> Observations:
         """What the cameras of the calibration saw."""
@@ -304,7 +322,7 @@ class FittedRig:
         posterior, labels = all_repaired(self.posterior, repairs), self.labels
         if labels is not None and labels.unknowns is not None:
             labels = labels._replace(unknowns=posterior.unknowns)
-        return replace(self, posterior=posterior, labels=labels)
+        return replace(self, posterior=posterior, labels=labels, laid=None)
 
     def predict(self, xyz: Floats) -> Floats:
         """Where all cameras see positions, in pixels without noise.

@@ -51,6 +51,8 @@ def why_not_tabulated(rig: FittedRig, known_points: int) -> str:
         return "the noise of its views has heavy tails"
     if not known_points:
         return "no known points say where its workspace is"
+    if rig.laid is not None:
+        return "its world was laid anew after the fit"
     if not rig.posterior.tied:
         return ""
     if len(rig.cameras) > MAX_TIED_CAMERAS:

@@ -73,8 +73,11 @@ def align(measured: JointPositions, xyz: Floats, sd: Floats, middle: Floats, *, 
     """
     pose, _ = register(measured.xyz, xyz)
     n, untold = len(xyz), 0.0
-    cov = measured.cov
     G = motions_about(measured.xyz, middle).reshape(3 * n, 6)
+    # what moves all of them alike is what is looked for: weights do not depend on the world they are measured in
+    shared = measured.shared.reshape(3 * n, -1)
+    shared = shared - G @ (np.linalg.pinv(G) @ shared)
+    cov = replace(measured, shared=shared.reshape(n, 3, -1)).cov
     grown = np.concatenate([G, (measured.xyz - middle).reshape(-1, 1)], axis=1)
 
     def weights(turn: Floats) -> Floats:

@@ -50,7 +50,7 @@ from implicam.rig_model import CentralCamera, GeneralCamera
 from implicam.rig_model.diagnostics import Diagnosis
 from implicam.rig_model.fit_result import FitResult
 from implicam.rig_model.level_errors import find_uncertain_planes
-from implicam.rig_model.placement import Placement, placed, placement_at_camera
+from implicam.rig_model.placement import Placement, WorldStep, lay_anew, placement_at_camera
 from implicam.rig_model.posterior import Posterior
 from implicam.rig_model.repair import Repair
 from implicam.rig_model.rig import FittedRig
@@ -218,6 +218,7 @@ class ForwardGPCalibration(RigCalibration):
     repairs: tuple[Repair, ...] = ()
     waved: Waved | None = None
     world: tuple[str, ...] = ()
+    laid: WorldStep | None = None
 
     method: ClassVar[str] = "forward-gp"
 
@@ -226,10 +227,19 @@ class ForwardGPCalibration(RigCalibration):
         """The data without what is there twice; of it are the numbers of points in the fit and its diagnosis."""
         return remove_copies(self.data)
 
-    @property
+    @cached_property
     def posterior(self) -> Posterior:
         """What is known of each camera, in the working frame."""
-        return self.fitted.posterior
+        if self.laid is None:
+            return self.fitted.posterior
+        return replace(self.fitted.posterior, joint=np.asarray(np.linalg.qr(self._root, mode="r")))
+
+    @cached_property
+    def _root(self) -> Floats:
+        """(q, P) of the covariance of all cameras; of a world laid anew with the numbers of the fit first."""
+        joint, models = self.fitted.posterior.joint, self.fitted.posterior.models
+        assert joint is not None  # of a wand all are tied
+        return joint if self.laid is None else self.laid.root(joint, cameras_move_with_the_world(models, np.zeros(3)))
 
     @cached_property
     def fitted_map(self) -> FittedRig:
@@ -244,6 +254,7 @@ class ForwardGPCalibration(RigCalibration):
             self._labels,
             degrees=None if tails is None else tails.degrees,
             settings=self.calibrator.settings,
+            laid=None if self.laid is None else (self.fitted.posterior, self.laid),
         )
 
     @cached_property
@@ -353,12 +364,11 @@ class ForwardGPCalibration(RigCalibration):
                 why="its places would no longer be where the cameras see them",
                 fix="set the world of the calibration as it was before, then check and repair that one",
             )
-        moves = cameras_move_with_the_world(self.posterior.models, self.frame.to_working(placement.middle))
-        posterior, frame = placed(self.posterior, self.frame, placement, moves)
+        posterior, frame, laid = lay_anew(self.fitted.posterior, self.frame, self.laid, placement)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = placement.new_from_old.rotation, placement.new_from_old.translation
         fitted = replace(self.fitted, posterior=posterior)
-        return replace(self, data=self.data.transformed(pose), frame=frame, fitted=fitted, world=told)
+        return replace(self, data=self.data.transformed(pose), frame=frame, fitted=fitted, world=told, laid=laid)
 
     def in_world_of_camera(self, name: str) -> ForwardGPCalibration:
         """The same calibration, in the world of one of its cameras: its centre, x right, y down, z forward.
@@ -377,14 +387,15 @@ class ForwardGPCalibration(RigCalibration):
         middle = self.data.xyz.mean(axis=0)
         number = self.camera_names.index(name)
         told = f"The world is that of {name}: its centre is the origin, x points right, y down, z forward."
-        here = self.cameras[name].camera_from_world
-        if here is None or not isinstance(self.posterior.models[number].camera, CentralCamera | GeneralCamera):
+        here, camera = self.cameras[name].camera_from_world, self.posterior.models[number].camera
+        if here is None or not isinstance(camera, CentralCamera | GeneralCamera):
             raise UsageError(
                 f"camera {name!r} has no place of its own.",
                 why="what it sees is described by a linear projection, or it looks into a mirror",
                 fix="name another camera",
             )
-        return self.in_world(placement_at_camera(self.posterior, self.frame, number, here, middle), (told,))
+        own = self._root[:, self.posterior.offsets[number] :]
+        return self.in_world(placement_at_camera(camera, own, self.frame, here, middle), (told,))
 
     def transformed(self, pose: Any) -> ForwardGPCalibration:
         """The calibration that measures in another frame of the world: fitted again to the known points in that frame;
@@ -400,9 +411,7 @@ class ForwardGPCalibration(RigCalibration):
         if not self.free_world:
             return super().transformed(pose)  # type: ignore[no-any-return]
         rotation, shift = rigid_parts(pose)
-        root = self.posterior.joint
-        assert root is not None
-        still = Placement(Pose(rotation, shift), np.zeros(3), np.zeros((6, len(root))), np.zeros((6, 6)))
+        still = Placement(Pose(rotation, shift), np.zeros(3), np.zeros((6, len(self._root))), np.zeros((6, 6)))
         return self.in_world(still, ("The world was turned and shifted as stated, exactly.",))
 
     def refit_from(self, data: Dataset, progress: Progress = silent, *, anew: bool = False) -> ForwardGPCalibration:
@@ -534,6 +543,8 @@ class ForwardGPCalibration(RigCalibration):
         moved, moved_arrays = repairs_state(self.repairs)
         waved, waved_arrays = ({}, {}) if self.waved is None else self.waved.state()
         waved |= {"world": list(self.world)} if self.world else {}
+        if self.laid is not None:
+            waved_arrays |= {"world/follows": self.laid.follows, "world/own": self.laid.own}
         arrays = arrays | moved_arrays | waved_arrays | {"frame": self.frame.as_array()}
         return self.calibrator.as_table() | table | moved | waved, arrays
 
@@ -558,5 +569,8 @@ class ForwardGPCalibration(RigCalibration):
         used = remove_copies(data)
         fitted = saved.restored(used, working.to_working(used.xyz), table, arrays, calibrator.settings)
         repairs = repairs_from_state(table, arrays, fitted.posterior)
-        world = tuple(str(one) for one in table.get("world", ()))
-        return cls(calibrator, data, working, fitted, repairs, Waved.from_state(table, arrays), world)
+        world, laid = tuple(str(one) for one in table.get("world", ())), None
+        if "world/follows" in arrays and fitted.posterior.joint is not None:
+            follows = finite_column(arrays, "world/follows", (6, len(fitted.posterior.joint)))
+            laid = WorldStep(follows, finite_column(arrays, "world/own", (6, 6)))
+        return cls(calibrator, data, working, fitted, repairs, Waved.from_state(table, arrays), world, laid)
