@@ -135,7 +135,7 @@ before."""
 
 def lying_still(data: Dataset, rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Frames in which nothing moved since one before: the same place seen again, with the same errors of detector and
-    lens.
+    lens. Copies of any earlier frame, to the last digit, too: an export that repeats itself tells nothing new.
 
     Args:
         data: Markers in frames.
@@ -148,7 +148,12 @@ def lying_still(data: Dataset, rows: NDArray[np.int64]) -> NDArray[np.int64]:
     half = np.array([max(c.width or 1280, c.height or 0) / 2 for c in data.cameras]) / 640
     markers = data.further_columns()[MARKER]
     first, last = np.arange(len(rows)), dict[str, int]()
+    alike = dict[str, int]()
     for f, pair in enumerate(rows.tolist()):
+        seen = np.array([uv[row] if row >= 0 else np.full(uv.shape[1:], np.nan) for row in pair])
+        if np.isfinite(seen[..., 0]).sum() >= 4 and (same := alike.setdefault(str(seen.tolist()), f)) != f:
+            first[f] = first[same]
+            continue
         key = str(markers[pair[0]]) if pair[0] >= 0 and pair[1] < 0 else ""
         single = key != "" and key in last and (rows[last[key]] >= 0).sum() == 1
         before = last.get(key) if key == "" or single else None

@@ -153,11 +153,17 @@ def fit_wand(waves: Waves, settings: ForwardGPSettings, length_sd: float, progre
     raise _explained(failure, waves)
 
 
-def _explained(failure: FitError | np.linalg.LinAlgError, waves: Waves) -> FitError | np.linalg.LinAlgError:
+def _explained(failure: FitError | np.linalg.LinAlgError, waves: Waves) -> FitError:
     """With the cause, where it can be told."""
     why = explain_no_rig(waves)
-    if not why:
+    if not why and isinstance(failure, FitError):
         return failure
+    if not why:
+        return FitError(
+            "no camera can be calibrated from this wand: the equations have no solution.",
+            why="the views contradict each other, or the wand was in too little of what the cameras see",
+            fix="look for cameras that are out of step and for wrong views; wave it in all directions, near and far",
+        )
     what = failure.what if isinstance(failure, FitError) else "no camera can be calibrated from this wand."
     return FitError(what, why=why, fix="trigger all cameras by one signal; of films, detect --offsets says by how much")
 

@@ -28,7 +28,7 @@ from implicam.rig_model.training_data import camera_views_of
 
 UNCHECKED = "two views meet there, and no third one and no length checks it"
 CONTRADICTED = "its views contradict each other, or the length of the wand"
-STILL = "it lay still since a frame before: one place counts once"
+STILL = "the same as in a frame before: a wand that lies still, or a frame that is repeated, counts once"
 TOO_FEW = "fewer than two calibrated cameras saw it"
 
 
