@@ -101,6 +101,35 @@ def test_known_points_say_where_the_world_is(waving: Waving, frame: Dataset) -> 
     assert not any("The world is the wand's" in note for note in in_world.notes)
 
 
+@pytest.mark.parametrize("sd", [np.nan, 0.01])
+def test_error_bars_contain_what_known_points_contradict(waving: Waving, frame: Dataset, sd: float) -> None:
+    """An L-frame measured with a wrong ruler: 1.5 % too large, which the wand knows better."""
+    large = known_as(waving.seen, 1.015 * waving.edge * np.array(list(FRAME.values()), dtype=float), sd)
+    calibration, held = set_world(waving.calibration, large), held_out(waving)
+    assert held.truth is not None
+    said = " ".join(calibration.world)
+    assert "% as far apart as the wand says" in said
+    assert "the error bars contain it" in said
+    measured = calibration.measure(held.observations)
+    off = measured.xyz - waving.in_frame(held.truth.xyz)
+    assert np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(measured.cov), off) < 7.81) > 0.85
+    own = set_world(waving.calibration, frame).measure(held.observations)
+    assert np.mean(np.trace(measured.cov, axis1=1, axis2=2) / np.trace(own.cov, axis1=1, axis2=2)) > 2
+
+
+def test_a_point_off_the_plane_is_named_and_error_bars_contain_it(waving: Waving) -> None:
+    corner = waving.edge * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, -0.1]])
+    names = ["o", "x", "y", "high"]
+    seen = show(waving.rig, names, waving.corner.apply(corner), 71)
+    laid = set_world(waving.calibration, seen, plane=names, x=["o", "x"], origin="o")
+    assert "not on one plane" in laid.world[1]
+    assert "the error bars of this world contain it" in laid.world[1]
+    measured = laid.measure(seen)
+    off = measured.xyz - corner
+    assert (np.abs(off[:3, 2]) < 2.5 * np.sqrt(measured.cov[:3, 2, 2])).all()
+    assert np.abs(off[:3, 2]).max() > 0.01 * waving.edge  # the plane is wrong, and its error bars say so
+
+
 def test_distances_are_what_they_were(waving: Waving, frame: Dataset) -> None:
     held = held_out(waving)
     pairs = [(0, i) for i in range(1, 20)]
@@ -181,8 +210,8 @@ def test_a_plumb_line_says_what_is_up(waving: Waving) -> None:
     assert np.abs(found.xyz[2]).max() < 0.5
     assert found.xyz[0] == pytest.approx([0, 0, 1.7 * waving.edge], abs=1.0)
     bent = world.apply(line + waving.edge * np.array([[0, 0, 0], [0.3, 0, 0], [0, 0, 0]]))
-    crooked = set_world(waving.calibration, show(waving.rig, ["a", "b", "c"], bent, 62), down=["a", "b", "c"])
-    assert "not on one plumb line: b is" in crooked.world[1]
+    with pytest.raises(FitError, match="not on one plumb line: b is"):
+        set_world(waving.calibration, show(waving.rig, ["a", "b", "c"], bent, 62), down=["a", "b", "c"])
 
 
 def test_what_falls_says_what_is_up(waving: Waving) -> None:
@@ -217,7 +246,8 @@ def test_what_falls_says_what_is_up(waving: Waving) -> None:
         set_world(waving.calibration, replace(flat, columns=seen.columns), falling="ball")
     carried = way + waving.edge * 0.2 * np.sin(9 * t)[:, None]
     jumping = replace(show(waving.rig, points, world.apply(carried), 66), columns=seen.columns)
-    assert "do not fall freely" in set_world(waving.calibration, jumping, falling="ball").world[1]
+    with pytest.raises(FitError, match="do not fall freely"):
+        set_world(waving.calibration, jumping, falling="ball")
 
 
 def _first(data: Dataset, rows: list[int]) -> dict[str, np.ndarray]:

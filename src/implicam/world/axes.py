@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc
@@ -114,6 +115,8 @@ def by_axes(calibration: PlacesItsWorld, data: Dataset, axes: Axes, middle: Floa
 
     if axes.times:
         _refuse_straight(axes, number, positions)
+    unit = calibration.data.length_unit
+    positions, doubts = _allow_for_misfit(axes, number, positions, unit)
     here, n = pose_of(positions.xyz), len(wanted)
     h = 1e-5 * max(float(np.ptp(positions.xyz, axis=0).max()), 1e-300)
     J = np.zeros((6, n, 3))
@@ -127,23 +130,31 @@ def by_axes(calibration: PlacesItsWorld, data: Dataset, axes: Axes, middle: Floa
     placement = Placement(here, middle, follows, own)
     turn_sd = float(np.sqrt(np.linalg.eigvalsh((own + follows @ follows.T)[:3, :3])[-1]))
     if turn_sd > MAX_TURN_SD:
-        raise FitError(
-            f"these points say where the axes are to {np.degrees(turn_sd):.0f} degrees only.",
-            why="they are too near each other for how exactly they are measured"
-            if not axes.times
-            else "its way bends too little: too few frames, or too short a time",
-            fix="take points that are farther apart"
-            if not axes.times
-            else "film a longer fall, with more frames a second",
-        )
-    unit = calibration.data.length_unit
+        raise _too_uncertain(np.degrees(turn_sd), axes, doubts)
     sd = float(placement.sd_at(middle[None])[0])
     told = (
         f"The world is laid by points of {data.name!r}: {_axes_in_words(axes)}. That these are known to "
         f"{decimal_number(sd)} {unit} in the middle of the wand's places is part of the error bars; distances do not "
         "depend on it."
     )
-    return Laid(placement, (told, *_not_straight(axes, number, positions, unit)))
+    return Laid(placement, (told, *doubts))
+
+
+def _too_uncertain(degrees: float, axes: Axes, doubts: Sequence[str]) -> FitError:
+    what = f"these points say where the axes are to {degrees:.0f} degrees only."
+    if doubts:
+        return FitError(what, why=doubts[0], fix="leave out the point that is off, or measure it again")
+    if axes.times:
+        why, fix = (
+            "its way bends too little: too few frames, or too short a time",
+            "film a longer fall, with more frames a second",
+        )
+    else:
+        why, fix = (
+            "they are too near each other for how exactly they are measured",
+            "take points that are farther apart",
+        )
+    return FitError(what, why=why, fix=fix)
 
 
 def _axes_in_words(axes: Axes) -> str:
@@ -277,15 +288,29 @@ def _refuse_straight(axes: Axes, number: dict[str, int], positions: JointPositio
         )
 
 
-def _not_straight(axes: Axes, number: dict[str, int], positions: JointPositions, unit: str) -> list[str]:
-    """What is left where more points are given than a plane or a line needs."""
+class _Misfit(NamedTuple):
+    """Of points that are more than a plane, a line or a fall needs: their names and what they are not, how far each is
+    off across it, their squares over the covariance of the points, and how many of these are free."""
+
+    names: tuple[str, ...]
+    what: str
+    off: Floats
+    chi2: float
+    free: int
+
+    @property
+    def beyond_chance(self) -> bool:
+        return self.free > 0 and bool(chdtrc(self.free, self.chi2) < MAX_CHANCE_PROBABILITY)
+
+
+def _misfit(axes: Axes, number: dict[str, int], positions: JointPositions) -> _Misfit:
     names, what = (axes.plane, "are not on one plane") if axes.plane else (axes.down, "are not on one plumb line")
     what = "do not fall freely" if axes.times else what
     rows = [number[name] for name in names]
     free = len(rows) - 3 if axes.plane else 2 * (len(rows) - 2)
     free = 3 * (len(rows) - 3) if axes.times else free
     if free < 1:
-        return []
+        return _Misfit(names, what, np.zeros((len(rows), 1)), 0.0, 0)
     if axes.times:
         across, off = np.eye(3), _flight_of(positions.xyz[rows], axes.times)[2]
         chi2 = float(np.einsum("ni,nij,nj->", off, np.linalg.inv(positions.own[rows]), off))
@@ -295,10 +320,22 @@ def _not_straight(axes: Axes, number: dict[str, int], positions: JointPositions,
         across = directions[2:] if axes.plane else directions[1:]
         off = centred @ across.T
         chi2 = float(np.sum(off**2 / np.einsum("ad,nde,ae->na", across, positions.own[rows], across)))
-    if chdtrc(free, chi2) >= MAX_CHANCE_PROBABILITY:
-        return []
-    worst = int(np.argmax(np.abs(off).max(axis=1)))
-    return [
-        f"The points {what}: {names[worst]} is {decimal_number(float(np.abs(off[worst]).max()))} {unit} "
-        f"off, {np.sqrt(chi2 / free):.1f} times what the error bars of the points allow. These do not contain it."
-    ]
+    return _Misfit(names, what, off, chi2, free)
+
+
+def _allow_for_misfit(
+    axes: Axes, number: dict[str, int], positions: JointPositions, unit: str
+) -> tuple[JointPositions, list[str]]:
+    """Points that may be off by what they contradict each other by, and a note; the same where chance explains it."""
+    found = _misfit(axes, number, positions)
+    if not found.beyond_chance:
+        return positions, []
+    off = float(np.sqrt(np.sum(found.off**2) / found.free))
+    worst = int(np.argmax(np.abs(found.off).max(axis=1)))
+    note = (
+        f"The points {found.what}: {found.names[worst]} is {decimal_number(float(np.abs(found.off[worst]).max()))} "
+        f"{unit} off, {np.sqrt(found.chi2 / found.free):.1f} times what the error bars of the points allow. Each of "
+        f"them is taken to be off by about {decimal_number(off)} {unit}, and the error bars of this world contain it."
+    )
+    own = positions.own + off**2 * np.eye(3)
+    return replace(positions, own=own), [note]

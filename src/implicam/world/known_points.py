@@ -57,22 +57,27 @@ class Aligned(NamedTuple):
         return self.residual.size - 6
 
 
-def align(measured: JointPositions, xyz: Floats, sd: Floats, middle: Floats, *, declared: bool) -> Aligned:
+def align(
+    measured: JointPositions, xyz: Floats, sd: Floats, middle: Floats, *, declared: bool, as_stated: bool = False
+) -> Aligned:
     """The rigid motion that lays measured points over known ones, weighted by what is known of both.
+
+    Where the points fit worse than they could be measured, and be stated, known points are taken to be off by what
+    explains it, their distances too: error bars that leave a contradiction out would be too small in this world.
 
     Args:
         measured: n points.
         xyz: (n, 3) known.
         sd: (n, 3) of these, each by itself; zero where nothing is stated.
         middle: (3,) in the old world, about which the step of the motion turns.
-        declared: Whether these are stated; if not, and the points fit worse than they could be measured, known points
-            are taken to be off by what explains it.
+        declared: Whether these are stated: then chance is to explain what it can.
+        as_stated: Nothing is taken to be off by more than is stated.
 
     Raises:
         FitError: The points lie on one line.
     """
     pose, _ = register(measured.xyz, xyz)
-    n, untold = len(xyz), 0.0
+    n, untold, untold_of_shape = len(xyz), 0.0, 0.0
     G = motions_about(measured.xyz, middle).reshape(3 * n, 6)
     # what moves all of them alike is what is looked for: weights do not depend on the world they are measured in
     shared = measured.shared.reshape(3 * n, -1)
@@ -80,27 +85,39 @@ def align(measured: JointPositions, xyz: Floats, sd: Floats, middle: Floats, *, 
     cov = replace(measured, shared=shared.reshape(n, 3, -1)).cov
     grown = np.concatenate([G, (measured.xyz - middle).reshape(-1, 1)], axis=1)
 
-    def weights(turn: Floats) -> Floats:
+    def weights(turn: Floats, off: float) -> Floats:
         stated = np.zeros((n, 3, n, 3))
-        stated[range(n), :, range(n), :] = turn.T @ ((sd**2 + untold**2)[:, :, None] * np.eye(3)) @ turn
+        stated[range(n), :, range(n), :] = turn.T @ ((sd**2 + off**2)[:, :, None] * np.eye(3)) @ turn
         return np.asarray(np.linalg.inv(cov + stated.reshape(3 * n, 3 * n)), dtype=np.float64)
 
     for number in range(STEPS):
-        W = weights(pose.rotation)
         residual = (pose.inverse().apply(xyz) - measured.xyz).ravel()
-        larger = np.linalg.inv(grown.T @ W @ grown)
-        scale = larger @ (grown.T @ W @ residual)
-        if number == 0 and not declared and n > MIN_POINTS:
-            untold = _untold(cov, grown, residual)
-            continue
+        if number == 0 and not as_stated:
+            known = np.asarray(np.linalg.inv(weights(pose.rotation, 0.0)), dtype=np.float64)
+            if (n > MIN_POINTS and not declared) or _is_beyond_chance(known, G, residual):
+                untold, untold_of_shape = _untold(known, G, residual), _untold(known, grown, residual)
+        W = weights(pose.rotation, untold)
         K = np.linalg.inv(G.T @ W @ G) @ G.T @ W
         pose = _moved(pose, K @ residual, middle)
     residual = (pose.inverse().apply(xyz) - measured.xyz).ravel()
-    W = weights(pose.rotation)
+    W, shape = weights(pose.rotation, untold), weights(pose.rotation, untold_of_shape)
+    larger = np.linalg.inv(grown.T @ shape @ grown)
+    scale = float((larger @ (grown.T @ shape @ residual))[6])
     return Aligned(
         pose, K, residual.reshape(-1, 3), np.asarray(np.linalg.inv(W)), float(residual @ W @ residual),
-        1 + float(scale[6]), float(np.sqrt(larger[6, 6])), untold,
+        1 + scale, float(np.sqrt(larger[6, 6])), untold,
     )  # fmt: skip
+
+
+def _left(cov: Floats, design: Floats, residual: Floats) -> float:
+    """Squares of what is left after a fit, over the covariance."""
+    W = np.linalg.inv(cov)
+    left = residual - design @ np.linalg.solve(design.T @ W @ design, design.T @ W @ residual)
+    return float(left @ W @ left)
+
+
+def _is_beyond_chance(cov: Floats, design: Floats, residual: Floats) -> bool:
+    return bool(chdtrc(len(residual) - design.shape[1], _left(cov, design, residual)) < MAX_CHANCE_PROBABILITY)
 
 
 def _untold(cov: Floats, design: Floats, residual: Floats) -> float:
@@ -108,9 +125,7 @@ def _untold(cov: Floats, design: Floats, residual: Floats) -> float:
     freedom = len(residual) - design.shape[1]
 
     def excess(sd: float) -> float:
-        W = np.linalg.inv(cov + sd**2 * np.eye(len(cov)))
-        left = residual - design @ np.linalg.solve(design.T @ W @ design, design.T @ W @ residual)
-        return float(left @ W @ left - freedom)
+        return float(_left(cov + sd**2 * np.eye(len(cov)), design, residual) - freedom)
 
     if excess(0.0) <= 0:
         return 0.0
@@ -184,7 +199,10 @@ def by_known_points(calibration: PlacesItsWorld, data: Dataset, middle: Floats) 
     own = np.einsum("knd,nde,lne->kl", K, noise, K)
     placement = Placement(found.new_from_old, middle, -np.einsum("knd,ndq->kq", K, positions.shared), own)
     told = _known_told(found, names, data, placement, middle, unit)
-    told += [*_notes(found, wrong, measured, unit), *_upside_down(xyz, placement.new_from_old, calibration)]
+    told += [
+        *_notes(found, wrong, measured, unit, declared=declared),
+        *_upside_down(xyz, placement.new_from_old, calibration),
+    ]
     return Laid(placement, tuple(told))
 
 
@@ -201,7 +219,7 @@ def _known_told(
     ]
 
 
-def _notes(found: Aligned, wrong: list[str], measured: Measurement, unit: str) -> list[str]:
+def _notes(found: Aligned, wrong: list[str], measured: Measurement, unit: str, *, declared: bool) -> list[str]:
     notes = []
     if wrong:
         notes.append(f"Known points that the others contradict are not used: {', '.join(wrong)}.")
@@ -214,13 +232,12 @@ def _notes(found: Aligned, wrong: list[str], measured: Measurement, unit: str) -
             f"The known points are {100 * found.scale:.4g} % as far apart as the wand says, "
             f"{abs(off):.1f} standard deviations: is the wand's length right? Distances are those of the wand."
         )
-    if found.untold == 0 and chdtrc(found.freedom, found.chi2) < MAX_CHANCE_PROBABILITY:
-        ratio = np.sqrt(found.chi2 / found.freedom)
+    if found.untold > 0 and declared:
         notes.append(
-            f"The known points contradict their stated uncertainties: what is left is {ratio:.1f} times as large as "
-            "it should be."
+            f"The known points contradict their stated uncertainties: they seem to be off by about "
+            f"{decimal_number(found.untold)} {unit} more in x, y and z each, and the error bars contain it."
         )
-    if found.untold > 0:
+    elif found.untold > 0:
         notes.append(
             f"The known points seem to be off by about {decimal_number(found.untold)} {unit} in x, y and z each, and "
             "the error bars contain it. State sd_x, sd_y, sd_z if you know better."
@@ -231,7 +248,7 @@ def _notes(found: Aligned, wrong: list[str], measured: Measurement, unit: str) -
 def _wrong_point(positions: JointPositions, xyz: Floats, sd: Floats, middle: Floats, found: Aligned) -> int | None:
     """The number of a known point that the others contradict, where there are enough of them to tell."""
     n = len(xyz)
-    raw = found if found.untold == 0 else align(positions, xyz, sd, middle, declared=True)
+    raw = found if found.untold == 0 else align(positions, xyz, sd, middle, declared=True, as_stated=True)
     if n <= MIN_POINTS + 1 or chdtrc(raw.freedom, raw.chi2) >= MAX_CHANCE_PROBABILITY:
         return None
     worst = np.argsort(-np.sum(raw.residual**2, axis=1) / np.trace(positions.own, axis1=1, axis2=2))[:SUSPECTS]
@@ -243,7 +260,7 @@ def _wrong_point(positions: JointPositions, xyz: Floats, sd: Floats, middle: Flo
             own=positions.own[keep], shared=positions.shared[keep],
         )  # fmt: skip
         try:
-            left.append(align(rest, xyz[keep], sd[keep], middle, declared=True))
+            left.append(align(rest, xyz[keep], sd[keep], middle, declared=True, as_stated=True))
         except FitError:
             left.append(raw)
     best = int(np.argmin([one.chi2 for one in left]))
