@@ -499,6 +499,7 @@ def test_what_was_promised_is_kept(rig: Rig, room: Workspace) -> None:
     assert np.mean(ratios) == pytest.approx(1, abs=0.25)
 
 
+@pytest.mark.slow
 def test_a_target_that_fails_is_not_asked_for_again(rig: Rig, room: Workspace) -> None:
     loop = Loop(ForwardGP(), room, rule=Budget(14), seed=4).run(SimulatedOracle(rig, 4, fails=0.4))
     assert loop.points == 14
@@ -574,6 +575,7 @@ def test_asking_for_several_to_begin_with_gives_several(room: Workspace) -> None
     assert [target.name for target in targets] == [f"p{i:03d}" for i in range(1, 9)]
 
 
+@pytest.mark.slow
 def test_a_grown_fit_is_a_fit(rig: Rig, room: Workspace) -> None:
     """Starting from the last result finds what starting from no guess finds."""
     data = simulate(rig, random_positions(rig, 60, np.random.default_rng(8)), seed=8, outliers=0.03)

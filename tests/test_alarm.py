@@ -49,6 +49,7 @@ def knocked(rig: Rig, camera: int, degrees: float) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
+@pytest.mark.slow
 def test_a_rig_that_was_knocked_raises_an_alarm() -> None:
     calibration, new = case("knocked-cameras-no-alarm")
     found = calibration.measure(new.observations)

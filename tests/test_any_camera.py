@@ -61,6 +61,7 @@ def error_on_new(known: Dataset, change: Callable[[np.ndarray], np.ndarray] = la
     return 1000 * float(np.sqrt(np.mean(np.sum((measured.xyz - xyz)[good] ** 2, axis=1)))), int(good.sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pixel", [10986.1, 30000.0])
 def test_a_wild_pixel_is_rejected_and_named_though_no_image_size_is_stated(pixel: float) -> None:
     def slipped(uv: np.ndarray) -> np.ndarray:
@@ -146,6 +147,7 @@ def test_ordinary_cameras_are_called_ordinary() -> None:
     assert calibration.notes == []
 
 
+@pytest.mark.slow
 def test_a_camera_that_saw_nonsense_does_not_take_the_rig_down() -> None:
     known, new = odd_rig(Unusual())
 

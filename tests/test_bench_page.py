@@ -80,6 +80,7 @@ def page(controller: SessionController) -> Iterator[BenchPage]:
 # ------------------------------------------------------------------------------------------------ a robot that is real
 
 
+@pytest.mark.slow
 def test_a_real_robot_moves_once_for_each_yes(arm: Arm, controller: SessionController, page: BenchPage) -> None:
     target = controller.state.target
     assert target is not None
@@ -127,6 +128,7 @@ def test_a_yes_does_not_outlive_a_stop_a_minute_or_the_target(
     assert not arm.went
 
 
+@pytest.mark.slow
 def test_going_on_by_itself_needs_its_own_yes_and_ends_where_nobody_watches(
     arm: Arm, controller: SessionController, page: BenchPage, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,6 +50,7 @@ def test_a_board_printed_before_opencv_4_6_is_named(tmp_path):
         assert len(controller.state.looks[0].found) > 40
 
 
+@pytest.mark.slow
 def test_mirrored_pictures_are_named(tmp_path):
     """April-Tag-VR-FullBody-Tracker #144: a webcam that mirrors, and who stands there is told that nothing is found."""
     with session(tmp_path / "s") as controller:

@@ -217,6 +217,7 @@ def test_the_loop_says_where_why_and_how_far(loop):
     assert step.usual < step.worst < 50
 
 
+@pytest.mark.slow
 def test_a_board_where_one_was_is_worth_little_and_one_in_the_outline_enough(loop):
     (target,) = loop.ask()
     calibration, shape = loop.calibration, loop.shape
@@ -277,6 +278,7 @@ def test_the_page_says_at_once_that_cameras_contradict_each_other():
     assert "The last fit failed: the cameras contradict" in failed.detail
 
 
+@pytest.mark.slow
 def test_the_report_says_how_far_distances_on_boards_held_out_are_off(tmp_path, rig, monkeypatch):
     data = boards_of_rig(rig, 9)
     calibrator = ic.Explicit(lens="brown-conrady")

@@ -73,6 +73,7 @@ def test_slopes_of_a_moved_camera_are_its_differences() -> None:
         np.testing.assert_allclose(views_there.by_point[:, :, i], (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "step",
     [
@@ -119,6 +120,7 @@ def test_two_cameras_that_moved_are_no_single_one() -> None:
     assert ic.check_calibration(calibration, views(both, 9)).verdict == "several moved"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [(3, 1), (0, 1, 2, 4, 5)], ids=["two", "all but one"])
 def test_cameras_that_were_knocked_away_are_not_taken_for_wrong_detections(which: tuple[int, ...]) -> None:
     """All views of the second were left out as wrong, and the first was named alone."""

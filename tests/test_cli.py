@@ -194,6 +194,7 @@ def test_importing_implicam_costs_numpy_and_scipy_only() -> None:
     assert told.stdout.split() == []
 
 
+@pytest.mark.slow
 def test_the_command_line_loads_no_heavy_library_before_it_is_needed() -> None:
     heavy = HEAVY
     script = f"import implicam.cli.commands, sys; print(*(name for name in {heavy!r} if name in sys.modules))"
@@ -370,6 +371,7 @@ def test_many_reasons_are_cut_with_the_number_of_those_left_out(cli: Cli) -> Non
     assert len(unused) == int((~seen.all(axis=1)).sum())
 
 
+@pytest.mark.slow
 def test_progress_goes_to_stderr_where_somebody_watches(made: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     quiet = cli("evaluate", made / "rig", "--cv", "2")
     monkeypatch.setattr(show, "err", Console(stderr=True, force_terminal=True, width=80))
@@ -405,6 +407,7 @@ def test_shares_are_whole_per_cent_with_their_interval() -> None:
     assert show.percent_interval(Estimate(np.nan, np.nan, np.nan)) == "-"
 
 
+@pytest.mark.slow
 def test_a_closed_pipe_is_no_error(made: Path) -> None:
     executable = Path(sys.executable).parent / "implicam"
     line = f"{shlex.quote(str(executable))} info {shlex.quote(str(made / 'rig.implicam'))} | head -n 1"
@@ -439,7 +442,7 @@ USAGE = {
     "compare RIG -o figure.txt": "is no picture",
     "convert RIG RIG --overwrite": "would be replaced by itself",
     "demo RIG": "was not made by the demo",
-    "demo FILE": "was not made by the demo",
+    "demo FILE": "is a file, and this command writes a folder",
     "demo demo.csv": "this command writes a folder",
     "evaluate FILE": "needs a calibration file and a dataset",
     "evaluate FILE CHECK --cv 5": "take one path",

@@ -124,6 +124,7 @@ def test_the_lens_is_an_option_of_forward_gp(made: Path, cli: Cli) -> None:
     assert by_lens[0].json["rows"] != by_lens[1].json["rows"]
 
 
+@pytest.mark.slow
 def test_compare_takes_forward_gp_with_either_lens(made: Path, cli: Cli) -> None:
     methods = ["forward-gp", "forward-gp:none", "inverse-gp"]
     words = ("compare", made / "rig", "--train", "12,30", "--seeds", "1", "--methods", ",".join(methods))
@@ -222,6 +223,7 @@ def test_measure_does_without_a_camera_that_is_not_there(cli: Cli) -> None:
     assert "the observations have no camera 'cam4'" in ran.err
 
 
+@pytest.mark.slow
 def test_one_camera_alone_measures_nothing_and_says_why(cli: Cli) -> None:
     four_cameras(cli)
     cli("calibrate", "rig", "-o", "x.implicam")
@@ -319,6 +321,7 @@ def test_measured_points_come_in_the_unit_that_is_asked_for(made: Path, cli: Cli
     assert not Path("x.csv").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", ["csv", "xlsx", "parquet"])
 def test_what_was_measured_is_written_as_its_name_says(ending: str, made: Path, cli: Cli) -> None:
     pandas = pytest.importorskip("pandas")
@@ -436,6 +439,7 @@ def test_report_of_a_calibration_alone_and_with_points(made: Path, cli: Cli) -> 
     assert "30 points not used in the fit" in Path("b.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_same_command_writes_the_same_bytes(made: Path, cli: Cli) -> None:
     cli("calibrate", made / "rig", "-o", "again.implicam")
     assert Path("again.implicam").read_bytes() == (made / "rig.implicam").read_bytes()
@@ -490,6 +494,7 @@ def test_the_classical_way_on_the_command_line(made: Path, cli: Cli) -> None:
     assert "made without known points" in cli("evaluate", "alone.implicam", "--cv", "3").err
 
 
+@pytest.mark.slow
 def test_the_command_writes_maps(made: Path, cli: Cli) -> None:
     words = ("export", made / "rig.implicam", "--to", "undistortion-maps")
     ran = cli(*words, "-o", "maps", "--size", "160x100", "--alpha", "0")
@@ -507,6 +512,7 @@ def test_the_command_writes_maps(made: Path, cli: Cli) -> None:
     assert "did you mean 'undistortion-maps'" in cli(*words[:3], "undistortion", "-o", "x").err
 
 
+@pytest.mark.slow
 def test_a_neural_network_says_what_its_numbers_are(made: Path, cli: Cli) -> None:
     pytest.importorskip("torch")
     ran = cli("calibrate", made / "rig", "--method", "mlp", "-o", "n.implicam")

@@ -589,6 +589,7 @@ def test_failures_are_told_once_with_how_many() -> None:
 # figure
 
 
+@pytest.mark.slow
 def test_the_figure_shows_mean_and_standard_error(tmp_path: Path) -> None:
     table = [
         {"method": method, "known": known, "seed": seed, "rmse": base * (1 + seed) / known, "ellipsoid_95": cover,

@@ -73,6 +73,7 @@ def test_the_case_of_rows_copied_is_measured_honestly() -> None:
     assert judged.coverage.overall.rmse < 0.6
 
 
+@pytest.mark.slow
 def test_copies_are_not_counted_when_held_out() -> None:
     data = ic.read_dataset(CASES / "rows-copied" / "known.csv")
     judged = ic.cross_validate(ic.ForwardGP().fit, data, 4)
@@ -91,6 +92,7 @@ def test_cameras_copied_are_one_and_named() -> None:
     assert calibration.data.observations.camera_names == tuple(names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ic.Explicit(), ic.InverseGP()])
 def test_other_methods_use_a_copied_camera_once(method: ic.Explicit | ic.InverseGP, tmp_path: Path) -> None:
     data = ic.read_dataset(CASES / "cameras-copied" / "known.csv")

@@ -41,6 +41,7 @@ def test_likelihood_is_that_of_the_dense_matrix_and_its_gradient_that_of_differe
     np.testing.assert_allclose(gradient, differences, rtol=2e-4, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_the_covariances_of_signal_and_noise_are_found() -> None:
     X, Y, B, N = problem(220, seed=5)
     starts = maximise_each(X, Y, shortest=0.3)

@@ -71,6 +71,7 @@ def test_all_corners_have_kalibrs_numbers_and_right_error_bars(angle, border, tu
     assert 1.3 < np.mean(np.sum((e / found.sd) ** 2, axis=1)) < 2.8
 
 
+@pytest.mark.slow
 def test_error_bars_hold_in_jpeg_pictures():
     values = []
     for k, quality in enumerate((75, 85, 95)):
@@ -130,6 +131,7 @@ def test_another_board_than_stated_is_refused(told, word):
     assert word in found.reason
 
 
+@pytest.mark.slow
 def test_what_cannot_be_numbered_is_refused_with_its_reason():
     sheet, unit = kalibr(4, 5)
     one_tag = photograph(paint(sheet, unit), rotated(0.1, 300, at=(-150, -400)), fine=2)

@@ -455,6 +455,7 @@ def test_settling_keeps_cameras_apart():
     assert all(len(one) for one in Ball().settle(found).values())
 
 
+@pytest.mark.slow
 def test_templates_find_the_same_ball(seen, clean, tmp_path):
     picture, at = seen
     u, v = np.rint(at).astype(int)
@@ -550,6 +551,7 @@ def true_shift(rig, xyz, radius):
     return np.array(pairs) - made.true_pixels[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lens_error", "most"), [(0.0, 0.005), (0.5, 0.012)])
 def test_the_outline_is_off_by_what_is_predicted(lens_error, most):
     """To 0.005 px; with an error no lens model has, a little worse where an outline reaches beyond what is known."""
@@ -573,6 +575,7 @@ def test_where_nothing_can_be_predicted_there_is_no_number(calibrated):
     assert np.isnan(nowhere).all()
 
 
+@pytest.mark.slow
 def test_observations_are_moved_to_the_middle(calibrated):
     rig, data, calibration = calibrated
     shift = true_shift(rig, data.xyz, 8.0)

@@ -217,6 +217,7 @@ def test_a_picture_without_a_board_gives_a_reason(picture, word):
     assert word in found.reason
 
 
+@pytest.mark.slow
 def test_a_checkerboard_over_the_whole_picture_gives_a_reason():
     v, u = np.mgrid[:480, :640]
     picture = noisy(np.where((v // 20 + u // 20) % 2, 0.8, 0.1))

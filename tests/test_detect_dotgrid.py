@@ -36,6 +36,7 @@ def true_pixels(rig, hand, points) -> np.ndarray:
     return rig.cameras[0].pixel_from_world(hand.pose().apply(hand.corners)[numbers])[0]
 
 
+@pytest.mark.slow
 def test_all_dots_are_found_within_what_they_state(rig, held):
     _, hand, picture = held
     found = PLATE.detect(picture, VIEW)

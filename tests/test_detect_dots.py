@@ -192,6 +192,7 @@ def test_all_dots_from_seven_labels_among_look_alikes():
     assert np.array_equal(again.uv, found.uv)
 
 
+@pytest.mark.slow
 def test_the_stated_uncertainty_of_found_dots_is_right():
     nees = []
     for seed in range(3):
@@ -202,6 +203,7 @@ def test_the_stated_uncertainty_of_found_dots_is_right():
     assert np.mean(nees) == pytest.approx(2, abs=0.3)  # 363 dots: standard error 0.1
 
 
+@pytest.mark.slow
 def test_a_flat_target_and_dark_dots():
     names, xyz, uv, picture, rng = scene(depths=(0.0,), seed=3)
     marks = {View("cam1", ""): clicks(names, uv, CORNERS[:6], rng)}
@@ -243,6 +245,7 @@ def test_labels_at_one_depth_leave_the_others_unsure_but_never_wrong():
     assert len(found) >= len(flat)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["swapped", "shifted", "mirrored"])
 def test_wrong_labels_are_refused_or_overcome_never_believed(kind):
     for seed in range(2):

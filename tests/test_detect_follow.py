@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from implicam.detect.ball import Ball
 from implicam.detect.follow import Follower
@@ -34,6 +35,7 @@ def walk(rig: Rig, places: int, step: float) -> Target:
     return replace(start, xyz=xyz)
 
 
+@pytest.mark.slow
 def test_a_ball_that_moves_is_found_near_its_last_place_as_in_the_whole_picture() -> None:
     rig = build_rig("stereo", seed=2, cameras="cam1")
     whole, near, shown = followed(Studio(rig, walk(rig, 9, 2.0), Optics(), 2), 0)
@@ -47,6 +49,7 @@ def test_a_ball_that_moves_is_found_near_its_last_place_as_in_the_whole_picture(
         np.testing.assert_allclose(a.sd, b.sd, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_a_ball_that_jumps_or_goes_is_looked_for_in_the_whole_picture() -> None:
     rig = build_rig("stereo", seed=2, cameras="cam1")
     places = random_positions(rig, 4, np.random.default_rng(5))

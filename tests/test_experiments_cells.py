@@ -251,6 +251,7 @@ def test_a_result_of_another_version_counts_and_is_noted(tmp_path: Path) -> None
 # --- processes on this machine ---
 
 
+@pytest.mark.slow
 def test_what_does_not_count_is_computed_again_and_noted(tmp_path: Path) -> None:
     journal, folder = tmp_path / "journal", tmp_path / "out"
     cells = squares(4, journal)

@@ -83,6 +83,7 @@ def test_the_group_knows_where_the_cameras_are() -> None:
     np.testing.assert_allclose(found.bundle.noise, 0.2, rtol=0.08)
 
 
+@pytest.mark.slow
 def test_pairs_agree_with_opencvs_multiview_calibration() -> None:
     """cv2.calibrateMultiview keeps intrinsics, wants metres, one lens family and whole boards: poses for our lenses."""
     rig = build_rig("bar6", seed=4, lens_error=0.0, cameras="2R")
@@ -403,6 +404,7 @@ def test_boards_alone_are_measured_in_the_frame_of_the_first_camera() -> None:
     assert calibration.data.known is not None
 
 
+@pytest.mark.slow
 def test_the_layout_may_come_from_known_positions() -> None:
     """The moving board of the paper, its positions taken for its shape only."""
     rig, _ = pair()
@@ -459,6 +461,7 @@ def test_declared_errors_of_the_known_points_are_used() -> None:
     assert 1.5 < np.mean(squares) < 6
 
 
+@pytest.mark.slow
 def test_wrong_views_are_rejected() -> None:
     rig = build_rig("bar6", seed=3, lens_error=0.0, cameras="2R2W")
     known = points(rig, 60, 5, outliers=0.1)

@@ -298,6 +298,7 @@ def test_a_wrong_file_is_not_read_as_one(tmp_path: Path) -> None:
         load_calibration(path)
 
 
+@pytest.mark.slow
 def test_lenses_that_opencv_does_not_have_are_refused() -> None:
     assert opencv_pipeline.FAMILIES == ("brown-conrady", "kannala-brandt")
     method = Explicit(lens="kannala-brandt", preset="paper", boards=boards().with_cameras(("cam2", "cam3")))

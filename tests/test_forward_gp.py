@@ -201,6 +201,7 @@ def test_views_that_agree_have_uniform_p_values_and_honest_error_bars() -> None:
     assert 0.91 < np.mean(nees < chi2.ppf(0.95, 3)) < 0.98
 
 
+@pytest.mark.slow
 def test_a_fifth_of_wrong_detections_is_found_out() -> None:
     data = simulate(rig(), random_positions(rig(), 100, np.random.default_rng(31)), seed=32, outliers=0.2)
     calibration = ForwardGP().fit(data)
@@ -397,6 +398,7 @@ def test_declared_noise_of_the_known_positions_widens_the_error_bars() -> None:
     assert np.mean(widening > 1) > 0.95
 
 
+@pytest.mark.slow
 def test_an_error_that_all_known_positions_share_is_in_every_measurement() -> None:
     """One shot: no camera can tell where it really was, so its declared variance is added to every position's."""
     declared_sd = np.array([0.8, 0.1, 0.4])

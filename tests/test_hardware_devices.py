@@ -105,6 +105,7 @@ def test_a_device_is_set_read_back_and_told(library: Path, tmp_path: Path) -> No
     assert max(k for k, name in enumerate(names) if name == "width") < names.index("exposure")  # a size undoes exposure
 
 
+@pytest.mark.slow
 def test_a_device_waits_for_its_trigger_as_long_as_it_takes(library: Path, tmp_path: Path) -> None:
     """opencv/opencv#10927, #25846: after a time without a pulse a read comes back with nothing, or with the last
     picture again. It is 10 s there; here 1 s, and the pulse comes after two."""

@@ -174,7 +174,7 @@ def test_stop_stops_the_arm_on_its_way(controller: Controller, arm: URRobot) -> 
         ("protective 1", "protective stop"),
         ("emergency 1", "emergency stop"),
         ("off 1", "no power"),
-        ("silent 1", "connection .* is lost"),
+        pytest.param("silent 1", "connection .* is lost", marks=pytest.mark.slow),
         ("hang_up", "connection .* is lost"),
     ],
 )

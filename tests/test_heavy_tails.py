@@ -183,6 +183,7 @@ def test_two_views_are_taken_as_they_are() -> None:
     assert (noise[1] > 2).all()
 
 
+@pytest.mark.slow
 def test_degrees_are_found_from_agreement_alone() -> None:
     for degrees, low, high in ((3.0, 2.2, 5.0), (6.0, 3.5, 20.0)):
         views = linear_views(150, 5, degrees, 4)
@@ -236,6 +237,7 @@ def test_heavy_tails_are_found_and_measured_with(
     assert np.mean(errors) < better
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", ["stereo", "bar4"])
 def test_normal_noise_is_left_alone(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for n in (20, 120):
@@ -304,6 +306,7 @@ def test_tied_cameras_weigh_their_views_too(monkeypatch: pytest.MonkeyPatch) -> 
     assert np.sqrt(error / before) < 1.02
 
 
+@pytest.mark.slow
 def test_it_is_saved(tmp_path: Path) -> None:
     calibration = heavy("bar6", 40)
     assert calibration.fitted.tails is not None

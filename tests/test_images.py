@@ -308,6 +308,7 @@ def test_mistakes_in_the_place_of_pictures_are_told(tmp_path):
             find_pictures(tmp_path, pattern)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.text(max_size=8) | st.from_regex(r"[a-z]?[0-9]{1,3}[²٣a-z]?[0-9]?", fullmatch=True), unique=True))
 def test_the_order_depends_on_the_names_only(names):

@@ -80,6 +80,7 @@ def test_type_checkers_see_the_same_names() -> None:
     assert seen == implicam._HOMES
 
 
+@pytest.mark.slow
 def test_a_name_is_the_same_whatever_was_imported_before(tmp_path: Path) -> None:
     """A module of the same name would take its place once it is imported."""
     code = """
@@ -96,6 +97,7 @@ def test_a_module_is_found_without_its_own_import(tmp_path: Path) -> None:
     assert fresh("import implicam; print(implicam.geometry.Pose.__name__)", tmp_path) == "Pose\n"
 
 
+@pytest.mark.slow
 def test_importing_every_module_starts_nothing(tmp_path: Path) -> None:
     """No command, no thread, no process, no file, no word on the screen, nothing of the process changed."""
     code = """

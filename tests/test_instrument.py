@@ -104,6 +104,7 @@ def test_a_smudge_is_named_with_camera_and_part_of_the_picture() -> None:
     assert all(sentence.startswith("cam3 is off by") and "left" in sentence for sentence in said)
 
 
+@pytest.mark.slow
 def test_good_data_get_no_advice_that_is_not_true() -> None:
     said = " ".join(Instrument(ic.ForwardGP().fit(known(300))).advice())
     assert "smudge" not in said
@@ -139,6 +140,7 @@ def test_cameras_without_known_points_of_their_own_are_reported_on_too() -> None
     assert "Where the uncertainty comes from" not in text
 
 
+@pytest.mark.slow
 def test_a_camera_whose_views_scatter_is_named() -> None:
     data = known(60)
     uv = data.observations.uv.copy()
@@ -148,6 +150,7 @@ def test_a_camera_whose_views_scatter_is_named() -> None:
     assert any(sentence.startswith("The views of cam5 scatter by") for sentence in said)
 
 
+@pytest.mark.slow
 def test_the_page_shows_the_instrument_and_who_reports(tmp_path: Path) -> None:
     calibration = calibrated()
     evaluation = ic.evaluate(calibration, _others())

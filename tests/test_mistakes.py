@@ -98,6 +98,7 @@ def test_a_fit_that_fails_says_why(method: type[ic.ForwardGP] | type[ic.Explicit
         method().fit(at(data, np.roll(data.xyz, 1, axis=0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [ic.ForwardGP, ic.Explicit])
 def test_a_fit_that_fails_says_it_once(method: type[ic.ForwardGP] | type[ic.Explicit]) -> None:
     data = known("stereo", 30)

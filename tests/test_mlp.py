@@ -90,6 +90,7 @@ def same_network(a: Network, b: Network, atol: float = 0.0) -> None:
 # the network
 
 
+@pytest.mark.slow
 def test_its_layers_are_the_papers() -> None:
     assert layer_shapes(12) == [(12, 128), (128, 128), (128, 64), (64, 3)]
     assert [w.shape for w in fitted().network.weights] == [(8, 128), (128, 128), (128, 64), (64, 3)]
@@ -125,6 +126,7 @@ def test_it_starts_where_torchs_layers_start() -> None:
         assert 0 < np.abs(bias).max() <= bound
 
 
+@pytest.mark.slow
 def test_the_spread_is_that_of_a_case_with_a_formula() -> None:
     """Constant last hidden units h and a linear output: the covariance is p / (1 - p) (h W)^T (h W), exactly."""
     rng = np.random.default_rng(3)
@@ -152,6 +154,7 @@ def test_the_spread_is_the_sample_covariance_of_the_passes() -> None:
     np.testing.assert_allclose(network.spread(X, masks), expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_spread_is_that_of_torchs_dropout() -> None:
     """Another judge: PyTorch's own layers in training mode, 4000 passes; each variance has a standard error of 2 %."""
     network, passes = fitted().network, 4000
@@ -314,6 +317,7 @@ def test_no_weight_is_fitted_to_the_points_kept_for_early_stopping() -> None:
     assert b.loss > 100 * a.loss
 
 
+@pytest.mark.slow
 def test_it_learns_a_map_and_not_noise() -> None:
     (learned,), (guessed,) = (
         train([examples(200, noise=noise)], 0.0, silent, MLPSettings(max_epochs=600)) for noise in (0.0, 1.0)

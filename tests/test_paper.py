@@ -508,6 +508,7 @@ def test_each_line_is_computed_by_its_own_pipeline(method: str, monkeypatch: pyt
     assert taken[0].boards is not None
 
 
+@pytest.mark.slow
 def test_a_line_of_the_papers_pipeline_has_its_reprojection_error() -> None:
     for row in ball.line(Source(0).options, "2R", EXPLICIT_PAPER, 10, 4, 0)["rows"]:
         assert not row["failure"]
@@ -666,6 +667,7 @@ def test_an_experiment_without_data_is_named(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_cell_that_fails_is_told_and_the_rest_is_written(tmp_path: Path) -> None:
     folder = measured(tmp_path / "mine")
     cells = ball.cells(Source.of(folder, 0), TINY)

@@ -100,6 +100,7 @@ def test_corners_are_darker():
     assert dark[middle] == pytest.approx(plain[middle], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_what_is_covered_is_what_the_truth_calls_hidden():
     """Where a ball is seen, the picture is dark at its middle; where it is hidden, the bar's grey is there."""
     studio = balls(seed=3, n=6, cameras="cam2", covered=0.4)
@@ -202,6 +203,7 @@ def test_wrong_detections_cannot_be_photographed():
     assert plain.photographs == 0
 
 
+@pytest.mark.slow
 def test_a_record_has_one_file_per_camera_and_shot(tmp_path):
     rig = build_rig("stereo", seed=0)
     made = record(rig, random_positions(rig, 3, np.random.default_rng(0)), seed=4, missing=0.4, optics=Optics())

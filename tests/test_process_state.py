@@ -96,6 +96,7 @@ def test_the_filter_of_warnings_goes_with_the_processes() -> None:
         warnings.warn(said, UserWarning, stacklevel=1)
 
 
+@pytest.mark.slow
 def test_photographs_leave_the_threads_of_opencv_alone(tmp_path: Path) -> None:
     cv2 = opencv()
     rig = build_rig("stereo", seed=0)

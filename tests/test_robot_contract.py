@@ -30,6 +30,7 @@ def rested() -> None:
     time.sleep(0.001)
 
 
+@pytest.mark.slow
 def test_the_toy_keeps_the_contract_in_any_unit() -> None:
     check_robot(lambda options: ToyRobot.from_spec("1", options), BOX, STAND_IN)
     metres = StandIn(lambda: AXES.place() / 1e3, AXES.silence, AXES.cut)

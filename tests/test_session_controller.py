@@ -313,6 +313,7 @@ def test_a_stop_that_fails_still_ends_what_goes_by_itself(
     assert not controller.state.auto
 
 
+@pytest.mark.slow
 def test_a_robot_that_never_shows_the_ball_gives_up(controller: SessionController) -> None:
     for camera in controller.equipment.cameras:
         camera.cover(100)  # type: ignore[attr-defined]
@@ -468,6 +469,7 @@ def test_by_itself_until_the_rule_says_stop(tmp_path: Path) -> None:
         assert [skipped.reason for skipped in controller.session.skipped] == ["the ball was not found"]
 
 
+@pytest.mark.slow
 def test_finishing_too_early_says_how_many_are_missing(controller: SessionController) -> None:
     measured(controller, 3)
     with pytest.raises(UsageError, match="too few") as error:

@@ -188,6 +188,7 @@ def by_hand(controller: Any) -> tuple[SessionController, Any]:
 TYPED = ("-0.38296", "-382.5667340745084", "0,25", "1e-3")
 
 
+@pytest.mark.slow
 def test_what_is_typed_is_in_points_csv_to_the_last_bit(tmp_path: Path) -> None:
     """The four numbers of the issue, and a unit."""
     with open_session(tmp_path / "s", Setup(rig="stereo")) as made:

@@ -416,6 +416,7 @@ def test_cameras_that_share_no_place_cannot_hold_a_board_together() -> None:
         held_boards(replace(rig, cameras=(turned, rig.cameras[1])), [("cam1", "cam2")], np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_only_the_cameras_of_the_group_take_a_photograph(tmp_path: Path) -> None:
     rig = build_rig("bar6", seed=5, cameras="2R")
     target = held_boards(rig, [("cam2",), ("cam3",), ("cam2", "cam3")], np.random.default_rng(0))

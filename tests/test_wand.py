@@ -140,6 +140,7 @@ def test_cameras_move_and_grow_with_the_world(waving: Waving) -> None:
     assert np.abs(by_growth).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_no_known_point_can_be_held_out(waving: Waving) -> None:
     with pytest.raises(UsageError, match="made from a wand"):
         waving.calibration.refit(waving.calibration.data)
@@ -148,6 +149,7 @@ def test_no_known_point_can_be_held_out(waving: Waving) -> None:
     assert judge(waving.calibration).held_out is None
 
 
+@pytest.mark.slow
 def test_lengths_of_frames_that_were_left_out_judge_it(waving: Waving) -> None:
     held_out = waving.calibration.hold_lengths_out()
     assert len(held_out.errors) >= 15

@@ -53,6 +53,7 @@ def stated(seen: Dataset, xyz: Floats, sd: float = SD) -> Dataset:
     return replace(seen, known=ic.KnownPositions(seen.points, xyz, np.full(xyz.shape, sd)))
 
 
+@pytest.mark.slow
 def test_known_points_say_where_the_world_is_and_more(both: Both) -> None:
     held = simulate(both.rig, random_positions(both.rig, 30, np.random.default_rng(8)), seed=800)
     assert held.truth is not None
@@ -67,6 +68,7 @@ def test_known_points_say_where_the_world_is_and_more(both: Both) -> None:
         ic.set_world(both.calibration, both.known)
 
 
+@pytest.mark.slow
 def test_a_wand_of_uncertain_length_is_corrected_by_known_points(both: Both) -> None:
     wrong = ForwardGP(wand=1.01 * both.length, wand_sd=0.01 * both.length, known=both.known).fit(both.wand)
     held = simulate(both.rig, random_positions(both.rig, 12, np.random.default_rng(8)), seed=801)
@@ -81,6 +83,7 @@ def test_a_wand_of_uncertain_length_is_corrected_by_known_points(both: Both) -> 
         ForwardGP(wand=1.03 * both.length, known=both.known).fit(both.wand)
 
 
+@pytest.mark.slow
 def test_a_wrong_known_point_is_named(both: Both) -> None:
     xyz = both.known.xyz.copy()
     xyz[3] += 10
@@ -90,6 +93,7 @@ def test_a_wrong_known_point_is_named(both: Both) -> None:
     assert "contradict the others: random004" in noted.notes[0]
 
 
+@pytest.mark.slow
 def test_known_points_of_another_scale_or_place_are_refused(both: Both) -> None:
     for xyz, what in (
         (both.known.xyz / 1000, "0.00.* times as far apart"),
@@ -160,6 +164,7 @@ def test_the_command(both: Both, tmp_path: Path, cli: Cli) -> None:
     assert "verdict: usable" in ran.out + ran.err
 
 
+@pytest.mark.slow
 def test_a_wand_that_lies_still_counts_once(both: Both) -> None:
     rng, uv = np.random.default_rng(4), both.wand.observations.uv
     still = np.repeat(uv[:2][None], 30, axis=0) + 0.2 * rng.normal(size=(30, 2, *uv.shape[1:]))

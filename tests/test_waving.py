@@ -76,6 +76,7 @@ def volume_of(rig: Rig, target: Any, calibration: ForwardGPCalibration) -> Works
 # --- the judge ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_position_is_said_to_be_known_as_well_as_measuring_it_says(design, calibration):
     """In the judged places the predicted covariance is that which a measurement of the same views states."""
     few = design.judged.select(np.arange(25))
@@ -134,6 +135,7 @@ def test_cells_count_views_and_the_emptiest_is_far_from_what_was_seen():
     assert Cells(np.minimum(left / 3, 1), left).emptiest[0] > 0.9
 
 
+@pytest.mark.slow
 def test_a_half_of_the_volume_that_was_never_waved_at_is_red_and_is_named(rig):
     """All frames in the left half of what cam1 sees: the other half is uncertain, and there it is to be waved."""
     target = waved_wand(rig, 240, np.random.default_rng(5))
@@ -178,6 +180,7 @@ def test_before_there_is_a_calibration_each_camera_is_shown_what_it_has_not_seen
     assert all(one.part < 0.5 for one in loop.camera_progress())
 
 
+@pytest.mark.slow
 def test_it_says_where_why_and_that_noise_alone_is_in_the_way(loop):
     assert loop.problem is None
     assert loop.stop == "all 60 frames of the budget are taken"
@@ -205,6 +208,7 @@ def test_wrong_error_bars_are_never_enough(loop):
     assert other.contradictions == ("The wand comes out 5 mm off.",)
 
 
+@pytest.mark.slow
 def test_the_volume_of_a_session_is_in_the_frame_of_the_first_camera(rig, data):
     box = Workspace.hull(rig.cameras[0].camera_from_world.apply(Workspace.from_box(rig.volume).vertices))
     loop = WandLoop(ForwardGP(wand=144.0), Wand(length=144.0), data.cameras, box, data=data)
@@ -410,6 +414,7 @@ def test_what_is_wrong_with_a_session_with_a_wand_is_said_first(options, what):
 # --- afterwards -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_suggest_says_of_a_recording_whether_it_was_waved_enough(calibration, cli):
     calibration.save("w.implicam")
     told = cli("suggest", "w.implicam", "--below", "30", "--json").json

@@ -420,6 +420,7 @@ def test_the_command(waving: Waving, frame: Dataset, tmp_path: Path, cli: Cli) -
     assert ran.code == 2
 
 
+@pytest.mark.slow
 def test_what_is_left_after_laying_over_has_the_covariance_that_is_stated() -> None:
     rng, n, q, repeats = np.random.default_rng(5), 12, 9, 400
     xyz = rng.normal(size=(n, 3)) * [100, 80, 60]
@@ -465,6 +466,7 @@ def test_a_world_of_its_own_is_laid_over_the_points_that_judge_it(waving: Waving
         ic.evaluate(waving.calibration, held.select(range(5)))
 
 
+@pytest.mark.slow
 def test_without_known_points_a_report_is_of_lengths(waving: Waving, tmp_path: Path, cli: Cli) -> None:
     pytest.importorskip("plotly")
     waving.calibration.save(tmp_path / "wand.implicam")
