@@ -198,6 +198,7 @@ class Setup:
                 raise UsageError(f"{what} = {value:g} is not possible.", fix="give a number greater than zero")
         if not 0 <= self.pulse_every < np.inf:
             raise UsageError(f"--pulse-every {self.pulse_every:g} is no time.", fix="give seconds, or 0 for no pulse")
+        self._refuse_words_of_another_target()
         if self.target == WAND:
             wand_detector(self)
         elif self.target != BALL:
@@ -212,6 +213,16 @@ class Setup:
         if self.most < MIN_POINTS_PER_CAMERA:
             raise UsageError(
                 f"{self.most} points are too few to calibrate.", fix=f"a budget of {MIN_POINTS_PER_CAMERA} or more"
+            )
+
+    def _refuse_words_of_another_target(self) -> None:
+        """The size of a board says nothing of a wand: who gives it means another target."""
+        others = {BALL: (*SIZES, *WAND_OPTIONS), WAND: (*SIZES, "radius")}.get(self.target, (*WAND_OPTIONS, "radius"))
+        stray = [f"--{name.replace('_', '-')}" for name in others if getattr(self, name) not in (None, False)]
+        if stray:
+            raise UsageError(
+                f"{', '.join(stray)}: the target is a {self.target}, of which that says nothing.",
+                fix=f"leave it out, or say what is shown: --target {'|'.join((BALL, *BOARD_KINDS, WAND))}",
             )
 
     @classmethod
