@@ -180,11 +180,8 @@ class Checkerboard:
         black = 0.5 + 0.5 * _stripes(x) * _stripes(y)
         if self.marks is not None:
             black = np.maximum(black, _read_print(self.marks, x + 1, y + 1, self.columns + 1, self.rows + 1))
-        albedo = 0.78 - 0.70 * black * printed
-        value = np.nan_to_num(np.asarray(albedo * self.light.at(hit), np.float32))
-        if (rays.centre - self.corner) @ facing < 0:
-            value = np.full_like(value, 0.3)  # its back
-        return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
+        from_behind = bool((rays.centre - self.corner) @ facing < 0)
+        return _paint_sheet(ground, cover, black * printed, self.light.at(hit), from_behind)
 
     def reach(self) -> Floats:
         """(4, 3) the corners of the sheet, in the world."""
@@ -282,11 +279,9 @@ class Sheet:
         (width, height), low = self.print.size, self.print.low.astype(np.float32)
         x, y = offset @ self.right.astype(np.float32) - low[0], offset @ self.down.astype(np.float32) - low[1]
         cover = _inside(x, 0, width) * _inside(y, 0, height)
-        albedo = 0.78 - 0.70 * _read_print(self.print.black, x, y, width, height)
-        value = np.nan_to_num(np.asarray(albedo * self.light.at(hit), np.float32))
-        if (rays.centre - self.corner) @ facing < 0:
-            value = np.full_like(value, 0.3)  # its back
-        return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
+        black = _read_print(self.print.black, x, y, width, height)
+        from_behind = bool((rays.centre - self.corner) @ facing < 0)
+        return _paint_sheet(ground, cover, black, self.light.at(hit), from_behind)
 
     def reach(self) -> Floats:
         """(4, 3) its corners, in the world."""
@@ -295,6 +290,14 @@ class Sheet:
 
 
 ShownObject = Ball | Checkerboard | Sheet | Wand
+
+
+def _paint_sheet(ground: Patch, cover: Patch, black: Patch, light: Patch, from_behind: bool) -> Patch:
+    """White paper with black print over what is behind it; its back is plain grey."""
+    value = np.nan_to_num(np.asarray((0.78 - 0.70 * black) * light, np.float32))
+    if from_behind:
+        value = np.full_like(value, 0.3)
+    return np.asarray(ground + np.nan_to_num(cover) * (value - ground), np.float32)
 
 
 def _read_print(black: Patch, x: Patch, y: Patch, width: float, height: float) -> Patch:

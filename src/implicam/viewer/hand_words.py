@@ -11,7 +11,7 @@ from implicam.active import Rule
 from implicam.formatting import number
 from implicam.session.by_hand import ByHandState
 from implicam.session.detections import Look
-from implicam.viewer.snapshot import numbers_of
+from implicam.viewer.snapshot import numbers_of, said_of
 from implicam.viewer.words import Headline, trouble_of
 
 
@@ -102,31 +102,21 @@ def common_snapshot(
         labels: Of the buttons go and skip; finish with what it reaches.
         moves: Whether a robot moves the target, or a person.
     """
-    problem = state.problem if state.phase == "trouble" else None
     following = "finish" if state.stop or state.phase == "done" else "go" if state.phase != "fitting" else ""
     go = {"trouble": "Try again", "done": "Take more"}.get(state.phase, "")
     finish = "Close the session" if state.phase == "done" else labels["finish"]
     named = {**labels, "finish": finish, **({"go": go} if go else {})}
     return {
-        "version": state.version,
-        "phase": state.phase,
-        "kind": head.kind,
-        "title": head.title,
-        "detail": head.detail,
-        "why": "" if problem is None else problem.why,
-        "fix": "" if problem is None else problem.fix,
-        "message": state.message,
+        **said_of(state, head),
         "target": None,
         "position": None,
         "to_go": None,
-        "auto": state.auto,
         "buttons": {
             button: {"enabled": enabled, "next": button == following, "label": named.get(button, "")}
             for button, enabled in allowed(state, moves).items()
         },
         "cameras": list(cameras),
         "numbers": {**numbers_of(state.history, rule, unit, skipped), "word": word},
-        "report": state.report is not None,
     }
 
 

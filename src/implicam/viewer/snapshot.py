@@ -36,10 +36,28 @@ def snapshot(
     """
     state = words.current(state)
     head = words.headline(state, moves, unit)
-    problem = state.problem if state.phase == "trouble" else None
     looks = {look.camera: look for look in state.looks}
     target = state.target
     circles = state.rough if len(state.rough) == len(cameras) else np.full((len(cameras), 3), np.nan)
+    return {
+        **said_of(state, head),
+        "target": None if target is None else {"name": target.name, "xyz": target.xyz.tolist()},
+        "position": finite_or_none(state.position),
+        "to_go": words.to_go(state, measured, unit),
+        "buttons": _buttons(state, moves, unit),
+        "cameras": [_camera(state, name, looks.get(name), rough) for name, rough in zip(cameras, circles, strict=True)],
+        "numbers": numbers_of(state.history, rule, unit, skipped),
+    }
+
+
+def said_of(state: State, head: words.Headline) -> dict[str, Any]:
+    """What the page of any target says of its state: the headline, and what to do after trouble.
+
+    Args:
+        state: Of the controller.
+        head: What to do now.
+    """
+    problem = state.problem if state.phase == "trouble" else None
     return {
         "version": state.version,
         "phase": state.phase,
@@ -49,13 +67,7 @@ def snapshot(
         "why": "" if problem is None else problem.why,
         "fix": "" if problem is None else problem.fix,
         "message": state.message,
-        "target": None if target is None else {"name": target.name, "xyz": target.xyz.tolist()},
-        "position": finite_or_none(state.position),
-        "to_go": words.to_go(state, measured, unit),
         "auto": state.auto,
-        "buttons": _buttons(state, moves, unit),
-        "cameras": [_camera(state, name, looks.get(name), rough) for name, rough in zip(cameras, circles, strict=True)],
-        "numbers": numbers_of(state.history, rule, unit, skipped),
         "report": state.report is not None,
     }
 

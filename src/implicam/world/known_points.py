@@ -85,26 +85,27 @@ def align(
     cov = replace(measured, shared=shared.reshape(n, 3, -1)).cov
     grown = np.concatenate([G, (measured.xyz - middle).reshape(-1, 1)], axis=1)
 
-    def weights(turn: Floats, off: float) -> Floats:
+    def covariance(turn: Floats, off: float) -> Floats:
         stated = np.zeros((n, 3, n, 3))
         stated[range(n), :, range(n), :] = turn.T @ ((sd**2 + off**2)[:, :, None] * np.eye(3)) @ turn
-        return np.asarray(np.linalg.inv(cov + stated.reshape(3 * n, 3 * n)), dtype=np.float64)
+        return np.asarray(cov + stated.reshape(3 * n, 3 * n), dtype=np.float64)
 
     for number in range(STEPS):
         residual = (pose.inverse().apply(xyz) - measured.xyz).ravel()
         if number == 0 and not as_stated:
-            known = np.asarray(np.linalg.inv(weights(pose.rotation, 0.0)), dtype=np.float64)
+            known = covariance(pose.rotation, 0.0)
             if (n > MIN_POINTS and not declared) or _is_beyond_chance(known, G, residual):
                 untold, untold_of_shape = _untold(known, G, residual), _untold(known, grown, residual)
-        W = weights(pose.rotation, untold)
+        W = np.linalg.inv(covariance(pose.rotation, untold))
         K = np.linalg.inv(G.T @ W @ G) @ G.T @ W
         pose = _moved(pose, K @ residual, middle)
     residual = (pose.inverse().apply(xyz) - measured.xyz).ravel()
-    W, shape = weights(pose.rotation, untold), weights(pose.rotation, untold_of_shape)
+    own = covariance(pose.rotation, untold)
+    shape = np.linalg.inv(covariance(pose.rotation, untold_of_shape))
     larger = np.linalg.inv(grown.T @ shape @ grown)
     scale = float((larger @ (grown.T @ shape @ residual))[6])
     return Aligned(
-        pose, K, residual.reshape(-1, 3), np.asarray(np.linalg.inv(W)), float(residual @ W @ residual),
+        pose, K, residual.reshape(-1, 3), own, float(residual @ np.linalg.solve(own, residual)),
         1 + scale, float(np.sqrt(larger[6, 6])), untold,
     )  # fmt: skip
 
