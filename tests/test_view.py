@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import re
@@ -28,6 +29,7 @@ from implicam.files import write_text
 from implicam.images import write_picture
 from implicam.measurement import notes_outside
 from implicam.report.instrument import Instrument
+from implicam.viewer.calibration_page import CalibrationPage
 from implicam.viewer.calibration_scene import COLUMNS, ROWS, measured_points, scene, uncertainty_map
 
 pytest.importorskip("starlette")
@@ -198,6 +200,28 @@ def test_points_stream_to_the_page_and_are_not_sent_twice(rig: Any, stereo: Any)
     with pytest.raises(UsageError, match="closed"):
         view.add(measured)
     view.close()
+
+
+def test_points_that_are_added_while_others_are_on_their_way_are_sent(rig: Any, stereo: Any) -> None:
+    """They come from another thread, so at any moment: also between an event and the next."""
+    measured = stereo.measure(rig)
+    page = CalibrationPage(stereo)
+    page.add(measured.select(np.arange(3)))
+
+    async def watch() -> list[str]:
+        events = []
+        async for event in page._stream(0):
+            if "data: " in event:
+                events.append(event)
+                if len(events) == 1:
+                    page.add(measured.select(np.arange(3, 7)))  # while the first is written to the socket
+                    threading.Timer(5.0, page.closed.set).start()
+                if len(events) == 2:
+                    page.closed.set()
+        return events
+
+    events = asyncio.run(watch())
+    assert [event.partition("\n")[0] for event in events] == ["id: 1", "id: 2"]
 
 
 def test_of_very_many_points_the_page_says_that_some_are_not_shown(

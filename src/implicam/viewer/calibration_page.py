@@ -137,9 +137,9 @@ class CalibrationPage:
         sent = begin
         yield "retry: 1000\n\n"
         while not self.closed.is_set():
-            for number in range(sent, len(self._chunks)):
-                yield f"id: {number + 1}\ndata: {json.dumps(self._chunks[number])}\n\n"
-            sent = max(sent, len(self._chunks))
+            while sent < len(self._chunks):  # asked each time: one may be added while another is on its way
+                yield f"id: {sent + 1}\ndata: {json.dumps(self._chunks[sent])}\n\n"
+                sent += 1
             await asyncio.sleep(LOOK_SECONDS)
 
     def application(self, origin: str) -> Starlette:
