@@ -296,3 +296,16 @@ def test_rigs_from_no_guess_with_wrong_and_missing_views(spec: str) -> None:
     assert ratio < (1.6 if spec == "stereo" else 1.25)
     assert inside > 0.85
     assert nees < 5
+
+
+@pytest.mark.slow
+def test_a_camera_with_more_noise_than_the_others_counts_less_though_nothing_says_so() -> None:
+    rig = build_rig("bar3", seed=11)
+    sds = (0.15, 0.45, 0.15)
+    rig = replace(rig, cameras=tuple(replace(one, noise_sd=sd) for one, sd in zip(rig.cameras, sds, strict=True)))
+    target = waved_wand(rig, 150, np.random.default_rng(11))
+    data = as_wand(simulate(rig, target, seed=11, outliers=0.05), target)
+    data = replace(data, observations=replace(data.observations, sd=np.full_like(data.observations.uv, np.nan)))
+    calibration = ForwardGP(wand=target.wand or 0.0).fit(data)
+    noise = [model.noise for model in calibration.posterior.models]
+    assert noise == pytest.approx(sds, rel=0.35)

@@ -153,6 +153,9 @@ class ForwardGPSettings(RigModelSettings):
     usual_wand_jitter_ratio: float = 1e-4
     """Sd of the length of a wand from frame to frame, over the length, where it is not stated: flex, and what is taken
     for the middle of a marker."""
+    wand_camera_noise_log_sd: float = 0.3
+    """Sd of the log noise of one camera about the rig's: what is left of its views by a wand says little of it, and
+    nothing where each place is seen by two."""
 
     # cameras as linear projections with a large field
     min_views_without_lens: int = 40

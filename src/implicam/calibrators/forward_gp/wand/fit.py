@@ -25,6 +25,7 @@ from implicam.calibrators.forward_gp.wand.known import (
     lay_known_over,
     refuse_contradicting_known,
 )
+from implicam.calibrators.forward_gp.wand.own_noise import left_of_views, own_noise
 from implicam.calibrators.forward_gp.wand.sizes import add_priors, estimate_sizes, size_fields, white_models
 from implicam.calibrators.forward_gp.wand.start import (
     MIN_LENGTH_SHARE,
@@ -383,27 +384,59 @@ def _enough_for_any_kind(agree: Bools) -> bool:
 
 def _with_fields(state: _State, settings: ForwardGPSettings) -> _State:
     """Sizes, posterior and what contradicts it, until nothing changes."""
-    search = True
+    search, own = True, np.zeros(len(state.waves.seen))
     for number in range(MAX_ROUNDS):
-        stated = state.waves.stated[list(state.cameras)]
+        cameras = list(state.cameras)
         hyper = estimate_sizes(
-            state.models, state.places, state.seen, state.facts, stated, settings, state.hyper, search=search
+            state.models,
+            state.places,
+            state.seen,
+            state.facts,
+            state.waves.stated[cameras],
+            own[cameras],
+            settings,
+            state.hyper,
+            search=search,
         )
         sized = size_fields(
             state.models, state.places.reshape(-1, 3), state.seen, hyper, settings.typical_log_distance_sd
         )
         state = _solved(replace(state, models=sized, hyper=hyper), fields=True)
+        state, told = _with_own_noise(state, own[cameras], settings)
+        louder, own[cameras] = float(np.max(np.abs(told - own[cameras]))), told
         judged = _judged(state, settings)
         changed = float(np.mean(judged.used != state.used)) + float(np.mean(judged.lengths != state.lengths))
         _LOG.info(
-            "round %d: lengthscale %s signal %.3g noise %.3g px, %.2g %% changed", number, hyper.lengthscale[0],
-            hyper.signal[0], hyper.noise[0], 100 * changed,
+            "round %d: lengthscale %s signal %.3g noise %s px, %.2g %% changed", number, hyper.lengthscale[0],
+            hyper.signal[0], np.round(hyper.noise, 3), 100 * changed,
         )  # fmt: skip
-        if not changed or number == MAX_ROUNDS - 1:
+        if (not changed and louder < MAX_OWN_NOISE_STEP) or number == MAX_ROUNDS - 1:
             break
         search = number == 0 or changed > 0.01
         state = judged
     return state
+
+
+def _with_own_noise(state: _State, own: Floats, settings: ForwardGPSettings) -> tuple[_State, Floats]:
+    """Weighted by the noise of each camera, and (C,) the log of that over the rig's."""
+    for number in range(MAX_OWN_NOISE_STEPS):
+        white = white_models(state.models, state.places.reshape(-1, 3), state.seen, with_fields=True)
+        equations = _known(state.equations)
+        left = left_of_views(white, equations, _frame_covariance(equations), _known(state.root))
+        told = own_noise(left, own, settings.wand_camera_noise_log_sd)
+        step, own = told - own, told
+        if np.abs(step).max() < MAX_OWN_NOISE_STEP or number == MAX_OWN_NOISE_STEPS - 1:
+            break
+        louder = tuple(replace(m, noise=m.noise * float(np.exp(d))) for m, d in zip(state.models, step, strict=True))
+        state = _solved(replace(state, models=louder), fields=True)
+    return state, own
+
+
+MAX_OWN_NOISE_STEPS = 6
+"""Of a camera whose views are trusted less, a place draws more of what is left to the others: it takes steps."""
+
+MAX_OWN_NOISE_STEP = 0.12
+"""Change of the log noise of a camera after which the rig is fitted again."""
 
 
 def _solved(state: _State, *, fields: bool) -> _State:

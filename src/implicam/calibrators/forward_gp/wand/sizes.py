@@ -180,6 +180,7 @@ def estimate_sizes(
     seen: Sequence[CameraViews],
     facts: Facts,
     stated: Floats,
+    own: Floats,
     settings: ForwardGPSettings,
     before: Hyperparameters | None,
     *,
@@ -193,6 +194,7 @@ def estimate_sizes(
         seen: Per camera the views to use.
         facts: Lengths and known places to use.
         stated: (C,) stated noise, NaN where none is.
+        own: (C,) log of the noise of each camera over what is stated or usual, but for a factor of all.
         settings: Priors.
         before: Those of the last round; None in the first.
         search: Look for other lengthscales.
@@ -200,12 +202,12 @@ def estimate_sizes(
     half = np.array([model.image.half for model in models])
     usual_signal = np.exp(settings.log_signal_prior(lens=True)[0]) * half
     told = bool(np.isfinite(stated).all())
-    usual = np.where(np.isfinite(stated), stated, np.exp(settings.log_noise_prior[0]) * half)
+    usual = np.where(np.isfinite(stated), stated, np.exp(settings.log_noise_prior[0]) * half) * np.exp(own)
     sds = np.array(
         [settings.signal_prior_log_sd, settings.stated_noise_log_sd if told else settings.noise_prior_log_sd]
     )
-    noise = usual if before is None else before.noise
-    at = np.array([0.0, float(np.mean(np.log(noise / usual)))])
+    at = np.array([0.0, 0.0 if before is None else float(np.mean(np.log(before.noise / usual)))])
+    noise = usual * np.exp(at[1])
     if before is not None:
         at[0] = float(np.mean(np.log(before.signal / usual_signal)))
     median, log_sd = np.log(settings.lengthscale_prior_median), np.array(settings.lengthscale_prior_log_sd)
