@@ -121,6 +121,20 @@ def test_two_cameras_that_moved_are_no_single_one() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("after", [30, 60])
+def test_a_camera_that_moved_while_views_were_taken_is_named(after: int) -> None:
+    rig, calibration = rig_and_calibration()
+    first, second = views(rig, 9, 80), views(moved(rig, 3, step_of(pan=0.3)), 9, 80)
+    uv = np.concatenate([first.observations.uv[:after], second.observations.uv[after:]])
+    data = replace(first, observations=replace(first.observations, uv=uv))
+    found = ic.check_calibration(calibration, data)
+    assert found.verdict == "moved midway"
+    assert found.midway is not None and found.midway[0] == "cam4"
+    assert abs(found.midway[1] - after) <= 20  # of 80: after a quarter, half or three quarters
+    assert "cam4 moved while these points were taken" in found.sentences()[0]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [(3, 1), (0, 1, 2, 4, 5)], ids=["two", "all but one"])
 def test_cameras_that_were_knocked_away_are_not_taken_for_wrong_detections(which: tuple[int, ...]) -> None:
     """All views of the second were left out as wrong, and the first was named alone."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -28,6 +28,7 @@ from implicam.geometry import cross_matrices
 from implicam.rig_model import NUMBERS, Check, Evidence, errors_with_and_without, find_repair
 
 STANDS, MOVED, ONE_MOVED, SEVERAL, BIASED = "stands", "moved", "one moved", "several moved", "biased"
+MIDWAY = "moved midway"
 DISAGREE = "disagree"
 """Of cameras of whose errors nothing is known: these may always have been so large."""
 UNSEEN = "A rig whose cameras all moved together looks the same to itself: only known points could show it."
@@ -143,8 +144,8 @@ class CalibrationCheck:
     ('stands', True)
 
     Attributes:
-        verdict: `stands`, `moved` (the first of `cameras`), `one moved` (of `candidates`), `several moved`, `biased` or
-            `disagree`: nothing is known of the errors of the cameras, and whether one has moved cannot be told.
+        verdict: `stands`, `moved` (the first of `cameras`), `one moved` (of `candidates`), `moved midway` (while these
+            views were taken, see `midway`), `several moved`, `biased` or `disagree`: nothing is known of the errors of the cameras, and whether one has moved cannot be told.
         p_value: That chance alone makes the views disagree as a movement would.
         cameras: Of each camera how it moved if it alone did, the likeliest first; none where hardly two views agree, or
             nothing is known of the errors of the cameras.
@@ -158,6 +159,7 @@ class CalibrationCheck:
         units: (7,) degrees, length units and per cent of a unit there.
         calibration: That was checked.
         dataset: Name of the data.
+        midway: The camera that moved while the views were taken, and after how many points; None where none did.
     """
 
     verdict: str
@@ -173,6 +175,7 @@ class CalibrationCheck:
     units: Floats = field(repr=False)
     calibration: RigCalibration = field(repr=False)
     dataset: str = ""
+    midway: tuple[str, int] | None = None
 
     @cached_property
     def noticed(self) -> dict[str, Floats]:
@@ -226,6 +229,10 @@ class CalibrationCheck:
             STANDS: f"Nothing speaks against the calibration (p = {decimal_number(self.p_value, 2)}).",
             MOVED: "" if moved is None else f"{moved.camera} has moved: {describe_movement(moved, unit)}.",
             ONE_MOVED: f"One of {' and '.join(self.candidates)} has moved; from these views nobody can say which.",
+            MIDWAY: ""
+            if self.midway is None
+            else f"{self.midway[0]} moved while these points were taken, after about "
+            f"{self.midway[1]} of them: before and after it no other camera's movement shows. Check the two parts apart.",
             SEVERAL: "The rig is not as it was calibrated, and no single camera's movement explains it: several moved"
             + (f", or many views of {doubtful} are wrong detections." if doubtful else "."),
             BIASED: "The views agree with each other, but not with the known points: all cameras moved together, or "
@@ -302,7 +309,59 @@ def check_calibration(calibration: Calibration, data: Dataset, *, level: float =
             "no two cameras saw enough of the same points.", fix="show the cameras more points, 20 or more that all see"
         )
     known = None if data.known is None else _known_points_test(rig, data)
-    return _conclude(rig, found, known, share, data.name)
+    concluded = _conclude(rig, found, known, share, data.name)
+    midway = _find_midway(rig, data, share / 2) if concluded.verdict == SEVERAL or _is_mixed(found) else None
+    return concluded if midway is None else replace(concluded, verdict=MIDWAY, midway=midway)
+
+
+MAX_LEFT_OUT, MAX_NOISE_RATIO = 0.1, 1.1
+"""Part of a camera's views that contradict all others, and noise over what is stated: with more it is asked whether a
+camera moved while the views were taken."""
+
+SPLITS = (0.25, 0.5, 0.75)
+"""Of the points, in the order of time: parts before and after which a camera stood differently."""
+
+MAX_SAME_STAND = 24.3
+"""Squared distance of two stands of one camera, of seven numbers, up to which they are one: p = 0.001."""
+
+
+def _is_mixed(found: Check) -> bool:
+    if not found.evidence:
+        return False
+    counts = found.rig.seen.sum(axis=0)
+    lost = (counts - found.evidence[0].seen.sum(axis=0)) / np.maximum(counts, 1)
+    return bool(lost.max() > MAX_LEFT_OUT or found.noise_ratio > MAX_NOISE_RATIO)
+
+
+def _find_midway(rig: RigCalibration, data: Dataset, level: float) -> tuple[str, int] | None:
+    """The camera that moved while the views were taken, their points being in the order of time, and after how many of
+    them; None where the parts before and after do not tell of one camera."""
+    uv, noise = rig.map.matched_views(data)
+    best: tuple[float, int, int] | None = None
+    for share in SPLITS:
+        split = round(share * len(uv))
+        if min(split, len(uv) - split) < MIN_POINTS:
+            continue
+        before, after = (
+            rig.map.movement_in_views(uv[part], noise[part], level=level) for part in (slice(split), slice(split, None))
+        )
+        if before is None or after is None or before.several or after.several:
+            continue
+        named = {one.named.camera for one in (before, after) if one.named is not None}
+        clear = all(named <= set(one.candidates) for one in (before, after) if one.alarm and one.named is None)
+        if len(named) != 1 or not clear:
+            continue
+        camera = named.pop()
+        stands = [one for part in (before, after) for one in part.evidence if one.camera == camera]
+        if len(stands) < 2:
+            continue
+        step, cov = stands[1].step - stands[0].step, stands[0].cov + stands[1].cov
+        unit = np.sqrt(np.diagonal(cov))
+        ratio = max(before.noise_ratio, after.noise_ratio, 1.0)
+        apart = float(step / unit @ np.linalg.solve(cov / np.outer(unit, unit), step / unit)) / ratio**2
+        if apart > MAX_SAME_STAND and (best is None or apart > best[0]):
+            best = apart, camera, split
+    return None if best is None else (rig.map.camera_names[best[1]], best[2])
 
 
 class CalibrationWatch:

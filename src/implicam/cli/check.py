@@ -20,6 +20,7 @@ from implicam.formatting import decimal_number, number_with_sd
 from implicam.stability import (
     BIASED,
     DISAGREE,
+    MIDWAY,
     MOVED,
     NUMBER_NAMES,
     ONE_MOVED,
@@ -124,6 +125,7 @@ def _tell(found: CalibrationCheck, given: int) -> None:
 _NO_REPAIR = {
     STANDS: "there is nothing to repair",
     ONE_MOVED: "show the cameras points that three of them see, or calibrate again with known points",
+    MIDWAY: "check the part of the views after the movement by itself",
     SEVERAL: "one camera that moved can be put right by the others; calibrate again with known points",
     BIASED: "no camera's movement explains it; calibrate again with known points",
     DISAGREE: "of these cameras it cannot be told that one has moved; calibrate with known points",

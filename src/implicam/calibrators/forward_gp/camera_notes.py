@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from implicam.dataset import Camera
+from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel
 from implicam.rig_model.fit_result import FitResult
-from implicam.rig_model.general_camera import GeneralCamera
+from implicam.rig_model.general_camera import SHAPE, TILT, GeneralCamera
 
 
 def kind_notes(fitted: FitResult, cameras: Sequence[Camera]) -> list[str]:
@@ -31,7 +32,7 @@ def kind_notes(fitted: FitResult, cameras: Sequence[Camera]) -> list[str]:
             "Or is v counted from below?"
         )
     for number, (described, model) in enumerate(zip(cameras, models, strict=True)):
-        words = _kind(model, sized=described.width is not None)
+        words = _kind(model, fitted.posterior.root(number), sized=described.width is not None)
         if mirrored[number] and not all(mirrored):
             words = ["its pictures are mirrored: it looks through a mirror, or v is counted from below", *words]
         if not words:
@@ -42,7 +43,23 @@ def kind_notes(fitted: FitResult, cameras: Sequence[Camera]) -> list[str]:
     return notes
 
 
-def _kind(model: CameraModel, sized: bool) -> list[str]:
+MIN_SQUARED_TILT = 40.0
+"""Squared distance of shape and tilt (four numbers) from those of an ordinary camera, from which a note says that they
+are others: a kind that was chosen because it leaves less is farther off than chance has it."""
+
+
+def _is_tilted(camera: GeneralCamera, root: Floats) -> bool:
+    """Whether pixels and image plane are others than those of an ordinary camera, beyond what is unknown of them."""
+    own = slice(SHAPE.start, TILT.stop)
+    found, part = camera.parameters[own], root[:, own]
+    size = np.linalg.norm(part, axis=0)
+    if not (size > 0).all():  # nothing is known of errors
+        return True
+    unit, within = found / size, (part / size).T @ (part / size)
+    return bool(unit @ np.linalg.solve(within + 1e-9 * np.eye(len(unit)), unit) > MIN_SQUARED_TILT)
+
+
+def _kind(model: CameraModel, root: Floats, sized: bool) -> list[str]:
     camera = model.camera
     if model.family == "none":
         return ["no lens model predicts its views as well as a linear projection and a smooth field do"]
@@ -59,4 +76,6 @@ def _kind(model: CameraModel, sized: bool) -> list[str]:
         ]
     if model.family == "crop":
         return [f"its lens looks past the middle of the image, by {off:.0f} px"]
+    if not _is_tilted(camera, root):
+        return []
     return [f"tilted sensor or oblique window (fy / fx = {aspect:.3g}, principal point {off:.0f} px off the middle)"]
