@@ -129,7 +129,8 @@ def test_a_camera_that_moved_while_views_were_taken_is_named(after: int) -> None
     data = replace(first, observations=replace(first.observations, uv=uv))
     found = ic.check_calibration(calibration, data)
     assert found.verdict == "moved midway"
-    assert found.midway is not None and found.midway[0] == "cam4"
+    assert found.midway is not None
+    assert found.midway[0] == "cam4"
     assert abs(found.midway[1] - after) <= 20  # of 80: after a quarter, half or three quarters
     assert "cam4 moved while these points were taken" in found.sentences()[0]
 

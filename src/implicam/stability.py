@@ -145,7 +145,8 @@ class CalibrationCheck:
 
     Attributes:
         verdict: `stands`, `moved` (the first of `cameras`), `one moved` (of `candidates`), `moved midway` (while these
-            views were taken, see `midway`), `several moved`, `biased` or `disagree`: nothing is known of the errors of the cameras, and whether one has moved cannot be told.
+            views were taken, see `midway`), `several moved`, `biased` or `disagree`: nothing is known of the errors of
+            the cameras, and whether one has moved cannot be told.
         p_value: That chance alone makes the views disagree as a movement would.
         cameras: Of each camera how it moved if it alone did, the likeliest first; none where hardly two views agree, or
             nothing is known of the errors of the cameras.
@@ -231,8 +232,8 @@ class CalibrationCheck:
             ONE_MOVED: f"One of {' and '.join(self.candidates)} has moved; from these views nobody can say which.",
             MIDWAY: ""
             if self.midway is None
-            else f"{self.midway[0]} moved while these points were taken, after about "
-            f"{self.midway[1]} of them: before and after it no other camera's movement shows. Check the two parts apart.",
+            else f"{self.midway[0]} moved while these points were taken, after about {self.midway[1]} of them; nothing "
+            "else shows before and after. Check the two parts apart.",
             SEVERAL: "The rig is not as it was calibrated, and no single camera's movement explains it: several moved"
             + (f", or many views of {doubtful} are wrong detections." if doubtful else "."),
             BIASED: "The views agree with each other, but not with the known points: all cameras moved together, or "
