@@ -7,7 +7,7 @@ import pytest
 
 from board_pictures import VIEW, checkered, corners_of, errors, noisy, photograph, rotated
 from implicam.detect.board import Board
-from implicam.detect.corner_noise import error_ratio
+from implicam.detect.corner_noise import _log_densities, error_ratio
 from implicam.images import opencv
 
 cv2 = pytest.importorskip("cv2")
@@ -114,3 +114,15 @@ def test_a_picture_of_little_noise_is_not_overrated():
     assert found.sd.max() < 0.01
     assert np.abs(errors(found, truth)).max() < 6 * found.sd.max()
     assert opencv() is cv2
+
+
+def test_one_reduction_gives_the_density_of_every_ratio():
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(2, 30, 30)) * np.exp(rng.uniform(-4, 6, size=30))
+    covariances, rest, added = list(root @ root.swapaxes(1, 2)), rng.normal(size=30), np.exp(np.linspace(-5, 10, 7))
+    found = _log_densities(covariances, rest, added)
+    for k, covariance in enumerate(covariances):
+        for j, more in enumerate(added):
+            whole = covariance + more * np.eye(30)
+            log_density = -0.5 * (rest @ np.linalg.solve(whole, rest) + np.linalg.slogdet(whole)[1])
+            assert found[k, j] == pytest.approx(log_density, rel=1e-6)

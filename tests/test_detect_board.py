@@ -92,6 +92,34 @@ def test_the_fit_has_no_bias_and_the_right_spread_on_skewed_edges():
     assert np.mean(np.sum((e / sd) ** 2, axis=2)) == pytest.approx(2, abs=0.3)
 
 
+def test_a_corner_is_fitted_the_same_beside_what_is_none():
+    """What never settles takes all rounds; the corners beside it end when they have settled, to what they state."""
+    h = rotated(0.3, 22)
+    picture, truth = photograph(checkered(5, 8), h, noise=0.02), corners_of(5, 8, h)
+    right, down = (np.tile(step, (40, 1)) for step in (truth[1] - truth[0], truth[8] - truth[0]))
+    whole = fit_corners(picture, truth + 0.5, right, down)
+    beside = np.where(np.arange(40)[:, None] % 3 == 1, right / 2, 0.5)  # an edge's middle, which is no corner
+    mixed = fit_corners(picture, truth + beside, right, down)
+    for k in (0, 2, 3, 39):
+        alone = fit_corners(picture, truth[k : k + 1] + 0.5, right[:1], down[:1])
+        for others in (whole, mixed):
+            np.testing.assert_allclose(alone.uv[0], others.uv[k], atol=1e-5)
+            np.testing.assert_allclose(alone.sd[0], others.sd[k], rtol=1e-3)
+
+
+def test_a_grid_that_grows_by_two_squares_does_not_jump_over_a_gap_of_one():
+    """Corners beyond a hidden line are taken only where two neighbours of them are found, too."""
+    h = rotated(0.1, 24)
+    board, truth = checkered(8, 11), corners_of(8, 11, h).reshape(8, 11, 2)
+
+    def paint(x, y):  # of the last two columns only what is about two corners is seen
+        return np.where((x > 3.4) & ((np.abs(x - 5) > 0.6) | (np.abs(y) > 1.2)), 0.8, board(x, y))
+
+    grid = grow_grid(photograph(paint, h, fine=4), truth[2:5, 2:5], 14)
+    assert (grid.rows, grid.columns) == (8, 9)
+    assert np.linalg.norm(grid.uv[grid.occupied][:, None] - truth.reshape(1, -1, 2), axis=2).min(axis=1).max() < 0.2
+
+
 def test_the_error_bar_grows_with_the_noise():
     h = rotated(0.2, 22)
     clean = photograph(checkered(5, 8), h, noise=0.0)

@@ -22,7 +22,8 @@ import numpy as np
 from implicam.dataset import Floats
 from implicam.dataset.boards import corner_name
 from implicam.detect.corner_noise import true_sd
-from implicam.detect.grid import Grid, grow_grid, join_grids
+from implicam.detect.corners import Bools
+from implicam.detect.grid import Grid, are_checkered, grow_grid, join_grids
 from implicam.detect.model import Detected, DetectorBase, Inferred, View, nothing
 from implicam.detect.numbering import END, MORE, Numbering, Sides, find_numberings, find_sides
 from implicam.detect.plane import MAX_SEARCH_SD_SQUARES, BoardPlane, complete_grid
@@ -364,17 +365,24 @@ def _saddle_seeds(picture: Grey, scale: float, grids: list[Grid]) -> Iterator[Fl
     """Seeds from the saddle points that no grid has yet, as long as each lets a grid grow."""
     small = resize(picture, scale)
 
-    def taken(uv: Floats) -> bool:
-        return any(_is_inside(grid, to_original_pixels(uv, small, picture)) for grid in grids)
+    def taken(uv: Floats) -> Bools:
+        uv = to_original_pixels(uv, small, picture)
+        there = np.zeros(len(uv), dtype=np.bool_)
+        for grid in grids:
+            there |= _are_inside(grid, uv)
+        return there
 
-    for seed in from_saddles(find_saddles(np.asarray(small, dtype=np.float32)), taken):
+    def checkered(seeds: Floats) -> Bools:
+        return are_checkered(picture, to_original_pixels(seeds, small, picture))
+
+    for seed in from_saddles(find_saddles(np.asarray(small, dtype=np.float32)), taken, checkered):
         yield to_original_pixels(seed, small, picture)
 
 
-def _is_inside(grid: Grid, uv: Floats) -> bool:
-    """Whether a pixel is within a square or so of the grid's corners."""
-    away = grid.found - uv
-    return float(np.einsum("nk,nk->n", away, away).min()) < (0.8 * grid.largest_step) ** 2
+def _are_inside(grid: Grid, uv: Floats) -> Bools:
+    """Which pixels (n, 2) are within a square or so of the grid's corners."""
+    du, dv = (grid.found[:, k] - uv[:, k, None] for k in range(2))
+    return np.asarray((du * du + dv * dv).min(axis=1) < (0.8 * grid.largest_step) ** 2, dtype=np.bool_)
 
 
 def _add_grid(grids: list[Grid], grid: Grid) -> None:

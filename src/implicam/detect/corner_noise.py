@@ -13,6 +13,7 @@ left at the edges counts as one common shift.
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.lapack import dsytrd
 
 from implicam.dataset import Floats
 from implicam.detect.corners import Bools, Corners
@@ -118,17 +119,36 @@ def error_ratio(nodes: Floats, uv: Floats, sd: Floats, half_length: float) -> fl
     image, J = project(process.theta, x)
     rest = ((y - image).ravel() + J @ process.theta) / stated.ravel()
     J = J / stated.ravel()[:, None]
-    log_density = []
-    for bend in BENDS:
-        smooth = np.kron(usual._replace(bend=bend).kernel(2)(x, x), np.eye(2)) / np.outer(stated, stated)
-        # of a ratio c the covariance over the stated one is smooth + c^2: one decomposition serves all ratios
-        values, vectors = np.linalg.eigh(J @ process.prior @ J.T + smooth)
-        squares = (vectors.T @ rest) ** 2
-        variance = np.maximum(values, 0) + np.exp(2 * LOG_RATIOS)[:, None]
-        log_density.append(-0.5 * np.sum(squares / variance + np.log(variance), axis=1))
-    density = np.asarray(log_density) - 0.5 * (LOG_RATIOS / PRIOR_LOG_SD) ** 2
+    flat = J @ process.prior @ J.T
+    curved = np.kron(usual._replace(bend=1).kernel(2)(x, x), np.eye(2)) / np.outer(stated, stated)
+    # of a ratio c the covariance over the stated one is this and c^2: one reduction serves all ratios
+    log_density = _log_densities([flat + bend**2 * curved for bend in BENDS], rest, np.exp(2 * LOG_RATIOS))
+    density = log_density - 0.5 * (LOG_RATIOS / PRIOR_LOG_SD) ** 2
     weight = np.exp(density - density.max())
     return float(np.sqrt(np.sum(weight * np.exp(2 * LOG_RATIOS)) / np.sum(weight)))
+
+
+def _log_densities(covariances: list[Floats], rest: Floats, added: Floats) -> Floats:
+    """Gaussian log densities of `rest` (n,), up to a constant, of each covariance (n, n) with each number added to its
+    diagonal: (covariances, added).
+
+    Householder's reflections that begin with `rest` make a covariance tridiagonal, T, and `rest` a multiple of its
+    first axis (Golub & Van Loan, section 8.3). The pivots of T + c, from the last up, give its determinant, and the
+    first of them is one over the corner of its inverse (a continued fraction).
+    """
+    n = len(rest)
+    whole = np.zeros((n + 1, n + 1), order="F")
+    diagonal, beside = np.zeros((len(covariances), n + 1)), np.zeros((len(covariances), n))
+    for k, covariance in enumerate(covariances):
+        whole[1:, 0], whole[1:, 1:] = rest, covariance
+        _, diagonal[k], beside[k], _, _ = dsytrd(whole, lower=1)
+    pivot = np.full((len(covariances), len(added)), np.inf)
+    log_determinant = np.zeros_like(pivot)
+    for i in range(n, 0, -1):
+        below = beside[:, i] ** 2 if i < n else np.zeros(len(covariances))
+        pivot = diagonal[:, i, None] + added - below[:, None] / pivot
+        log_determinant += np.log(pivot)
+    return np.asarray(-0.5 * (beside[:, :1] ** 2 / pivot + log_determinant), dtype=np.float64)
 
 
 def _normalised(nodes: Floats, uv: Floats, sd: Floats, half_length: float) -> tuple[Floats, Floats, Floats]:

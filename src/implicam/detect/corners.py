@@ -39,6 +39,9 @@ EDGE_CLEARANCE_PX = 1.6
 
 MAX_ROUNDS = 12
 
+SETTLED_PX = 2e-4
+"""Pixels of a step below which a corner's fit ends; the next step would be a tenth of it."""
+
 MIN_SD_PX = 0.003
 """Pixels that no standard uncertainty goes below: what curved edges and the sensor's pixels do to the model."""
 
@@ -128,23 +131,31 @@ class _Windows:
 
     def fit(self) -> Corners:
         n = len(self.start)
-        parameters = np.hstack([self.start, self.angle, np.full((n, 1), np.log(0.8))])
-        self._choose_window(parameters)
-        state = self._evaluate(parameters)
-        damping = np.full(n, 1e-3)
+        state = self._restart(np.hstack([self.start, self.angle, np.full((n, 1), np.log(0.8))]))
+        damping, rows = np.full(n, 1e-3), np.arange(n)
         for turn in range(MAX_ROUNDS):
             if turn == 2:  # the window follows the corner once only: else the fit does not converge
-                self._choose_window(state.parameters)
-                state = self._evaluate(state.parameters)
-            trial = self._limit(state.parameters - self._solve_step(state, damping))
-            change = np.abs(trial - state.parameters)[:, :2].max(axis=1)
-            tried = self._evaluate(trial)
-            better = tried.error < state.error
-            damping = np.where(better, damping / 5, damping * 5)
-            state = tried if better.all() else state.replace_where(better, tried)
-            if turn > 3 and np.all(change < 2e-4):
+                state = self._restart(state.parameters)
+            now = state if len(rows) == n else _some(state, rows)
+            trial = self._limit(now.parameters - _solve_step(now, damping[rows]), rows)
+            change = np.abs(trial - now.parameters)[:, :2].max(axis=1)
+            tried = self._evaluate(trial, rows)
+            better = tried.error < now.error
+            damping[rows] *= np.where(better, 0.2, 5)
+            if better.all() and len(rows) == n:
+                state = tried
+            else:
+                for whole, part in zip(state, tried, strict=True):
+                    whole[rows[better]] = part[better]
+            if turn >= 2:  # what is no corner never settles: the others do not wait for it
+                rows = rows[change >= SETTLED_PX]
+            if not len(rows):
                 break
         return self._collect(state)
+
+    def _restart(self, parameters: Floats) -> _State:
+        self._choose_window(parameters)
+        return self._evaluate(parameters, np.arange(len(parameters)))
 
     def _choose_window(self, parameters: Floats) -> None:
         """The pixels that are used, and their weight (n, pixels), 1 in the window and 0 outside; the window is
@@ -166,51 +177,44 @@ class _Windows:
         self.offset, self.grey = self.around[:, where], self.picture[:, where]
         self.weight = np.asarray(inside[:, some], dtype=np.float64)
 
-    def _evaluate(self, parameters: Floats) -> _State:
+    def _evaluate(self, parameters: Floats, rows: NDArray[np.intp]) -> _State:
         """Mean and height enter linearly and are solved for each time (variable projection, Golub & Pereyra 1973); the
         Jacobian is that of the whole model: u, v, two angles, log blur, mean, height."""
+        weight, grey = self.weight[rows], self.grey[rows]
         u, v = (self.offset[k] - parameters[:, k, None] for k in range(2))
-        cos, sin = np.cos(parameters[:, 2:4])[..., None], np.sin(parameters[:, 2:4])[..., None]
-        blur = np.exp(parameters[:, 4])[:, None]
+        inverse_blur = np.exp(-parameters[:, 4, None])
+        cos, sin = np.cos(parameters[:, 2:4]) * inverse_blur, np.sin(parameters[:, 2:4]) * inverse_blur
         # k = 0: the edge that runs to the right, and how far below it
-        distance = [(v * cos[:, k] - u * sin[:, k]) / blur for k in range(2)]
+        distance = [v * cos[:, k, None] - u * sin[:, k, None] for k in range(2)]
         shape = [erf(x * np.sqrt(0.5)) for x in distance]
         product = -shape[0] * shape[1]  # below the one edge and left of the other is not between the two steps
-        mean, height = _fit_lines(product, self.grey, self.weight)
-        residual = (mean[:, None] + height[:, None] * product - self.grey) * self.weight
-        scale = height[:, None] * np.sqrt(2 / np.pi)
-        a, b = (-scale * np.exp(-0.5 * distance[k] ** 2) * shape[1 - k] for k in range(2))
+        mean, height = _fit_lines(product, grey, weight)
+        residual = height[:, None] * product
+        residual += mean[:, None]
+        residual -= grey
+        residual *= weight
+        scale = weight * (-np.sqrt(2 / np.pi) * height)[:, None]
+        a, b = (scale * shape[1 - k] * np.exp(-0.5 * distance[k] ** 2) for k in range(2))
         jacobian = np.empty((len(parameters), 7, product.shape[1]))
-        jacobian[:, 0] = (a * sin[:, 0] + b * sin[:, 1]) / blur
-        jacobian[:, 1] = -(a * cos[:, 0] + b * cos[:, 1]) / blur
+        jacobian[:, 0] = a * sin[:, 0, None] + b * sin[:, 1, None]
+        np.negative(a * cos[:, 0, None] + b * cos[:, 1, None], out=jacobian[:, 1])
         for k, part in enumerate((a, b)):
-            jacobian[:, 2 + k] = -part * (u * cos[:, k] + v * sin[:, k]) / blur
-        jacobian[:, 4] = -(a * distance[0] + b * distance[1])
-        jacobian[:, 5], jacobian[:, 6] = 1, product
+            np.multiply(part, u * -cos[:, k, None] - v * sin[:, k, None], out=jacobian[:, 2 + k])
+        np.negative(a * distance[0] + b * distance[1], out=jacobian[:, 4])
+        jacobian[:, 5] = weight
+        np.multiply(product, weight, out=jacobian[:, 6])
         error = np.einsum("np,np->n", residual, residual)
         return _State(error, parameters, np.column_stack([mean, height]), residual, jacobian)
 
-    def _normal(self, jacobian: Floats) -> tuple[Floats, Floats]:
-        """The weighted Jacobian (n, 7, pixels), and the normal equations' matrix (n, 7, 7)."""
-        weighted = jacobian * self.weight[:, None]
-        return weighted, weighted @ jacobian.swapaxes(1, 2)
-
-    def _solve_step(self, state: _State, damping: Floats) -> Floats:
-        weighted, normal = self._normal(state.jacobian)
-        diagonal = np.einsum("nii->ni", normal)
-        diagonal += damping[:, None] * diagonal + 1e-9
-        gradient = weighted @ state.residual[..., None]
-        step = np.asarray(np.linalg.solve(normal, gradient)[:, :5, 0], dtype=np.float64)
-        return np.clip(step, -0.7, 0.7)
-
-    def _limit(self, parameters: Floats) -> Floats:
-        parameters[:, :2] = self.start + np.clip(parameters[:, :2] - self.start, -self.half / 2, self.half / 2)
+    def _limit(self, parameters: Floats, rows: NDArray[np.intp]) -> Floats:
+        start = self.start[rows]
+        parameters[:, :2] = start + np.clip(parameters[:, :2] - start, -self.half / 2, self.half / 2)
         parameters[:, 4] = np.clip(parameters[:, 4], np.log(0.25), np.log(4.0))
         return parameters
 
     def _collect(self, state: _State) -> Corners:
         parameters, (mean, height) = state.parameters, state.levels.T
-        weighted, normal = self._normal(state.jacobian)
+        normal = state.jacobian @ state.jacobian.swapaxes(1, 2)
         spare = self.weight.sum(axis=1) - 7
         with np.errstate(invalid="ignore", divide="ignore"):
             noise = np.where(spare > 5, state.error / spare, np.nan)
@@ -222,7 +226,7 @@ class _Windows:
         sd = np.sqrt(np.where(good[:, None], variance, np.nan) + MIN_SD_PX**2)
         uv = np.where(good[:, None], self.corner + parameters[:, :2], np.nan)
         turned = np.abs(np.sin(parameters[:, 2:4] - self.angle)).max(axis=1)
-        shift = np.column_stack([_shift_of_edges(state.residual, weighted[:, k], self.weight) for k in range(2)])
+        shift = np.column_stack([_shift_of_edges(state.residual, state.jacobian[:, k], self.weight) for k in range(2)])
         return Corners(uv, sd, mean, height, misfit, np.exp(parameters[:, 4]), turned, shift)
 
 
@@ -230,7 +234,7 @@ class _State(NamedTuple):
     """Where n fits stand.
 
     error: (n,) sums of squares. parameters: (n, 5) crossing, two angles, log blur. levels: (n, 2) mean and height.
-    residual: (n, pixels), weighted. jacobian: (n, 7, pixels).
+    residual: (n, pixels), and jacobian: (n, 7, pixels), both 0 outside of the window.
     """
 
     error: Floats
@@ -239,10 +243,19 @@ class _State(NamedTuple):
     residual: Floats
     jacobian: Floats
 
-    def replace_where(self, which: Bools, other: _State) -> _State:
-        """The other's rows where `which` (n,) says so."""
-        pairs = zip(self, other, strict=True)
-        return _State(*(np.where(which.reshape(-1, *[1] * (x.ndim - 1)), y, x) for x, y in pairs))
+
+def _some(state: _State, rows: Bools | NDArray[np.intp]) -> _State:
+    return _State(*(x[rows] for x in state))
+
+
+def _solve_step(state: _State, damping: Floats) -> Floats:
+    """(n, 5) a step of Levenberg and Marquardt, to be subtracted."""
+    normal = state.jacobian @ state.jacobian.swapaxes(1, 2)
+    diagonal = np.einsum("nii->ni", normal)
+    diagonal += damping[:, None] * diagonal + 1e-9
+    gradient = state.jacobian @ state.residual[..., None]
+    step = np.asarray(np.linalg.solve(normal, gradient)[:, :5, 0], dtype=np.float64)
+    return np.clip(step, -0.7, 0.7)
 
 
 def _invert(matrices: Floats) -> Floats:

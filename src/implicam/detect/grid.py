@@ -22,6 +22,9 @@ from implicam.images import Grey, opencv
 
 NEIGHBOURS = 16
 
+MIN_CORNERS = 9
+"""Corners of the smallest grid: three rows of three."""
+
 MAX_RESIDUAL_HEIGHTS = 0.35
 """A corner whose residuals are a larger part of its height is none."""
 
@@ -39,6 +42,9 @@ MIN_HEIGHT_RATIO = 0.3
 
 MAX_ASTRAY_SQUARES = 0.25
 """Squares that a corner may lie from where its neighbours put it, when it is first found."""
+
+STEP_SQUARES = 2
+"""Squares that a grid grows by at once: a few fits of many corners take less time than many fits of a few."""
 
 MAX_GAP_SQUARES = 4
 """Squares across which a grid is continued, where something stands before the board."""
@@ -244,18 +250,18 @@ def _overlay_grids(a: Grid, b: Grid, shift: NDArray[np.intp]) -> Grid | None:
 
 
 def _grow_from(picture: Grey, grid: Grid, limit: int) -> Grid | None:
-    reach = 1
+    across = False
     while True:
-        larger = _extend(picture, grid, reach=reach, limit=limit)
-        if larger.count == grid.count and reach == MAX_GAP_SQUARES:
+        larger = _extend(picture, grid, across=across, limit=limit)
+        if larger.count == grid.count and across:
             return _drop_wrong_corners(grid)
-        reach = MAX_GAP_SQUARES if larger.count == grid.count else 1
+        across = larger.count == grid.count
         grid = larger
 
 
 def _grid_from_seed(picture: Grey, seed: Floats) -> Grid | None:
     rows, columns = seed.shape[:2]
-    if rows < 3 or columns < 3 or np.isfinite(seed[..., 0]).sum() < 9:
+    if rows < 3 or columns < 3 or np.isfinite(seed[..., 0]).sum() < MIN_CORNERS:
         return None
     if _handedness(seed) < 0:
         seed = seed[:, ::-1]
@@ -265,22 +271,55 @@ def _grid_from_seed(picture: Grey, seed: Floats) -> Grid | None:
     places = rough.places(nodes.astype(np.float64))
     if not _is_checkered(picture, nodes, places._replace(uv=rough.uv[rough.occupied])):
         return None
-    found = fit_corners(picture, rough.uv[rough.occupied], places.right, places.down)
-    good = _judge_corners(found, nodes, places._replace(uv=rough.uv[rough.occupied]), None)
-    good &= _have_four_squares(picture, places._replace(uv=found.uv), found.mean, found.height)
+    places = places._replace(uv=rough.uv[rough.occupied])
+    if len(nodes) == MIN_CORNERS and not _fit_rough(picture, nodes[4:5], Places(*(x[4:5] for x in places)))[1].all():
+        return None  # all of them must be good, so that one tells it for most seeds
+    found, good = _fit_rough(picture, nodes, places)
     grid = replace(rough, corners=_scatter_corners(found, rough.occupied.ravel()))
     grid = grid.keep_only(scatter(good, rough.occupied))
-    return grid.crop() if grid.count >= 9 else None
+    return grid.crop() if grid.count >= MIN_CORNERS else None
 
 
-def _is_checkered(picture: Grey, nodes: NDArray[np.intp], places: Places) -> bool:
-    """Whether the four squares about most rough corners are bright and dark in turn; saves fitting most seeds."""
-    squares = _sample_quadrants(picture, places)
+def _fit_rough(picture: Grey, nodes: NDArray[np.intp], places: Places) -> tuple[Corners, Bools]:
+    """Corners fitted where nothing else of their grid is known, and which of them are corners."""
+    found = fit_corners(picture, places.uv, places.right, places.down)
+    good = _judge_corners(found, nodes, places, None)
+    return found, good & _have_four_squares(picture, places._replace(uv=found.uv), found.mean, found.height)
+
+
+def are_checkered(picture: Grey, seeds: Floats) -> Bools:
+    """Whether the four squares about most rough corners are bright and dark in turn; saves fitting most seeds.
+
+    Args:
+        picture: (height, width) grey from 0 to 1.
+        seeds: (m, rows, columns, 2) pixels of corners found roughly, without holes.
+
+    Returns:
+        (m,).
+    """
+    nodes = np.argwhere(np.ones(seeds.shape[1:3]))
+    uv, known = seeds.reshape(len(seeds), len(nodes), 2), nodes.astype(np.float64)
+    return _is_checkered(picture, nodes, predict_places(known, uv, known)._replace(uv=uv))
+
+
+def _is_checkered(picture: Grey, nodes: NDArray[np.intp], places: Places) -> Bools:
+    """Whether it is so of the corners (..., n) at nodes (n, 2), some of which may be missing."""
+    squares = _sample_quadrants(picture, Places(*(x.reshape(-1, 2) for x in places))).reshape(4, *places.uv.shape[:-1])
     crossed = (squares[0] + squares[3] - squares[1] - squares[2]) * (1 - 2 * (nodes.sum(axis=1) % 2))
     apart = np.minimum(squares[0], squares[3]) > np.maximum(squares[1], squares[2])
     apart |= np.maximum(squares[0], squares[3]) < np.minimum(squares[1], squares[2])
-    sign = np.sign(np.nanmedian(crossed)) if np.isfinite(crossed).any() else 0.0
-    return bool(np.mean(apart & (sign * crossed > 0)) > 0.6)
+    sign = np.sign(_median_known(crossed))[..., None]
+    return np.asarray(np.mean(apart & (sign * crossed > 0), axis=-1) > 0.6, dtype=np.bool_)
+
+
+def _median_known(values: Floats) -> Floats:
+    """The median over the last axis of what is not NaN; 0 where nothing is."""
+    count = np.isfinite(values).sum(axis=-1)
+    ranked = np.sort(values, axis=-1)  # NaN last
+    middle = [
+        np.take_along_axis(ranked, np.maximum(k, 0)[..., None], -1)[..., 0] for k in ((count - 1) // 2, count // 2)
+    ]
+    return np.where(count > 0, (middle[0] + middle[1]) / 2, 0.0)
 
 
 def _handedness(uv: Floats) -> float:
@@ -313,18 +352,23 @@ def _judge_corners(
         return np.asarray(good & sound & (polarity * signed > MIN_HEIGHT_RATIO * usual), dtype=np.bool_)
 
 
-def _extend(picture: Grey, grid: Grid, *, reach: int, limit: int) -> Grid:
-    """The grid with the missing nodes up to `reach` squares from known ones that are found; across gaps (reach > 1)
-    only where two neighbours are found too."""
+def _extend(picture: Grey, grid: Grid, *, across: bool, limit: int) -> Grid:
+    """The grid with the missing nodes near it that are found and hang together with it; `across` gaps also others,
+    where two neighbours are found too."""
+    reach = MAX_GAP_SQUARES if across else STEP_SQUARES
     wide = grid.pad(reach)
     there = wide.occupied
-    near = ndimage.binary_dilation(there, iterations=reach) & ~there
+    shape = ndimage.generate_binary_structure(2, 1 if across else 2)
+    near = ndimage.binary_dilation(there, shape, iterations=reach) & ~there
     used_rows, used_columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
     if len(used_rows) >= limit:
         near[: used_rows[0]] = near[used_rows[-1] + 1 :] = False
     if len(used_columns) >= limit:
         near[:, : used_columns[0]] = near[:, used_columns[-1] + 1 :] = False
-    return add_corners(picture, wide, near, wide.places(np.argwhere(near).astype(np.float64)), 0 if reach == 1 else 2)
+    places = wide.places(np.argwhere(near).astype(np.float64))
+    if across:
+        return add_corners(picture, wide, near, places, neighbours=2)
+    return add_corners(picture, wide, near, places, touching=True)
 
 
 def add_corners(
@@ -332,7 +376,9 @@ def add_corners(
     grid: Grid,
     where: Bools,
     places: Places,
-    neighbours: int,
+    *,
+    neighbours: int = 0,
+    touching: bool = False,
     astray: Floats | float = MAX_ASTRAY_SQUARES,
 ) -> Grid:
     """Look for corners at nodes where none is known.
@@ -343,6 +389,7 @@ def add_corners(
         where: (rows, columns) the n nodes to look at.
         places: Where they must be, in the order of `np.argwhere(where)`.
         neighbours: So many of the four neighbours of a corner must be found with it.
+        touching: Whether corners must hang together with those known, from neighbour to neighbour.
         astray: (n,) or one number, squares that a corner may lie from its place.
 
     Returns:
@@ -360,6 +407,8 @@ def add_corners(
     good = scatter(_judge_corners(found, nodes, places, grid, astray), where)
     if neighbours:
         good &= _count_neighbours(good) >= neighbours
+    if touching:
+        good &= ndimage.binary_propagation(grid.occupied, mask=grid.occupied | good)
     corners = _merge_corners(grid.corners, _scatter_corners(found, where.ravel()), good.ravel())
     return Grid(grid.rows, grid.columns, corners).crop()
 
@@ -408,7 +457,7 @@ def _count_neighbours(there: Bools) -> Floats:
 def _drop_wrong_corners(grid: Grid) -> Grid | None:
     """Without the corners that are not where their neighbours say, or that something else cuts into; None if few."""
     for _ in range(4):
-        if grid.count < 9:
+        if grid.count < MIN_CORNERS:
             return None
         nodes = np.argwhere(grid.occupied)
         uv = grid.uv[grid.occupied]
@@ -421,7 +470,7 @@ def _drop_wrong_corners(grid: Grid) -> Grid | None:
         if smaller.count == grid.count:
             return grid
         grid = smaller
-    return grid if grid.count >= 9 else None
+    return grid if grid.count >= MIN_CORNERS else None
 
 
 def drop_thin_rims(grid: Grid) -> Grid:
@@ -451,10 +500,13 @@ def predict_places(known: Floats, uv: Floats, nodes: Floats) -> Places:
 
     Args:
         known: (k, 2) row and column of the nodes that are known; the nearest `NEIGHBOURS` are used.
-        uv: (k, 2) their pixels.
+        uv: (k, 2) their pixels; or (m, k, 2), of m grids.
         nodes: (n, 2) row and column, whole numbers or not.
+
+    Returns:
+        The n places; of m grids, all of them with m before n.
     """
-    nodes, pixels = nodes.astype(np.float64), uv
+    nodes = nodes.astype(np.float64)
     distance = np.linalg.norm(nodes[:, None] - known[None], axis=2)
     distance[distance < 1e-6] = np.inf
     n = min(NEIGHBOURS, len(known) - 1)
@@ -462,32 +514,33 @@ def predict_places(known: Floats, uv: Floats, nodes: Floats) -> Places:
     d = np.take_along_axis(distance, pick, axis=1)
     weight = np.where(np.isfinite(d), 1 / d, 0)  # of the residual: squared in the normal equations
     x = np.where(np.isfinite(d)[..., None], known[pick] - nodes[:, None], 0)
-    middle = pixels[pick].mean(axis=1)
-    scale = np.sqrt(np.mean((pixels[pick] - middle[:, None]) ** 2, axis=(1, 2))) + 1e-9
-    y = (pixels[pick] - middle[:, None]) / scale[:, None, None]
-    h = _fit_homographies(x, y, weight)
-    at = h[:, [2, 5]]
-    right = h[:, [1, 4]] - at * h[:, 7:8]
-    down = h[:, [0, 3]] - at * h[:, 6:7]
-    s = scale[:, None]
+    pixels = uv[..., pick, :]
+    middle = pixels.mean(axis=-2)
+    pixels = pixels - middle[..., None, :]
+    s = np.sqrt(np.mean(pixels**2, axis=(-2, -1)))[..., None] + 1e-9
+    h = _fit_homographies(x, pixels / s[..., None], weight)
+    at = h[..., [2, 5]]
+    right = h[..., [1, 4]] - at * h[..., 7:8]
+    down = h[..., [0, 3]] - at * h[..., 6:7]
     return Places(middle + s * at, s * right, s * down)
 
 
 def _fit_homographies(x: Floats, y: Floats, weight: Floats) -> Floats:
-    """(n, 8) of y = (h0 x0 + h1 x1 + h2, h3 x0 + h4 x1 + h5) / (1 + h6 x0 + h7 x1), from points (n, k, 2)."""
-    n, k = weight.shape
-    rows = np.zeros((n, 2 * k, 8))
+    """(..., n, 8) of y = (h0 x0 + h1 x1 + h2, h3 x0 + h4 x1 + h5) / (1 + h6 x0 + h7 x1), from points x (n, k, 2) and
+    y (..., n, k, 2)."""
+    *several, k, _ = y.shape
+    rows = np.zeros((*several, 2 * k, 8))
     for c in range(2):
-        part = rows[:, c::2]
+        part = rows[..., c::2, :]
         part[..., 3 * c : 3 * c + 2], part[..., 3 * c + 2] = x, 1
         part[..., 6:] = -y[..., c : c + 1] * x
     w = np.repeat(weight, 2, axis=1)
     rows *= w[..., None]
-    normal = rows.swapaxes(1, 2) @ rows
+    normal = rows.swapaxes(-1, -2) @ rows
     index = np.arange(8)
-    normal[:, index, index] += np.where(index < 6, 1e-12, 1e-7) * np.maximum(np.sum(w**2, axis=1), 1e-9)[:, None]
-    right = np.einsum("nki,nk->ni", rows, y.reshape(n, 2 * k) * w)
-    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0], dtype=np.float64)
+    normal[..., index, index] += np.where(index < 6, 1e-12, 1e-7) * np.maximum(np.sum(w**2, axis=1), 1e-9)[:, None]
+    right = rows.swapaxes(-1, -2) @ (y.reshape(*several, 2 * k) * w)[..., None]
+    return np.asarray(np.linalg.solve(normal, right)[..., 0], dtype=np.float64)
 
 
 def scatter(values: Bools, where: Bools) -> Bools:

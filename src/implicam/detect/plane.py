@@ -158,7 +158,7 @@ def complete_grid(picture: Grey, grid: Grid, size: tuple[int, int]) -> Grid:
         sure = sd < MAX_SEARCH_SD_SQUARES
         where[tuple(nodes[~sure].T)] = False
         astray = np.minimum(MAX_ASTRAY_SDS * sd[sure] + TOLERATED_SQUARES, MAX_ASTRAY_SQUARES)
-        larger = add_corners(picture, wide, where, Places(*(x[sure] for x in places)), 0, astray)
+        larger = add_corners(picture, wide, where, Places(*(x[sure] for x in places)), astray=astray)
         if larger.count == grid.count:
             break
         grid = larger

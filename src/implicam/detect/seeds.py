@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from implicam.dataset import Floats
+from implicam.detect.corners import Bools
 from implicam.images import Grey, eight_bit, opencv
 
 MIN_ROWS = 4
@@ -163,9 +164,8 @@ def find_saddles(picture: Grey, blur: float = 1.5) -> Saddles:
     cv2 = opencv()
     smooth = cv2.GaussianBlur(picture, (0, 0), blur)
     uu, vv, uv = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1)))
-    strength = uv * uv
+    strength = uv * uv  # its square
     strength -= np.multiply(uu, vv, out=smooth)
-    np.sqrt(np.maximum(strength, 0, out=strength), out=strength)
     peak = (strength >= cv2.dilate(strength, np.ones((5, 5), np.uint8), dst=smooth)) & (strength > 0)
     peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = False, False, False, False
     at = np.flatnonzero(peak)
@@ -175,7 +175,7 @@ def find_saddles(picture: Grey, blur: float = 1.5) -> Saddles:
         at, height = at[enough], height[enough]
     v, u = np.unravel_index(at[np.argsort(-height, kind="stable")[:MAX_SADDLES]], strength.shape)
     if len(v):
-        clear = strength[v, u] > MIN_STRENGTH_RATIO * strength[v, u][min(FAINT_RANK, len(v) - 1)]
+        clear = strength[v, u] > MIN_STRENGTH_RATIO**2 * strength[v, u][min(FAINT_RANK, len(v) - 1)]
         v, u = v[clear], u[clear]
     hessian = np.stack([uu[v, u], uv[v, u], uv[v, u], vv[v, u]], axis=1).reshape(-1, 2, 2).astype(np.float64)
     values, vectors = np.linalg.eigh(hessian)
@@ -187,67 +187,73 @@ def find_saddles(picture: Grey, blur: float = 1.5) -> Saddles:
     return Saddles(np.column_stack([u, v]).astype(np.float64), edges, vectors[:, :, 1])
 
 
-def from_saddles(points: Saddles, taken: Callable[[Floats], bool]) -> Iterator[Floats]:
+def from_saddles(
+    points: Saddles, taken: Callable[[Floats], Bools], promising: Callable[[Floats], Bools]
+) -> Iterator[Floats]:
     """Three by three saddle points that lie as corners of a board do; each is the middle of one seed at most.
 
     Args:
         points: Saddle points.
-        taken: Whether a pixel (2,) belongs to a board already; no seed is made there.
+        taken: Which of pixels (n, 2) belong to a board already; no seeds are made there. Asked again after each seed.
+        promising: Which of seeds (n, 3, 3, 2) are worth a closer look; the others count, but are not handed on.
 
     Yields:
-        Seeds (3, 3, 2) in pixels, the strongest first, at most `MAX_SEEDS`.
+        Seeds (3, 3, 2) in pixels, the strongest first, from at most `MAX_SEEDS`.
     """
     if len(points.uv) < 9:
         return
     given = 0
-    arms: list[NDArray[np.intp] | None] = []
-    for k in range(len(points.uv)):
-        if k == len(arms):
-            arms += _find_arms(points, slice(k, k + TOGETHER))
-        four = arms[k]
-        seed = None if four is None or taken(points.uv[k]) else _make_square(points, k, four)
-        if seed is not None:
-            yield seed
+    for some in np.split(np.arange(len(points.uv)), range(TOGETHER, len(points.uv), TOGETHER)):
+        some = some[~taken(points.uv[some])]
+        middles, seeds = _make_squares(points, some, *_find_arms(points, some))
+        there = np.zeros(len(middles), dtype=np.bool_)
+        for k, (seed, good) in enumerate(zip(seeds, promising(seeds), strict=True)):
+            if there[k]:
+                continue
+            if good:
+                yield seed
+                there = taken(points.uv[middles])
             given += 1
             if given == MAX_SEEDS:
                 return
 
 
-def _find_arms(points: Saddles, some: slice) -> list[NDArray[np.intp] | None]:
-    """Of each of some points, the nearest points (4,) along its two edges, there and back, within 20 degrees; None
-    where one of them is missing."""
-    away = points.uv - points.uv[some, None]
-    distance = np.linalg.norm(away, axis=2)
-    other = np.abs(points.bright[some] @ points.bright.T) < 0.75  # from corner to corner bright and dark change over
-    other &= distance > 0
-    distance[~other] = np.inf
-    along = away @ points.edges[some].swapaxes(1, 2)  # (some, n, 2)
+def _find_arms(points: Saddles, some: NDArray[np.intp]) -> tuple[NDArray[np.intp], Bools]:
+    """Of each of some points, the nearest points (n, 4) along its two edges, there and back, within 20 degrees; and
+    (n,) where there are all of them."""
+    du, dv = (points.uv[:, k] - points.uv[some, k, None] for k in range(2))
+    distance = np.hypot(du, dv)
+    # from corner to corner bright and dark change over
+    distance[np.abs(points.bright[some] @ points.bright.T) >= 0.75] = np.inf
+    distance[distance == 0] = np.inf
     least = 0.94 * distance
-    found, there = [], np.ones(len(away), dtype=np.bool_)
+    found, there = [], np.ones(len(some), dtype=np.bool_)
     for edge in range(2):
-        for sign in (1, -1):
-            ahead = np.where(sign * along[..., edge] > least, distance, np.inf)
-            found.append(np.argmin(ahead, axis=1))
-            there &= np.isfinite(ahead.min(axis=1))
-    return [four if good else None for four, good in zip(np.stack(found, axis=1), there, strict=True)]
+        u, v = points.edges[some, edge].T[..., None]
+        along = u * du + v * dv
+        for ahead in (along > least, along < -least):
+            near = np.where(ahead, distance, np.inf)
+            found.append(np.argmin(near, axis=1))
+            there &= np.isfinite(near[np.arange(len(some)), found[-1]])
+    return np.stack(found, axis=1), there
 
 
-def _make_square(points: Saddles, k: int, arms: NDArray[np.intp]) -> Floats | None:
-    """The seed about a point from its four neighbours; None where the corners of the square are missing."""
-    ap, am, bp, bm = points.uv[arms]
-    middle = points.uv[k]
-    seed = np.array([[middle, middle, middle]] * 3)
-    seed[1, 2], seed[1, 0], seed[2, 1], seed[0, 1] = ap, am, bp, bm
-    steps = np.stack([(ap - am) / 2, (bp - bm) / 2])
-    lengths = np.linalg.norm(steps, axis=1)
-    size = lengths.min()
-    if abs(np.linalg.det(steps)) < MIN_ANGLE_SINE * lengths.prod():
-        return None
-    for i, down in ((0, bm), (2, bp)):
-        for j, right in ((0, am), (2, ap)):
-            off = np.linalg.norm(points.uv - (down + right - middle), axis=1)
-            nearest = int(np.argmin(off))
-            if off[nearest] > 0.4 * size:
-                return None
-            seed[i, j] = points.uv[nearest]
-    return seed
+def _make_squares(
+    points: Saddles, some: NDArray[np.intp], arms: NDArray[np.intp], there: Bools
+) -> tuple[NDArray[np.intp], Floats]:
+    """The seeds (m, 3, 3, 2) about those of some points (m,) whose four neighbours and corners of the square exist."""
+    some, arms = some[there], arms[there]
+    middle = points.uv[some]
+    seeds = np.repeat(middle, 9, axis=0).reshape(-1, 3, 3, 2)
+    seeds[:, 1, 2], seeds[:, 1, 0], seeds[:, 2, 1], seeds[:, 0, 1] = points.uv[arms].swapaxes(0, 1)
+    steps = np.stack([seeds[:, 1, 2] - seeds[:, 1, 0], seeds[:, 2, 1] - seeds[:, 0, 1]], axis=1) / 2
+    lengths = np.linalg.norm(steps, axis=2)
+    good = np.abs(np.linalg.det(steps)) >= MIN_ANGLE_SINE * lengths.prod(axis=1)
+    for i in (0, 2):
+        for j in (0, 2):
+            corner = seeds[:, i, 1] + seeds[:, 1, j] - middle
+            square = (points.uv[:, 0] - corner[:, :1]) ** 2 + (points.uv[:, 1] - corner[:, 1:]) ** 2
+            nearest = np.argmin(square, axis=1)
+            good &= square[np.arange(len(some)), nearest] <= (0.4 * lengths.min(axis=1)) ** 2
+            seeds[:, i, j] = points.uv[nearest]
+    return some[good], seeds[good]
