@@ -70,8 +70,9 @@ def looked_at(studio, detector, take=None):
                 seconds += time.process_time() - begin
     names, shots = [camera.name for camera in studio.rig.cameras], list(studio.shots)
 
-    def read(view):
-        return (take or studio.picture)(names.index(view.camera), shots.index(view.shot))
+    def read(views):
+        for view in views:
+            yield view, (take or studio.picture)(names.index(view.camera), shots.index(view.shot))
 
     return detector.look_again(detector.settle(found), read), seconds
 

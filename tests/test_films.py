@@ -118,6 +118,27 @@ def test_a_moving_ball_tells_the_offset_to_a_millisecond(two_films: Path, cli: C
     assert len(again.sheets) == 2
 
 
+@pytest.mark.parametrize("thing", [True, False], ids=["a thing", "a ball"])
+def test_what_a_film_shows_once_and_has_in_its_other_pictures_too_is_no_ball(tmp_path: Path, thing: bool) -> None:
+    """A look-alike that something covers in all pictures of one film but one; or a ball that comes once."""
+    times = np.arange(12) / 6
+    film(tmp_path / "cam1.mkv", 0, times, 6.0, WHERE, "FFV1")
+    rng, pictures = np.random.default_rng(5), []
+    for k in range(len(times)):
+        picture = draw(np.array([150.3, 120.2]) if thing or k == 7 else np.array([-50.0, -50.0]), rng)
+        if thing and k != 7:
+            picture[120:128, 150:] = 130  # a cable that leaves the rest of the disc to be seen
+        pictures.append(picture)
+    write_film(tmp_path / "cam2.mkv", pictures, 6.0, "FFV1")
+    run = detect_films(tmp_path, Ball(), films_of(tmp_path), unit="mm", offsets="0", overlays=False)
+    found = {result.view: result.found for result in run.results}
+    assert [view.shot for view, one in found.items() if view.camera == "cam2" and len(one)] == (
+        [] if thing else ["000007"]
+    )
+    assert not thing or "is in other pictures, too" in found[View("cam2", "000007")].reason
+    assert sum(len(one) for view, one in found.items() if view.camera == "cam1") == len(times)
+
+
 @pytest.mark.slow
 def test_a_table_of_times_says_it_all(tmp_path: Path) -> None:
     folder = tmp_path / "rig"

@@ -10,7 +10,7 @@ moves.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -299,12 +299,8 @@ class Ball(DetectorBase):
             picture: (height, width) grey, in which it was found now.
             found: The ball in `picture`.
         """
-        reach = int(np.ceil(ALIKE_RADII * float(found.notes["radius_px"])))
-        u, v = np.rint(found.uv[0]).astype(int)
-        rows, columns = slice(max(v - reach, 0), v + reach + 1), slice(max(u - reach, 0), u + reach + 1)
-        before, now = (one[rows, columns] - one[rows, columns].mean() for one in (earlier, picture))
-        size = float(np.sqrt(np.mean(before**2) * np.mean(now**2)))
-        return float(np.mean(before * now)) > ALIKE_CORRELATION * size
+        part = _surroundings(found)
+        return _are_alike(earlier[part], picture[part])
 
     def settle(self, found: Mapping[View, Detected]) -> dict[View, Detected]:
         """Drop what is before nothing white, stays at its place in shot after shot, or is far fainter than usual.
@@ -329,31 +325,30 @@ class Ball(DetectorBase):
         }
         return {view: _drop_if_faint(moving[view], usual.get(view.camera, 0.0)) for view in found}
 
-    def look_again(self, found: Mapping[View, Detected], read: Callable[[View], Grey]) -> dict[View, Detected]:
+    def look_again(
+        self, found: Mapping[View, Detected], read: Callable[[Collection[View]], Iterable[tuple[View, Grey]]]
+    ) -> dict[View, Detected]:
         """Drop a ball that a camera shows now and then, where its other pictures show the same thing at that place.
 
         Args:
             found: What `settle` gave of each picture.
-            read: Gives a picture, (height, width) grey.
+            read: Gives pictures, (height, width) grey, each once and in any order.
         """
+        others = _doubtful(found)
+        wanted: dict[View, list[View]] = {}
+        for ball, views in others.items():
+            for view in (ball, *views):
+                wanted.setdefault(view, []).append(ball)
+        parts: dict[View, dict[View, Grey]] = {ball: {} for ball in others}
+        for view, picture in read(wanted) if wanted else ():
+            for ball in wanted[view]:
+                parts[ball][view] = picture[_surroundings(found[ball])].copy()  # not all of a film is kept
         kept = dict(found)
-        tracks = {camera: _Track.of(own, found) for camera, own in _by_camera(found).items()}
-        for camera, own in _by_camera(found).items():
-            balls = [view for view in own if len(found[view])]
-            if len(balls) > MAX_DOUBTFUL_SHARE * len(own):
-                continue
-            for view in balls:
-                others = _spread([other for other in own if not _is_there(found[other], found[view])])
-                shots = {view.shot, *(other.shot for other in others)}
-                witnesses = [track for name, track in tracks.items() if name != camera]
-                rests = sum(_rests(track, shots) for track in witnesses) > 0.5 * len(witnesses)
-                if len(others) == OTHER_PICTURES and not rests:
-                    picture = read(view)
-                    if all(self.was_there(read(other), picture, found[view]) for other in others):
-                        u, v = found[view].uv[0]
-                        kept[view] = nothing(
-                            f"no ball: what looks like one at ({u:.0f}, {v:.0f}) is in other pictures, too"
-                        )
+        for ball, views in others.items():
+            shown = parts[ball]
+            if all(view in shown and ball in shown and _are_alike(shown[view], shown[ball]) for view in views):
+                u, v = found[ball].uv[0]
+                kept[ball] = nothing(f"no ball: what looks like one at ({u:.0f}, {v:.0f}) is in other pictures, too")
         return kept
 
     def correct(self, data: Dataset) -> tuple[Dataset, list[str]]:
@@ -539,6 +534,38 @@ def _by_camera(found: Mapping[View, Detected]) -> dict[str, list[View]]:
 def _is_there(found: Detected, ball: Detected) -> bool:
     """Whether a ball is found within another ball's radius of that one."""
     return len(found) > 0 and float(np.linalg.norm(found.uv[0] - ball.uv[0])) < float(ball.notes["radius_px"])
+
+
+def _doubtful(found: Mapping[View, Detected]) -> dict[View, list[View]]:
+    """The pictures with a ball of cameras that show one now and then, and the pictures each is to be held against."""
+    tracks = {camera: _Track.of(own, found) for camera, own in _by_camera(found).items()}
+    others: dict[View, list[View]] = {}
+    for camera, own in _by_camera(found).items():
+        balls = [view for view in own if len(found[view])]
+        if len(balls) > MAX_DOUBTFUL_SHARE * len(own):
+            continue
+        witnesses = [track for name, track in tracks.items() if name != camera]
+        for ball in balls:
+            against = _spread([view for view in own if not _is_there(found[view], found[ball])])
+            shots = {ball.shot, *(view.shot for view in against)}
+            rests = sum(_rests(track, shots) for track in witnesses) > 0.5 * len(witnesses)
+            if len(against) == OTHER_PICTURES and not rests:
+                others[ball] = against
+    return others
+
+
+def _surroundings(found: Detected) -> tuple[slice, slice]:
+    """Rows and columns of a picture around a ball."""
+    reach = int(np.ceil(ALIKE_RADII * float(found.notes["radius_px"])))
+    u, v = np.rint(found.uv[0]).astype(int)
+    return slice(max(v - reach, 0), v + reach + 1), slice(max(u - reach, 0), u + reach + 1)
+
+
+def _are_alike(before: NDArray[Any], now: NDArray[Any]) -> bool:
+    """Whether two parts of pictures show the same thing, brighter or darker."""
+    before, now = before - before.mean(), now - now.mean()
+    size = float(np.sqrt(np.mean(before**2) * np.mean(now**2)))
+    return float(np.mean(before * now)) > ALIKE_CORRELATION * size
 
 
 def _spread(views: list[View]) -> list[View]:

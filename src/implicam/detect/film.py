@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -41,7 +41,7 @@ from implicam.detect.folder import (
     write_observations,
 )
 from implicam.detect.journal import Entry, Journal, Key, digest, find_entry, join_lines, look_at
-from implicam.detect.model import Detected, Detector, View, nothing
+from implicam.detect.model import Detected, Detector, LooksAgain, View, nothing
 from implicam.detect.overlay import Result
 from implicam.detect.sheets import draw_sheets
 from implicam.detect.tracks import Track
@@ -367,10 +367,22 @@ def _settle(rig: _FilmRig, detector: Detector, searched: Mapping[str, _Searched]
         for view in runs[head]:
             own = searched[view.camera].found[view]
             kept[view] = own if same else nothing(settled[head].reason or "another thing was taken for the target")
+    if isinstance(detector, LooksAgain):
+        kept = detector.look_again(kept, lambda views: _read_again(rig, views))
     results = [
         Result(view, rig.films[camera].path, kept[view]) for camera, one in searched.items() for view in one.found
     ]
     return results, [note for one in searched.values() for note in one.notes]
+
+
+def _read_again(rig: _FilmRig, views: Collection[View]) -> Iterator[tuple[View, Grey]]:
+    """Some pictures of the films, each film read once as far as the last of them."""
+    for camera, film in rig.films.items():
+        wanted = {int(view.shot) for view in views if view.camera == camera}
+        for picture in film.pictures(wanted) if wanted else ():
+            yield View(camera, shot_name(picture.number)), picture.grey
+            if picture.number == max(wanted):
+                break
 
 
 def _rests(before: Detected, after: Detected) -> bool:

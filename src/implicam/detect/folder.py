@@ -411,7 +411,9 @@ def _settle(rig: _Rig, detector: Detector, looked: JournalResults) -> tuple[list
     }
     settled = detector.settle(found)
     if isinstance(detector, LooksAgain):
-        settled = detector.look_again(settled, lambda view: read_picture(rig.pictures[view]))
+        settled = detector.look_again(
+            settled, lambda views: ((view, read_picture(rig.pictures[view])) for view in views)
+        )
     results = [
         Result(view, path, nothing(problems[view]) if view in problems else settled[view], rig.expected(view))
         for view, path in rig.pictures.items()

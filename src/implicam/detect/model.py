@@ -5,7 +5,7 @@ CONTRIBUTING.md has the recipe for one more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -159,12 +159,14 @@ class Detector(Protocol):
 class LooksAgain(Protocol):
     """A detector that looks into some pictures a second time, when it knows what was found in all of them."""
 
-    def look_again(self, found: Mapping[View, Detected], read: Callable[[View], Grey]) -> dict[View, Detected]:
+    def look_again(
+        self, found: Mapping[View, Detected], read: Callable[[Collection[View]], Iterable[tuple[View, Grey]]]
+    ) -> dict[View, Detected]:
         """What is left of what was found.
 
         Args:
             found: What `settle` gave of each picture.
-            read: Gives a picture, (height, width) grey from 0 to 1.
+            read: Gives pictures, (height, width) grey from 0 to 1, each once and in any order: a film is read once.
         """
 
 
