@@ -36,6 +36,8 @@ POINTS = RNG.uniform(-0.7, 0.7, size=(40, 3))
 @pytest.mark.parametrize("one", CAMERAS)
 def test_derivatives_agree_with_finite_differences(one: GeneralCamera) -> None:
     view = one.view(POINTS)
+    for found, expected in zip(one.sight(POINTS), view[:2], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
     scale = np.abs(view.by_parameters).max(axis=(0, 1))
     for number in range(one.size):
         h = 1e-3 / scale[number] if scale[number] > 0 else 1e-6  # a step of a thousandth of a pixel

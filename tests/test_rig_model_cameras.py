@@ -88,6 +88,16 @@ def test_the_log_distance_is_that(name: str) -> None:
 
 
 @every_camera
+def test_what_is_seen_at_a_glance_is_what_is_seen_in_full(name: str) -> None:
+    camera, points = CAMERAS[name][0], seen_points(name)
+    with np.errstate(invalid="ignore"):  # log w behind a linear projection
+        for found, expected in zip(camera.sight(-points), camera.view(-points)[:2], strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
+    for found, expected in zip(camera.sight(points), camera.view(points)[:2], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
+
+
+@every_camera
 def test_a_line_of_sight_passes_through_what_is_seen_on_it(name: str) -> None:
     camera, points = CAMERAS[name][0], seen_points(name)
     centre, directions = camera.lines(camera.pixel(points))

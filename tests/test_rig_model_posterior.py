@@ -349,6 +349,7 @@ def test_rows_and_predictions_agree_with_each_other_and_with_differences() -> No
     at = points[:20] * 0.9
     mean, slope = model.predict(at)
     np.testing.assert_allclose(model.rows(at).mean, mean, atol=1e-9)
+    np.testing.assert_allclose(model.pixel(at), mean, atol=1e-9)
     for one, other in zip(model.rows_and_slope(at), (model.rows(at), slope), strict=True):
         np.testing.assert_array_equal(np.concatenate([*map(np.ravel, one)]), np.concatenate([*map(np.ravel, other)]))
     expected = numeric(lambda d: model.predict(at + d)[0], np.full(3, 1e-5))

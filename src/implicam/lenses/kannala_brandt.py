@@ -86,31 +86,39 @@ class KannalaBrandt:
         """
         return self._by_parameters(self._polar(points))
 
-    def pixel_and_slopes(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """Pixels, `jacobian` and `parameter_jacobian` at once, in half the time.
+    def bend(self, points: Floats) -> Bent:
+        """What the lens makes of points in the plane at distance 1, and its slopes, at once in a fraction of the time.
 
         Args:
             points: (n, 3) in the camera frame.
 
         Returns:
-            (n, 2) pixels, (n, 2, 3) and (n, 2, 8) their derivatives; NaN where there is no pixel.
+            Of n points in columns, which are many times as fast as rows; NaN where there is no pixel.
         """
         at = self._polar(points)
-        pixel = pixel_from_plane(self, at.xyz[:, :2] * at.across[:, None])
-        return pixel, self._by_point(at), self._by_parameters(at)
+        squared = at.theta * at.theta
+        powers = np.empty((4, len(squared)))
+        powers[0] = at.theta * squared
+        for k in range(1, 4):
+            np.multiply(powers[k - 1], squared, out=powers[k])
+        return Bent(at.xyz[:, :2].T * at.across, self._slopes(at), at.outward.T, powers)
 
-    def _by_point(self, at: _Polar) -> Floats:
+    def _slopes(self, at: _Polar) -> Floats:
+        """(2, 3, n) of what is in the plane at distance 1, by the points."""
         x, y, z = at.xyz.T
         cos, sin = at.outward.T
         slope = odd_polynomial_slope(at.theta, self._radial) / (at.r * at.r + z * z)
         along = slope * z  # away from the axis
-        out = np.empty((len(x), 2, 3))
-        out[:, 0, 0] = along * cos * cos + at.across * sin * sin
-        out[:, 1, 1] = along * sin * sin + at.across * cos * cos
-        out[:, 0, 1] = out[:, 1, 0] = (along - at.across) * cos * sin
-        out[:, 0, 2], out[:, 1, 2] = -slope * x, -slope * y
-        jacobian: Floats = np.array([self.fx, self.fy])[:, None] * out
-        return jacobian
+        out = np.empty((2, 3, len(x)))
+        out[0, 0] = along * cos * cos + at.across * sin * sin
+        out[1, 1] = along * sin * sin + at.across * cos * cos
+        out[0, 1] = out[1, 0] = (along - at.across) * cos * sin
+        out[0, 2], out[1, 2] = -slope * x, -slope * y
+        return out
+
+    def _by_point(self, at: _Polar) -> Floats:
+        jacobian: Floats = np.array([self.fx, self.fy])[:, None] * self._slopes(at).transpose(2, 0, 1)
+        return np.ascontiguousarray(jacobian)
 
     def _by_parameters(self, at: _Polar) -> Floats:
         out = np.zeros((len(at.xyz), 2, 8))
@@ -214,6 +222,17 @@ class KannalaBrandt:
         across = divide(bent, r, 1 / np.where(r > 0, 1.0, xyz[:, 2]))
         outward = np.column_stack([divide(xyz[:, 0], r, 1.0), divide(xyz[:, 1], r, 0.0)])  # on the axis any will do
         return _Polar(xyz, valid, r, theta, bent, across, outward)
+
+
+class Bent(NamedTuple):
+    """What a lens makes of n points in the plane at distance 1: xy (2, n); by_point (2, 3, n) its derivative; outward
+    (2, n) the direction away from the axis; powers (4, n) of the angle to it, third to ninth: outward times powers is
+    the derivative by k1 ... k4."""
+
+    xy: Floats
+    by_point: Floats
+    outward: Floats
+    powers: Floats
 
 
 class _Polar(NamedTuple):

@@ -36,6 +36,13 @@ class View(NamedTuple):
     distance_by_point: Floats
 
 
+class Sight(NamedTuple):
+    """Where a camera sees n points, and no derivatives: pixels (n, 2), log distance (n,)."""
+
+    uv: Floats
+    log_distance: Floats
+
+
 class Prior(NamedTuple):
     """A normal prior on the parameters: mean (p,), precision (p, p); zero where nothing is known, as of the pose."""
 
@@ -82,6 +89,15 @@ class CentralCamera:
             slope @ self.pose.rotation,
             there @ self.pose.rotation / squared[:, None],
         )
+
+    def sight(self, points: Floats) -> Sight:
+        """Pixels and log distance of `view`, in a fraction of its time.
+
+        Args:
+            points: (n, 3) in the working frame.
+        """
+        there = self.pose.apply(points)
+        return Sight(self.lens.pixel_from_camera_point(there)[0], 0.5 * np.log(np.sum(there**2, axis=1)))
 
     def pixel(self, points: Floats) -> Floats:
         """Where the camera sees points.
@@ -259,9 +275,17 @@ class ProjectiveCamera:
         Returns:
             (n, 2) pixels, NaN behind the camera.
         """
+        return self.sight(points).uv
+
+    def sight(self, points: Floats) -> Sight:
+        """Pixels and log w of `view`, in a fraction of its time.
+
+        Args:
+            points: (n, 3) in the working frame.
+        """
         x, y, w = (np.column_stack([points, np.ones(len(points))]) @ self.P.T).T
         w = np.where(w > 0, w, np.nan)
-        return np.column_stack([x / w, y / w])
+        return Sight(np.column_stack([x / w, y / w]), np.log(w))
 
     def lines(self, uv: Floats) -> tuple[Floats, Floats]:
         """The lines of sight of pixels, as `CentralCamera.lines`.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from implicam.geometry import Bools, Floats
 from implicam.gp.low_rank import LowRank
-from implicam.rig_model.camera import Image, Prior, View
+from implicam.rig_model.camera import Image, Prior, Sight, View
 from implicam.rig_model.field import UNSCALED_DEPTH, DepthScale, field_coordinates
 from implicam.rig_model.general_camera import AnyCamera
 
@@ -41,12 +41,7 @@ class CameraModel:
         """Number of unknowns."""
         return self.camera.size + 2 * len(self.field.inducing)
 
-    def _views(self, points: Floats) -> tuple[View, View]:
-        """What the camera sees, and its field camera."""
-        view = self.camera.view(points)
-        return view, view if self.field_camera is self.camera else self.field_camera.view(points)
-
-    def coordinates(self, view: View) -> Floats:
+    def coordinates(self, view: View | Sight) -> Floats:
         """Where the field is looked up.
 
         Args:
@@ -75,7 +70,20 @@ class CameraModel:
             Mean pixels (n, 2) and their derivative by the point (n, 2, 3); NaN where the lens has no answer.
         """
         at = self._look(points)
-        return at.view.uv + at.K @ self._coefficients, self._slope(at)
+        return at.view.uv + at.K @ self._coefficients, self._slope(at, points)
+
+    def pixel(self, points: Floats) -> Floats:
+        """The mean pixels of `predict`, in a third of its time.
+
+        Args:
+            points: (n, 3) in the working frame.
+
+        Returns:
+            (n, 2), NaN where the lens has no answer.
+        """
+        seen = self.camera.sight(points)
+        _, K = self._covariance(seen if self.field_camera is self.camera else self.field_camera.sight(points))
+        return np.asarray(seen.uv + K @ self._coefficients, dtype=np.float64)
 
     def rows(self, points: Floats) -> Rows:
         """How the pixels of points depend on the camera's unknowns, about the present mean.
@@ -99,12 +107,17 @@ class CameraModel:
             included.
         """
         at = self._look(points)
-        return self._rows(at), self._slope(at)
+        return self._rows(at), self._slope(at, points)
 
     def _look(self, points: Floats) -> _Looked:
-        view, measured = self._views(points)
+        view = self.camera.view(points)
+        q, K = self._covariance(view if self.field_camera is self.camera else self.field_camera.sight(points))
+        return _Looked(view, q, K)
+
+    def _covariance(self, measured: View | Sight) -> tuple[Floats, Floats]:
+        """Where the field is looked up (n, 3), and its covariance with the inducing points (n, m)."""
         q = self.coordinates(measured)
-        return _Looked(view, measured, q, self.field.kernel(q, self.field.inducing))
+        return q, self.field.kernel(q, self.field.inducing)
 
     def _rows(self, at: _Looked) -> Rows:
         phi = self.field.features_from(at.K)
@@ -112,22 +125,22 @@ class CameraModel:
         mean = at.view.uv + at.K @ self._coefficients
         return Rows(mean, at.view.by_parameters, self.signal * phi, self.signal**2 * left, at.view.by_point)
 
-    def _slope(self, at: _Looked) -> Floats:
+    def _slope(self, at: _Looked, points: Floats) -> Floats:
+        measured = at.view if self.field_camera is self.camera else self.field_camera.view(points)
         by_q = self.field.slope(at.q, at.K, self._coefficients)
         by_point = (
             at.view.by_point
-            + by_q[:, :, :2] @ (at.measured.by_point / self.image.half)
-            + by_q[:, :, 2, None] * (at.measured.distance_by_point[:, None, :] / self.depth.unit)
+            + by_q[:, :, :2] @ (measured.by_point / self.image.half)
+            + by_q[:, :, 2, None] * (measured.distance_by_point[:, None, :] / self.depth.unit)
         )
         return np.asarray(by_point, dtype=np.float64)
 
 
 class _Looked(NamedTuple):
-    """What a camera sees of n points, and its field camera; where the field is looked up (n, 3), and its covariance
-    with the inducing points (n, m)."""
+    """What a camera sees of n points; where the field is looked up (n, 3), and its covariance with the inducing points
+    (n, m)."""
 
     view: View
-    measured: View
     q: Floats
     K: Floats
 

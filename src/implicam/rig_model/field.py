@@ -9,7 +9,7 @@ import numpy as np
 from implicam.geometry import Floats
 from implicam.gp import Kernel
 from implicam.gp.low_rank import LowRank
-from implicam.rig_model.camera import Image, View
+from implicam.rig_model.camera import Image, Sight, View
 
 
 class Hyperparameters(NamedTuple):
@@ -40,7 +40,7 @@ class DepthScale(NamedTuple):
     unit: float = 1.0
 
     @classmethod
-    def of(cls, view: View, typical_sd: float) -> DepthScale:
+    def of(cls, view: View | Sight, typical_sd: float) -> DepthScale:
         """The scale for the known points that a camera sees.
 
         Args:
@@ -58,7 +58,7 @@ UNSCALED_DEPTH = DepthScale()
 """Log distance itself is the coordinate."""
 
 
-def field_coordinates(view: View, image: Image, depth: DepthScale) -> Floats:
+def field_coordinates(view: View | Sight, image: Image, depth: DepthScale) -> Floats:
     """Where a field is looked up, eq. (8).
 
     Args:

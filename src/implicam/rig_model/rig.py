@@ -250,7 +250,7 @@ class FittedRig:
 
     def _pixels(self, points: Floats) -> Floats:
         """(n, C, 2) where the calibrated cameras see points (n, 3) of the working frame."""
-        return np.stack([model.predict(points)[0] for model in self.posterior.models], axis=1)
+        return np.stack([model.pixel(points) for model in self.posterior.models], axis=1)
 
     def matched_views(self, observations: Observations | Dataset) -> tuple[Floats, Floats]:
         """`views` of observations that may have other cameras besides.
@@ -340,7 +340,7 @@ class FittedRig:
         if self.labels is not None:
             where = where + self.labels.off(where)
         for number, c in enumerate(self.cameras):
-            uv[finite, c] = self.posterior.models[number].predict(where)[0]
+            uv[finite, c] = self.posterior.models[number].pixel(where)
         return uv
 
     def sensitivities(self, xyz: Floats) -> list[Sensitivity]:

@@ -121,7 +121,7 @@ def size_fields(
     def one(c: int) -> CameraModel:
         model = models[c]
         points = training.points[used[c].rows]
-        view = model.camera.view(points[:: max(1, len(points) // 4000)])
+        view = model.camera.sight(points[:: max(1, len(points) // 4000)])
         depth = DepthScale.of(view, training.settings.typical_log_distance_sd)
         tolerance = FIELD_VARIANCE_TOLERANCE[model.camera.kind]
         field = empty_field(hyper.lengthscale[c], field_coordinates(view, model.image, depth), tolerance)

@@ -247,7 +247,7 @@ def plan_rig(
     rows = [np.flatnonzero(seen[:, c]) for c in numbers]
     models = tuple(_model(cameras[c], frame, points[mine], settings) for c, mine in zip(numbers, rows, strict=True))
     views = tuple(
-        CameraViews(mine, model.predict(points[mine])[0], np.ones(len(mine)))
+        CameraViews(mine, model.pixel(points[mine]), np.ones(len(mine)))
         for model, mine in zip(models, rows, strict=True)
     )
     alone = tuple(solve_normal(each.A, each.b)[0] for each in camera_normals(models, points, views))

@@ -103,7 +103,7 @@ def check_fitted(training: Training, state: Round) -> None:
         points = points + posterior.displacement
     for number, (model, views) in enumerate(zip(posterior.models, training.camera_views, strict=True)):
         used = views.select(state.inliers[number])
-        error = np.linalg.norm(model.predict(points[used.rows])[0] - used.uv, axis=1) / used.relative
+        error = np.linalg.norm(model.pixel(points[used.rows]) - used.uv, axis=1) / used.relative
         limit = training.settings.max_median_error_noises * model.noise
         if len(error) < MIN_POINTS_PER_CAMERA or not np.median(error) < limit:
             off = float(np.median(error)) if len(error) else np.nan
