@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from implicam.gp import GaussianProcess, Kernel
-from implicam.gp.low_rank import MAX_CANDIDATE_POINTS, LowRank, pivoted_cholesky
+from implicam.gp.low_rank import MAX_CANDIDATE_POINTS, LowRank, pivoted_cholesky, pivoted_kernel
 
 NOISE_SD, SIGNAL = 0.1, 1.7
 LENGTHSCALE = np.array([0.6, 0.6, 1.5])
@@ -92,6 +92,16 @@ def test_pivoted_cholesky_leaves_less_than_the_tolerance(tolerance: float) -> No
     before = np.diag(K - factor[:, :-1] @ factor[:, :-1].T)
     assert before.max() > tolerance  # one fewer would not have been enough
     assert pivots[-1] == np.argmax(before)
+
+
+@pytest.mark.parametrize(("lengths", "n"), [(0.25, 300), (1.0, 600), (1.0, 40)])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-6])
+def test_the_rows_of_the_pivots_alone_give_the_same_factor(lengths: float, n: int, tolerance: float) -> None:
+    one, X = Kernel("squared-exponential", 1.7, lengths * LENGTHSCALE), points(n, 9)
+    pivots, factor = pivoted_kernel(one, X, tolerance)
+    expected, factor_expected = pivoted_cholesky(one(X, X), tolerance)
+    np.testing.assert_array_equal(pivots, expected)
+    np.testing.assert_allclose(factor, factor_expected, atol=1e-9)
 
 
 def test_pivots_are_where_most_is_left() -> None:

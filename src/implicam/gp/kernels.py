@@ -102,4 +102,15 @@ class Kernel:
         """
         scaled = A / self.lengthscale
         d2 = squared_distances(scaled, scaled if A is B else B / self.lengthscale)
+        return self.of_squared_distances(d2)
+
+    def of_squared_distances(self, d2: Floats) -> Floats:
+        """The covariance of function values at inputs so far apart.
+
+        Args:
+            d2: Squared distances in lengthscales, of any shape; may be overwritten.
+
+        Returns:
+            The shape of `d2`.
+        """
         return self.signal_variance * SHAPES[self.shape](d2)[0]

@@ -21,6 +21,12 @@ from implicam.gp.linalg import address, cholesky, load_routine, solve_lower
 MAX_CANDIDATE_POINTS = 1000
 """Points of many among which the inducing points are looked for; drawn at random but always the same."""
 
+FEWEST_POINTS_BY_ROWS = 250
+"""From so many points on, a kernel matrix takes longer than the rows of its pivots one by one."""
+
+MOST_ROWS = 0.2
+"""A part of the points: with more pivots than this the whole matrix takes less time again."""
+
 _DPSTRF = load_routine("dpstrf", 9)
 
 
@@ -50,7 +56,7 @@ class LowRank:
             if len(X) <= MAX_CANDIDATE_POINTS
             else X[np.random.default_rng(0).choice(len(X), MAX_CANDIDATE_POINTS, replace=False)]
         )
-        pivots, _ = pivoted_cholesky(kernel(drawn, drawn), tolerance)
+        pivots, _ = pivoted_kernel(kernel, drawn, tolerance)
         return cls(kernel, drawn[pivots])
 
     @cached_property
@@ -108,6 +114,47 @@ class LowRank:
         both = coefficients[:, :, None] * pulled[:, None, :]
         toward = np.einsum("nm,mkd->nkd", K, both, optimize=True)
         return np.asarray(toward - value[:, :, None] * scaled[:, None, :], dtype=np.float64)
+
+
+def pivoted_kernel(kernel: Kernel, X: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
+    """`pivoted_cholesky` of the kernel matrix of many points, of which only the pivots' rows are made.
+
+    Args:
+        kernel: Of any variance.
+        X: (n, d) points.
+        tolerance: What may be left on the diagonal.
+
+    Returns:
+        (m,) pivots, and (n, m) the factor, rows as in X.
+    """
+    n = len(X)
+    if n < FEWEST_POINTS_BY_ROWS or not np.isfinite(X).all():
+        return pivoted_cholesky(kernel(X, X), tolerance)
+    columns = np.ascontiguousarray((X / kernel.lengthscale).T)
+    squares = np.einsum("ij,ij->j", columns, columns)
+    left = np.full(n, kernel.signal_variance)
+    rows, pivots = np.empty((64, n)), []
+    while len(pivots) < n:
+        i, m = int(left.argmax()), len(pivots)
+        if not left[i] > tolerance:
+            break
+        if m > MOST_ROWS * n:
+            return pivoted_cholesky(kernel(X, X), tolerance)
+        if m == len(rows):
+            rows = np.concatenate([rows, np.empty_like(rows)])
+        d2 = columns[:, i] @ columns
+        d2 *= -2.0
+        d2 += squares
+        d2 += squares[i]
+        row = kernel.of_squared_distances(np.maximum(d2, 0.0, out=d2))
+        if m:
+            row -= rows[:m, i] @ rows[:m]
+        row /= np.sqrt(left[i])
+        rows[m] = row
+        left -= np.multiply(row, row, out=row)
+        pivots.append(i)
+        left[pivots] = -np.inf  # by rounding a little may be left there
+    return np.array(pivots, dtype=np.int64), np.ascontiguousarray(rows[: len(pivots)].T)
 
 
 def pivoted_cholesky(K: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:

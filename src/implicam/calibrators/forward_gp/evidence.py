@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 
 from implicam.calibrators.forward_gp.settings import ForwardGPSettings
 from implicam.geometry import Floats
-from implicam.gp.low_rank import pivoted_cholesky
+from implicam.gp.low_rank import pivoted_kernel
 from implicam.rig_model.camera import Prior
 from implicam.rig_model.field import Hyperparameters, field_kernel
 from implicam.rig_model.normal_equations import stable_cholesky
@@ -77,7 +77,7 @@ class CameraEvidence:
             What `objective` needs.
         """
         p = self.X.shape[2]
-        _, phi = pivoted_cholesky(field_kernel(lengthscale)(self.q, self.q), tolerance)
+        _, phi = pivoted_kernel(field_kernel(lengthscale), self.q, tolerance)
         phi /= self.relative[:, None]
         both = np.concatenate([self.residual[:, :, None], self.X], axis=2) / self.relative[:, None, None]
         e, V = np.linalg.eigh(phi.T @ phi)
