@@ -133,7 +133,8 @@ def pivoted_kernel(kernel: Kernel, X: Floats, tolerance: float) -> tuple[NDArray
     columns = np.ascontiguousarray((X / kernel.lengthscale).T)
     squares = np.einsum("ij,ij->j", columns, columns)
     left = np.full(n, kernel.signal_variance)
-    rows, pivots = np.empty((64, n)), []
+    rows = np.empty((64, n))
+    pivots: list[int] = []
     while len(pivots) < n:
         i, m = int(left.argmax()), len(pivots)
         if not left[i] > tolerance:
