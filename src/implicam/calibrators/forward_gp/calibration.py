@@ -19,10 +19,10 @@ from implicam.calibrators.forward_gp.camera_notes import kind_notes
 from implicam.calibrators.forward_gp.fit import AUTO, fit_rig
 from implicam.calibrators.forward_gp.position_error_fit import separate_position_errors
 from implicam.calibrators.forward_gp.settings import DEFAULT_SETTINGS, ForwardGPSettings, Training
-from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, find_faults, fit_to_wand
+from implicam.calibrators.forward_gp.wand import WandDiagnosis, Waved, find_faults, fit_to_bars, fit_to_wand
 from implicam.calibrators.forward_gp.wand.fitted import stated_again
 from implicam.calibrators.forward_gp.wand.gauge import cameras_move_with_the_world
-from implicam.calibrators.forward_gp.wand.held_out import hold_lengths_out
+from implicam.calibrators.forward_gp.wand.held_out import hold_bars_out, hold_lengths_out
 from implicam.calibrators.protocol import (
     Arrays,
     CalibratorBase,
@@ -39,6 +39,7 @@ from implicam.calibrators.protocol import (
 from implicam.dataset import Dataset, remove_copies
 from implicam.dataset.frames import rigid_parts
 from implicam.dataset.requirements import require_dataset
+from implicam.dataset.scale_bars import in_one_line, read_bars
 from implicam.dataset.unused import Rejected, Unused, describe_point_copies, explain_copied_cameras, list_copied_points
 from implicam.dataset.wand import Wand, wand_of
 from implicam.errors import UsageError, did_you_mean
@@ -71,6 +72,8 @@ class ForwardGP(CalibratorBase):
     wand: the distance between two markers that were waved at places nobody knows (the columns `frame` and `marker` say
     which they are), in the dataset's unit; wand_sd: its standard uncertainty, one error for all frames; wand_jitter:
     how much it varies from frame to frame; wand_ends: the names of the two, where there are others: single points.
+    scale_bars: instead of a wand, known lengths between points at places nobody knows: `a,b,812.4,0.2`, several with
+    semicolons, or the name of a table a,b,distance,sd.
     known: known points that the same cameras saw: they say where the world is, and more. What [target] of the dataset
     says of a wand holds where these are not given. Cameras are ordinary ones then (`lens`
     does not count). docs/wand.md.
@@ -94,6 +97,10 @@ class ForwardGP(CalibratorBase):
     known: Dataset | None = field(
         default=None, metadata=option("known points, adjusted together with a wand", "DATASET", is_dataset=True)
     )
+    scale_bars: str = field(
+        default="",
+        metadata=option("known lengths between points nobody knows, without a wand: a .csv, or", "A,B,LENGTH[,SD]"),
+    )
     seed: int = 0
     settings: ForwardGPSettings = DEFAULT_SETTINGS
 
@@ -114,6 +121,14 @@ class ForwardGP(CalibratorBase):
                 raise UsageError(f"{name} = {length}; it is a length.", fix="for example wand = 500")
         if self.wand_ends and len(self._ends) != 2:
             raise UsageError(f"wand_ends = {self.wand_ends!r}; a wand has two ends.", fix="two names, as in pt1,pt2")
+        if self.scale_bars:
+            if self.wand or self.known is not None:
+                raise UsageError(
+                    "scale bars are for points without a wand, and without known positions.",
+                    fix="leave out --wand and --known, or --scale-bars",
+                )
+            # a calibration file says what the table said
+            object.__setattr__(self, "scale_bars", in_one_line(read_bars(self.scale_bars)))
         super().__post_init__()
 
     @property
@@ -156,6 +171,10 @@ class ForwardGP(CalibratorBase):
         """
         require_dataset(data)
         with explain_fit_error(data):
+            if self.scale_bars:
+                with solvable(), blas_threads(1):
+                    kept, frame, fitted, waved = fit_to_bars(data, read_bars(self.scale_bars), self.settings, progress)
+                return ForwardGPCalibration(self, kept, frame, fitted, waved=waved)
             wand = self._wand(data)
             if wand is not None:
                 with solvable(), blas_threads(1):
@@ -327,19 +346,21 @@ class ForwardGPCalibration(RigCalibration):
             return None
         kept: LengthsHeldOut | None = self.__dict__.get(_HELD_OUT)
         if kept is None:
-            kept = self.__dict__[_HELD_OUT] = hold_lengths_out(self, progress)  # a fit: once is enough
+            hold_out = hold_bars_out if self.waved.bars else hold_lengths_out
+            kept = self.__dict__[_HELD_OUT] = hold_out(self, progress)  # a fit: once is enough
         return kept
 
     @property
     def wand(self) -> Wand | None:
-        """The wand as it was used; None for a calibration from known points."""
-        return None if self.waved is None else self.waved.wand
+        """The wand as it was used; None for a calibration from known points, or from scale bars."""
+        return None if self.waved is None or self.waved.bars else self.waved.wand
 
     def _refuse_wand(self) -> None:
         if self.waved is not None:
+            of = "scale bars" if self.waved.bars else "a wand"
             raise UsageError(
-                "this calibration was made from a wand, without known points, so none can be held out or added.",
-                fix="calibrate the whole dataset of the wand again, or evaluate with a dataset of known points: "
+                f"this calibration was made from {of}, without known points, so none can be held out or added.",
+                fix="calibrate the whole dataset again, or evaluate with a dataset of known points: "
                 "implicam evaluate FILE DATASET",
             )
 
@@ -522,7 +543,9 @@ class ForwardGPCalibration(RigCalibration):
                 points_used=len(self.used),
                 points_unused=len(self.waved.unused),
                 views_rejected=len(self.rejected),
-                held_out="the length of the wand, measured in each frame without knowing it, is right",
+                held_out="each scale bar, measured without knowing it, is right"
+                if self.waved.bars
+                else "the length of the wand, measured in each frame without knowing it, is right",
                 leave_one_out_rms={"length": float(np.sqrt(np.mean(self.waved.errors**2)))},
                 leave_one_out_mean_sd={"length": float(np.mean(self.waved.sds))},
                 noise_px=dict(zip(self.camera_names, map(float, noise), strict=True)),
@@ -563,7 +586,9 @@ class ForwardGPCalibration(RigCalibration):
         Raises:
             KeyError, ValueError, TypeError: Something is missing or does not fit.
         """
-        before_wands = {name: getattr(ForwardGP, name) for name in ("wand", "wand_sd", "wand_jitter", "wand_ends")}
+        before_wands = {
+            name: getattr(ForwardGP, name) for name in ("wand", "wand_sd", "wand_jitter", "wand_ends", "scale_bars")
+        }
         calibrator = ForwardGP.from_table({**before_wands, **table}, known=stated_again(data))
         working = Frame.from_array(finite_column(arrays, "frame", (4,)))
         used = remove_copies(data)

@@ -5,7 +5,7 @@ In the order of the fit: `waves` (what was seen), `pairs` and `start` (from no g
 `held_out` (what speaks against it).
 """
 
-from implicam.calibrators.forward_gp.wand.fitted import WandDiagnosis, Waved, fit_to_wand
+from implicam.calibrators.forward_gp.wand.fitted import WandDiagnosis, Waved, fit_to_bars, fit_to_wand
 from implicam.calibrators.forward_gp.wand.held_out import find_faults
 
-__all__ = ["WandDiagnosis", "Waved", "find_faults", "fit_to_wand"]
+__all__ = ["WandDiagnosis", "Waved", "find_faults", "fit_to_bars", "fit_to_wand"]

@@ -43,10 +43,10 @@ class WhiteRows(NamedTuple):
 
 
 class Lengths(NamedTuple):
-    """Of the frames where it is used, (k,) numbers: sd (k,) about the length of the wand."""
+    """Of the frames where it is used, (k,) numbers: length (k,), of a wand the same in all; sd (k,) about it."""
 
     frames: np.ndarray
-    length: float
+    length: Floats
     sd: Floats
 
     def linear(self, places: Floats) -> tuple[Floats, Floats]:

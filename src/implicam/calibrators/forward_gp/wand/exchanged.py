@@ -36,6 +36,8 @@ def find_exchanged(waves: Waves, cameras: Mapping[int, CentralCamera | GeneralCa
     Returns:
         (F, C).
     """
+    if waves.still:
+        return np.zeros((waves.frames, len(waves.seen)), dtype=np.bool_)
     whole, uv = waves.whole_views, waves.uv
     votes = np.zeros((waves.frames, uv.shape[1], uv.shape[1]), dtype=np.int8)
     for i, j in combinations(sorted(cameras), 2):
@@ -47,7 +49,7 @@ def find_exchanged(waves: Waves, cameras: Mapping[int, CentralCamera | GeneralCa
             one = _meet(waves, cameras, (i, j), (2 * frames, 2 * frames + crossed))
             two = _meet(waves, cameras, (i, j), (2 * frames + 1, 2 * frames + 1 - crossed))
             off.append(np.maximum(one[1], two[1]))
-            sizes.append(np.linalg.norm(two[0] - one[0], axis=1) / waves.length)
+            sizes.append(np.linalg.norm(two[0] - one[0], axis=1) / waves.lengths[frames])
         right = np.abs(np.array(sizes) - 1) < MAX_LENGTH_ERROR
         straight = (off[0] < near_px) & (off[1] > CLEARLY_OFF * near_px)
         crossed_only = (off[1] < near_px) & right[1] & ((off[0] > CLEARLY_OFF * near_px) | ~right[0])

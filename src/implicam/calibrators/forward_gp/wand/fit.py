@@ -145,6 +145,8 @@ def fit_wand(waves: Waves, settings: ForwardGPSettings, length_sd: float, progre
         tried.append(started.first)
         try:
             return _from_start(started, settings, length_sd, progress)
+        except _Decided:
+            raise
         except (FitError, np.linalg.LinAlgError) as error:
             failure = failure or error
             _LOG.info("from %s: %s", started.first, error)
@@ -154,16 +156,23 @@ def fit_wand(waves: Waves, settings: ForwardGPSettings, length_sd: float, progre
     raise _explained(failure, waves)
 
 
+class _Decided(FitError):
+    """No other start would change it."""
+
+
 def _explained(failure: FitError | np.linalg.LinAlgError, waves: Waves) -> FitError:
     """With the cause, where it can be told."""
-    why = explain_no_rig(waves)
+    why = "" if waves.still else explain_no_rig(waves)
     if not why and isinstance(failure, FitError):
         return failure
     if not why:
         return FitError(
-            "no camera can be calibrated from this wand: the equations have no solution.",
-            why="the views contradict each other, or the wand was in too little of what the cameras see",
-            fix="look for cameras that are out of step and for wrong views; wave it in all directions, near and far",
+            f"no camera can be calibrated from {'these points' if waves.still else 'this wand'}: the equations have no "
+            "solution.",
+            why="the views contradict each other, or they are in too little of what the cameras see",
+            fix="show more points where the cameras look together, near and far"
+            if waves.still
+            else "look for cameras that are out of step and for wrong views; wave it in all directions, near and far",
         )
     what = failure.what if isinstance(failure, FitError) else "no camera can be calibrated from this wand."
     return FitError(what, why=why, fix="trigger all cameras by one signal; of films, detect --offsets says by how much")
@@ -232,8 +241,8 @@ class _State:
         Args:
             frames: Their numbers.
         """
-        sd = np.full(len(frames), self.waves.jitter / self.scale)
-        return Lengths(frames, self.waves.length / self.scale, sd)
+        found = self.waves.lengths_of(frames)
+        return Lengths(frames, found.length / self.scale, found.sd / self.scale)
 
     def grown_lengths_of(self, frames: NDArray[np.int64]) -> Lengths:
         """The same, as long as the known places say.
@@ -257,10 +266,8 @@ def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings, lengt
         bundle = bundle_of(waves, cameras, places, settings)
         seen = [waves.seen[c].select(agree[waves.seen[c].rows, c]) for c in numbers]
         frames = np.flatnonzero(known.reshape(-1, 2).all(axis=1) & waves.ends)
-        sd = np.full(len(frames), max(relative * waves.length, waves.jitter))
-        bundle = bundle.adjusted(
-            seen, sigma * half, Lengths(frames, waves.length, sd), robust=True, max_steps=25, tolerance=1e-4
-        )
+        stated = waves.lengths_of(frames, relative)
+        bundle = bundle.adjusted(seen, sigma * half, stated, robust=True, max_steps=25, tolerance=1e-4)
         cameras = dict(zip(numbers, bundle.cameras, strict=True))
         off = np.concatenate([e / h for e, h in zip(bundle.errors(seen), half, strict=True)])
         # a place takes up a part of its views' errors: of two views three numbers of four
@@ -295,7 +302,7 @@ def _adjusted(waves: Waves, started: Started, settings: ForwardGPSettings, lengt
         models.append(lens_only_model(InitialCamera(camera, prior, agree[:, c], family), waves.images[c], noise))
     # seen by cameras of any kind alone, the world may be stretched: there lengths are needed from the start
     odd = any(isinstance(camera, GeneralCamera) for camera in cameras.values())
-    lengths = _likely_lengths(waves, at, known) if odd else np.zeros(waves.frames, dtype=np.bool_)
+    lengths = _likely_lengths(waves, at, known) if odd or waves.still else np.zeros(waves.frames, dtype=np.bool_)
     unused = np.zeros(len(anchors.rows), dtype=np.bool_)
     state = _State(
         waves, numbers, tuple(models), working, agree, lengths, scale, anchors, unused, offset=offset
@@ -336,9 +343,8 @@ def _freed(
     def adjusted(own: dict[int, WandCamera], steps: int) -> tuple[dict[int, WandCamera], Bundle, Floats]:
         seen = [waves.seen[c].select(agree[waves.seen[c].rows, c]) for c in numbers]
         frames = np.flatnonzero(np.isfinite(places[:, 0]).reshape(-1, 2).all(axis=1) & waves.ends)
-        sd = np.full(len(frames), max(0.001 * waves.length, waves.jitter))
         found = bundle_of(waves, own, places, settings).adjusted(
-            seen, sigma * half, Lengths(frames, waves.length, sd), robust=True, max_steps=steps, tolerance=1e-3
+            seen, sigma * half, waves.lengths_of(frames, 0.001), robust=True, max_steps=steps, tolerance=1e-3
         )
         off = [float(np.median(e / h)) for e, h in zip(found.errors(seen), half, strict=True)]
         return dict(zip(numbers, found.cameras, strict=True)), found, np.array(off)
@@ -369,9 +375,9 @@ def _likely_lengths(waves: Waves, at: Floats, known: Bools) -> Bools:
     """(F,) frames in which places (2 F, 3) are as far apart as in most."""
     both = known.reshape(-1, 2).all(axis=1) & waves.ends
     ends = at.reshape(-1, 2, 3)
-    off = np.abs(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / waves.length - 1)
+    off = np.abs(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / waves.lengths - 1)
     usual = 1.4826 * float(np.median(off[both])) if both.any() else 0.0
-    return np.asarray(both & (off < max(4 * usual, 4 * waves.jitter / waves.length)), dtype=np.bool_)
+    return np.asarray(both & (off < np.maximum(4 * usual, 4 * waves.jitter / waves.lengths)), dtype=np.bool_)
 
 
 MAX_FREER_ERROR_RATIO = 0.7
@@ -553,10 +559,13 @@ def _without_poor_cameras(state: _State) -> _State:
     if len(good) == len(state.cameras):
         return state
     if len(good) < 2:
+        shown = "these points" if state.waves.still else "this wand"
         raise FitError(
-            f"{len(good)} of {len(state.waves.seen)} cameras can be calibrated from this wand; a position takes two.",
+            f"{len(good)} of {len(state.waves.seen)} cameras can be calibrated from {shown}; a position takes two.",
             why="the views of the others contradict each other",
-            fix="look whether frames and markers belong together in all cameras, and wave the wand where they see it "
+            fix="look whether names mean the same point in all cameras, and show more points in all of their pictures"
+            if state.waves.still
+            else "look whether frames and markers belong together in all cameras, and wave the wand where they see it "
             "together",
         )
     used = state.used.copy()
@@ -572,14 +581,24 @@ def _finished(state: _State, settings: ForwardGPSettings, length_sd: float) -> W
     known, waves = state.known, state.waves
     equations, root, hyper = _known(state.equations), _known(state.root), _known(state.hyper)
     whole = state.lengths & known.reshape(-1, 2).all(axis=1) & waves.ends
-    checked = known & ((state.used.sum(axis=1) >= 3) | np.repeat(whole, 2))
+    bars_check = not waves.still or whole.sum() >= MIN_CHECKING_BARS
+    checked = known & ((state.used.sum(axis=1) >= 3) | np.repeat(whole & bars_check, 2))
+    if checked.sum() < MIN_CHECKED_PLACES and waves.still:
+        raise FitError(
+            f"{checked.sum()} points are where something checks them; it takes {MIN_CHECKED_PLACES}.",
+            why="two views meet nearly anywhere, and of two cameras alone points do not tell what lenses they have",
+            fix="take three cameras or more that see the same points; or wave a wand before these (--wand)",
+        )
+    if waves.still:
+        _refuse_unsized(state, whole)
     if checked.sum() < MIN_CHECKED_PLACES:
         raise FitError(
             f"{checked.sum()} markers of the wand are where something checks them; it takes {MIN_CHECKED_PLACES}.",
             why="two views meet nearly anywhere; a third one, or the length of the wand, must agree",
             fix="wave the wand longer where two cameras or more see both its markers",
         )
-    _refuse_contradicted(state, whole)
+    if not waves.still:
+        _refuse_contradicted(state, whole)
     refuse_contradicting_known(state.anchors, state.places, state.anchored & state.known[state.anchors.rows])
     anchors = state.facts.known
     checked[anchors.rows] = True
@@ -624,6 +643,35 @@ def _offsets(state: _State) -> tuple[Offset, ...]:
     equations = (lengths.frames, *lengths.linear(state.places))
     found = time_offsets(white, equations, _known(state.equations), moving.reshape(-1, 3))
     return clear_offsets(state.cameras, found)
+
+
+MIN_CHECKING_BARS = 3
+"""Scale bars that check each other: one gives the size, and of two that differ none is known to be right."""
+
+
+def _refuse_unsized(state: _State, whole: Bools) -> None:
+    """Stop where no scale bar gives the size, or most contradict each other."""
+    seen = np.isfinite(state.waves.uv[:, list(state.cameras), 0]).sum(axis=1) >= 2
+    bars = np.flatnonzero(seen.reshape(-1, 2).all(axis=1) & state.waves.ends)
+    if not len(bars):
+        names = ", ".join(name for name, bar in zip(state.waves.frame_names, state.waves.ends, strict=True) if bar)
+        raise _Decided(
+            f"no scale bar has both ends where two cameras see them ({names}): the rig has no size.",
+            fix="take two points that several cameras see",
+        )
+    if whole.sum() >= (2 if len(bars) == 2 else 0.5 * len(bars)):
+        return
+    size = np.linalg.norm(state.places[bars, 1] - state.places[bars, 0], axis=1) * state.scale
+    there = np.asarray(state.known.reshape(-1, 2)[bars].all(axis=1))
+    told = [
+        f"{state.waves.frame_names[f]} {100 * r:.4g} %" if placed else f"{state.waves.frame_names[f]} cannot be placed"
+        for f, r, placed in zip(bars.tolist(), size / state.waves.lengths[bars], there.tolist(), strict=True)
+    ]
+    raise _Decided(
+        f"{whole.sum()} of {len(bars)} scale bars agree with the others and with what the cameras saw.",
+        why=f"measured together they are, of what is stated: {', '.join(told[:5])}",
+        fix="measure them again, or state how exact they are (the column sd); a single one cannot contradict others",
+    )
 
 
 def _refuse_contradicted(state: _State, whole: Bools) -> None:

@@ -17,6 +17,7 @@ from implicam.calibrators.forward_gp.wand.waves import Waves
 from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, KnownPositions, Observations
 from implicam.dataset.requirements import match_cameras
+from implicam.dataset.scale_bars import ScaleBar, bar_rows
 from implicam.dataset.unused import Rejected, Unused
 from implicam.dataset.wand import FRAME, MARKER, Wand, each_place_once, lying_still, marker_rows
 from implicam.errors import DatasetError, UsageError
@@ -49,6 +50,7 @@ class Waved:
         exchanged: Names of cameras, and in how many of their pictures the two ends bore each other's names.
         offsets: Names of cameras whose pictures are not of the instants of the others', by how many frames they are
             later, and its standard uncertainty.
+        bars: Known lengths between points, where these were given and no wand: its length is their median then.
     """
 
     wand: Wand
@@ -61,6 +63,7 @@ class Waved:
     known_scale: tuple[float, float] = (1.0, 0.0)
     exchanged: tuple[tuple[str, int], ...] = ()
     offsets: tuple[tuple[str, float, float], ...] = ()
+    bars: tuple[ScaleBar, ...] = ()
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """A readable table, and arrays, of a calibration file."""
@@ -71,6 +74,8 @@ class Waved:
             "exchanged": [list(one) for one in self.exchanged],
             "offsets": [list(one) for one in self.offsets],
         }
+        if self.bars:
+            table["bars"] = [list(bar) for bar in self.bars]
         if self.known:
             table |= {"known": list(self.known), "known_rejected": list(self.known_rejected)}
             table["known_scale"] = list(self.known_scale)
@@ -110,6 +115,7 @@ class Waved:
             (float(scale[0]), float(scale[1])),
             tuple((str(camera), int(number)) for camera, number in own.get("exchanged", ())),
             tuple((str(camera), float(late), float(sd)) for camera, late, sd in own.get("offsets", ())),
+            tuple(ScaleBar(str(a), str(b), float(length), float(sd)) for a, b, length, sd in own.get("bars", ())),
         )
 
 
@@ -159,6 +165,50 @@ def fit_to_wand(
     if stated is not None:
         waves = replace(waves, known=_known_places(data, rows, wand.length))
     found = fit_wand(waves, settings, wand.length_sd / wand.length, progress)
+    return _told(data, names, rows, waves, found, wand._replace(jitter=jitter), again)
+
+
+def fit_to_bars(
+    data: Dataset, bars: Sequence[ScaleBar], settings: ForwardGPSettings, progress: Progress
+) -> tuple[Dataset, Frame, FitResult, Waved]:
+    """Cameras from points at places nobody knows, and one known length between two of them or several.
+
+    Args:
+        data: The points, and what the cameras saw of them.
+        bars: The known lengths.
+        settings: Priors and thresholds.
+        progress: Is told how far the fit is.
+
+    Returns:
+        As `fit_to_wand`.
+
+    Raises:
+        FitError: Fewer than two cameras can be fitted, or the lengths contradict each other.
+        DatasetError: A bar ends where no point is.
+        UsageError: The positions of the points are known.
+    """
+    if data.known is not None:
+        raise UsageError(
+            "the positions of these points are known, and a scale bar is for points that nobody knows.",
+            fix="leave out --scale-bars; or implicam verify with the lengths, which are a proof then",
+        )
+    names, rows = bar_rows(data, bars)
+    usual = float(np.median([bar.length for bar in bars]))
+    waves = _waves(data, names, rows, settings.usual_wand_jitter_ratio)
+    lengths, jitter = waves.lengths.copy(), waves.jitter.copy()
+    lengths[: len(bars)] = [bar.length / usual for bar in bars]
+    sds = (bar.sd or settings.usual_wand_jitter_ratio * bar.length for bar in bars)
+    jitter[: len(bars)] = [sd / usual for sd in sds]
+    waves = replace(waves, lengths=lengths, jitter=jitter, still=True)
+    found = fit_wand(waves, settings, 0.0, progress)
+    return _told(data, names, rows, waves, found, Wand((), usual), np.zeros(0, dtype=np.int64), tuple(bars))
+
+
+def _told(
+    data: Dataset, names: list[str], rows: NDArray[np.int64], waves: Waves, found: WandFit, wand: Wand,
+    again: NDArray[np.int64], bars: tuple[ScaleBar, ...] = (),
+) -> tuple[Dataset, Frame, FitResult, Waved]:  # fmt: skip
+    """A fit in the units and names of the data; again: rows of markers that lay still."""
     scale = found.scale * wand.length
     frame = Frame(found.offset * wand.length, scale)
     flat = rows.ravel()
@@ -185,12 +235,13 @@ def fit_to_wand(
         tuple(str(data.points[flat[i]]) for i in waves.known.rows[one]) for one in (found.known, ~found.known)
     ]
     waved = Waved(
-        wand._replace(jitter=jitter), found.length_errors * wand.length, found.length_sds * wand.length,
+        wand, found.length_errors * wand.length, found.length_sds * wand.length,
         tuple(names[i] for i in np.flatnonzero(wrong)), unused,
         stated_names[0], stated_names[1],
         found.known_scale,
         tuple((name, int(n)) for name, n in zip(waves.names, found.exchanged.sum(axis=0), strict=True) if n),
         tuple((waves.names[one.camera], one.frames, one.sd) for one in found.offsets),
+        bars,
     )  # fmt: skip
     return kept, frame, fitted, waved
 
@@ -285,7 +336,8 @@ def _waves(data: Dataset, names: Sequence[str], rows: NDArray[np.int64], jitter:
     images = tuple(image_of(observations, c) for c in range(len(observations.cameras)))
     none = np.zeros((len(rows), len(observations.cameras)), dtype=np.bool_)
     ends = np.asarray((rows >= 0).all(axis=1))
-    return Waves(rows, seen, images, stated, 1.0, jitter, ends, none, observations.camera_names, tuple(names))
+    lengths, sds = np.ones(len(rows)), np.full(len(rows), jitter)
+    return Waves(rows, seen, images, stated, lengths, sds, ends, none, observations.camera_names, tuple(names))
 
 
 def _put_right(observations: Observations, rows: NDArray[np.int64], exchanged: Bools) -> Observations:
@@ -338,12 +390,28 @@ class WandDiagnosis(Diagnosis):
         if self.waved.known:
             return [self._known_note(), *super().notes(), *self._length_notes()]
         first = self.data.observations.camera_names[self.fitted.cameras[0]]
+        if self.waved.bars:
+            return [*(self.world or (_points_world(first),)), *super().notes(), *self._bar_notes()]
         own = (
             "The world is the wand's: its origin is the middle of all places where the wand was, its axes are those "
             f"of {first} (x right, y down, z forward). Error bars are of positions relative to these places. "
             "implicam world says where it is instead, from an L-frame, known points, a floor or a plumb line."
         )
         return [*(self.world or (own,)), *super().notes(), *self._picture_notes(), *self._length_notes()]
+
+    def _bar_notes(self) -> list[str]:
+        used, given = len(self.waved.errors), len(self.waved.bars)
+        notes = []
+        if self.waved.rejected_lengths:
+            named = ", ".join(self.waved.rejected_lengths[:MAX_NAMED_IN_NOTE])
+            notes.append(f"Not used, because they contradict the other scale bars or what the cameras saw: {named}.")
+        if used == 1:
+            of = "" if given == 1 else f", of {given} that were given"
+            notes.append(
+                f"The size rests on one length{of}: nothing here checks it. Verify another one (implicam verify), or "
+                "give several."
+            )
+        return notes
 
     def _picture_notes(self) -> list[str]:
         notes = [
@@ -410,6 +478,14 @@ def describe_offsets(waved: Waved) -> list[str]:
         "those of the other cameras: trigger all of them by one signal, or give detect --offsets for films"
         for camera, late, sd in waved.offsets
     ]
+
+
+def _points_world(first: str) -> str:
+    return (
+        "The world is that of the points: its origin is the middle of all that something checks, its axes are those of "
+        f"{first} (x right, y down, z forward). Error bars are of positions relative to these points. implicam world "
+        "says where it is instead."
+    )
 
 
 NARROW_SHARE, MIN_FOR_OUTLINE = 0.15, 12

@@ -10,6 +10,7 @@ import numpy as np
 
 from implicam.calibrators.forward_gp.wand.fitted import STATED, describe_offsets
 from implicam.calibrators.protocol import LengthsHeldOut
+from implicam.dataset.scale_bars import in_one_line
 from implicam.dataset.wand import FRAME, MARKER, marker_rows
 from implicam.derived import distances
 from implicam.errors import FitError
@@ -66,6 +67,77 @@ def hold_lengths_out(calibration: ForwardGPCalibration, progress: Progress) -> L
     )
 
 
+MIN_BARS = 3
+"""Scale bars of which a third can be left out."""
+
+
+def hold_bars_out(calibration: ForwardGPCalibration, progress: Progress) -> LengthsHeldOut | None:
+    """Fit again without a third of the scale bars, and measure these; None of fewer than three that are used.
+
+    Args:
+        calibration: From points and scale bars.
+        progress: Is told that it is checked.
+
+    Raises:
+        FitError: Without these there is no calibration.
+    """
+    assert calibration.waved is not None
+    data = replace(calibration.data, known=None)
+    points = set(map(str, data.points))
+    bars = [bar for bar in calibration.waved.bars if {bar.a, bar.b} <= points]
+    bars = [bar for bar in bars if str(bar) not in calibration.waved.rejected_lengths]
+    if len(bars) < MIN_BARS:
+        return None
+    order = np.random.default_rng(0).permutation(len(bars))
+    held, kept = ([bars[i] for i in part] for part in np.split(order, [len(bars) // FOLDS]))
+    progress("checking", 0, 1)
+    again = replace(calibration.calibrator, scale_bars=in_one_line(kept)).fit(data)
+    measured = again.measure(data.observations)
+    row = {str(name): i for i, name in enumerate(measured.points)}
+    pairs = [(bar, (row[bar.a], row[bar.b])) for bar in held]
+    there = [(bar, pair) for bar, pair in pairs if measured.measured[list(pair)].all()]
+    found = distances(measured, [pair for _, pair in there]) if there else []
+    progress("checking", 1, 1)
+    usual = calibration.calibrator.settings.usual_wand_jitter_ratio
+    return LengthsHeldOut(
+        f"{len(there)} scale bar{'s' * (len(there) != 1)} held out",
+        np.array([one.value - bar.length for one, (bar, _) in zip(found, there, strict=True)]),
+        np.array([np.hypot(one.sd, bar.sd or usual * bar.length) for one, (bar, _) in zip(found, there, strict=True)]),
+    )
+
+
+def _faults_of_bars(calibration: ForwardGPCalibration, progress: Progress) -> Iterator[Finding]:
+    assert calibration.waved is not None
+    if len(calibration.data) < MIN_POINTS:
+        yield Finding(
+            False,
+            f"{len(calibration.data)} points only are where three cameras check each other: show them more, in all of "
+            "their pictures, near and far.",
+        )
+    try:
+        held_out = calibration.hold_lengths_out(progress)
+    except FitError as error:
+        yield Finding(False, f"Without a third of the scale bars there is no calibration ({error.what}).")
+        return
+    if held_out is None or not len(held_out.errors):
+        return
+    worst = float(np.max(np.abs(held_out.errors / held_out.sds)))
+    if worst > MAX_BAR_SDS:
+        rms, stated = (float(np.sqrt(np.mean(v**2))) for v in (held_out.errors, held_out.sds))
+        yield Finding(
+            False,
+            f"Scale bars that a fit did not know come out {rms:.3g} {calibration.data.length_unit} off (rms), where "
+            f"the error bars say {stated:.3g}: are they as exact as is stated (sd), and are their ends the points?",
+        )
+
+
+MIN_POINTS = 40
+"""Points that three cameras see, below which a rig is known by little."""
+
+MAX_BAR_SDS = 4.0
+"""Of a scale bar that was held out."""
+
+
 def find_faults(calibration: ForwardGPCalibration, progress: Progress) -> Iterator[Finding]:
     """What speaks against a calibration from a wand.
 
@@ -74,6 +146,9 @@ def find_faults(calibration: ForwardGPCalibration, progress: Progress) -> Iterat
         progress: Is told that it is checked.
     """
     assert calibration.waved is not None
+    if calibration.waved.bars:
+        yield from _faults_of_bars(calibration, progress)
+        return
     used, unit = len(calibration.waved.errors), calibration.data.length_unit
     for text in describe_offsets(calibration.waved):
         yield Finding(False, f"{text}.")

@@ -44,7 +44,13 @@ class PairStart(NamedTuple):
 
 
 def pair_starts(
-    uv: Floats, frame: NDArray[np.int64], marker: NDArray[np.int64], images: Sequence[Image], length: float
+    uv: Floats,
+    frame: NDArray[np.int64],
+    marker: NDArray[np.int64],
+    images: Sequence[Image],
+    length: Floats,
+    *,
+    still: bool = False,
 ) -> list[PairStart]:
     """All rungs of both cameras, the best first.
 
@@ -53,7 +59,9 @@ def pair_starts(
         frame: (n,) of each point.
         marker: (n,) 0 or 1, or -1 of a point that is no end of the wand.
         images: Of both cameras.
-        length: Of the wand.
+        length: (n,) of the wand in the frame of each point.
+        still: No wand, but points and scale bars: these are ranked by epipolar lines alone, and without a bar the
+            distance of the cameras is 1.
 
     Returns:
         Those whose lines of sight meet before both cameras.
@@ -65,11 +73,11 @@ def pair_starts(
     found = []
     for focals, k, rays in _rungs(uv, images):
         E, px, inliers = _essential(rays, focals, samples, more)
-        placed = _placed(E, rays, inliers, ends)
+        placed = _placed(E, rays, inliers, ends, length, 0 if still else MIN_WHOLE_FRAMES)
         if placed is None:
             continue
         pose, size, spread = placed
-        poses = Pose(np.eye(3), np.zeros(3)), Pose(pose.rotation, pose.translation * (length / size))
+        poses = Pose(np.eye(3), np.zeros(3)), Pose(pose.rotation, pose.translation / size)
         cameras = tuple(
             CentralCamera(KannalaBrandt(f, f, *image.centre.tolist(), *k.tolist()), place)
             for f, image, place in zip(focals, images, poses, strict=True)
@@ -134,11 +142,13 @@ def _distance(E: Floats, rays: Floats, focals: tuple[float, float]) -> Floats:
     return np.asarray(np.abs(off) / np.maximum(scale, 1e-300), dtype=np.float64)
 
 
-def _placed(E: Floats, rays: Floats, inliers: Bools, ends: NDArray[np.int64]) -> tuple[Pose, float, float] | None:
+def _placed(
+    E: Floats, rays: Floats, inliers: Bools, ends: NDArray[np.int64], length: Floats, least: int
+) -> tuple[Pose, float, float] | None:
     """The second camera from the first of the four poses of an essential matrix (Hartley & Zisserman, section 9.6.2),
-    the wand's length with a base of 1, and the spread of its logarithm."""
+    the wand as measured with a base of 1 over its length, and the spread of its logarithm."""
     whole = ends[inliers[ends].all(axis=1)]
-    if len(whole) < MIN_WHOLE_FRAMES:
+    if len(whole) < least:
         return None
     U, _, Vt = np.linalg.svd(E)
     U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
@@ -154,11 +164,13 @@ def _placed(E: Floats, rays: Floats, inliers: Bools, ends: NDArray[np.int64]) ->
     count, pose, x = best
     if count < 0.6 * inliers.sum():
         return None
-    size = np.linalg.norm(x[whole[:, 1]] - x[whole[:, 0]], axis=1)
+    size = np.linalg.norm(x[whole[:, 1]] - x[whole[:, 0]], axis=1) / length[whole[:, 0]]
     log = np.log(np.maximum(size[np.isfinite(size)], 1e-12))
-    if len(log) < MIN_WHOLE_FRAMES:
+    if len(log) < least:
         return None
-    middle = float(np.median(log))
+    middle = float(np.median(log)) if len(log) else 0.0
+    if len(log) < MIN_WHOLE_FRAMES:
+        return pose, float(np.exp(middle)), 1.0
     return pose, float(np.exp(middle)), float(1.4826 * np.median(np.abs(log - middle)))
 
 

@@ -45,6 +45,9 @@ JUDGED_LENGTH_SD = 0.005
 BEST_STARTS = (8, 3, 2)
 """So many rungs of the ladder go through each step."""
 
+STILL_STARTS = (8, 5, 5)
+"""The same where no length tells them apart: other cameras do."""
+
 GOOD_PX, GOOD_SHARE = 2.0, 0.5
 """Median error in pixels of 1280, and share of shared views that agree, of a pair that is good enough to go on with."""
 
@@ -100,6 +103,8 @@ def start(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int
     cameras, waves = pair.cameras, pair.waves
     first = tuple(cameras)
     while True:
+        if waves.still:
+            cameras = _sized(waves, cameras)
         places, agree = consensus(waves, cameras)
         left = [c for c in range(len(waves.seen)) if c not in cameras]
         odd = sum(isinstance(camera, GeneralCamera) for camera in cameras.values()) > len(cameras) / 2
@@ -117,6 +122,20 @@ def start(waves: Waves, settings: ForwardGPSettings, tried: Collection[tuple[int
         waves = waves.with_exchanged(wrong)
         places, agree = consensus(waves, cameras)
     return Started(waves, first, cameras, places, agree)
+
+
+def _sized(waves: Waves, cameras: dict[int, WandCamera]) -> dict[int, WandCamera]:
+    """As large as the scale bars say that these cameras see: the first two cameras may see none."""
+    places = consensus(waves, cameras)[0].reshape(-1, 2, 3)
+    ratio = waves.lengths / np.linalg.norm(places[:, 1] - places[:, 0], axis=1)
+    ratio = ratio[np.isfinite(ratio) & waves.ends]
+    if not len(ratio):
+        return cameras
+    by = float(np.median(ratio))
+    return {
+        c: replace(camera, pose=Pose(camera.pose.rotation, by * camera.pose.translation))
+        for c, camera in cameras.items()
+    }
 
 
 def _resected_exchanged(
@@ -161,6 +180,14 @@ def _best_pair(waves: Waves, settings: ForwardGPSettings, tried: Collection[tupl
     if best is None:
         most = max((int(shared[pair]) for pair in pairs), default=0)
         two = " and ".join(waves.names[c] for c in pairs[0]) if pairs else "two cameras"
+        if waves.still:
+            raise FitError(
+                "no two cameras can be started from these points.",
+                why=f"{two}, which share most, see {most} points together, and it takes {MIN_SHARED_POINTS} that agree "
+                "on two cameras",
+                fix="show all cameras more points, in all of their pictures, near and far; do names mean the same "
+                "point in every camera?",
+            )
         raise FitError(
             "no two cameras can be started from this wand.",
             why=f"{two}, which share most, see {most} markers at the same time; it takes {MIN_SHARED_POINTS}, and both "
@@ -235,7 +262,8 @@ def _pair(
     marker = np.where(waves.ends[both // 2], both % 2, -1)
     images = [waves.images[c] for c in pair]
     straight = np.stack([one.straightened(uv[both, k], images[k]) for k, one in enumerate(odd)], axis=1)
-    starts = pair_starts(straight, both // 2, marker, images, waves.length)[: BEST_STARTS[0]]
+    starts = pair_starts(straight, both // 2, marker, images, waves.lengths[both // 2], still=waves.still)
+    starts = starts[: BEST_STARTS[0]]
     if not starts:
         return None
     part = _part(waves, pair, both)
@@ -245,19 +273,44 @@ def _pair(
         for one in starts
     ]
     scale = np.array([image.half for image in images]) / 640
-    for (px, relative), most in zip(SCHEDULE, BEST_STARTS, strict=True):
-        sd = relative * waves.length
-        found = sorted((trial.adjusted(px * scale, sd).judged(part, every, scale) for trial in found[:most]), key=_cost)
+    for (px, relative), most in zip(SCHEDULE, STILL_STARTS if waves.still else BEST_STARTS, strict=True):
+        found = sorted(
+            (trial.adjusted(px * scale, relative).judged(part, every, scale) for trial in found[:most]), key=_cost
+        )
+    if waves.still and len(waves.seen) > 2:
+        found.sort(key=lambda trial: -_joinable(waves, dict(zip(pair, trial.bundle.cameras, strict=True)), settings))
     score, bundle = found[0].cost, found[0].bundle
     off = np.max([e / (image.half / 640) for e, image in zip(bundle.errors(part.seen), images, strict=True)], axis=0)
     near = off < NEAR_PX
     across = bundle.places[every.frames, 1] - bundle.places[every.frames, 0]
-    right = np.abs(np.linalg.norm(across, axis=1) / waves.length - 1) < GOOD_LENGTH
+    right = np.abs(np.linalg.norm(across, axis=1) / every.length - 1) < GOOD_LENGTH
     at = np.zeros(2 * part.frames, dtype=np.bool_)
     at[both] = near
     right &= at[2 * every.frames] & at[2 * every.frames + 1]
-    good = near.mean() > GOOD_SHARE and np.median(off[near]) < GOOD_PX and right.mean() > MIN_LENGTH_SHARE
+    good = near.mean() > GOOD_SHARE and np.median(off[near]) < GOOD_PX
+    good = good and (waves.still or right.mean() > MIN_LENGTH_SHARE)
     return _Pair(score / len(both), dict(zip(pair, bundle.cameras, strict=True)), bool(good), waves)
+
+
+def _joinable(waves: Waves, cameras: dict[int, WandCamera], settings: ForwardGPSettings) -> float:
+    """How many of the other cameras' views agree with ordinary ones beside these two, as shares: without lengths two
+    cameras fit as well in a world that is skew, and it is the others that do not fit in there."""
+    places, _ = consensus(waves, cameras)
+    shared = {c: np.isfinite(places[seen.rows]).all(axis=1) for c, seen in enumerate(waves.seen) if c not in cameras}
+    total = 0.0
+    for c in sorted(shared, key=lambda c: -shared[c].sum())[:MAX_JOINED]:
+        known, seen = shared[c], waves.seen[c]
+        camera = _resected_ordinary(waves, c, places, settings)
+        if camera is None:
+            continue
+        off = np.linalg.norm(camera.pixel(places[seen.rows[known]]) - seen.uv[known], axis=1)
+        off = np.nan_to_num(off / (waves.images[c].half / 640), nan=np.inf)
+        total += float(np.mean(1 / (1 + off**2)))
+    return total
+
+
+MAX_JOINED = 2
+"""Cameras by which two others are compared."""
 
 
 class _Trial(NamedTuple):
@@ -267,18 +320,18 @@ class _Trial(NamedTuple):
     agreed: Waves
     cost: float
 
-    def adjusted(self, noise: Floats, length_sd: float) -> _Trial:
+    def adjusted(self, noise: Floats, relative_sd: float) -> _Trial:
         """To the views that agreed: wrong ones among them would draw it elsewhere while the noise is large."""
         places = np.zeros(2 * self.agreed.frames, dtype=np.bool_)
         places[self.agreed.seen[0].rows] = True
         lengths = _whole(self.agreed, places)
-        lengths = lengths._replace(sd=np.full(len(lengths.frames), length_sd))
+        lengths = lengths._replace(sd=relative_sd * lengths.length)
         bundle = self.bundle.adjusted(self.agreed.seen, noise, lengths, robust=True, max_steps=12, tolerance=1e-3)
         return self._replace(bundle=bundle)
 
     def judged(self, every: Waves, lengths: Lengths, scale: Floats) -> _Trial:
         """By all views, of a pixel, and all lengths."""
-        lengths = lengths._replace(sd=np.full(len(lengths.frames), JUDGED_LENGTH_SD * every.length))
+        lengths = lengths._replace(sd=JUDGED_LENGTH_SD * lengths.length)
         return self._replace(cost=self.bundle.cost(every.seen, scale, lengths, robust=True))
 
 
@@ -300,7 +353,7 @@ def _part(waves: Waves, cameras: Sequence[int], rows: np.ndarray | None = None) 
 def _whole(waves: Waves, known: Bools) -> Lengths:
     """The frames of which both markers (2 F,) are known."""
     frames = np.flatnonzero(known.reshape(-1, 2).all(axis=1) & waves.ends)
-    return Lengths(frames, waves.length, np.full(len(frames), 1.0))
+    return waves.lengths_of(frames)
 
 
 def _bundle_of(
@@ -511,7 +564,7 @@ def explain_no_rig(waves: Waves) -> str:
         frames = np.unique(both // 2)
         both = both[np.isin(both // 2, frames[:: -(-len(frames) // MAX_SHIFTED_FRAMES)])]
         marker = np.where(tried.ends[both // 2], both % 2, -1)
-        starts = pair_starts(uv[both], both // 2, marker, images, tried.length)
+        starts = pair_starts(uv[both], both // 2, marker, images, tried.lengths[both // 2])
         return float(np.exp(starts[0].rank)) if starts else np.inf
 
     late = find_shift(waves, pair[1], misfit, PAIR_SHIFTS)
@@ -549,7 +602,7 @@ def _adjusted_together(
     seen = [waves.seen[c].select(agree[waves.seen[c].rows, c]) for c in used]
     noise = np.array([waves.images[c].half for c in used]) / 640
     lengths = _whole(waves, np.isfinite(places[:, 0]))
-    lengths = lengths._replace(sd=np.full(len(lengths.frames), 0.002 * waves.length))
+    lengths = lengths._replace(sd=0.002 * lengths.length)
     bundle = bundle.adjusted(seen, noise, lengths, robust=True, max_steps=10, tolerance=1e-3)
     return dict(zip(used, bundle.cameras, strict=True))
 

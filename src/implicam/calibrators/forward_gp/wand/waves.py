@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from implicam.calibrators.forward_gp.wand.bundle import Lengths
 from implicam.calibrators.forward_gp.wand.known import NOTHING_KNOWN, KnownPlaces
 from implicam.geometry import Bools, Floats
 from implicam.rig_model import CameraViews, Image
@@ -22,25 +23,37 @@ class Waves:
         seen: Per camera what it saw: `rows` are numbers of places, 2 frame + marker.
         images: Where the pixels of each camera are measured from.
         stated: (C,) stated noise in pixels, NaN where none is.
-        length: Of the wand.
-        jitter: Sd of the length of one frame about that of all: flex, and centres of markers.
-        ends: (F,) whether the two markers are the wand's ends.
+        lengths: (F,) between the two markers.
+        jitter: (F,) sd of that: flex, and centres of markers; of a scale bar, its standard uncertainty.
+        ends: (F,) whether the two markers are the wand's ends, or those of a scale bar.
         exchanged: (F, C) where the names of the ends were exchanged, and are put right in `seen`.
         names: (C,) of the cameras; frame_names (F,).
         known: Places that are known, in a world of their own.
+        still: Points and scale bars that lie still, and no wand: the fewest lengths do, and none says what a lens is.
     """
 
     rows: NDArray[np.int64]
     seen: tuple[CameraViews, ...]
     images: tuple[Image, ...]
     stated: Floats
-    length: float
-    jitter: float
+    lengths: Floats
+    jitter: Floats
     ends: Bools
     exchanged: Bools
     names: tuple[str, ...]
     frame_names: tuple[str, ...]
     known: KnownPlaces = NOTHING_KNOWN
+    still: bool = False
+
+    def lengths_of(self, frames: NDArray[np.int64], relative_sd: float = 0.0) -> Lengths:
+        """Of some frames.
+
+        Args:
+            frames: Their numbers.
+            relative_sd: Their sd at least, over the length.
+        """
+        length = self.lengths[frames]
+        return Lengths(frames, length, np.maximum(self.jitter[frames], relative_sd * length))
 
     @property
     def frames(self) -> int:
