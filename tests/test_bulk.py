@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from decimal import Decimal
 from functools import cache
 from pathlib import Path
 
@@ -184,6 +185,9 @@ def test_a_folder_of_a_person_is_not_taken_for_parts(tmp_path: Path) -> None:
         ("point,u_cam1,v_cam1\na,1,2\n", "fewer than two cameras"),
         ("u_cam1,v_cam1,u_cam2,v_cam2,sd_u_cam1\n1,2,3,4,5\n", "sd_u_cam1"),
         ("u_cam1,v_cam1,u_cam2,v_cam2\n", "no points"),
+        ("u_cam1,v_cam1,u_cam2,v_cam2,u_cam1\n1,2,3,4,5\n", "u_cam1 more than once"),
+        ("u_cam1,v_cam1,u_cam2,v_cam2\n1,2,3,4\n1,5,2,3,4\n", "row 2 has 5 cells"),
+        ('point,u_cam1,v_cam1,u_cam2,v_cam2\na,1,2,3,4\n"b\nc",1,2,3,4\n', "row 2: a cell goes over more"),
         ("", "fewer than two cameras"),
     ],
 )
@@ -191,6 +195,70 @@ def test_mistakes_are_named(content: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "new.csv").write_text(content)
     with pytest.raises(ImplicamError, match=words):
         measure_file(made(), tmp_path / "new.csv", tmp_path / "m.csv")
+
+
+def test_a_csv_of_another_encoding_is_named(tmp_path: Path) -> None:
+    for encoding in ("utf-16", "latin-1"):
+        (tmp_path / "new.csv").write_bytes("point,u_cam1,v_cam1,u_cam2,v_cam2\n\u00e9,1,2,3,4\n".encode(encoding))
+        with pytest.raises(DatasetError, match=r"new\.csv is no UTF-8"):
+            measure_file(made(), tmp_path / "new.csv", tmp_path / "m.csv")
+
+
+@pytest.mark.parametrize("kind", ["dictionary", "text", "float32", "decimal"])
+def test_parquet_of_other_types_is_the_same(kind: str, tmp_path: Path) -> None:
+    """Columns that pandas, R and databases write; float32 keeps 1e-4 px of 2,000."""
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+
+    def column(values: np.ndarray) -> object:
+        if kind == "text":
+            return ["" if x != x else repr(x) for x in values.tolist()]
+        if kind == "decimal":
+            return [None if x != x else Decimal(repr(x)).quantize(Decimal("1e-9")) for x in values.tolist()]
+        if kind == "dictionary":
+            return arrow.array(values, from_pandas=True).dictionary_encode()
+        return values.astype(np.float32)
+
+    heads = [f"{axis}_{name}" for name in made().camera_names for axis in "uv"]
+    columns = {name: column(values) for name, values in zip(heads, pixels().reshape(ROWS, -1).T, strict=True)}
+    parquet.write_table(
+        arrow.table({"point": arrow.array(NAMES).dictionary_encode(), **columns}), tmp_path / "new.parquet"
+    )
+    measure_file(made(), tmp_path / "new.parquet", tmp_path / "m.parquet", points_at_once=20)
+    found, whole = read(tmp_path / "m.parquet"), made().measure_pixels(pixels())
+    np.testing.assert_allclose(found["xyz"], whole.xyz, atol=1e-3 if kind == "float32" else 1e-6)
+    assert found["point"].tolist() == NAMES
+
+
+def test_frame_numbers_with_gaps_keep_their_digits(tmp_path: Path) -> None:
+    """Pandas makes floats of them: 2147483648.0, and of a missing one None or NaN."""
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    heads = [f"{axis}_{name}" for name in made().camera_names for axis in "uv"]
+    columns = dict(zip(heads, pixels()[:4].reshape(4, -1).T, strict=True))
+    for names in ([2.0**31, 2.0**53 - 1, None, float("nan")], [2**31, 2**53 - 1, None, None]):
+        parquet.write_table(arrow.table({"point": arrow.array(names), **columns}), tmp_path / "new.parquet")
+        measure_file(made(), tmp_path / "new.parquet", tmp_path / "m.parquet")
+        assert read(tmp_path / "m.parquet")["point"].tolist() == ["2147483648", "9007199254740991", "", ""]
+
+
+def test_parquet_that_has_no_pixels_is_named(tmp_path: Path) -> None:
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    heads, path = [f"{axis}_{name}" for name in made().camera_names for axis in "uv"], tmp_path / "new.parquet"
+    numbers = arrow.array([1.0])
+    others = {
+        "row 1: u_cam1 is 'x'": arrow.array(["x"]),
+        "u_cam1 is of the type timestamp": arrow.array([0], arrow.timestamp("s")),
+        "u_cam1 is of the type bool": arrow.array([True]),
+    }
+    for words, values in others.items():
+        parquet.write_table(arrow.table([values] + [numbers] * 7, names=heads), path)
+        with pytest.raises(DatasetError, match=words):
+            measure_file(made(), path, tmp_path / "m.csv")
+    parquet.write_table(arrow.table([numbers] * 9, names=[*heads, heads[0]]), path)
+    with pytest.raises(DatasetError, match="u_cam1 more than once"):
+        measure_file(made(), path, tmp_path / "m.csv")
+    path.write_bytes(path.read_bytes()[:100])  # as a writer leaves it that was killed
+    with pytest.raises(DatasetError, match="cannot be read as Parquet"):
+        measure_file(made(), path, tmp_path / "m.csv")
 
 
 def test_what_is_no_table_is_refused(tmp_path: Path) -> None:

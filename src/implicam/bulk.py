@@ -158,7 +158,9 @@ def _numbered(
             points = part.points or [f"p{i + 1:07d}" for i in range(first, first + len(part.uv))]
             yield NumberedPart(number, first, points, part.uv)
             number, first = number + 1, first + len(part.uv)
-    except OSError as error:
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{source} is no UTF-8.", why=str(error), fix="save it as CSV in UTF-8") from error
+    except (OSError, csv.Error) as error:
         raise DatasetError(f"{source} cannot be read.", why=str(error), fix="check the file") from error
 
 
@@ -300,6 +302,9 @@ def _wanted(source: Path, given: list[str], names: tuple[str, ...]) -> tuple[lis
             f"{source} has the column {refused[0]}, and tables of any length have no uncertainties of their own.",
             fix="measure it as a whole, or leave the column out: each camera's usual noise is then taken",
         )
+    twice = [name for name in given if given.count(name) > 1 and (name == "point" or name[2:] in names)]
+    if twice:
+        raise DatasetError(f"{source} has the column {twice[0]} more than once.", fix="leave one of them in")
     missing = [name for name in names if not {f"u_{name}", f"v_{name}"} <= set(given)]
     if len(missing) > len(names) - 2:
         raise DatasetError(
@@ -359,6 +364,19 @@ def _cells(
 ) -> tuple[Columns, list[str] | None]:
     """The same by Python alone; an error names the row."""
     rows, columns = list(csv.reader(lines)), {}
+    if len(rows) != len(lines):
+        i = next(i for i, row in enumerate(rows) if any("\n" in cell or "\r" in cell for cell in row))
+        raise DatasetError(
+            f"{source}, row {first + i + 1}: a cell goes over more than one line.",
+            why="tables of any length are read line by line",
+            fix="take the line breaks out of the cells, or measure it as a whole",
+        )
+    for i, row in enumerate(rows):
+        if any(row[len(head) :]):  # 1,5 for 1.5 moves all that follow into another column
+            raise DatasetError(
+                f"{source}, row {first + i + 1} has {len(row)} cells, and there are {len(head)} columns.",
+                fix="write decimals with a point, and names with commas in quotes",
+            )
     for name in wanted:
         k = head.index(name)
         try:
@@ -382,18 +400,64 @@ def _unreadable(source: Path, rows: list[list[str]], k: int, name: str, first: i
 
 def _read_parquet(source: Path, names: tuple[str, ...], size: int, skip: int) -> Iterator[Part]:
     parquet = import_extra("pyarrow.parquet", "parquet", "reading Parquet")
-    file = parquet.ParquetFile(source)
-    head = list(file.schema_arrow.names)
-    wanted, _ = _wanted(source, head, names)
-    named = ["point"] if "point" in head else []
-    for number, batch in enumerate(_in_parts(file.iter_batches(size, columns=[*wanted, *named]), size)):
-        if number < skip:
-            continue
-        columns = {
-            name: np.asarray(batch.column(name).to_numpy(zero_copy_only=False), dtype=np.float64) for name in wanted
-        }
-        points = [str(name) for name in batch.column("point").to_pylist()] if named else None
-        yield Part(points, _pixels(columns, names, batch.num_rows))
+    pyarrow = import_extra("pyarrow", "parquet", "reading Parquet")
+    first = skip * size
+    try:
+        file = parquet.ParquetFile(source)
+        head = list(file.schema_arrow.names)
+        wanted, _ = _wanted(source, head, names)
+        for name in wanted:
+            _refuse_no_numbers(source, name, file.schema_arrow.field(name).type)
+        named = ["point"] if "point" in head else []
+        for number, batch in enumerate(_in_parts(file.iter_batches(size, columns=[*wanted, *named]), size)):
+            if number < skip:
+                continue
+            columns = {name: _numbers(source, name, batch.column(name), first) for name in wanted}
+            points = [_name(value) for value in batch.column("point").to_pylist()] if named else None
+            yield Part(points, _pixels(columns, names, batch.num_rows))
+            first += batch.num_rows
+    except pyarrow.ArrowException as error:
+        raise DatasetError(
+            f"{source} cannot be read as Parquet.", why=" ".join(str(error).split()), fix="check the file"
+        ) from error
+
+
+def _refuse_no_numbers(source: Path, name: str, kind: Any) -> None:
+    """Refuse a column of a type that pyarrow would make numbers of, such as dates."""
+    types = import_extra("pyarrow.types", "parquet", "reading Parquet")
+    kind = kind.value_type if types.is_dictionary(kind) else kind
+    numbers = (types.is_integer, types.is_floating, types.is_decimal, types.is_null, *_texts(types))
+    if not any(test(kind) for test in numbers):
+        raise DatasetError(f"{source}: {name} is of the type {kind}.", fix="write pixels as numbers")
+
+
+def _texts(types: Any) -> tuple[Callable[[Any], bool], ...]:
+    return types.is_string, types.is_large_string
+
+
+def _numbers(source: Path, name: str, column: Any, first: int) -> Floats:
+    """A column of Parquet; where it is text, an error names the row."""
+    values = column.to_numpy(zero_copy_only=False)
+    if values.dtype.kind != "O":
+        return np.asarray(values, dtype=np.float64)
+    numbers = np.full(len(values), np.nan)
+    for i, value in enumerate(values):
+        if value is not None and value != "":
+            try:
+                numbers[i] = float(value)
+            except ValueError:
+                raise DatasetError(
+                    f"{source}, row {first + i + 1}: {name} is {value!r}.",
+                    fix="write a number, or leave the cell empty",
+                ) from None
+    return numbers
+
+
+def _name(value: Any) -> str:
+    """The name of a point; pandas makes 7.0 of a number 7 where others of the column are missing."""
+    if value is None or value != value:
+        return ""
+    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
 
 
 def _in_parts(batches: Iterator[Any], size: int) -> Iterator[Any]:
