@@ -257,3 +257,12 @@ def test_what_lies_outside_of_where_the_wand_was_has_larger_error_bars_that_hold
     narrow = [note for note in calibration.notes if "saw the wand in" in note]
     assert len(narrow) == 4
     assert "of its picture (u from" in narrow[0]
+
+
+@pytest.mark.slow
+def test_a_wand_that_makes_a_rig_of_millimetres_is_asked_about() -> None:
+    _, target, _, data = recorded_wand("stereo", 40)
+    data = replace(data, extra={})
+    notes = [ForwardGP(wand=length).fit(data).notes for length in ((target.wand or 0.0) / 1000, target.wand or 0.0)]
+    asked = ["is that length in mm?" in " ".join(one) for one in notes]
+    assert asked == [True, False]

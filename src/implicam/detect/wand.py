@@ -400,10 +400,19 @@ def _log_ratio(chosen: Sequence[Spot], told_by: str) -> float:
     return float(np.log(a.radius / b.radius) if told_by == "size" else np.log(a.step / b.step))
 
 
-def _unsure(a: Spot, b: Spot, ratio: float, told_by: str) -> str:
+def _differ_by(a: Spot, b: Spot, ratio: float, told_by: str) -> str:
     return (
         f"which end is which is not sure: the {_NOUN[told_by]} at {a.at} and {b.at} differ by a factor of "
         f"{np.exp(abs(ratio)):.2f} only"
+    )
+
+
+def _unsure(a: Spot, b: Spot, ratio: float, told_by: str) -> str:
+    if told_by == "spacing":
+        return _differ_by(a, b, ratio, told_by)
+    return (
+        f"{_differ_by(a, b, ratio, told_by)} (two equal markers: make one smaller or darker, with tape, or put a third "
+        "between them, nearer to one end: --markers 3)"
     )
 
 
@@ -413,7 +422,8 @@ def _drop_if_unsure(found: Detected, least: float, told_by: str) -> Detected:
         return found
     by_place = {(spot.u, spot.v): spot for spot in _spots_of(found)}
     a, b = (by_place[float(u), float(v)] for u, v in found.uv[[0, -1]])
-    why = f"{_unsure(a, b, found.notes['log_ratio'], told_by)}, and in most pictures by more than {least**2:.2f}"
+    told = _differ_by(a, b, found.notes["log_ratio"], told_by)
+    why = f"{told}, and in most pictures by more than {least**2:.2f}"
     return nothing(why, notes=found.notes)
 
 

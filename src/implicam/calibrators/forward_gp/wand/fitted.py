@@ -18,12 +18,22 @@ from implicam.calibrators.protocol import Arrays, finite_column
 from implicam.dataset import Dataset, KnownPositions, Observations
 from implicam.dataset.requirements import match_cameras
 from implicam.dataset.scale_bars import ScaleBar, bar_rows
+from implicam.dataset.units import METRES_PER_UNIT
 from implicam.dataset.unused import Rejected, Unused
 from implicam.dataset.wand import FRAME, MARKER, Wand, each_place_once, lying_still, marker_rows
 from implicam.errors import DatasetError, UsageError
 from implicam.geometry import Bools, Floats
 from implicam.progress import Progress
-from implicam.rig_model import MAX_NAMED_IN_NOTE, Diagnosis, FitResult, Frame, image_of, stated_noise
+from implicam.rig_model import (
+    MAX_NAMED_IN_NOTE,
+    CentralCamera,
+    Diagnosis,
+    FitResult,
+    Frame,
+    GeneralCamera,
+    image_of,
+    stated_noise,
+)
 from implicam.rig_model.placement import MAX_SCALE_SDS
 from implicam.rig_model.training_data import camera_views_of
 
@@ -391,13 +401,31 @@ class WandDiagnosis(Diagnosis):
             return [self._known_note(), *super().notes(), *self._length_notes()]
         first = self.data.observations.camera_names[self.fitted.cameras[0]]
         if self.waved.bars:
-            return [*(self.world or (_points_world(first),)), *super().notes(), *self._bar_notes()]
+            own = _points_world(first)
+            return [*(self.world or (own,)), *super().notes(), *self._bar_notes(), *self._size_notes()]
         own = (
             "The world is the wand's: its origin is the middle of all places where the wand was, its axes are those "
             f"of {first} (x right, y down, z forward). Error bars are of positions relative to these places. "
             "implicam world says where it is instead, from an L-frame, known points, a floor or a plumb line."
         )
-        return [*(self.world or (own,)), *super().notes(), *self._picture_notes(), *self._length_notes()]
+        more = [*self._picture_notes(), *self._length_notes(), *self._size_notes()]
+        return [*(self.world or (own,)), *super().notes(), *more]
+
+    def _size_notes(self) -> list[str]:
+        """A rig as no rig is large or small: nothing but the stated length says how large it is."""
+        unit = self.data.length_unit
+        if unit not in METRES_PER_UNIT:
+            return []
+        cameras = (self.fitted.posterior.models[number].camera for number in range(len(self.fitted.cameras)))
+        centres = np.array([one.pose.centre for one in cameras if isinstance(one, CentralCamera | GeneralCamera)])
+        away = float(np.median(np.linalg.norm(centres, axis=1))) * self.frame.scale
+        if LEAST_DISTANCE_M <= away * METRES_PER_UNIT[unit] <= LARGEST_DISTANCE_M:
+            return []
+        what = "scale bars" if self.waved.bars else f"wand of {self.waved.wand.length:.4g} {unit}"
+        return [
+            f"Cameras are {away:.3g} {unit} from the middle of what they see, by the {what}: is that length in {unit}? "
+            "Nothing else says how large the rig is."
+        ]
 
     def _bar_notes(self) -> list[str]:
         used, given = len(self.waved.errors), len(self.waved.bars)
@@ -487,6 +515,9 @@ def _points_world(first: str) -> str:
         "says where it is instead."
     )
 
+
+LEAST_DISTANCE_M, LARGEST_DISTANCE_M = 0.02, 500.0
+"""Median distance of cameras from what they see, in metres, beyond which a length is likely in another unit."""
 
 NARROW_SHARE, MIN_FOR_OUTLINE = 0.15, 12
 """Of a picture that the views of a wand enclose, below which a note says so; and views that tell what they enclose."""
