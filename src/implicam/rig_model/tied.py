@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from implicam.geometry import Floats
 from implicam.rig_model.camera_model import CameraModel, CameraViews, apply_covariance_root
@@ -68,9 +70,9 @@ def condition_scattered(
     k, P = rig.shot_unknowns, len(b)
     shots = np.eye(k, k + P + 1)  # normal equations of the shots: with themselves, with the cameras, right hand side
     M = np.zeros((P, P))
-    for views, slopes in rig.views():
-        shots += np.tensordot(views[:, :, :k], views, axes=((0, 1), (0, 1)))
-        half, squares_less_logs = eliminate(*_displacement_equations(views, slopes))
+    for some in rig.displacement_equations():
+        shots += some.shots
+        half, squares_less_logs = eliminate(some.H, some.rest)
         value += squares_less_logs
         shots -= half[:, :k].T @ half
         M += half[:, k:-1].T @ half[:, k:-1]
@@ -103,10 +105,13 @@ def condition_scattered(
     )
 
 
-def _displacement_equations(views: Floats, slopes: Floats) -> tuple[Floats, Floats]:
-    """Normal equations of the points' displacements: H (m, 3, 3), and (m, 3, k + P + 1) with all the rest."""
-    across = slopes.swapaxes(1, 2)
-    return np.eye(3) + across @ slopes, across @ views
+class _DisplacementEquations(NamedTuple):
+    """Normal equations of the displacements of m points: H (m, 3, 3), and rest (m, 3, k + P + 1) with the shots, the
+    white unknowns of the cameras, and the right hand side; shots (k, k + P + 1), what their views say of the shots."""
+
+    H: Floats
+    rest: Floats
+    shots: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,39 +134,52 @@ class _Rig:
         """Into the parts of each camera, along the first axis."""
         return np.split(white, np.cumsum([len(root) for root in self.alone])[:-1])
 
-    def views(self) -> Iterator[tuple[Floats, Floats]]:
-        """Some points at a time, in units of the noise: (m, 2 C, k + P + 1) how their views depend on the shots and on
-        the white unknowns of the cameras, and what was seen; (m, 2 C, 3) on their own displacement, in its sds."""
+    def displacement_equations(self) -> Iterator[_DisplacementEquations]:
+        """Of some points at a time, in units of the noise and of the sds of the displacements."""
         for start in range(0, len(self.points), POINTS_PER_CHUNK):
-            yield self._views(slice(start, min(start + POINTS_PER_CHUNK, len(self.points))))
+            yield self._equations(slice(start, min(start + POINTS_PER_CHUNK, len(self.points))))
 
-    def _views(self, part: slice) -> tuple[Floats, Floats]:
-        m, C, k = part.stop - part.start, len(self.models), self.shot_unknowns
+    def _equations(self, part: slice) -> _DisplacementEquations:
+        """A view is of one camera: all are never beside each other in one matrix of all their unknowns, of which nearly
+        everything would be zero."""
+        m, k = part.stop - part.start, self.shot_unknowns
         starts = k + np.cumsum([0, *(len(root) for root in self.alone)])
-        views, slopes = np.zeros((m, 2 * C, int(starts[-1]) + 1)), np.zeros((m, 2 * C, 3))
+        width = int(starts[-1]) + 1
+        H, rest, shots = np.zeros((m, 3, 3)) + np.eye(3), np.zeros((m, 3, width)), np.zeros((k, width))
         own = self.scatter.root * self.scatter.size[part, None, None]
 
-        def fill(c: int) -> None:
+        def fill(c: int) -> tuple[NDArray[np.int64], Floats, Floats, Floats]:
+            """Its own columns; and what it adds to those that all cameras share: shots, right hand side."""
             seen = self.camera_views[c]
             seen = seen.select((seen.rows >= part.start) & (seen.rows < part.stop))
             model = self.models[c].without_weights()
             rows = model.rows(self.points[seen.rows])
             noise = (model.noise * seen.relative)[:, None, None]
-            at, pair = seen.rows - part.start, slice(2 * c, 2 * c + 2)
+            at, columns = seen.rows - part.start, slice(starts[c], starts[c + 1])
             by_point = rows.by_point / noise
+            slopes = by_point @ own[at]
+            across = slopes.swapaxes(1, 2)
+            white = apply_covariance_root(rows, self.alone[c]) / noise
+            rest[at, :, columns] = across @ white
+            shared = ((seen.uv - rows.mean) / noise[..., 0])[..., None]
             if self.errors is not None:
-                views[at, pair, :k] = by_point @ self.errors.scaled[seen.rows]
-            views[at, pair, starts[c] : starts[c + 1]] = apply_covariance_root(rows, self.alone[c]) / noise
-            views[at, pair, -1] = (seen.uv - rows.mean) / noise[..., 0]
-            slopes[at, pair] = by_point @ own[at]
+                shared = np.concatenate([by_point @ self.errors.scaled[seen.rows], shared], axis=2)
+                flat = shared[..., :k].reshape(-1, k).T
+                shots[:, columns] = flat @ white.reshape(-1, white.shape[2])
+                return at, across @ slopes, across @ shared, flat @ shared.reshape(-1, k + 1)
+            return at, across @ slopes, across @ shared, np.zeros((0, 1))
 
-        side_by_side(fill, range(C))
-        return views, slopes
+        ends = [*range(k), width - 1]
+        for at, square, to_shared, of_shots in side_by_side(fill, range(len(self.models))):
+            H[at] += square  # a camera sees a point once
+            rest[at[:, None], :, ends] += to_shared.swapaxes(1, 2)
+            shots[:, ends] += of_shots
+        return _DisplacementEquations(H, rest, shots)
 
     def displacement(self, white: Floats, shots: Floats) -> Floats:
         """(n, 3) of the known points, the posterior mean, that of their shot included."""
         taken = np.concatenate([-shots, -white, [1.0]])
-        parts = [_displacement_equations(*each) for each in self.views()]
-        found = np.concatenate([np.linalg.solve(H, (rest @ taken)[..., None])[..., 0] for H, rest in parts])
+        parts = [np.linalg.solve(one.H, (one.rest @ taken)[..., None]) for one in self.displacement_equations()]
+        found = np.concatenate(parts)[..., 0]
         found = self.scatter.size[:, None] * (found @ self.scatter.root.T)
         return found if self.errors is None else found + self.errors.scaled @ shots
