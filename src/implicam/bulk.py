@@ -138,7 +138,7 @@ def measure_file(
         raise UsageError(f"parts of {points_at_once} points are none.", fix=f"take {POINTS_AT_ONCE}")
     parts = _Parts(target, _plan(calibration, source, points_at_once))
     resumed = parts.rows
-    read = _numbered(calibration, source, points_at_once, len(parts.done), resumed)
+    read = numbered_parts(calibration, source, points_at_once, len(parts.done), resumed)
     for part, found in _measured(calibration, read, scheduler):
         parts.add(part, found)
         progress("measuring", parts.rows, parts.rows)
@@ -148,14 +148,23 @@ def measure_file(
     return BulkResult(parts.rows, parts.measured, resumed, tuple(parts.alarms))
 
 
-def _numbered(
-    calibration: RigCalibration, source: Path, points_at_once: int, number: int, first: int
+def numbered_parts(
+    calibration: RigCalibration, source: Path, points_at_once: int, number: int, first: int, *, prefix: str = ""
 ) -> Iterator[NumberedPart]:
-    """The parts of a table from one on, checked."""
+    """The parts of a table from one on, checked.
+
+    Args:
+        calibration: Whose cameras are read.
+        source: The table.
+        points_at_once: Rows of a part.
+        number: Of the part to begin with.
+        first: Number of its first row, from 0.
+        prefix: Of the names of points that have none.
+    """
     try:
         for part in _READERS[source.suffix.lower()](source, calibration.camera_names, points_at_once, number):
             check_views(part.uv, np.full_like(part.uv, np.nan), _cameras(calibration), _place(source, first))
-            points = part.points or [f"p{i + 1:07d}" for i in range(first, first + len(part.uv))]
+            points = part.points or [f"{prefix}p{i + 1:07d}" for i in range(first, first + len(part.uv))]
             yield NumberedPart(number, first, points, part.uv)
             number, first = number + 1, first + len(part.uv)
     except UnicodeDecodeError as error:
@@ -209,17 +218,47 @@ def _place(source: Path, first: int) -> Callable[[int, int], str]:
     return lambda i, _: f"{source}, row {first + i + 1}"
 
 
-def _plan(calibration: RigCalibration, source: Path, points_at_once: int) -> dict[str, Any]:
-    """What the parts are made from."""
+def state_of_file(source: Path) -> list[str | int]:
+    """Name, bytes and time in ns of a table, by which a change is noticed.
+
+    Args:
+        source: The table.
+    """
     try:
         state = source.stat()
     except OSError as error:
         raise DatasetError(
             f"{source} cannot be read.", why=error.strerror or str(error), fix="check the name"
         ) from error
+    return [source.name, state.st_size, state.st_mtime_ns]
+
+
+def count_rows(source: Path) -> int:
+    """Rows of a table, without measuring it.
+
+    Args:
+        source: The table.
+    """
+    ending = source.suffix.lower()
+    try:
+        if ending == ".csv":
+            with source.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+                return max(0, sum(1 for line in file if line.strip()) - 1)
+        if ending == ".npz":
+            with np.load(source, allow_pickle=False) as arrays:
+                return len(arrays["uv"])
+        parquet = import_extra("pyarrow.parquet", "parquet", "reading Parquet")
+        return int(parquet.ParquetFile(source).metadata.num_rows)
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:  # pyarrow's are ValueErrors
+        why = " ".join(str(error).split())
+        raise DatasetError(f"{source} cannot be read as a table.", why=why, fix="check the file") from error
+
+
+def _plan(calibration: RigCalibration, source: Path, points_at_once: int) -> dict[str, Any]:
+    """What the parts are made from."""
     return {
         "calibration": calibration_file.checksum(calibration),  # type: ignore[arg-type]
-        "table": [source.name, state.st_size, state.st_mtime_ns],
+        "table": state_of_file(source),
         "points_at_once": points_at_once,
         "implicam": calibration_file.package_version(),
     }
@@ -409,9 +448,7 @@ def _read_parquet(source: Path, names: tuple[str, ...], size: int, skip: int) ->
         for name in wanted:
             _refuse_no_numbers(source, name, file.schema_arrow.field(name).type)
         named = ["point"] if "point" in head else []
-        for number, batch in enumerate(_in_parts(file.iter_batches(size, columns=[*wanted, *named]), size)):
-            if number < skip:
-                continue
+        for batch in _in_parts(_batches_from(file, first, size, [*wanted, *named]), size):
             columns = {name: _numbers(source, name, batch.column(name), first) for name in wanted}
             points = [_name(value) for value in batch.column("point").to_pylist()] if named else None
             yield Part(points, _pixels(columns, names, batch.num_rows))
@@ -458,6 +495,19 @@ def _name(value: Any) -> str:
     if value is None or value != value:
         return ""
     return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+
+
+def _batches_from(file: Any, first: int, size: int, columns: list[str]) -> Iterator[Any]:
+    """Batches of Parquet from a row on; row groups before it are not read."""
+    ends = np.cumsum([0, *(file.metadata.row_group(i).num_rows for i in range(file.num_row_groups))])
+    groups = np.flatnonzero(ends[1:] > first).tolist()
+    if not groups:
+        return
+    skip = first - int(ends[groups[0]])
+    for batch in file.iter_batches(size, row_groups=groups, columns=columns):
+        if skip < batch.num_rows:
+            yield batch.slice(skip)
+        skip = max(0, skip - batch.num_rows)
 
 
 def _in_parts(batches: Iterator[Any], size: int) -> Iterator[Any]:
@@ -520,6 +570,21 @@ def _columns(points: list[str], found: MeasuredPixels, doubtful: bool) -> dict[s
         reason = np.array(words, dtype=np.str_)
     last = (found.views, found.consistency, reason, found.share_calibration)
     return dict(zip(MEASURED_COLUMNS, (points, *numbers, *last), strict=True))
+
+
+def write_part(path: Path, ending: str, points: list[str], found: MeasuredPixels, doubtful: bool) -> None:
+    """Write a part that stands alone.
+
+    Args:
+        path: The file.
+        ending: Of what it will be called.
+        points: (n,) names.
+        found: What was measured.
+        doubtful: Whether the part contradicts the calibration.
+    """
+    _WRITERS[ending](path, points, found, doubtful)
+    if ending == ".csv":
+        path.write_bytes((",".join(MEASURED_COLUMNS) + "\n").encode() + path.read_bytes())
 
 
 def _write_csv(path: Path, points: list[str], found: MeasuredPixels, doubtful: bool) -> None:

@@ -204,6 +204,7 @@ def _measure_in_parts(
             )
         return
     from implicam.bulk import measure_file
+    from implicam.bulk_folder import measure_folder
 
     if any(others):
         raise UsageError(
@@ -218,7 +219,8 @@ def _measure_in_parts(
             fix="measure it as a whole, or calibrate with forward-gp or explicit",
         )
     with show.progress(json) as progress:
-        found = measure_file(fitted, source, output, points_at_once=chunk, scheduler=scheduler, progress=progress)
+        measure = measure_folder if source.is_dir() else measure_file
+        found = measure(fitted, source, output, points_at_once=chunk, scheduler=scheduler, progress=progress)
     if json:
         show.emit_json({"measured": str(output), **asdict(found), "notes": _unknown_errors(fitted)})
     else:
@@ -249,8 +251,8 @@ def measure_command(
         int | None,
         typer.Option(
             metavar="POINTS",
-            help="Measure a .csv, .parquet or .npz of any length in parts of so many points; killed, the same command "
-            "goes on.",
+            help="Measure a .csv, .parquet or .npz of any length, or a folder of them, in parts of so many points; "
+            "killed, the same command goes on.",
         ),
     ] = None,
     scheduler: Scheduler = None,
