@@ -362,15 +362,17 @@ def assert_whole(session: Session) -> None:
     assert {p.name for p in folder.iterdir()} <= tops
 
 
+KILLS = 60
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kills", [6, pytest.param(60, marks=pytest.mark.slow)])
-def test_every_point_that_was_accepted_survives_kill_9(tmp_path, kills):
+def test_every_point_that_was_accepted_survives_kill_9(tmp_path):
     folder, rng = tmp_path / "s", np.random.default_rng(7)
     begin(folder).close()
     (folder / "images" / "right").mkdir(parents=True)
     (folder / "images" / "té st").mkdir()
     accepted: list[str] = []
-    for _ in range(kills):
+    for _ in range(KILLS):
         with child(ACCEPTING, folder) as process:
             assert process.stdout is not None
             assert process.stdout.readline() == "open\n"
