@@ -743,6 +743,23 @@ def test_each_move_of_a_board_is_asked_for(tmp_path, monkeypatch):
         controller.close()
 
 
+def test_poses_that_no_simulated_camera_sees_are_refused_with_where_cameras_look(tmp_path, slots):
+    """Where the rig's box is turned, poses that face along z are edge-on: a session would wait for ever."""
+    rows = [[*pose.translation, *vector_from_rotation(pose.rotation)] for _, pose in slots[:2]]
+    turned = slots[2].pose.rotation @ rotation_from_vector([0.0, np.pi, 0.0])
+    rows.append([*slots[2].pose.apply(np.array([[140.0, 0.0, 0.0]]))[0], *vector_from_rotation(turned)])
+    for name, wrong, says in (("back", rows, "at pose03 (1 of 3 poses)"), ("far", [[0, 0, 300]] * 2, "(2 of 2 poses)")):
+        file = tmp_path / f"{name}.csv"
+        head = "x,y,z,rx,ry,rz" if name == "back" else "x,y,z"
+        file.write_text("\n".join([head, *(",".join(map(str, row)) for row in wrong)]))
+        setup = Setup(rig="stereo", seed=1, target="board", board="5x8", square=20.0, poses=str(file))
+        with pytest.raises(UsageError) as caught:
+            open_session(tmp_path / name, setup).close()
+        assert says in str(caught.value)
+        assert ("they see its back, or it lies edge-on" in str(caught.value)) == (name == "back")
+        assert "its cameras look at x" in str(caught.value)
+
+
 @pytest.mark.slow
 def test_a_session_goes_through_the_slots_of_a_block_and_calibrates_by_any_method(tmp_path, slots):
     file = tmp_path / "poses.csv"

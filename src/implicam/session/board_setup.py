@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from implicam.active import Workspace, workspace_from
-from implicam.active.board_design import BoardShape
+from implicam.active.board_design import MIN_CORNERS, BoardShape
 from implicam.active.board_loop import BoardLoop
 from implicam.active.board_poses import (
+    KnownPose,
     KnownPosesLoop,
     carried_poses,
     described,
@@ -26,6 +29,7 @@ from implicam.dataset.units import METRES_PER_UNIT
 from implicam.dataset.wand import WAND
 from implicam.detect import ALSO_CALLED, TARGETS, Detector, options_of
 from implicam.errors import UsageError, did_you_mean
+from implicam.formatting import list_some
 from implicam.geometry import Pose
 from implicam.hardware import FrameSource, Person, Robot
 from implicam.hardware.simulated import SimulatedRobot
@@ -36,6 +40,7 @@ from implicam.session.journal import TARGET_KEY, Session
 
 if TYPE_CHECKING:
     from implicam.session.setup import Setup
+    from implicam.simulate import Rig
 
 BALL = "ball"
 
@@ -58,6 +63,9 @@ POSES_KEY = "known_poses"
 
 MIN_DOTS_COSINE = 0.5
 """Of the angle between a plate of dots and the line to a camera that is to find all of them."""
+
+MIN_SPACING_PX = 10.0
+"""From one corner to the next, below which no picture is asked for."""
 
 ROBOT_PLACES = 600
 """Where a robot can put the board, among which it is sent."""
@@ -173,6 +181,8 @@ def board_hardware(
         turn = _rotation_of(setup)
     if cameras is None:
         rig = setup.built()
+        if setup.poses:
+            _refuse_unseen(rig, shape_of(detector), poses_from(setup.poses))
         found, hand = simulated_hand(rig, detector.describe(), seed=setup.seed, seconds=HAND_SECONDS)
         if carried and volume is not None:
             speed = (setup.speed or SIMULATED_SPEED) / METRES_PER_UNIT[setup.unit]
@@ -225,6 +235,42 @@ def _refuse_useless(setup: Setup, carried: bool) -> None:
             why="the robot moves it without turning it, and tells where it is",
             fix="--facing=0,0,-1, the normal of its printed side in the robot's frame; or --facing=r:RX,RY,RZ",
         )
+
+
+def _refuse_unseen(rig: Rig, shape: BoardShape, poses: Sequence[KnownPose]) -> None:
+    """UsageError where no simulated camera can see the board at one of its poses: nobody could go on there."""
+    needed = len(shape.corners) if shape.whole else MIN_CORNERS
+    unseen, turned_away = [], False
+    for one in poses:
+        corners, front = one.pose.apply(shape.corners), -one.pose.rotation[:, 2]
+        there = [camera for camera in rig.cameras if _can_be_found(*camera.pixel_from_world(corners), needed)]
+        towards = [camera.camera_from_world.centre - one.pose.apply(shape.middle) for camera in there]
+        if not any(front @ line > shape.facing * np.linalg.norm(line) for line in towards):  # of a mirror, its image
+            unseen.append(one.name)
+            turned_away |= bool(there)
+    if not unseen:
+        return
+    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2 * rig.volume.size
+    places = rig.volume.world_from_box.apply(corners)
+    box = ", ".join(
+        f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in zip("xyz", places.min(0), places.max(0), strict=True)
+    )
+    normal = ", ".join(f"{value:.3g}" for value in np.round(-rig.volume.world_from_box.rotation[:, 2], 3) + 0.0)
+    raise UsageError(
+        f"no camera of the simulated rig {rig.name!r} sees the board at {list_some(unseen)}"
+        f" ({len(unseen)} of {len(poses)} poses).",
+        why=f"its cameras look at {box}, and a board that faces them there, near enough, has the normal ({normal})"
+        + ("; at some of these poses they see its back, or it lies edge-on" if turned_away else ""),
+        fix="give poses in there, with nx,ny,nz in the CSV file; or leave --poses out to see how it works",
+    )
+
+
+def _can_be_found(uv: Floats, on_image: NDArray[np.bool_], needed: int) -> bool:
+    """Whether enough corners are in a picture, and as far apart as any detector needs."""
+    if on_image.sum() < needed:
+        return False
+    nearest = cKDTree(uv[on_image]).query(uv[on_image], k=2)[0][:, 1]
+    return bool(np.median(nearest) > MIN_SPACING_PX)
 
 
 def _rotation_of(setup: Setup) -> Floats:
