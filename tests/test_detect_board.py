@@ -16,7 +16,7 @@ from implicam.detect.model import Detected, View
 from implicam.detect.numbering import find_numberings
 from implicam.detect.seeds import from_libcbdetect
 from implicam.errors import UsageError
-from implicam.images import opencv
+from implicam.images import opencv, read_picture
 from implicam.simulate import build_rig, moving_board
 from implicam.simulate.photographs import Optics, Studio
 
@@ -66,6 +66,17 @@ def test_what_covers_a_board_never_makes_a_number_wrong():
     assert np.linalg.norm(off, axis=1).max() < 0.2
     assert refused < 6  # some of them can be numbered for certain
     assert abs(nees.mean() - 2) < 0.3 + 8 / np.sqrt(len(nees))  # four standard deviations
+
+
+@pytest.mark.parametrize("bits", [8, 10])
+def test_pictures_of_few_bits_that_are_stored_with_sixteen_are_dark_and_good(tmp_path, bits):
+    """Ten bits of a camera that nobody shifted: their white is 1.6 % of what the file can hold."""
+    H = rotated(0.3, 24, tilt=(0.01, 0.005))
+    picture = np.rint(photograph(checkered(8, 11), H, fine=4) * (2**bits - 1)).astype(np.uint16)
+    assert opencv().imwrite(str(tmp_path / "dark.png"), picture)
+    got = Board().detect(read_picture(tmp_path / "dark.png"), VIEW)
+    assert len(got) == 88
+    assert np.abs(errors(got, corners_of(8, 11, H))).max() < 0.06
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, 1.6, 2.5, np.pi, -2.2, -1.5, -0.6])

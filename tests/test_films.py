@@ -202,7 +202,7 @@ def test_a_damaged_film_is_named(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "cam1.avi").write_bytes(avi[: len(avi) * 6 // 10])
     run = detect_films(folder, Ball(), films_of(folder), unit="mm", overlays=False)
-    (note,) = [note for note in run.notes if "cut off or damaged" in note]
+    (note,) = [note for note in run.notes if "cut off, or damaged" in note]
     assert "of the 20 pictures that it promises" in note
     assert 5 < len(run.data) < 20
     described = (folder / "dataset.toml").read_text()

@@ -32,6 +32,9 @@ from implicam.errors import UsageError
 from implicam.images import Grey, opencv
 from implicam.registry import Option
 
+MIN_CONTRAST_SDS = 10.0
+"""From dark to bright, in sds of the noise of a pixel, below which a dim picture shows nothing: noise alone has 6."""
+
 MAX_SEARCH_PIXELS = 2_500_000
 """Pixels beyond which the search is done in a smaller picture; corners are always fitted in the original."""
 
@@ -350,10 +353,17 @@ def explain_unusable(picture: Grey) -> str:
     if not np.isfinite(picture).all():
         return "the picture holds values that are no numbers. Export it again."
     low, high = np.quantile(picture[::3, ::3], (0.002, 0.998))
-    if high - low < 0.02:
+    if high - low < 0.02 and high - low < MIN_CONTRAST_SDS * _pixel_noise(picture):  # 10 bits in 16 are dark, and good
         what = "black" if high < 0.1 else "white" if low > 0.9 else "plain grey"
         return f"the picture is {what}: nothing can be seen in it. Check lens cap, exposure and light."
     return ""
+
+
+def _pixel_noise(picture: Grey) -> float:
+    """Sd of the grey of a pixel, from neighbours; at least a third of the steps in which it is given."""
+    steps = np.abs(np.diff(picture[::3], axis=1)).ravel()
+    step = float(steps[steps > 0].min(initial=1.0))
+    return max(float(np.median(steps) / (0.6745 * np.sqrt(2))), step / 3)
 
 
 def _search_scale(picture: Grey) -> float:

@@ -300,8 +300,9 @@ def _search(camera: str, film: Film, detector: Detector, journal: Journal, every
     notes = []
     if film.promised > len(all_times):
         notes.append(
-            f"{film.path.name}: {len(all_times)} of the {film.promised} pictures that it promises can be read; it is "
-            "cut off or damaged after them."
+            f"{film.path.name}: {len(all_times)} of the {film.promised} pictures that it promises can be read: "
+            "it is cut off, or damaged. If the damage is midway, what comes after it may be dated too early by what is "
+            "missing: record it again, or leave these pictures out."
         )
     ordered = {v: found[v] for n in numbers if (v := View(camera, shot_name(int(n)))) in found}
     return _Searched(film, numbers, all_times, ordered, notes, len(known), seconds)
