@@ -242,7 +242,8 @@ def test_two_cameras_start_from_no_guess() -> None:
     recorded = simulate(rig, target, seed=5, outliers=0.1)
     uv, observations = recorded.observations.uv, recorded.observations
     rows = np.arange(len(uv))
-    best = pair_starts(uv, rows // 2, rows % 2, [image_of(observations, c) for c in range(2)], target.wand or 0.0)[0]
+    lengths = np.full(len(uv), target.wand)
+    best = pair_starts(uv, rows // 2, rows % 2, [image_of(observations, c) for c in range(2)], lengths)[0]
     assert best.px < 1.0
     assert best.spread < 0.2
     assert 0.6 < best.cameras[0].lens.fx / rig.cameras[0].lens.fx < 1.6
